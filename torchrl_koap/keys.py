@@ -1,0 +1,184 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Names of all tensordict entries, the two layouts they live in, and their validator.
+
+Storage layout (TorchRL's TED, flat over steps; ``N`` steps of all trajectories one after the other)::
+
+    observation            [N, obs]   float   what the environment returned before the step
+    state                  [N, d]     float   the part of it that planner and controller may see (optional)
+    action                 [N, act]   float   NaN where the label is not in the budget
+    has_action             [N, 1]     bool    False where ``action`` is NaN
+    episode                [N]        int64   trajectory index, constant inside a trajectory
+    step_count             [N]        int64   0, 1, 2, ... inside a trajectory
+    next/observation       [N, obs]   float
+    next/done, terminated, truncated  [N, 1]  bool
+    next/reward            [N, 1]     float   (optional)
+
+Window layout (``T = history + horizon`` consecutive steps of one trajectory, "now" is frame ``history - 1``)::
+
+    frame        0     1     2     3  ...  8   9  ...  15          (history = 2, horizon = 14, k = 8)
+                 x_0   x_1   x_2   x_3     x_8 x_9     x_15
+                 past  now   `------- planned (or recorded) future -------'
+    action             a_1   a_2   a_3 ...             a_14        a_t moves x_t to x_{t+1}
+    f for a_1    x_0   x_1                     x_{1+k}
+
+Every entry of a window is ``[*B, T, ...]``; ``latent_action`` and ``action`` of frame ``t`` belong to the
+transition from ``x_t`` to ``x_{t+1}``.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+
+OBSERVATION = "observation"
+STATE = "state"
+ACTION = "action"
+HAS_ACTION = "has_action"
+EPISODE = "episode"
+STEP_COUNT = "step_count"
+NEXT_OBSERVATION = ("next", "observation")
+NEXT_DONE = ("next", "done")
+NEXT_TERMINATED = ("next", "terminated")
+NEXT_TRUNCATED = ("next", "truncated")
+NEXT_REWARD = ("next", "reward")
+
+LIFTED_STATE = "lifted_state"
+LATENT_ACTION = "latent_action"
+HISTORY = "history"
+PLAN = "plan"
+
+SUCCESS = "success"
+COLLISION = "collision"
+MODE = "mode"
+
+REQUIRED = (
+    OBSERVATION,
+    ACTION,
+    HAS_ACTION,
+    EPISODE,
+    STEP_COUNT,
+    NEXT_OBSERVATION,
+    NEXT_DONE,
+    NEXT_TERMINATED,
+    NEXT_TRUNCATED,
+)
+
+
+class LayoutError(ValueError):
+    """A tensordict that does not follow the storage layout; ``problems`` lists every fault found."""
+
+    def __init__(self, problems: list[str]):
+        self.problems = problems
+        super().__init__("the data do not follow the storage layout:\n  - " + "\n  - ".join(problems))
+
+
+def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDictBase:
+    """Checks a flat tensordict against the storage layout and returns it unchanged.
+
+    Args:
+        data (TensorDictBase): flat data, ``batch_size == [N]``.
+        command (slice, optional): columns of the observation that may be NaN, as a whole, because
+            :func:`~torchrl_koap.data.hide_commands` blanked them. Default: none.
+
+    Raises:
+        LayoutError: with *all* problems found: missing keys, wrong dtypes or shapes, non-finite states,
+            labels that are NaN although ``has_action`` says they are there (or the reverse: a leak), step
+            counts that do not restart with the trajectory, trajectories that are not contiguous.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.keys import LayoutError, validate
+        >>> try:
+        ...     validate(TensorDict({"observation": torch.zeros(3, 2)}, [3]))
+        ... except LayoutError as error:
+        ...     print(error.problems[0])
+        missing key 'action'
+    """
+    if data.batch_dims != 1:
+        raise LayoutError([f"batch size must be [N] (flat over steps), got {list(data.batch_size)}"])
+    if data.shape[0] == 0:
+        raise LayoutError(["there are no steps (batch size [0])"])
+    present = set(data.keys(include_nested=True, leaves_only=True))
+    problems = [f"missing key {key!r}" for key in REQUIRED if key not in present]
+    problems += _shape_problems(data, present)
+    if not problems:  # the rules below compare entries with each other and need all of them
+        problems += _value_problems(data, present, command)
+    if problems:
+        raise LayoutError(problems)
+    return data
+
+
+def _shape_problems(data: TensorDictBase, present: set) -> list[str]:
+    problems = []
+    for key in (OBSERVATION, STATE, ACTION, NEXT_OBSERVATION, NEXT_REWARD):
+        if key in present:
+            value = data.get(key)
+            if value.ndim != 2 or not value.is_floating_point():
+                problems.append(f"{key!r} must be a float tensor [N, d], got {value.dtype} {list(value.shape)}")
+    for key in (HAS_ACTION, NEXT_DONE, NEXT_TERMINATED, NEXT_TRUNCATED):
+        if key in present:
+            value = data.get(key)
+            if value.dtype != torch.bool or value.shape != (data.shape[0], 1):
+                problems.append(f"{key!r} must be a bool tensor [N, 1], got {value.dtype} {list(value.shape)}")
+    for key in (EPISODE, STEP_COUNT):
+        if key in present:
+            value = data.get(key)
+            if value.dtype != torch.int64 or value.shape != (data.shape[0],):
+                problems.append(f"{key!r} must be an int64 tensor [N], got {value.dtype} {list(value.shape)}")
+    if not problems and {OBSERVATION, NEXT_OBSERVATION} <= present:
+        width, next_width = data.get(OBSERVATION).shape[-1], data.get(NEXT_OBSERVATION).shape[-1]
+        if width != next_width:
+            problems.append(f"'observation' has {width} columns, {NEXT_OBSERVATION!r} has {next_width}")
+    return problems
+
+
+def _value_problems(data: TensorDictBase, present: set, command: slice | None) -> list[str]:
+    problems = []
+    for key in (OBSERVATION, STATE, NEXT_OBSERVATION):
+        if key in present:
+            bad_entries = ~data.get(key).isfinite()
+            if command is not None and key != STATE:
+                bad_entries[:, command] &= ~data.get(key)[:, command].isnan().all(-1, keepdim=True)
+            bad = bad_entries.any(-1)
+            if bad.any():
+                problems.append(f"{key!r} is NaN or infinite in {int(bad.sum())} steps, first at step {_first(bad)}")
+
+    action, has_action = data.get(ACTION), data.get(HAS_ACTION).squeeze(-1)
+    lost = has_action & ~action.isfinite().all(-1)
+    if lost.any():
+        problems.append(f"'action' is not finite in {int(lost.sum())} labelled steps, first at step {_first(lost)}")
+    leaked = ~has_action & ~action.isnan().all(-1)
+    if leaked.any():
+        problems.append(
+            f"'action' holds numbers in {int(leaked.sum())} unlabelled steps, first at step {_first(leaked)}"
+            " (an action outside the label budget must be NaN)"
+        )
+
+    episode, step_count = data.get(EPISODE), data.get(STEP_COUNT)
+    same = episode[1:] == episode[:-1]
+    edge = torch.ones(1, dtype=torch.bool, device=same.device)
+    starts = torch.cat([edge, ~same])
+    if int(starts.sum()) != episode.unique().numel():
+        problems.append("'episode': the steps of a trajectory must lie one after the other")
+    wrong = starts & (step_count != 0)
+    wrong[1:] |= same & (step_count[1:] != step_count[:-1] + 1)
+    if wrong.any():
+        problems.append(f"'step_count' must count 0, 1, 2, ... in a trajectory, first fault at step {_first(wrong)}")
+
+    done = data.get(NEXT_DONE).squeeze(-1)
+    ends = torch.cat([~same, edge])
+    if (ends & ~done).any():
+        problems.append(f"('next', 'done') is False at the end of the trajectory at step {_first(ends & ~done)}")
+    if (done & ~ends).any():
+        problems.append(f"('next', 'done') is True inside a trajectory at step {_first(done & ~ends)}")
+    stopped = (data.get(NEXT_TERMINATED) | data.get(NEXT_TRUNCATED)).squeeze(-1)
+    if (done != stopped).any():
+        problems.append(
+            f"('next', 'done') must be 'terminated or truncated', first fault at step {_first(done != stopped)}"
+        )
+    return problems
+
+
+def _first(mask: torch.Tensor) -> int:
+    return int(mask.nonzero()[0])
