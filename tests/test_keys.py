@@ -1,0 +1,124 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The validator accepts the layout and names every departure from it, all at once."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.keys import REQUIRED, LayoutError, validate
+
+
+def flat(lengths=(3, 1, 4), obs=4, act=2, dtype=torch.float32):
+    n = sum(lengths)
+    generator = torch.Generator().manual_seed(0)
+    done = torch.zeros(n, 1, dtype=torch.bool)
+    done[torch.tensor(lengths).cumsum(0) - 1] = True
+    return TensorDict(
+        {
+            "observation": torch.randn(n, obs, generator=generator, dtype=dtype),
+            "action": torch.randn(n, act, generator=generator, dtype=dtype),
+            "has_action": torch.ones(n, 1, dtype=torch.bool),
+            "episode": torch.cat([torch.full((length,), i) for i, length in enumerate(lengths)]),
+            "step_count": torch.cat([torch.arange(length) for length in lengths]),
+            "next": {
+                "observation": torch.randn(n, obs, generator=generator, dtype=dtype),
+                "done": done,
+                "terminated": done.clone(),
+                "truncated": torch.zeros_like(done),
+            },
+        },
+        [n],
+    )
+
+
+def problems(data, **kwargs):
+    with pytest.raises(LayoutError) as error:
+        validate(data, **kwargs)
+    assert all(problem in str(error.value) for problem in error.value.problems)
+    return error.value.problems
+
+
+@pytest.mark.parametrize("lengths", [(3, 1, 4), (1,), (1, 1), (7,)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_layout_is_accepted_and_unchanged(lengths, dtype):
+    data = flat(lengths, dtype=dtype)
+    copy = data.clone()
+    assert validate(data) is data
+    assert (data == copy).all()
+    data["state"] = data["observation"][:, 2:]
+    data["next", "reward"] = torch.zeros(data.shape[0], 1)
+    data["action"][1:] = float("nan")
+    data["has_action"][1:] = False
+    validate(data)
+
+
+@pytest.mark.parametrize("key", REQUIRED)
+def test_missing_keys(key):
+    assert problems(flat().exclude(key)) == [f"missing key {key!r}"]
+
+
+def test_everything_is_reported_at_once():
+    data = flat().exclude("action", ("next", "done"))
+    data["episode"] = data["episode"].float()
+    data["has_action"] = data["has_action"].squeeze(-1)
+    found = problems(data)
+    assert len(found) == 4
+    assert any("int64" in problem for problem in found) and any("[N, 1]" in problem for problem in found)
+
+
+def test_batch_size():
+    assert "flat over steps" in problems(flat().reshape(2, 4))[0]
+    assert "no steps" in problems(flat()[:0])[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["observation"][5].fill_(float("nan")), "'observation' is NaN or infinite in 1 steps, first at step 5"),
+        (lambda d: d["next", "observation"][2, 1].fill_(float("inf")), "('next', 'observation') is NaN"),
+        (lambda d: d["action"][2].fill_(float("nan")), "labelled steps, first at step 2"),
+        (lambda d: d["has_action"][3].fill_(False), "outside the label budget must be NaN"),
+        (lambda d: d["step_count"][1].fill_(7), "'step_count' must count 0, 1, 2, ... in a trajectory, first fault at step 1"),
+        (lambda d: d["step_count"][3].fill_(1), "first fault at step 3"),
+        (lambda d: d["episode"][-1].fill_(0), "one after the other"),
+        (lambda d: d["next", "done"][2].fill_(False), "False at the end of the trajectory at step 2"),
+        (lambda d: d["next", "done"][0].fill_(True), "True inside a trajectory at step 0"),
+        (lambda d: d["next", "truncated"][0].fill_(True), "terminated or truncated"),
+    ],
+)
+def test_wrong_values(change, message):
+    data = flat()
+    change(data)
+    assert any(message in problem for problem in problems(data))
+
+
+def test_one_step_with_a_wrong_count():
+    data = flat((1,))
+    data["step_count"][0] = 3
+    assert any("step_count" in problem for problem in problems(data))
+
+
+def test_widths_must_agree():
+    data = flat()
+    data["next", "observation"] = data["next", "observation"][:, :3].clone()
+    assert problems(data) == ["'observation' has 4 columns, ('next', 'observation') has 3"]
+
+
+def test_a_half_poisoned_label_is_a_fault():
+    data = flat()
+    data["action"][1, 0] = float("nan")
+    data["has_action"][1] = False
+    assert any("unlabelled" in problem for problem in problems(data))
+
+
+def test_blanked_commands():
+    data = flat()
+    data["observation"][:4, 0:2] = float("nan")
+    data["next", "observation"][:4, 0:2] = float("nan")
+    validate(data, command=slice(0, 2))
+    assert len(problems(data)) == 2
+    data["observation"][6, 1] = float("nan")  # half a command is a fault
+    data["observation"][7, 3] = float("nan")
+    assert "in 2 steps, first at step 6" in problems(data, command=slice(0, 2))[0]
