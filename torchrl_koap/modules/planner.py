@@ -1,0 +1,237 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The planner: a generative model of the next states given the last observed ones. It never sees an action."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn.probabilistic import InteractionType, interaction_type
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_koap import keys
+from torchrl_koap.data.normalizers import Normalizer
+from torchrl_koap.modules.diffusion import SOLVERS, NoiseSchedule
+
+Tensor = torch.Tensor
+
+
+class StatePlanner(TensorDictModuleBase):
+    """Samples the next ``horizon`` states given the last ``history`` ones: pi_PL(x_{t+1:t+H} | x_{t-h+1:t}) of the KOAP paper.
+
+    With ``relative=True`` a plan is modelled as displacements from the current state, and the condition is the displacement of
+    the older frames together with the current state itself::
+
+        frame        0      1       2      3          (history = 2)
+                     x_0    x_1     x_2    x_3
+        condition    x_0-x_1, x_1
+        plan                        x_2-x_1, x_3-x_1, ...
+
+    Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state dict.
+
+    Sampling always starts from random noise, also under ``ExplorationType.DETERMINISTIC`` (or ``MODE``, ``MEAN``), where only a
+    stochastic solver is exchanged for its deterministic sibling ``"ddim"``: one fixed start noise would give one fixed mode.
+    For evaluations that can be repeated per environment put standard normal noise into the entry ``noise_key``.
+
+    Args:
+        denoiser (nn.Module): ``denoiser(sequence [*B, H, d], time [*B], condition [*B, h * d]) -> [*B, H, d]``.
+        schedule (NoiseSchedule, optional): noise schedule and prediction type. Defaults to ``NoiseSchedule()``, the 50 steps,
+            squared cosine and noise prediction of KOAP's first public code.
+
+    Keyword Args:
+        state_dim (int): number ``d`` of state columns.
+        history (int): number ``h`` of observed frames, the current one included. Defaults to 2.
+        horizon (int): number ``H`` of planned frames. Defaults to 14.
+        relative (bool): model displacements from the current state. Defaults to True.
+        solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a flow path.
+        num_steps (int): solver steps. Defaults to 10.
+        clip (float, optional): bound of the normalised plan at every solver step. Defaults to no bound; ``1.0`` suits ``"minmax"``
+            statistics.
+        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]`` in raw units. Defaults to ``["history"]``.
+        out_keys (list of NestedKey): the entry of the plan ``[*B, H, d]`` in raw units. Defaults to ``["plan"]``.
+        noise_key (NestedKey, optional): entry read if present: start noise ``[*B, H, d]``, or ``[*B, 1 + num_steps, H, d]`` where
+            the rest are the draws of a stochastic solver. Defaults to ``"noise"``.
+
+    Raises:
+        ValueError: for a history of another length or width, noise of another shape, an unknown or unfit solver.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules.denoisers import TemporalUnet
+        >>> from torchrl_koap.modules.diffusion import NoiseSchedule
+        >>> from torchrl_koap.modules.planner import StatePlanner
+        >>> planner = StatePlanner(TemporalUnet(2, 4), NoiseSchedule("flow"), state_dim=2, num_steps=4)
+        >>> windows = torch.randn(100, 16, 2).cumsum(1)
+        >>> planner.fit_normalizers(windows)
+        >>> planner(TensorDict({"history": windows[:5, :2]}, [5]))["plan"].shape
+        torch.Size([5, 14, 2])
+    """
+
+    def __init__(
+        self,
+        denoiser: nn.Module,
+        schedule: NoiseSchedule | None = None,
+        *,
+        state_dim: int,
+        history: int = 2,
+        horizon: int = 14,
+        relative: bool = True,
+        solver: str | None = None,
+        num_steps: int = 10,
+        clip: float | None = None,
+        in_keys: list[NestedKey] | None = None,
+        out_keys: list[NestedKey] | None = None,
+        noise_key: NestedKey | None = "noise",
+    ):
+        super().__init__()
+        for name, value in {"state_dim": state_dim, "history": history, "horizon": horizon}.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        self.in_keys = [keys.HISTORY] if in_keys is None else list(in_keys)
+        self.out_keys = [keys.PLAN] if out_keys is None else list(out_keys)
+        if len(self.in_keys) != 1 or len(self.out_keys) != 1:
+            raise ValueError(f"one in_key and one out_key are needed, got {self.in_keys} and {self.out_keys}")
+        self.denoiser = denoiser
+        self.schedule = NoiseSchedule() if schedule is None else schedule
+        self.state_dim, self.history, self.horizon, self.relative = state_dim, history, horizon, relative
+        self.clip, self.noise_key = clip, noise_key
+        self.condition_normalizer = _identity(history * state_dim)
+        self.plan_normalizer = _identity(horizon * state_dim)
+        default = "heun" if self.schedule.path == "flow" else "dpm++2m"
+        self.solver = default if solver is None else solver
+        self.num_steps = num_steps
+
+    @property
+    def solver(self) -> str:
+        """Name of the solver; may be set at any time."""
+        return self._solver
+
+    @solver.setter
+    def solver(self, name: str) -> None:
+        self.schedule.check_solver(name)
+        self._solver = name
+
+    @property
+    def num_steps(self) -> int:
+        """Number of solver steps; may be set at any time."""
+        return self._num_steps
+
+    @num_steps.setter
+    def num_steps(self, number: int) -> None:
+        self.schedule.nodes(number)
+        self._num_steps = number
+
+    def set_keys(self, *, history: NestedKey | None = None, plan: NestedKey | None = None) -> None:
+        """Renames the entries read and written."""
+        if history is not None:
+            self.in_keys = [history]
+        if plan is not None:
+            self.out_keys = [plan]
+
+    def fit_normalizers(self, windows: Tensor, *, mode: str = "minmax", per_step: bool = True) -> None:
+        """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
+
+        Args:
+            windows (Tensor): states in raw units, ``[*N, history + horizon, d]``.
+
+        Keyword Args:
+            mode (str): ``"minmax"``, ``"standard"`` or ``"identity"`` (see :class:`~torchrl_koap.data.normalizers.Normalizer`).
+            per_step (bool): own statistics for every planned step instead of shared ones. Defaults to True.
+        """
+        history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
+        plan = plan - history[..., -1:, :] if self.relative else plan
+        if per_step:
+            plan = plan.flatten(-2)
+        else:
+            plan = plan.reshape(-1, self.state_dim).repeat(1, self.horizon)
+        condition = self._displace(history).flatten(-2)
+        example = self.plan_normalizer.scale
+        self.condition_normalizer = Normalizer.fit(condition, mode=mode).to(example)
+        self.plan_normalizer = Normalizer.fit(plan, mode=mode).to(example)
+
+    def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
+        """Cuts windows ``[*B, history + horizon, d]`` into history and plan."""
+        length = self.history + self.horizon
+        if window.ndim < 2 or window.shape[-2] != length or window.shape[-1] != self.state_dim:
+            raise ValueError(
+                f"windows must be [*B, {length}, {self.state_dim}] (history + horizon, state_dim), got {list(window.shape)}"
+            )
+        return window[..., : self.history, :], window[..., self.history :, :]
+
+    def encode_history(self, history: Tensor) -> Tensor:
+        """Raw history ``[*B, h, d]`` to the denoiser's condition ``[*B, h * d]``."""
+        if history.ndim < 2 or history.shape[-2:] != (self.history, self.state_dim):
+            raise ValueError(
+                f"{self.in_keys[0]!r} must be [*B, {self.history}, {self.state_dim}] (history, state_dim), got {list(history.shape)}"
+            )
+        return self.condition_normalizer(self._displace(history).flatten(-2))
+
+    def encode_plan(self, history: Tensor, plan: Tensor) -> Tensor:
+        """Raw plan ``[*B, H, d]`` to the normalised sequence that noise is added to."""
+        if plan.shape[-2:] != (self.horizon, self.state_dim):
+            raise ValueError(
+                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self.state_dim}] (horizon, state_dim), got {list(plan.shape)}"
+            )
+        plan = plan - history[..., -1:, :] if self.relative else plan
+        return self.plan_normalizer(plan.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
+
+    def decode_plan(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Inverse of :meth:`encode_plan`."""
+        plan = self.plan_normalizer.inverse(sequence.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
+        return plan + history[..., -1:, :] if self.relative else plan
+
+    def draw_noise(self, history: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Start noise ``[*B, H, d]`` for histories ``[*B, h, d]``."""
+        shape = (*history.shape[:-2], self.horizon, self.state_dim)
+        return torch.randn(shape, dtype=history.dtype, device=history.device, generator=generator)
+
+    def plan(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
+        """Samples plans ``[*B, H, d]`` for histories ``[*B, h, d]``, both in raw units; see the class for ``noise``."""
+        condition = self.encode_history(history)
+        step_noise = None
+        if noise is None:
+            noise = self.draw_noise(history, generator)
+        elif noise.ndim == history.ndim + 1:
+            step_noise = noise[..., 1:, :, :].movedim(-3, 0)
+            noise = noise[..., 0, :, :]
+        expected = (*history.shape[:-2], self.horizon, self.state_dim)
+        if noise.shape != expected or (step_noise is not None and step_noise.shape[0] < self.num_steps):
+            raise ValueError(
+                f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, state_dim]), or hold at least {1 + self.num_steps}"
+                f" (1 + num_steps) of these on axis -3, got start noise {list(noise.shape)}"
+                + ("" if step_noise is None else f" and {step_noise.shape[0]} further draws")
+            )
+        sequence = self.schedule.solve(
+            lambda x, time: self.denoiser(x, time, condition),
+            noise,
+            self.num_steps,
+            self._solver_now(explicit=step_noise is not None),
+            clip=self.clip,
+            step_noise=step_noise,
+            generator=generator,
+        )
+        return self.decode_plan(history, sequence)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the plan into the tensordict."""
+        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
+
+    def _displace(self, history: Tensor) -> Tensor:
+        if not self.relative:
+            return history
+        now = history[..., -1:, :]
+        return torch.cat([history[..., :-1, :] - now, now], -2)
+
+    def _solver_now(self, explicit: bool) -> str:
+        """A stochastic solver stays if the exploration type asks for samples, or if its draws are given."""
+        if explicit or not SOLVERS[self.solver].stochastic or interaction_type() in (None, InteractionType.RANDOM):
+            return self.solver
+        return "ddim"
+
+
+def _identity(width: int) -> Normalizer:
+    return Normalizer.fit(torch.zeros(1, width), mode="identity")
