@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
-from dm_control import mjcf
+from torchrl_koap.envs.mjcf import mjcf
 
 NUM_ARM_JOINTS = 7
 NUM_FINGERS = 2

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import mujoco
-from dm_control import mjcf
 
+from torchrl_koap.envs.mjcf import mjcf
 from torchrl_koap.envs.panda import panda
 
 TIMESTEP = 0.001

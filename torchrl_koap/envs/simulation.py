@@ -129,6 +129,13 @@ class SimulationBatch:
             return
         for row in rows:
             self.log_time[row] = self.data[row].time + tracking.TIMESTEP
+        due = [self.data[row].time + arguments[3] * tracking.TIMESTEP for row in rows]
+        self._dispatch(kernel, rows, arguments)
+        for row, time in zip(rows, due, strict=True):
+            if abs(self.data[row].time - time) > 0.5 * tracking.TIMESTEP:  # MuJoCo resets a state that blows up
+                raise RuntimeError(f"the simulation of environment {row} became unstable")
+
+    def _dispatch(self, kernel, rows: np.ndarray, arguments: tuple) -> None:
         fixed = (self._step, self.model._address, self._data_addresses, self._pointers)
         if self.num_threads == 1 or len(rows) == 1:
             kernel(*fixed, rows, *arguments)
@@ -176,6 +183,36 @@ class SimulationBatch:
         self.joint_speeds[row] = state["joint_speeds"]
         self.started[row] = state["started"]
         self.widths[row], self.grasping[row] = state["width"], state["grasping"]
+
+    def set_physics(self, row: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
+        """Puts one simulation into a physics state and forgets the controller's past.
+
+        Args:
+            row (int): index of the simulation.
+            qpos (array): positions [nq] (m, rad).
+            qvel (array, optional): velocities [nv].
+            qacc_warmstart (array, optional): warm start of the solver [nv].
+            ctrl (array, optional): motor commands [nu] (N m, N).
+            time (float): clock (s).
+
+        Raises:
+            ValueError: if a size is wrong or a number is not finite.
+        """
+        data = self.data[row]
+        mujoco.mj_resetData(self.model, data)
+        given = {"qpos": qpos, "qvel": qvel, "ctrl": ctrl, "qacc_warmstart": qacc_warmstart}
+        for name, value in given.items():
+            if value is None:
+                continue
+            array, value = getattr(data, name), np.asarray(value, dtype=np.float64)
+            if value.shape != array.shape or not np.isfinite(value).all():
+                raise ValueError(f"{name!r} must be {array.shape[0]} finite numbers, got shape {list(value.shape)}")
+            array[:] = value
+        data.time = time
+        mujoco.mj_forward(self.model, data)
+        if qacc_warmstart is not None:  # the forward pass has replaced it
+            data.qacc_warmstart[:] = qacc_warmstart
+        self.started[row] = False
 
     def contacts(self, row: int, geom: int, others: Sequence[int]) -> np.ndarray:
         """Which geoms of ``others`` touched ``geom`` in the last substep, bool [len(others)]."""

@@ -1,0 +1,197 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Avoiding: steer a rod between six cylinders to the finish line, in any of 24 ways (spec section 6.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from torchrl_koap.envs.base import ManipulationEnv
+from torchrl_koap.envs.scene import PANDA, compile_scene, scene
+from torchrl_koap.tasks import get_task
+
+START_JOINTS = (
+    -0.3564086847,
+    0.4294454540,
+    -0.1350105953,
+    -2.0546518930,
+    0.0935782229,
+    2.4807179407,
+    0.2325067588,
+)
+FINISH_Y = 0.35
+ROW_Y = (-0.1, 0.08, 0.26)
+ROW_REACH = 0.03
+# name, x, y, radius, half height
+OBSTACLES = (
+    ("row1", 0.5, ROW_Y[0], 0.03, 0.07),
+    ("row2_left", 0.425, ROW_Y[1], 0.025, 0.1),
+    ("row2_right", 0.575, ROW_Y[1], 0.025, 0.1),
+    ("row3_left", 0.35, ROW_Y[2], 0.025, 0.1),
+    ("row3_mid", 0.5, ROW_Y[2], 0.025, 0.1),
+    ("row3_right", 0.65, ROW_Y[2], 0.025, 0.1),
+)
+ACTION_BOUND = 0.012
+
+
+def mode_index(flags: torch.Tensor) -> torch.Tensor:
+    """Number of the mode, 0 to 23, from the nine flags; -1 while a row of obstacles has not been passed.
+
+    ``12 * row1 + 4 * row2 + row3``, each counted from small x to large x.
+
+    Args:
+        flags (torch.Tensor): leaf ``mode`` of :class:`AvoidingEnv`, bool or int [*B, 9].
+
+    Returns:
+        torch.Tensor: int64 [*B].
+
+    Raises:
+        ValueError: if the last axis does not hold nine flags.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.envs.avoiding import mode_index
+        >>> mode_index(torch.tensor([[0, 1, 0, 0, 1, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0, 0, 0]]))
+        tensor([23, -1])
+    """
+    if flags.shape[-1] != 9:
+        raise ValueError(f"mode flags must have 9 entries on the last axis, got shape {list(flags.shape)}")
+    flags = flags.to(torch.int64)
+    rows = flags.split([2, 3, 4], dim=-1)
+    complete = torch.stack([row.sum(-1) == 1 for row in rows]).all(0)
+    index = 12 * rows[0].argmax(-1) + 4 * rows[1].argmax(-1) + rows[2].argmax(-1)
+    return torch.where(complete, index, -torch.ones_like(index))
+
+
+class AvoidingEnv(ManipulationEnv):
+    """Avoiding of D3IL as a native-batch TorchRL environment on MuJoCo.
+
+    ============== ========== ================= ===============================================================
+    key            shape      dtype             meaning
+    ============== ========== ================= ===============================================================
+    ``observation`` [n, 4]    ``dtype``         0-1 last commanded xy, 2-3 measured TCP xy (m); after a reset the
+                                                commanded xy is the measured one
+    ``action``      [n, 2]    ``dtype``         change of the commanded xy (m)
+    ``success``     [n, 1]    bool              the rod has crossed y = 0.35 before any collision was seen
+    ``collision``   [n, 1]    bool              the rod was seen touching a cylinder before it crossed
+    ``mode``        [n, 9]    bool              passage flags, see :func:`mode_index`
+    ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
+    ``terminated``  [n, 1]    bool              ``success`` or ``collision``
+    ``truncated``   [n, 1]    bool              ``max_steps`` control steps are over
+    ============== ========== ================= ===============================================================
+
+    Kept from the original because policies experience it: the measured xy is one control step old (the first step
+    repeats the reset's), ``success``, ``collision`` and ``done`` come one step after the state that caused them, collisions are
+    looked at once per control step (a graze in between is missed), and crossing the line while touching is a success. The outcome
+    is latched: ``success`` and ``collision`` are never both True and the last frame of an episode tells which it was
+    (neither: out of time). Unlike the original, collisions are seen in every environment, not only in the first one of the process.
+
+    The commanded height is held at the TCP height after the reset, the orientation at (0, 1, 0, 0). Commands are
+    accumulated in float64. Every episode starts in the same state; nothing is random.
+
+    Human demonstrators move the command by at most 0.012 m per axis and step. The action spec has this range for
+    random actions; larger actions are executed as they are, never clipped.
+
+    Args:
+        num_envs (int): number of environments, the batch size.
+        num_threads (int): threads that advance them; results do not depend on it.
+        max_steps (int): control steps (35 ms each) after which an episode is truncated.
+        seed (int, optional): seed of the environments' random generator (Avoiding draws nothing from it).
+        device (torch.device, optional): device of the tensors handed out.
+        dtype (torch.dtype): floating type of observation, action and reward.
+        arm_alpha (float): opacity of the arm in pictures.
+
+    Raises:
+        ValueError: for sizes below 1, actions of a wrong shape or actions that are not finite.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.envs.avoiding import AvoidingEnv
+        >>> env = AvoidingEnv(num_envs=2)
+        >>> data = env.rollout(3, lambda td: td.set("action", torch.full((2, 2), 0.005)))
+        >>> data["next", "observation"][0, -1, :2].sub(data["observation"][0, 0, :2]).mul(1e3).round().tolist()
+        [15.0, 15.0]
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        num_threads: int = 1,
+        max_steps: int = 250,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype = torch.float32,
+        *,
+        arm_alpha: float = 0.3,
+    ):
+        super().__init__(
+            get_task("avoiding"),
+            compile_scene(avoiding_scene(arm_alpha=arm_alpha)),
+            start_joints=START_JOINTS,
+            num_mode_flags=9,
+            action_bound=ACTION_BOUND,
+            num_envs=num_envs,
+            num_threads=num_threads,
+            max_steps=max_steps,
+            seed=seed,
+            device=device,
+            dtype=dtype,
+        )
+        model = self.sims.model
+        self._rod = model.geom(f"{PANDA}rod").id
+        self._obstacles = np.array([model.geom(name).id for name, *_ in OBSTACLES])
+
+    def _begin(self, rows: np.ndarray) -> None:
+        self._commands[rows, :3] = self.sims.tcp_position[rows]
+        self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
+
+    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
+        self._commands[rows, :2] += action
+
+    def _observe(self, rows: np.ndarray) -> np.ndarray:
+        return np.concatenate([self._commands[rows, :2], self.sims.tcp_position[rows, :2]], axis=1)
+
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        crossed = self.sims.tcp_position[rows, 1] > FINISH_Y
+        touching = np.array([self.sims.contacts(row, self._rod, self._obstacles).any() for row in rows], dtype=bool)
+        return crossed, touching
+
+    def obstacle_contacts(self) -> np.ndarray:
+        """Which cylinders the rod touches in the present state, bool [n, 6] in the order of ``OBSTACLES``."""
+        return np.stack([self.sims.contacts(row, self._rod, self._obstacles) for row in range(len(self.sims))])
+
+    def _update_mode(self, rows: np.ndarray) -> None:
+        x, y = self.sims.tcp_position[rows, 0], self.sims.tcp_position[rows, 1]
+        mode = self._mode[rows]
+        at = (abs(y - ROW_Y[0]) <= ROW_REACH) & ~mode[:, 0:2].any(1)
+        mode[:, 0] |= at & (x < 0.5)
+        mode[:, 1] |= at & (x > 0.5)
+        at = (abs(y - ROW_Y[1]) <= ROW_REACH) & ~mode[:, 2:5].any(1)
+        mode[:, 2] |= at & (x < 0.425)
+        mode[:, 3] |= at & (x > 0.425) & (x < 0.575)
+        mode[:, 4] |= at & (x > 0.575)
+        at = (y >= ROW_Y[2]) & ~mode[:, 5:9].any(1)
+        mode[:, 5] |= at & (x < 0.35)
+        mode[:, 6] |= at & (x > 0.35) & (x < 0.5)
+        mode[:, 7] |= at & (x > 0.5) & (x < 0.65)
+        # the original compares with 0.35 here, so exactly 0.5 and 0.65 count as the outermost passage too
+        mode[:, 8] |= at & (x > 0.35) & ~mode[:, 5:8].any(1)
+        self._mode[rows] = mode
+
+
+def avoiding_scene(*, arm_alpha: float = 0.3):
+    """Scene of Avoiding: table, arm with rod, six red cylinders, green finish line.
+
+    Args:
+        arm_alpha (float): opacity of the arm when drawn.
+
+    Returns:
+        mjcf.RootElement: the scene; geoms of the cylinders carry the names of ``OBSTACLES``.
+    """
+    root = scene(rod=True, image_size=1024, arm_alpha=arm_alpha)
+    for name, x, y, radius, half_height in OBSTACLES:
+        body = root.worldbody.add("body", name=name, pos=(x, y, 0))
+        body.add("geom", name=name, type="cylinder", size=(radius, half_height), rgba=(1, 0, 0, 1))
+    line = {"type": "box", "size": (0.5, 0.01, 0.005), "pos": (0.4, FINISH_Y, 0), "rgba": (0, 1, 0, 1)}
+    root.worldbody.add("geom", name="finish_line", contype=0, conaffinity=0, **line)
+    return root

@@ -1,0 +1,271 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The order of events in one control step, shared by all tasks (spec section 3.4), as a native-batch TorchRL environment.
+
+One control step of the original, kept as it is because a policy experiences it::
+
+    1. the action becomes a new command
+    2. observation, success and failure are read from the state *before* this step's substeps
+    3. 35 substeps of 1 ms: the controller tracks the command
+    4. the mode is updated from the state after the substeps
+
+so the observation is one control step old, and ``done`` comes one step after the state that caused it.
+"""
+
+from __future__ import annotations
+
+import abc
+
+import mujoco
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_koap import keys
+from torchrl_koap.envs import tracking
+from torchrl_koap.envs.simulation import SimulationBatch
+from torchrl_koap.tasks import Task
+
+
+class ManipulationEnv(EnvBase):
+    """Base of the D3IL tasks: a batch of simulations, outcome bookkeeping, partial resets and partial steps.
+
+    A task implements five hooks; each receives ``rows``, the indices of the environments concerned:
+    :meth:`_begin`, :meth:`_command`, :meth:`_observe`, :meth:`_check`, :meth:`_update_mode`.
+
+    Success and collision are *latched*: whichever is seen first is the outcome of the episode, and at most one of them
+    is ever True. They become True in the frame that also carries ``terminated``, and stay until the reset.
+
+    Args:
+        task (Task): layout of the observation.
+        model (mujoco.MjModel): compiled scene.
+        start_joints (sequence): arm joints [7] after a reset (rad).
+        num_modes_flags (int): number of flags of the leaf ``mode``.
+        action_bound (float): half range of random actions; actions outside are executed unchanged.
+        num_envs (int): number of environments, the batch size.
+        num_threads (int): threads that advance them.
+        max_steps (int): control steps after which an episode is truncated.
+        substeps (int): physics steps (1 ms) per control step.
+        seed (int, optional): seed of the environments' own random generator.
+        device (torch.device, optional): device of the tensors handed out; the physics runs on the CPU.
+        dtype (torch.dtype): floating type of observation, action and reward.
+
+    Raises:
+        ValueError: for sizes below 1 or a non-floating dtype.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        model: mujoco.MjModel,
+        *,
+        start_joints,
+        num_mode_flags: int,
+        action_bound: float,
+        num_envs: int,
+        num_threads: int,
+        max_steps: int,
+        substeps: int = 35,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype = torch.float32,
+    ):
+        for name, value in (("num_envs", num_envs), ("num_threads", num_threads), ("max_steps", max_steps)):
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
+        if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
+            raise ValueError(f"dtype must be a floating torch.dtype, got {dtype!r}")
+        super().__init__(device=device, batch_size=[num_envs])
+        self.task = task
+        self.max_steps = max_steps
+        self.substeps = substeps
+        self.sims = SimulationBatch(model, num_envs, num_threads)
+        self._start_joints = np.asarray(start_joints, dtype=np.float64)
+        self._dtype = dtype
+        self._observation = np.zeros((num_envs, task.observation_dim))
+        self._commands = np.zeros((num_envs, 7))
+        self._mode = np.zeros((num_envs, num_mode_flags), dtype=bool)
+        self._success = np.zeros(num_envs, dtype=bool)
+        self._collision = np.zeros(num_envs, dtype=bool)
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._ready = np.zeros(num_envs, dtype=bool)
+        self._renderer = None
+        self._make_specs(action_bound)
+        self._set_seed(seed)
+
+    def _make_specs(self, action_bound: float) -> None:
+        shape, device = self.batch_size, self.device
+        flag = {"n": 1, "shape": (*shape, 1), "device": device, "dtype": torch.bool}
+        flags = self._mode.shape[1]
+        self.observation_spec = Composite(
+            {
+                keys.OBSERVATION: Unbounded((*shape, self.task.observation_dim), device=device, dtype=self._dtype),
+                keys.SUCCESS: Binary(**flag),
+                keys.COLLISION: Binary(**flag),
+                keys.MODE: Binary(n=flags, shape=(*shape, flags), device=device, dtype=torch.bool),
+            },
+            shape=shape,
+        )
+        size = (*shape, self.task.action_dim)
+        self.action_spec = Bounded(-action_bound, action_bound, size, device=device, dtype=self._dtype)
+        self.reward_spec = Bounded(0.0, 1.0, (*shape, 1), device=device, dtype=self._dtype)
+        done = Categorical(2, (*shape, 1), device=device, dtype=torch.bool)
+        self.done_spec = Composite(
+            {"done": done.clone(), "terminated": done.clone(), "truncated": done.clone()}, shape=shape
+        )
+
+    @abc.abstractmethod
+    def _begin(self, rows: np.ndarray) -> None:
+        """Writes the first command into ``self._commands[rows]`` after a reset."""
+
+    @abc.abstractmethod
+    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
+        """Turns actions [len(rows), act] into new commands ``self._commands[rows]``."""
+
+    @abc.abstractmethod
+    def _observe(self, rows: np.ndarray) -> np.ndarray:
+        """Observation [len(rows), obs] of the present state and command."""
+
+    @abc.abstractmethod
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whether the present state is a success, and whether it is a failure, each bool [len(rows)]."""
+
+    @abc.abstractmethod
+    def _update_mode(self, rows: np.ndarray) -> None:
+        """Updates ``self._mode[rows]`` from the present state."""
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.generator = np.random.default_rng(seed)
+
+    def _rows(self, tensordict: TensorDictBase | None, key: str) -> np.ndarray:
+        mask = None if tensordict is None else tensordict.get(key, None)
+        if mask is None:
+            return np.arange(self.batch_size[0])
+        return mask.reshape(self.batch_size[0], -1).any(-1).cpu().numpy().nonzero()[0]
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        rows = self._rows(tensordict, "_reset")
+        self.sims.reset(rows, self._start_joints)
+        self.sims.widths[rows] = tracking.FINGER_OPEN
+        self._begin_episode(rows)
+        return self._leaves(np.zeros(self.batch_size[0], dtype=bool))
+
+    def _begin_episode(self, rows: np.ndarray) -> None:
+        self._success[rows] = self._collision[rows] = self._mode[rows] = False
+        self._steps[rows] = 0
+        self._ready[rows] = True
+        self._begin(rows)
+        self._observation[rows] = self._observe(rows)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        rows = self._rows(tensordict, "_step")
+        action = self._checked_action(tensordict, rows)
+        self._command(rows, action)
+
+        success, failure = self._check(rows)
+        open_rows = ~(self._success[rows] | self._collision[rows])
+        self._success[rows] |= open_rows & success
+        self._collision[rows] |= open_rows & failure & ~success  # both at once count as success
+        self._observation[rows] = self._observe(rows)
+
+        self.sims.track_pose(rows, self._commands, self.substeps)
+        self._steps[rows] += 1
+        self._update_mode(rows)
+        stepped = np.zeros(self.batch_size[0], dtype=bool)
+        stepped[rows] = True
+        out = self._leaves(stepped)
+        out.set("reward", self._tensor((self._success & stepped)[:, None], self._dtype))
+        return out
+
+    def _checked_action(self, tensordict: TensorDictBase, rows: np.ndarray) -> np.ndarray:
+        action = tensordict.get(keys.ACTION, None)
+        wanted = (*self.batch_size, self.task.action_dim)
+        if action is None or tuple(action.shape) != wanted:
+            came = "none" if action is None else f"shape {list(action.shape)}"
+            raise ValueError(f"{keys.ACTION!r} must have shape {list(wanted)} [num_envs, action], got {came}")
+        action = action.detach().to("cpu", torch.float64).numpy()[rows]
+        bad = ~np.isfinite(action).all(-1)
+        if bad.any():
+            row = int(rows[bad][0])
+            raise ValueError(
+                f"{keys.ACTION!r} must be finite, got {action[bad][0].tolist()} for environment {row}"
+                f" ({int(bad.sum())} of {len(rows)} environments concerned)"
+            )
+        if not self._ready[rows].all():
+            raise RuntimeError("step() before the first reset() of these environments")
+        return action
+
+    def _leaves(self, stepped: np.ndarray) -> TensorDictBase:
+        terminated = self._success | self._collision
+        truncated = self._steps >= self.max_steps
+        return TensorDict(
+            {
+                keys.OBSERVATION: self._tensor(self._observation, self._dtype),
+                keys.SUCCESS: self._tensor(self._success[:, None]),
+                keys.COLLISION: self._tensor(self._collision[:, None]),
+                keys.MODE: self._tensor(self._mode),
+                "terminated": self._tensor(terminated[:, None]),
+                "truncated": self._tensor(truncated[:, None]),
+                "done": self._tensor((terminated | truncated)[:, None]),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _tensor(self, array: np.ndarray, dtype: torch.dtype | None = None) -> torch.Tensor:
+        return torch.tensor(array, dtype=dtype, device=self.device)  # a copy: the arrays change with the next step
+
+    def get_state(self, index: int) -> dict:
+        """Full state of one environment: simulation, controller, command, mode, outcome and step count.
+
+        Args:
+            index (int): which environment.
+
+        Returns:
+            dict: arrays for :meth:`set_state`; also valid in another environment of the same task.
+        """
+        names = ("_observation", "_commands", "_mode", "_success", "_collision", "_steps", "_ready")
+        return {"simulation": self.sims.get_state(index)} | {n: np.copy(getattr(self, n)[index]) for n in names}
+
+    def set_state(self, index: int, state: dict) -> None:
+        """Restores what :meth:`get_state` returned; the episode then continues bit for bit."""
+        self.sims.set_state(index, state["simulation"])
+        for name, value in state.items():
+            if name != "simulation":
+                getattr(self, name)[index] = value
+
+    def set_physics(self, index: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
+        """Starts a fresh episode of one environment from a given physics state.
+
+        Args:
+            index (int): which environment.
+            qpos (array): positions [nq] (m, rad).
+            qvel (array, optional): velocities [nv]; zero if not given.
+            qacc_warmstart (array, optional): warm start of the solver [nv].
+            ctrl (array, optional): motor commands of the substep before [nu].
+            time (float): clock (s).
+
+        Raises:
+            ValueError: if a size is wrong.
+        """
+        self.sims.set_physics(index, qpos, qvel, qacc_warmstart=qacc_warmstart, ctrl=ctrl, time=time)
+        self.sims.widths[index] = tracking.FINGER_OPEN
+        self._begin_episode(np.array([index]))
+
+    def raw_log(self) -> dict[str, np.ndarray]:
+        """What D3IL's recorder logs for the last control step, one row per environment (spec section 9).
+
+        The recorder looks after the *first* substep, so ``c_pos`` (m) is the TCP at the start of the step and
+        ``des_c_pos`` the command of that step. Joints in rad, velocities in rad/s and m/s, ``time_stamp`` in s.
+
+        Returns:
+            dict: ``j_pos, j_vel, des_j_pos, des_j_vel, des_j_acc`` [n, 7], ``c_pos, c_vel, des_c_pos`` [n, 3],
+            ``c_quat, des_c_quat`` [n, 4], ``gripper_width, sim_step, time_stamp`` [n].
+        """
+        row = {name: self.sims.log[:, columns].copy() for name, columns in tracking.LOG_COLUMNS.items()}
+        row["gripper_width"] = row["gripper_width"][:, 0]
+        row["des_c_pos"], row["des_c_quat"] = self._commands[:, :3].copy(), self._commands[:, 3:].copy()
+        row["time_stamp"] = self.sims.log_time.copy()
+        row["sim_step"] = np.rint(self.sims.log_time / tracking.TIMESTEP).astype(np.int64)
+        return row
