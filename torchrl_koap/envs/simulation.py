@@ -55,7 +55,7 @@ class SimulationBatch:
         if (self._qpos_start, self._qvel_start) != (model.nq - _NUM_JOINTS, model.nv - _NUM_JOINTS):
             raise ValueError("the arm's nine joints must come last in the state, after the free bodies of the task")
         self._tcp = model.body(f"{PANDA}tcp").id
-        self._root = int(model.body_rootid[self._tcp])
+        self._joint = joint.id
         self._step = tracking.step_address()
         self._data_addresses = np.array([data._address for data in self.data], dtype=np.int64)
         self._pointers = np.array([self._arrays(data) for data in self.data], dtype=np.int64)
@@ -71,8 +71,8 @@ class SimulationBatch:
         arrays[tracking.BIAS] = data.qfrc_bias[self._qvel_start :]
         arrays[tracking.TCP_POS] = data.xpos[self._tcp]
         arrays[tracking.TCP_QUAT] = data.xquat[self._tcp]
-        arrays[tracking.TCP_CVEL] = data.cvel[self._tcp]
-        arrays[tracking.TREE_COM] = data.subtree_com[self._root]
+        arrays[tracking.ANCHORS] = data.xanchor[self._joint :]
+        arrays[tracking.JOINT_AXES] = data.xaxis[self._joint :]
         return [array.ctypes.data for array in arrays]
 
     def __len__(self) -> int:

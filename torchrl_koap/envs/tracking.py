@@ -35,7 +35,7 @@ FINGER_OPEN = 0.04
 FINGER_RESET = 0.001
 
 # Columns of the pointer table: addresses of one simulation's arrays inside its mjData.
-QPOS, QVEL, CTRL, BIAS, TCP_POS, TCP_QUAT, TCP_CVEL, TREE_COM = range(8)
+QPOS, QVEL, CTRL, BIAS, TCP_POS, TCP_QUAT, ANCHORS, JOINT_AXES = range(8)
 NUM_POINTERS = 8
 # Columns of the log row written after the first substep of a control step.
 LOG_COLUMNS = {
@@ -323,16 +323,21 @@ def _finger_forces(position, velocity, width, grasping, ctrl):
 
 @njit(cache=True)
 def _write_log(row, pointers, qpos, qvel, q_des, v_des, a_des, tcp, quat):
-    """Log row of D3IL's recorder: joints after the substep, TCP pose and velocity at its beginning."""
-    cvel, com = _array(pointers[TCP_CVEL], 6), _array(pointers[TREE_COM], 3)
+    """Log row of D3IL's recorder: joints after the substep, TCP pose at its beginning.
+
+    The velocity mixes both as the original does: Jacobian of the beginning, joint velocities after the substep.
+    """
+    anchors, joint_axes = _array(pointers[ANCHORS], 21), _array(pointers[JOINT_AXES], 21)
+    row[42:45] = 0.0
     for j in range(7):
         row[j], row[7 + j], row[14 + j], row[21 + j], row[28 + j] = qpos[j], qvel[j], q_des[j], v_des[j], a_des[j]
-    x, y, z = tcp[0] - com[0], tcp[1] - com[1], tcp[2] - com[2]
+        zx, zy, zz = joint_axes[3 * j], joint_axes[3 * j + 1], joint_axes[3 * j + 2]
+        rx, ry, rz = tcp[0] - anchors[3 * j], tcp[1] - anchors[3 * j + 1], tcp[2] - anchors[3 * j + 2]
+        row[42] += qvel[j] * (zy * rz - zz * ry)
+        row[43] += qvel[j] * (zz * rx - zx * rz)
+        row[44] += qvel[j] * (zx * ry - zy * rx)
     row[35], row[36], row[37] = tcp[0], tcp[1], tcp[2]
     row[38], row[39], row[40], row[41] = quat[0], quat[1], quat[2], quat[3]
-    row[42] = cvel[3] + cvel[1] * z - cvel[2] * y
-    row[43] = cvel[4] + cvel[2] * x - cvel[0] * z
-    row[44] = cvel[5] + cvel[0] * y - cvel[1] * x
     row[45] = qpos[7] + qpos[8]
 
 
@@ -381,7 +386,7 @@ def track_pose(
             _inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors)
             for j in range(7):
                 v[j] = (q[j] - targets[row, j]) / TIMESTEP
-                a[j] = (v[j] - speeds[row, j]) / TIMESTEP
+                a[j] = 0.4 * (v[j] - speeds[row, j]) / TIMESTEP  # logged by the original, used for nothing
                 ctrl[j] = KP[j] * (q[j] - qpos[j]) + KD[j] * (v[j] - qvel[j]) + bias[j]
             _finger_forces(qpos, qvel, widths[row], grasping[row], ctrl)
             _step_physics(step, model, data[row])
