@@ -24,6 +24,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_koap import keys
 from torchrl_koap.envs import tracking
+from torchrl_koap.envs.rendering import Renderer
 from torchrl_koap.envs.simulation import SimulationBatch
 from torchrl_koap.tasks import Task
 
@@ -41,7 +42,7 @@ class ManipulationEnv(EnvBase):
         task (Task): layout of the observation.
         model (mujoco.MjModel): compiled scene.
         start_joints (sequence): arm joints [7] after a reset (rad).
-        num_modes_flags (int): number of flags of the leaf ``mode``.
+        num_mode_flags (int): number of flags of the leaf ``mode``.
         action_bound (float): half range of random actions; actions outside are executed unchanged.
         num_envs (int): number of environments, the batch size.
         num_threads (int): threads that advance them.
@@ -252,6 +253,38 @@ class ManipulationEnv(EnvBase):
         self.sims.set_physics(index, qpos, qvel, qacc_warmstart=qacc_warmstart, ctrl=ctrl, time=time)
         self.sims.widths[index] = tracking.FINGER_OPEN
         self._begin_episode(np.array([index]))
+
+    def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str = "cage") -> np.ndarray:
+        """Draws one environment.
+
+        Args:
+            index (int): which environment.
+            width (int): width in pixels.
+            height (int): height in pixels.
+            camera (str): ``"front"`` (whole scene), ``"cage"`` (D3IL's view) or ``"wrist"``.
+
+        Returns:
+            np.ndarray: uint8 [height, width, 3], RGB.
+
+        Raises:
+            RuntimeError: if no OpenGL library can be used; the message says what to install.
+            ValueError: for an unknown camera, an environment outside the batch or a size below 1.
+        """
+        if not 0 <= index < len(self.sims):
+            raise ValueError(f"index must be 0 to {len(self.sims) - 1}, got {index}")
+        if self._renderer is None or self._renderer.size != (width, height):
+            if self._renderer is not None:
+                self._renderer.close()
+            self._renderer = Renderer(self.sims.model, width, height)
+        return self._renderer.render(self.sims.data[index], camera)
+
+    def close(self, **kwargs) -> None:
+        """Frees graphics memory, if any was used, and the threads."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        self.sims.close()
+        super().close(**kwargs)
 
     def raw_log(self) -> dict[str, np.ndarray]:
         """What D3IL's recorder logs for the last control step, one row per environment (spec section 9).

@@ -61,6 +61,7 @@ def scene(*, rod: bool = True, image_size: int = 96, arm_alpha: float = 0.1, lin
     world = root.worldbody
     world.add("light", name="lamp", pos=(0.4, 0, 2.5), dir=(0, 0, -1), diffuse=(0.5,) * 3, directional=True)
     world.add("camera", name="cage", pos=(1.05, 0, 1.2), quat=(0.6830127, 0.1830127, 0.1830127, 0.683012), fovy=45)
+    world.add("camera", name="front", pos=(1.75, 0, 0.85), xyaxes=(0, 1, 0, -0.53, 0, 0.85), fovy=40)
     world.add("geom", name="ground", type="plane", pos=(0, 0, -0.94), size=(5, 5, 1), rgba=(0.75,) * 3 + (1,), **_DRAWN)
     table = world.add("body", name="table")
     table.add("geom", name="table_top", type="box", pos=(0.4, 0, -0.02), size=(0.49, 0.98, 0.001), rgba=_WOOD, **_STIFF)

@@ -147,6 +147,12 @@ class SimulationBatch:
         for future in [self._executor.submit(kernel, *fixed, piece, *arguments) for piece in pieces]:
             future.result()
 
+    def close(self) -> None:
+        """Ends the threads; they start again when needed."""
+        if self._executor is not None:
+            self._executor.shutdown()
+            self._executor = None
+
     def get_state(self, row: int) -> dict[str, np.ndarray]:
         """Everything that decides the future of one simulation, controller included.
 

@@ -1,0 +1,123 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Pictures of a simulation. Graphics libraries are looked for when the first picture is asked for, never before."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+import warnings
+
+import mujoco
+import numpy as np
+
+_SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
+_INSTALL = (
+    "on a machine without display install EGL (apt-get install libegl1) and set MUJOCO_GL=egl, or software rendering"
+    " (apt-get install libosmesa6) and set MUJOCO_GL=osmesa"
+)
+
+
+def backends() -> list[str]:
+    """OpenGL back ends to try, in order: the one named by ``MUJOCO_GL``, else what suits this machine.
+
+    Raises:
+        RuntimeError: if ``MUJOCO_GL`` switches rendering off or names a back end that does not exist.
+    """
+    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
+    if chosen in _SWITCHED_OFF:
+        raise RuntimeError(f"rendering is switched off by the environment variable MUJOCO_GL={chosen}")
+    if chosen in ("egl", "osmesa", "glfw", "cgl"):
+        return [chosen]
+    if chosen not in ("", "enable", "enabled", "on", "true", "1", "glx", "wgl"):
+        raise RuntimeError(f"MUJOCO_GL={chosen!r} is no OpenGL back end; use egl, osmesa or glfw")
+    if sys.platform == "darwin":
+        return ["cgl", "glfw"]
+    if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        return ["egl", "osmesa"]
+    return ["glfw", "egl", "osmesa"] if sys.platform.startswith("linux") else ["glfw"]
+
+
+def _open_context(width: int, height: int):
+    reasons = []
+    for name in backends():
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+                context.make_current()
+                return context
+        except Exception as error:  # the back ends raise whatever their libraries raise
+            reasons.append(f"{name}: {type(error).__name__}: {error}")
+    raise RuntimeError(f"no OpenGL library could be used to draw ({'; '.join(reasons)}); {_INSTALL}")
+
+
+class Renderer:
+    """Draws simulations of one model into arrays.
+
+    Args:
+        model (mujoco.MjModel): the scene.
+        width (int): width of the pictures in pixels.
+        height (int): height of the pictures in pixels.
+
+    Raises:
+        RuntimeError: if no OpenGL library can be used; the message says what to install.
+        ValueError: if a size is below 1.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int):
+        for name, size in (("width", width), ("height", height)):
+            if not isinstance(size, int) or size < 1:
+                raise ValueError(f"{name} must be a positive number of pixels, got {size!r}")
+        self.size = (width, height)
+        self._model = model
+        self._context = _open_context(width, height)
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._scene = mujoco.MjvScene(model, maxgeom=1000)
+        self._option = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
+        self._gpu = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
+
+    def render(self, data: mujoco.MjData, camera: str = "cage") -> np.ndarray:
+        """Draws one simulation.
+
+        Args:
+            data (mujoco.MjData): its state.
+            camera (str): name of a camera of the scene; the prefix of the arm may be left out.
+
+        Returns:
+            np.ndarray: uint8 [height, width, 3], RGB.
+
+        Raises:
+            ValueError: if the scene has no such camera.
+        """
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
+        self._camera.fixedcamid = self._camera_id(camera)
+        self._context.make_current()
+        perturbation, everything = mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._option, perturbation, self._camera, everything, self._scene)
+        width, height = self.size
+        viewport = mujoco.MjrRect(0, 0, width, height)
+        picture = np.empty((height, width, 3), dtype=np.uint8)
+        mujoco.mjr_render(viewport, self._scene, self._gpu)
+        mujoco.mjr_readPixels(picture, None, viewport, self._gpu)
+        return np.ascontiguousarray(picture[::-1])  # OpenGL counts rows from below
+
+    def _camera_id(self, name: str) -> int:
+        names = [self._model.camera(index).name for index in range(self._model.ncam)]
+        for candidate in (name, f"panda/{name}"):
+            if candidate in names:
+                return names.index(candidate)
+        near = difflib.get_close_matches(name, [n.removeprefix("panda/") for n in names], n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"known cameras: {', '.join(names)}"
+        raise ValueError(f"unknown camera {name!r}; {hint}")
+
+    def close(self) -> None:
+        """Frees the graphics memory; the renderer cannot be used afterwards."""
+        if self._context is not None:
+            self._context.make_current()
+            self._gpu.free()
+            self._context.free()
+            self._context = None
