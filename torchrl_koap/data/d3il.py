@@ -1,0 +1,380 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""D3IL's demonstrations as a TorchRL data set.
+
+A folder of raw pickles is read once, through the restricted unpickler, into a memory-mapped data set in a cache folder.
+A folder whose files have other names, sizes or times is converted again; a damaged cache is rebuilt. The raw files
+are never written to.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl._utils import logger as torchrl_logger
+from torchrl.data import ImmutableDatasetWriter, TensorStorage
+from torchrl.data.datasets import register_dataset
+from torchrl.data.datasets.common import BaseDatasetExperienceReplay
+
+from torchrl_koap import keys
+from torchrl_koap.data.labels import LabelBudget, LabelReport
+from torchrl_koap.data.raw import RawEpisode, RawEpisodeError, read_raw_episode
+from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
+from torchrl_koap.data.trajectories import flatten_trajectories, select_state
+from torchrl_koap.data.unpickling import load_pickle
+from torchrl_koap.tasks import Task, get_task
+
+_CONVERSION = 1  # raise it when the same raw files convert to other data
+_NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.pkl")
+
+OBJECTS = {
+    "avoiding": (),
+    "aligning": ("push-box", "target-box"),
+    "sorting": ("red-box1", "red-box2", "blue-box1", "blue-box2"),
+    "stacking": ("red-box", "green-box", "blue-box", "target-box"),
+}
+
+
+@dataclass(frozen=True)
+class Converter:
+    """How the raw episodes of one task become observations and actions.
+
+    Args:
+        robot (tuple of str): entries of ``robot`` that are read.
+        objects (tuple of str): objects whose pose is read.
+        folder (str): where D3IL keeps the files, seen from its data folder.
+        convert (callable): from a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``,
+            as float64 arrays.
+    """
+
+    robot: tuple[str, ...]
+    objects: tuple[str, ...]
+    folder: str
+    convert: Callable[[RawEpisode], tuple[np.ndarray, np.ndarray]]
+
+
+def _avoiding(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
+    desired = np.asarray(episode.robot["des_c_pos"], dtype=np.float64)[:, :2]
+    measured = np.asarray(episode.robot["c_pos"], dtype=np.float64)[:, :2]
+    return np.concatenate([desired, measured], axis=1), np.diff(desired, axis=0)
+
+
+CONVERTERS = {
+    "avoiding": Converter(
+        robot=("des_c_pos", "c_pos"), objects=OBJECTS["avoiding"], folder="avoiding/data", convert=_avoiding
+    ),
+}
+
+
+class RawFolderError(ValueError):
+    """A folder of demonstrations that cannot be used; ``problems`` lists those of all its files."""
+
+    def __init__(self, folder: Path, problems: list[str]):
+        self.problems = problems
+        super().__init__(f"{len(problems)} problem(s) in {folder}:\n  - " + "\n  - ".join(problems))
+
+
+class D3ILExperienceReplay(BaseDatasetExperienceReplay):
+    """Demonstrations of a D3IL task as a replay buffer over flat steps.
+
+    A file of ``T`` rows gives ``T - 1`` steps (specification, section 7). The entries are those of
+    :mod:`torchrl_koap.keys`; ``state`` holds the columns that a policy may see. Also reached by
+    ``torchrl.data.datasets.load_dataset("d3il:avoiding", root=...)``.
+
+    Args:
+        task (str): name of the task.
+        root (str or Path): folder of raw pickles, or a folder above it as D3IL lays them out (``<task>/data``,
+            ``environments/dataset/data/<task>/data``).
+        split_file (str or Path, optional): a pickled list of the file names to use, looked for in ``root`` and in the
+            folder of the files, and above. Default: every pickle, in the order of the names.
+        cache (str or Path, optional): where converted data are kept. Default: ``$KOAP_CACHE``, else
+            ``~/.cache/torchrl_koap``.
+        dtype (torch.dtype): floating type of the entries; the differences are taken in float64.
+        label_budget (LabelBudget, optional): hides labels, and the commands that would give them away, from everything
+            that uses this data set; what was spent is in :attr:`label_report`. Never part of the cache.
+        batch_size, sampler, sample_unit, transform, prefetch, collate_fn (optional): as in
+            :class:`~torchrl.data.TensorDictReplayBuffer`.
+
+    Raises:
+        RawFolderError: with the problems of *all* files.
+        ValueError: if the task is unknown.
+        FileNotFoundError: if the folder, its pickles or the split file are not there.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap.data import D3ILExperienceReplay, RawEpisode, write_raw_episode
+        >>> positions = np.cumsum(np.full((5, 3), 0.01), axis=0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     raw = RawEpisode(robot={"des_c_pos": positions, "c_pos": positions - 0.002})
+        ...     write_raw_episode(Path(folder) / "demos" / "env_000_00.pkl", raw)
+        ...     dataset = D3ILExperienceReplay("avoiding", Path(folder) / "demos", cache=Path(folder) / "cache")
+        ...     dataset.data["action"].shape, dataset.data["state"].shape, len(dataset)
+        (torch.Size([4, 2]), torch.Size([4, 2]), 4)
+    """
+
+    label_report: LabelReport | None = None
+
+    def __init__(
+        self,
+        task: str,
+        root: str | Path,
+        *,
+        split_file: str | Path | None = None,
+        cache: str | Path | None = None,
+        dtype: torch.dtype = torch.float32,
+        label_budget: LabelBudget | None = None,
+        **kwargs: Any,
+    ):
+        facts, converter = get_task(task), _converter(task)
+        folder, files = find_raw_files(task, root, split_file=split_file)
+        self.root = folder
+        self._cache = _cache_folder(cache)
+        self._data_path = self._cache / "d3il" / f"{task}-{_fingerprint(facts, files, dtype)}"
+        data = self._open(facts, converter, files, dtype)
+        self._begin(facts, data, label_budget, kwargs)
+
+    @classmethod
+    def from_tensordict(
+        cls, data: TensorDictBase, task: str, *, label_budget: LabelBudget | None = None, **kwargs: Any
+    ) -> D3ILExperienceReplay:
+        """Makes a data set of flat TED data in memory, for example recorded by our own environments.
+
+        Args:
+            data (TensorDictBase): flat data ``[N]`` in the storage layout.
+            task (str): name of the task.
+            label_budget (LabelBudget, optional): see the class.
+            **kwargs: as in :class:`~torchrl.data.TensorDictReplayBuffer`.
+
+        Raises:
+            LayoutError: if the data do not follow the storage layout.
+            ValueError: if the numbers of columns are not those of the task.
+
+        Examples:
+            >>> import torch
+            >>> from torchrl_koap.data import D3ILExperienceReplay, flatten_trajectories
+            >>> data = flatten_trajectories([torch.rand(9, 4)], [torch.rand(8, 2)])
+            >>> D3ILExperienceReplay.from_tensordict(data, "avoiding", batch_size=4).sample().shape
+            torch.Size([4])
+        """
+        self = cls.__new__(cls)
+        self.root = self._cache = self._data_path = None
+        self._begin(get_task(task), data, label_budget, kwargs)
+        return self
+
+    @classmethod
+    def from_folder(
+        cls, folder: str | Path, *, task: str | None = None, label_budget: LabelBudget | None = None, **kwargs: Any
+    ) -> D3ILExperienceReplay:
+        """Opens a data set that :func:`~torchrl_koap.data.save_ted` wrote.
+
+        Args:
+            folder (str or Path): the folder.
+            task (str, optional): the task the data must belong to.
+            label_budget (LabelBudget, optional): see the class.
+            **kwargs: as in :class:`~torchrl.data.TensorDictReplayBuffer`.
+
+        Raises:
+            DamagedDataError: if files are missing or changed.
+            ValueError: if the data belong to another task, or to none.
+        """
+        data = load_ted(folder, task=task)
+        self = cls.__new__(cls)
+        self.root = self._cache = Path(folder)
+        self._data_path = Path(folder)
+        self._begin(get_task(read_about(folder)["task"]), data, label_budget, kwargs)
+        return self
+
+    def _begin(self, task: Task, data: TensorDictBase, label_budget: LabelBudget | None, kwargs: dict) -> None:
+        command = task.observation[task.command]
+        keys.validate(data, command=command)
+        for key, wanted in ((keys.OBSERVATION, task.observation_dim), (keys.ACTION, task.action_dim)):
+            if data.get(key).shape[-1] != wanted:
+                got = data.get(key).shape[-1]
+                raise ValueError(f"{key!r} of task {task.name!r} has {wanted} columns, the data have {got}")
+        if keys.STATE not in data.keys():
+            data = select_state(data, task.state_columns)
+        if label_budget is not None:
+            data, self.label_report = label_budget.apply(data, command=command)
+        self.task = task
+        kwargs = {"writer": ImmutableDatasetWriter(), **kwargs}
+        super().__init__(storage=TensorStorage(data), **kwargs)
+
+    def _open(self, task, converter, files, dtype) -> TensorDictBase:
+        if self._is_downloaded():
+            try:
+                return load_ted(self._data_path, task=task.name)
+            except (DamagedDataError, ValueError) as error:
+                torchrl_logger.warning("converting %s again: %s", self.root, error)
+                shutil.rmtree(self._data_path, ignore_errors=True)
+        data = select_state(convert_raw_files(converter, files, self.root, dtype=dtype), task.state_columns)
+        save_ted(data, self._data_path, task=task.name, notes={"files": [file.name for file in files]})
+        return load_ted(self._data_path, task=task.name)
+
+    @property
+    def data(self) -> TensorDictBase:
+        """All steps, flat ``[N]``, within the label budget."""
+        return self._storage.get(slice(None))
+
+    @property
+    def data_path(self) -> Path | None:
+        """Folder of the converted data, None for data in memory."""
+        return self._data_path
+
+    @property
+    def data_path_root(self) -> Path | None:
+        """Folder that holds all converted data, None for data in memory."""
+        return self._cache
+
+    def _is_downloaded(self) -> bool:
+        return self._data_path is not None and self._data_path.is_dir()
+
+    def delete(self) -> None:
+        """Deletes the converted data from the cache; the raw files and recorded data sets stay.
+
+        Raises:
+            RuntimeError: if the data did not come from raw files.
+        """
+        if self._data_path is None or self._data_path == self.root:
+            raise RuntimeError("only data converted from raw files are kept in a cache that can be deleted")
+        shutil.rmtree(self._data_path)
+
+
+def find_raw_files(
+    task: str, root: str | Path, *, split_file: str | Path | None = None
+) -> tuple[Path, list[Path]]:
+    """Finds the raw demonstrations of a task.
+
+    Args:
+        task (str): name of the task.
+        root (str or Path): the folder of the pickles or one above it.
+        split_file (str or Path, optional): a pickled list of file names.
+
+    Returns:
+        tuple: the folder, and its files in the order of their names.
+
+    Raises:
+        FileNotFoundError: if nothing is there; the message lists the places looked at.
+        ValueError: if the split file is no list of plain file names.
+    """
+    root, inside = Path(root).expanduser(), _converter(task).folder
+    places = [root, root / PurePosixPath(inside).name, root / inside, root / "environments/dataset/data" / inside]
+    for folder in places:
+        files = _pickles(folder)
+        if files:
+            break
+    else:
+        if not root.is_dir():
+            raise FileNotFoundError(f"no folder {root}")
+        raise FileNotFoundError("no demonstrations (*.pkl) in " + ", ".join(map(str, places)))
+    if split_file is not None:
+        names = _read_split([Path(split_file), root / split_file, folder / split_file, folder.parent / split_file])
+        files = [folder / name for name in names]
+        absent = [file.name for file in files if not file.is_file()]
+        if absent:
+            raise FileNotFoundError(f"{folder} lacks {len(absent)} files of {split_file}: {', '.join(absent[:10])}")
+    return folder, files
+
+
+def convert_raw_files(
+    converter: Converter, files: Sequence[Path], folder: Path, *, dtype: torch.dtype = torch.float32
+) -> TensorDictBase:
+    """Converts raw demonstrations to flat TED data.
+
+    Args:
+        converter (Converter): that of the task.
+        files (sequence of Path): the demonstrations, one trajectory each.
+        folder (Path): what to call the whole in an error message.
+        dtype (torch.dtype): floating type of the entries.
+
+    Raises:
+        RawFolderError: with the problems of all files.
+    """
+    problems, observations, actions = [], [], []
+    for file in files:
+        try:
+            episode = read_raw_episode(file, robot=converter.robot, objects=converter.objects)
+            _refuse_other_task(file, episode, converter)
+            observation, action = converter.convert(episode)
+        except RawEpisodeError as error:
+            problems += error.problems
+            continue
+        except OSError as error:
+            problems.append(f"{file}: cannot be read: {error}")
+            continue
+        observations.append(torch.from_numpy(observation))
+        actions.append(torch.from_numpy(action))
+    if problems:
+        raise RawFolderError(folder, problems)
+    return flatten_trajectories(observations, actions, dtype=dtype)
+
+
+def _converter(task: str) -> Converter:
+    get_task(task)
+    if task not in CONVERTERS:
+        raise ValueError(f"raw demonstrations of task {task!r} cannot be read yet; known: {', '.join(CONVERTERS)}")
+    return CONVERTERS[task]
+
+
+def _refuse_other_task(file: Path, episode: RawEpisode, converter: Converter) -> None:
+    if set(episode.objects) == set(converter.objects):
+        return
+    logged = ", ".join(map(str, episode.objects)) or "no objects"
+    others = [task for task, objects in OBJECTS.items() if set(objects) == set(episode.objects)]
+    origin = f"a demonstration of {others[0]!r}" if others else "of an unknown task"
+    wanted = ", ".join(converter.objects) or "no objects"
+    raise RawEpisodeError([f"{file}: {origin}: it logs {logged}, wanted {wanted}"])
+
+
+def _pickles(folder: Path) -> list[Path]:
+    """The demonstrations of a folder in the order of their names, without D3IL's lists of files and contexts."""
+    return [
+        file
+        for file in sorted(folder.glob("*.pkl"))
+        if not file.name.startswith(".") and not any(fnmatch.fnmatch(file.name, other) for other in _NO_EPISODES)
+    ]
+
+
+def _read_split(places: Sequence[Path]) -> list[str]:
+    for file in places:
+        if file.is_file():
+            break
+    else:
+        raise FileNotFoundError("no split file at " + ", ".join(map(str, places)))
+    names = load_pickle(file)
+    names = names.tolist() if isinstance(names, np.ndarray) else names
+    if not isinstance(names, (list, tuple)) or not names:
+        raise ValueError(f"{file}: a split file is a list of file names, got {type(names).__name__}")
+    for name in names:
+        if not isinstance(name, str) or PurePosixPath(name).name != name:
+            raise ValueError(f"{file}: {name!r} is no plain file name")
+    return sorted(set(names))
+
+
+def _cache_folder(cache: str | Path | None) -> Path:
+    return Path(cache or os.environ.get("KOAP_CACHE") or "~/.cache/torchrl_koap").expanduser()
+
+
+def _fingerprint(task: Task, files: Sequence[Path], dtype: torch.dtype) -> str:
+    facts = {
+        "conversion": _CONVERSION,
+        "task": task.name,
+        "state": task.state_columns,
+        "dtype": str(dtype),
+        "files": [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files],
+    }
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
+
+
+register_dataset("d3il", "torchrl_koap.data:D3ILExperienceReplay", replace=True)

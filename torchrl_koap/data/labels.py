@@ -1,0 +1,237 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Which steps keep their action label, and an exact account of how many that were.
+
+Everything outside the budget is poisoned rather than dropped: the action becomes NaN, so whoever reads it by mistake
+finds out at once. The observation of some tasks repeats the last command, whose differences *are* the actions; those
+columns are poisoned too (:func:`hide_commands`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import numbers
+from dataclasses import dataclass
+from decimal import ROUND_CEILING, ROUND_HALF_UP, Context, Decimal
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_koap import keys
+from torchrl_koap.data.trajectories import trajectory_lengths
+
+Unit = Literal["trajectory", "window", "transition"]
+
+
+@dataclass(frozen=True)
+class LabelReport:
+    """What a label budget spent.
+
+    Args:
+        unit (str): what was drawn.
+        requested (float or int): the fraction or count that was asked for.
+        selected_units (int): trajectories, windows or transitions drawn.
+        total_units (int): how many there were to draw from.
+        labelled_transitions (int): distinct transitions that keep their action.
+        total_transitions (int): all transitions.
+        trajectories_touched (int): trajectories with at least one label.
+        total_trajectories (int): all trajectories.
+        seed (int): seed of the draw.
+    """
+
+    unit: str
+    requested: float | int
+    selected_units: int
+    total_units: int
+    labelled_transitions: int
+    total_transitions: int
+    trajectories_touched: int
+    total_trajectories: int
+    seed: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report as a plain dictionary, for JSON."""
+        return dataclasses.asdict(self)
+
+    def __str__(self) -> str:
+        share = self.labelled_transitions / self.total_transitions
+        return (
+            f"{self.selected_units} of {self.total_units} {_plural(self.unit)} drawn: {self.labelled_transitions} of"
+            f" {self.total_transitions} transitions labelled ({share:.2%}),"
+            f" {self.trajectories_touched} of {self.total_trajectories} trajectories touched"
+        )
+
+
+@dataclass(frozen=True)
+class LabelBudget:
+    """Keeps the labels of a few trajectories, windows or single transitions, and hides all others.
+
+    The draw depends on the seed alone. With the same seed a larger budget contains every smaller one.
+
+    * ``"trajectory"``: whole demonstrations. The honest default: a robot records whole demonstrations.
+    * ``"window"``: the paper's levels. Windows are drawn without replacement from all windows of all trajectories, and
+      of each the inner frames ``history - 1 .. window - 2`` keep their label (14 of 16). A window costs 14 labels where
+      windows overlap less, and the windows of a small share touch most trajectories: read the report.
+    * ``"transition"``: single steps.
+
+    Args:
+        amount (float or int): a fraction in (0, 1], rounded half up to whole units, or a count >= 1. ``1.0`` is
+            everything, ``1`` is one unit.
+        unit (str): ``"trajectory"``, ``"window"`` or ``"transition"``.
+        seed (int): seed of the draw.
+        window (int): frames of a window.
+        history (int): frames of a window up to and including "now".
+
+    Raises:
+        ValueError: if an argument is out of range.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories
+        >>> data = flatten_trajectories([torch.rand(31, 4)] * 10, [torch.rand(30, 2)] * 10)
+        >>> labelled, report = LabelBudget(0.2).apply(data)
+        >>> print(report)
+        2 of 10 trajectories drawn: 60 of 300 transitions labelled (20.00%), 2 of 10 trajectories touched
+        >>> int(labelled["has_action"].sum()), int(labelled["action"].isnan().all(-1).sum())
+        (60, 240)
+    """
+
+    amount: float | int
+    unit: Unit = "trajectory"
+    seed: int = 0
+    window: int = 16
+    history: int = 2
+
+    def __post_init__(self):
+        if self.unit not in get_args(Unit):
+            raise ValueError(f"unknown unit {self.unit!r}; wanted one of {', '.join(get_args(Unit))}")
+        if isinstance(self.amount, bool) or not isinstance(self.amount, numbers.Real):
+            raise ValueError(f"amount must be a fraction in (0, 1] or a count >= 1, got {self.amount!r}")
+        if isinstance(self.amount, numbers.Integral):
+            if self.amount < 1:
+                raise ValueError(f"a count of labelled units must be at least 1, got {self.amount}")
+        elif not 0 < self.amount <= 1:
+            raise ValueError(f"a fraction must be in (0, 1], got {self.amount}; counts are integers")
+        if not 1 <= self.history < self.window:
+            raise ValueError(f"wanted 1 <= history < window, got history {self.history} and window {self.window}")
+
+    def apply(self, data: TensorDictBase, *, command: slice | None = None) -> tuple[TensorDictBase, LabelReport]:
+        """Hides all labels outside the budget.
+
+        Args:
+            data (TensorDictBase): fully labelled flat data ``[N]``; not changed.
+            command (slice, optional): columns of the observation that repeat the command; they are blanked where they
+                would give hidden actions away, see :func:`hide_commands`. Default: the observation has none.
+
+        Returns:
+            tuple: a copy of the data within the budget, and what was spent.
+
+        Raises:
+            LayoutError: if the data do not follow the storage layout.
+            ValueError: if labels are missing already, if the budget selects nothing, or more than there is.
+        """
+        keys.validate(data)
+        missing = int((~data.get(keys.HAS_ACTION)).sum())
+        if missing:
+            raise ValueError(f"a label budget is applied to fully labelled data; {missing} steps have no action")
+        lengths = trajectory_lengths(data).cpu().numpy()
+        starts = np.cumsum(lengths) - lengths
+
+        if self.unit == "trajectory":
+            units, labels = starts, None
+        elif self.unit == "transition":
+            units, labels = np.arange(lengths.sum()), range(1)
+        else:
+            counts = np.maximum(lengths - self.window + 1, 0)
+            if not counts.any():
+                raise ValueError(
+                    f"no trajectory is as long as a window of {self.window} steps (longest: {lengths.max()})"
+                )
+            units = np.concatenate(
+                [start + np.arange(count) for start, count in zip(starts, counts, strict=True)]
+            )
+            labels = range(self.history - 1, self.window - 1)
+
+        number = self._number_of(len(units))
+        chosen = np.random.default_rng(self.seed).permutation(len(units))[:number]
+        kept = np.zeros(lengths.sum(), dtype=bool)
+        if labels is None:
+            for index in chosen:
+                kept[starts[index] : starts[index] + lengths[index]] = True
+        else:
+            kept[units[chosen][:, None] + np.asarray(labels)] = True
+
+        has_action = torch.from_numpy(kept).to(data.get(keys.ACTION).device).unsqueeze(-1)
+        labelled = data.clone()
+        labelled.set(keys.HAS_ACTION, has_action)
+        labelled.set(keys.ACTION, torch.where(has_action, data.get(keys.ACTION), math.nan))
+        if command is not None:
+            labelled = hide_commands(labelled, command)
+        touched = np.add.reduceat(kept, starts, dtype=np.int64) > 0
+        report = LabelReport(
+            unit=self.unit,
+            requested=self.amount,
+            selected_units=number,
+            total_units=len(units),
+            labelled_transitions=int(kept.sum()),
+            total_transitions=len(kept),
+            trajectories_touched=int(touched.sum()),
+            total_trajectories=len(lengths),
+            seed=self.seed,
+        )
+        return labelled, report
+
+    def _number_of(self, total: int) -> int:
+        plural = _plural(self.unit)
+        if isinstance(self.amount, numbers.Integral):
+            if self.amount > total:
+                raise ValueError(f"{self.amount} labelled {plural} asked for, there are {total}")
+            return int(self.amount)
+        # in decimals, so that 0.145 of 100 is 14.5 and not 14.499999999999998
+        number = int((Decimal(repr(float(self.amount))) * total).to_integral_value(ROUND_HALF_UP))
+        if number == 0:
+            least = Context(prec=4, rounding=ROUND_CEILING).divide(Decimal("0.5"), Decimal(total))
+            raise ValueError(
+                f"a label fraction of {self.amount} selects none of the {total} {plural};"
+                f" the smallest fraction that selects one is {least}"
+            )
+        return number
+
+
+def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
+    """Blanks the command columns of every trajectory that has a hidden action.
+
+    The difference of two commands is the sum of the actions between them, labelled or not, so the commands around a
+    hidden action must not be seen, and neither must commands further away. Only trajectories whose actions are all
+    labelled keep them. ``state``, which never holds commands, stays as it is.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]``; not changed.
+        command (slice): columns of the observation that repeat the command.
+
+    Returns:
+        TensorDictBase: a copy with NaN in those columns of ``observation`` and ``("next", "observation")``. It passes
+        ``validate(data, command=command)``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, hide_commands
+        >>> data = flatten_trajectories([torch.ones(2, 4), torch.ones(2, 4)], [torch.ones(1, 2), torch.ones(1, 2)])
+        >>> hide_commands(LabelBudget(1).apply(data)[0], slice(0, 2))["observation"].isnan().sum(-1).sort().values
+        tensor([0, 2])
+    """
+    lengths = trajectory_lengths(data)
+    hidden = torch.stack([~part.all() for part in data.get(keys.HAS_ACTION).split(lengths.tolist())])
+    rows = hidden.repeat_interleave(lengths)
+    result = data.clone()
+    for key in (keys.OBSERVATION, keys.NEXT_OBSERVATION):
+        value = result.get(key).clone()
+        value[:, command] = torch.where(rows.unsqueeze(-1), math.nan, value[:, command])
+        result.set(key, value)
+    return result
+
+
+def _plural(unit: str) -> str:
+    return {"trajectory": "trajectories"}.get(unit, f"{unit}s")

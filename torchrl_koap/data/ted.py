@@ -1,0 +1,173 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A data set on disk: one memory-mapped TED tensordict and a description in JSON beside it.
+
+::
+
+    folder/
+      about.json         task, number of trajectories and steps, lengths, statistics, checksums, and the caller's notes
+      steps/             the tensordict, one file per entry, in the storage layout of ``torchrl_koap.keys``
+
+The folder is written aside and renamed. When it is read, every file is compared with its checksum.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from torchrl_koap import keys
+from torchrl_koap.data.saving import replacing_folder
+from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.tasks import TASKS
+
+FORMAT = 1
+_ABOUT = "about.json"
+_STEPS = "steps"
+
+
+class DamagedDataError(ValueError):
+    """A data set whose files are missing, changed, or do not belong together."""
+
+
+def save_ted(
+    data: TensorDictBase, folder: str | Path, *, task: str | None = None, notes: Mapping[str, Any] | None = None
+) -> Path:
+    """Writes flat TED data into a folder; an earlier data set there is replaced in one step.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` in the storage layout.
+        folder (str or Path): folder to create or replace.
+        task (str, optional): name of the task.
+        notes (mapping, optional): anything JSON can hold that should be kept with the data.
+
+    Returns:
+        Path: the folder.
+
+    Raises:
+        LayoutError: if the data do not follow the storage layout.
+        TypeError: if an entry is no tensor.
+        FileExistsError: if the folder holds something other than a data set.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import torch
+        >>> from torchrl_koap.data import flatten_trajectories, load_ted, read_about, save_ted
+        >>> data = flatten_trajectories([torch.rand(4, 2), torch.rand(6, 2)], [torch.rand(3, 1), torch.rand(5, 1)])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = save_ted(data, Path(folder) / "demos", notes={"seed": 0})
+        ...     load_ted(path).shape, read_about(path)["lengths"], read_about(path)["notes"]
+        (torch.Size([8]), [3, 5], {'seed': 0})
+    """
+    folder = Path(folder)
+    command = TASKS[task].observation[TASKS[task].command] if task in TASKS else None
+    keys.validate(data, command=command)
+    strange = [key for key, value in data.items(True, True) if not isinstance(value, torch.Tensor)]
+    if strange:  # they would be written as pickles
+        raise TypeError(f"only tensors can be saved, {strange} are none")
+    if folder.exists() and not (folder.is_dir() and ((folder / _ABOUT).is_file() or not any(folder.iterdir()))):
+        raise FileExistsError(f"{folder} exists and holds no data set; it is left as it is")
+    about = {
+        "format": FORMAT,
+        "task": task,
+        "trajectories": len(trajectory_lengths(data)),
+        "steps": data.shape[0],
+        "lengths": trajectory_lengths(data).tolist(),
+        "statistics": _statistics(data),
+        "notes": dict(notes or {}),
+    }
+    with replacing_folder(folder) as aside:
+        data.to_tensordict().cpu().memmap(aside / _STEPS, copy_existing=True)
+        about["sha256"] = _checksums(aside)
+        (aside / _ABOUT).write_text(json.dumps(about, indent=1))
+    return folder
+
+
+def read_about(folder: str | Path) -> dict[str, Any]:
+    """Reads the description of a data set.
+
+    Raises:
+        DamagedDataError: if the folder holds no data set, or one written by a newer version.
+
+    Examples:
+        See :func:`save_ted`.
+    """
+    path = Path(folder) / _ABOUT
+    try:
+        about = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise DamagedDataError(f"{folder} holds no data set ({_ABOUT} is missing)") from None
+    except (OSError, ValueError) as error:
+        raise DamagedDataError(f"{path} cannot be read: {error}") from error
+    if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("sha256"), dict):
+        raise DamagedDataError(f"{path} is no description of a data set in format {FORMAT}")
+    return about
+
+
+def load_ted(folder: str | Path, *, task: str | None = None, memmap: bool = True) -> TensorDict:
+    """Opens a data set written by :func:`save_ted`.
+
+    Args:
+        folder (str or Path): the folder.
+        task (str, optional): the task the data must belong to.
+        memmap (bool): leave the entries on disk (writes into them change the files and are found out by the next
+            load), or copy them into memory.
+
+    Returns:
+        TensorDict: flat data ``[N]``.
+
+    Raises:
+        DamagedDataError: if files are missing, changed, or not those that were written.
+        ValueError: if the data belong to another task.
+
+    Examples:
+        See :func:`save_ted`.
+    """
+    folder = Path(folder)
+    about = read_about(folder)
+    if task is not None and about["task"] != task:
+        raise ValueError(f"{folder} holds demonstrations of {about['task']!r}, wanted {task!r}")
+    found = _checksums(folder)
+    for name in sorted(found.keys() | about["sha256"].keys()):
+        if found.get(name) != about["sha256"].get(name):
+            fault = "was changed"
+            if name not in found or name not in about["sha256"]:
+                fault = "does not belong there" if name in found else "is missing"
+            raise DamagedDataError(f"{folder / name} {fault}")
+    try:
+        data = TensorDict.load_memmap(folder / _STEPS, allow_pickle=False)
+    except Exception as error:  # a forged description passes the checksums and can be wrong in any way
+        raise DamagedDataError(f"{folder / _STEPS} cannot be read: {error}") from error
+    return data if memmap else data.clone()
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted((folder / _STEPS).rglob("*"))
+        if path.is_file()
+    }
+
+
+def _statistics(data: TensorDictBase) -> dict[str, dict[str, list[float | None]]]:
+    """Column statistics of the observations and of the labelled actions, for people who look at the file."""
+    statistics = {}
+    for key in (keys.OBSERVATION, keys.STATE, keys.ACTION):
+        if key not in data.keys():
+            continue
+        values = data.get(key).double()
+        values = values[values.isfinite().all(-1)]
+        if len(values):
+            statistics[key] = {
+                "mean": values.mean(0).tolist(),
+                "std": values.std(0, correction=0).tolist(),
+                "min": values.amin(0).tolist(),
+                "max": values.amax(0).tolist(),
+            }
+    return statistics
