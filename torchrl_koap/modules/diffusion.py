@@ -5,8 +5,9 @@ Every schedule is one line of ``SCHEDULES``, every solver one line of ``SOLVERS`
 
     x_t = signal(t) x_0 + noise(t) eps,    eps ~ N(0, I)
 
-with ``signal^2 + noise^2 = 1`` on a *diffusion* path and ``signal + noise = 1`` on a *flow* path. Time is measured in training
-steps: integers ``0 .. N-1`` on a diffusion path, real numbers ``0 < t <= N`` on a flow path. Solvers walk from much noise to none.
+with ``signal^2 + noise^2 = 1`` on a *diffusion* path and ``signal + noise = 1`` on a *flow* path. Time is measured in
+training steps: integers ``0 .. N-1`` on a diffusion path, real numbers ``0 < t <= N`` on a flow path. Solvers walk
+from much noise to none.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ Network = Callable[[Tensor, Tensor], Tensor]
 
 
 def squared_cosine(num_train_steps: int) -> Tensor:
-    """Signal variance after each step, nearly a squared cosine (Nichol and Dhariwal 2021); each step keeps at least 0.1 %."""
+    """Signal variance after each step, nearly a squared cosine (Nichol and Dhariwal 2021)."""
     edges = torch.arange(num_train_steps + 1, dtype=torch.float64) / num_train_steps
     kept = torch.cos((edges + 0.008) / 1.008 * math.pi / 2).square()
     return (kept[1:] / kept[:-1]).clamp_min(1e-3).cumprod(0)
 
 
 def linear(num_train_steps: int) -> Tensor:
-    """Signal variance under variances growing linearly (Ho et al. 2020), rescaled so that any number of steps ends in noise."""
+    """Signal variance if the added one grows linearly (Ho et al. 2020), rescaled so that any number ends in noise."""
     stretch = 1000 / num_train_steps
     added = torch.linspace(1e-4 * stretch, 0.02 * stretch, num_train_steps, dtype=torch.float64).clamp_max(0.999)
     return (1 - added).cumprod(0)
@@ -68,7 +69,7 @@ Denoise = Callable[[Tensor, Node], tuple[Tensor, Tensor]]
 
 
 def ddpm(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Ancestral sampling with the posterior's variance (Ho et al. 2020, eq. 7); ``draws[i]`` is the noise added by step i."""
+    """Ancestral sampling with the posterior's variance (Ho et al. 2020, eq. 7); step i adds ``draws[i]``."""
     for index, (node, after) in enumerate(zip(nodes[:-1], nodes[1:], strict=True)):
         sample, _ = denoise(x, node)
         keep = (node.signal / after.signal) ** 2
@@ -88,7 +89,7 @@ def ddim(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
 
 
 def dpm_solver_2m(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2); first order at both ends."""
+    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2)."""
     previous, previous_step = None, 0.0
     for node, after in zip(nodes[:-1], nodes[1:], strict=True):
         sample, _ = denoise(x, node)
@@ -145,8 +146,9 @@ PREDICTIONS = ("epsilon", "sample", "velocity")
 class NoiseSchedule(nn.Module):
     """Adds noise to plans, says what the network has to predict, and removes noise again.
 
-    What the network predicts (``prediction``): ``"epsilon"`` the noise, ``"sample"`` the clean plan, ``"velocity"`` the
-    derivative along the path (``signal eps - noise x_0`` on a diffusion path, Salimans and Ho 2022; ``eps - x_0`` on a flow path).
+    What the network predicts (``prediction``): ``"epsilon"`` the noise, ``"sample"`` the clean plan, ``"velocity"``
+    the derivative along the path (``signal eps - noise x_0`` on a diffusion path, Salimans and Ho 2022; ``eps - x_0``
+    on a flow path).
 
     Args:
         schedule (str): a name in ``SCHEDULES``. Defaults to ``"squared_cosine"``.
@@ -155,7 +157,8 @@ class NoiseSchedule(nn.Module):
         num_train_steps (int): number ``N`` of noise levels in training. Defaults to 50 as in KOAP's first public code.
 
     Raises:
-        ValueError: for an unknown schedule or prediction (the nearest name is suggested), and for ``"epsilon"`` on a flow
+        ValueError: for an unknown schedule or prediction (the nearest name is suggested), and for ``"epsilon"`` on a
+        flow
             path, whose start holds no signal, so that the plan cannot be computed from the noise.
 
     Examples:
@@ -176,7 +179,9 @@ class NoiseSchedule(nn.Module):
         if prediction not in PREDICTIONS:
             raise ValueError(_unknown("prediction", prediction, PREDICTIONS))
         if kind.path == "flow" and prediction == "epsilon":
-            raise ValueError("prediction 'epsilon' does not fit schedule 'flow' (no signal at its start); use 'velocity'")
+            raise ValueError(
+                "prediction 'epsilon' does not fit schedule 'flow' (no signal at its start); use 'velocity'"
+            )
         if num_train_steps < 1:
             raise ValueError(f"num_train_steps must be at least 1, got {num_train_steps}")
         self.schedule, self.path, self.prediction = schedule, kind.path, prediction
@@ -233,7 +238,7 @@ class NoiseSchedule(nn.Module):
         if times is None:
             if num_steps < 1 or (self.path == "diffusion" and num_steps > self.num_train_steps):
                 raise ValueError(f"num_steps must lie in 1..{self.num_train_steps} (num_train_steps), got {num_steps}")
-            times = [self.num_train_steps * (1 - step / num_steps) for step in range(num_steps)]
+            times = [self.num_train_steps * (num_steps - step) / num_steps for step in range(num_steps)]
             if self.path == "diffusion":
                 times = [round(time) - 1 for time in times]
         if self.path == "flow":
@@ -279,7 +284,8 @@ class NoiseSchedule(nn.Module):
             solver (str): a name in ``SOLVERS`` that fits the schedule's path.
 
         Keyword Args:
-            clip (float, optional): the clean plan is clipped to ``[-clip, clip]`` at every step. Defaults to no clipping.
+            clip (float, optional): the clean plan is clipped to ``[-clip, clip]`` at every step. Defaults to no
+                clipping.
             step_noise (Tensor, optional): the draws of a stochastic solver, ``[num_steps, *B, H, d]``.
             generator (torch.Generator, optional): source of those draws if ``step_noise`` is not given.
             times (sequence of float, optional): own stops instead of ``num_steps`` even ones.

@@ -18,40 +18,43 @@ Tensor = torch.Tensor
 
 
 class StatePlanner(TensorDictModuleBase):
-    """Samples the next ``horizon`` states given the last ``history`` ones: pi_PL(x_{t+1:t+H} | x_{t-h+1:t}) of the KOAP paper.
+    """Samples the next ``horizon`` states given the last ``history`` ones: KOAP's pi_PL(x_{t+1:t+H} | x_{t-h+1:t}).
 
-    With ``relative=True`` a plan is modelled as displacements from the current state, and the condition is the displacement of
-    the older frames together with the current state itself::
+    With ``relative=True`` a plan is modelled as displacements from the current state, and the condition is the
+    displacement of the older frames together with the current state itself::
 
         frame        0      1       2      3          (history = 2)
                      x_0    x_1     x_2    x_3
         condition    x_0-x_1, x_1
         plan                        x_2-x_1, x_3-x_1, ...
 
-    Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state dict.
+    Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state
+    dict.
 
-    Sampling always starts from random noise, also under ``ExplorationType.DETERMINISTIC`` (or ``MODE``, ``MEAN``), where only a
-    stochastic solver is exchanged for its deterministic sibling ``"ddim"``: one fixed start noise would give one fixed mode.
-    For evaluations that can be repeated per environment put standard normal noise into the entry ``noise_key``.
+    Sampling always starts from random noise, also under ``ExplorationType.DETERMINISTIC`` (or ``MODE``, ``MEAN``),
+    where only a stochastic solver is exchanged for its deterministic sibling ``"ddim"``: one fixed start noise would
+    give one fixed mode. For evaluations that can be repeated per environment put standard normal noise into the entry
+    ``noise_key``.
 
     Args:
         denoiser (nn.Module): ``denoiser(sequence [*B, H, d], time [*B], condition [*B, h * d]) -> [*B, H, d]``.
-        schedule (NoiseSchedule, optional): noise schedule and prediction type. Defaults to ``NoiseSchedule()``, the 50 steps,
-            squared cosine and noise prediction of KOAP's first public code.
+        schedule (NoiseSchedule, optional): noise schedule and prediction type. Defaults to ``NoiseSchedule()``, the
+            50 steps, squared cosine and noise prediction of KOAP's first public code.
 
     Keyword Args:
         state_dim (int): number ``d`` of state columns.
         history (int): number ``h`` of observed frames, the current one included. Defaults to 2.
         horizon (int): number ``H`` of planned frames. Defaults to 14.
         relative (bool): model displacements from the current state. Defaults to True.
-        solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a flow path.
+        solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
+            flow path.
         num_steps (int): solver steps. Defaults to 10.
-        clip (float, optional): bound of the normalised plan at every solver step. Defaults to no bound; ``1.0`` suits ``"minmax"``
-            statistics.
+        clip (float, optional): bound of the normalised plan at every solver step. Defaults to no bound; ``1.0`` suits
+            ``"minmax"`` statistics.
         in_keys (list of NestedKey): the entry of the history ``[*B, h, d]`` in raw units. Defaults to ``["history"]``.
         out_keys (list of NestedKey): the entry of the plan ``[*B, H, d]`` in raw units. Defaults to ``["plan"]``.
-        noise_key (NestedKey, optional): entry read if present: start noise ``[*B, H, d]``, or ``[*B, 1 + num_steps, H, d]`` where
-            the rest are the draws of a stochastic solver. Defaults to ``"noise"``.
+        noise_key (NestedKey, optional): entry read if present: start noise ``[*B, H, d]``, or ``[*B, 1 + num_steps,
+            H, d]`` where the rest are the draws of a stochastic solver. Defaults to ``"noise"``.
 
     Raises:
         ValueError: for a history of another length or width, noise of another shape, an unknown or unfit solver.
@@ -59,7 +62,7 @@ class StatePlanner(TensorDictModuleBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules.denoisers import TemporalUnet
+        >>> from torchrl_koap.modules.unet import TemporalUnet
         >>> from torchrl_koap.modules.diffusion import NoiseSchedule
         >>> from torchrl_koap.modules.planner import StatePlanner
         >>> planner = StatePlanner(TemporalUnet(2, 4), NoiseSchedule("flow"), state_dim=2, num_steps=4)
@@ -137,7 +140,8 @@ class StatePlanner(TensorDictModuleBase):
             windows (Tensor): states in raw units, ``[*N, history + horizon, d]``.
 
         Keyword Args:
-            mode (str): ``"minmax"``, ``"standard"`` or ``"identity"`` (see :class:`~torchrl_koap.data.normalizers.Normalizer`).
+            mode (str): ``"minmax"``, ``"standard"`` or ``"identity"`` (see
+                :class:`~torchrl_koap.data.normalizers.Normalizer`).
             per_step (bool): own statistics for every planned step instead of shared ones. Defaults to True.
         """
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
@@ -156,7 +160,8 @@ class StatePlanner(TensorDictModuleBase):
         length = self.history + self.horizon
         if window.ndim < 2 or window.shape[-2] != length or window.shape[-1] != self.state_dim:
             raise ValueError(
-                f"windows must be [*B, {length}, {self.state_dim}] (history + horizon, state_dim), got {list(window.shape)}"
+                f"windows must be [*B, {length}, {self.state_dim}] (history + horizon, state_dim),"
+                f" got {list(window.shape)}"
             )
         return window[..., : self.history, :], window[..., self.history :, :]
 
@@ -164,7 +169,8 @@ class StatePlanner(TensorDictModuleBase):
         """Raw history ``[*B, h, d]`` to the denoiser's condition ``[*B, h * d]``."""
         if history.ndim < 2 or history.shape[-2:] != (self.history, self.state_dim):
             raise ValueError(
-                f"{self.in_keys[0]!r} must be [*B, {self.history}, {self.state_dim}] (history, state_dim), got {list(history.shape)}"
+                f"{self.in_keys[0]!r} must be [*B, {self.history}, {self.state_dim}] (history, state_dim),"
+                f" got {list(history.shape)}"
             )
         return self.condition_normalizer(self._displace(history).flatten(-2))
 
@@ -172,7 +178,8 @@ class StatePlanner(TensorDictModuleBase):
         """Raw plan ``[*B, H, d]`` to the normalised sequence that noise is added to."""
         if plan.shape[-2:] != (self.horizon, self.state_dim):
             raise ValueError(
-                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self.state_dim}] (horizon, state_dim), got {list(plan.shape)}"
+                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self.state_dim}] (horizon, state_dim),"
+                f" got {list(plan.shape)}"
             )
         plan = plan - history[..., -1:, :] if self.relative else plan
         return self.plan_normalizer(plan.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
@@ -199,8 +206,8 @@ class StatePlanner(TensorDictModuleBase):
         expected = (*history.shape[:-2], self.horizon, self.state_dim)
         if noise.shape != expected or (step_noise is not None and step_noise.shape[0] < self.num_steps):
             raise ValueError(
-                f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, state_dim]), or hold at least {1 + self.num_steps}"
-                f" (1 + num_steps) of these on axis -3, got start noise {list(noise.shape)}"
+                f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, state_dim]), or hold at least"
+                f" {1 + self.num_steps} (1 + num_steps) of these on axis -3, got start noise {list(noise.shape)}"
                 + ("" if step_noise is None else f" and {step_noise.shape[0]} further draws")
             )
         sequence = self.schedule.solve(

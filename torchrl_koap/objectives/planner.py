@@ -29,8 +29,8 @@ class PlannerLoss(LossModule):
         planner (StatePlanner): planner to train, its normalisers already fitted.
 
     Keyword Args:
-        window (bool): read whole windows ``[*B, history + horizon, d]`` from the entry ``state`` and cut them (True), or read
-            the entries ``history`` and ``plan`` (False). Defaults to True.
+        window (bool): read whole windows ``[*B, history + horizon, d]`` from the entry ``state`` and cut them (True),
+            or read the entries ``history`` and ``plan`` (False). Defaults to True.
         create_target_params (bool): keep an averaged copy of the weights in ``target_planner_params``, to be moved by
             :class:`torchrl.objectives.SoftUpdate` and used for planning. Defaults to True.
         reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, d]``. Defaults to ``"mean"``.
@@ -43,7 +43,7 @@ class PlannerLoss(LossModule):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.objectives import SoftUpdate
-        >>> from torchrl_koap.modules.denoisers import TemporalUnet
+        >>> from torchrl_koap.modules.unet import TemporalUnet
         >>> from torchrl_koap.modules.planner import StatePlanner
         >>> from torchrl_koap.objectives.planner import PlannerLoss
         >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
@@ -63,8 +63,8 @@ class PlannerLoss(LossModule):
             state (NestedKey): windows ``[*B, history + horizon, d]``. Defaults to ``"state"``.
             history (NestedKey): observed frames ``[*B, history, d]``. Defaults to the planner's in-key.
             plan (NestedKey): recorded future ``[*B, horizon, d]``. Defaults to the planner's out-key.
-            mask (NestedKey): bool, False where a step is padding: ``[*B, horizon]`` or ``[*B, history + horizon]``, with or
-                without a trailing 1. Defaults to ``"mask"``.
+            mask (NestedKey): bool, False where a step is padding: ``[*B, horizon]`` or ``[*B, history + horizon]``,
+                with or without a trailing 1. Defaults to ``"mask"``.
             noise (NestedKey): noise ``[*B, horizon, d]`` instead of random. Defaults to ``"planner_noise"``.
             time (NestedKey): time ``[*B]`` in training steps instead of random. Defaults to ``"planner_time"``.
         """
@@ -159,7 +159,9 @@ class PlannerLoss(LossModule):
     def _read(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
         value = tensordict.get(key, None)
         if value is None:
-            raise KeyError(f"the planner's loss needs the entry {key!r}; there are {sorted(map(str, tensordict.keys(True)))}")
+            raise KeyError(
+                f"the planner's loss needs the entry {key!r}; there are {sorted(map(str, tensordict.keys(True)))}"
+            )
         return value
 
     def _read_mask(self, tensordict: TensorDictBase, plan: torch.Tensor) -> torch.Tensor | None:
