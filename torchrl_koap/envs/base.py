@@ -89,6 +89,7 @@ class ManipulationEnv(EnvBase):
         self._mode = np.zeros((num_envs, num_mode_flags), dtype=bool)
         self._success = np.zeros(num_envs, dtype=bool)
         self._collision = np.zeros(num_envs, dtype=bool)
+        self._seen = np.zeros((num_envs, 2), dtype=bool)  # success, failure of the present state, told a step later
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._ready = np.zeros(num_envs, dtype=bool)
         self._renderer = None
@@ -158,21 +159,23 @@ class ManipulationEnv(EnvBase):
         self._ready[rows] = True
         self._begin(rows)
         self._observation[rows] = self._observe(rows)
+        self._seen[rows] = np.stack(self._check(rows), axis=1)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         rows = self._rows(tensordict, "_step")
         action = self._checked_action(tensordict, rows)
         self._command(rows, action)
 
-        success, failure = self._check(rows)
-        open_rows = ~(self._success[rows] | self._collision[rows])
-        self._success[rows] |= open_rows & success
-        self._collision[rows] |= open_rows & failure & ~success  # both at once count as success
+        success, failure = self._seen[rows].T
+        undecided = ~(self._success[rows] | self._collision[rows])
+        self._success[rows] |= undecided & success
+        self._collision[rows] |= undecided & failure & ~success  # both at once count as success
         self._observation[rows] = self._observe(rows)
 
         self.sims.track_pose(rows, self._commands, self.substeps)
         self._steps[rows] += 1
         self._update_mode(rows)
+        self._seen[rows] = np.stack(self._check(rows), axis=1)
         stepped = np.zeros(self.batch_size[0], dtype=bool)
         stepped[rows] = True
         out = self._leaves(stepped)
@@ -226,7 +229,7 @@ class ManipulationEnv(EnvBase):
         Returns:
             dict: arrays for :meth:`set_state`; also valid in another environment of the same task.
         """
-        names = ("_observation", "_commands", "_mode", "_success", "_collision", "_steps", "_ready")
+        names = ("_observation", "_commands", "_mode", "_success", "_collision", "_seen", "_steps", "_ready")
         return {"simulation": self.sims.get_state(index)} | {n: np.copy(getattr(self, n)[index]) for n in names}
 
     def set_state(self, index: int, state: dict) -> None:

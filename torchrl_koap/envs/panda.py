@@ -8,6 +8,7 @@ from that package. Lengths in m, masses in kg, inertias in kg m^2, angles in rad
 from __future__ import annotations
 
 import importlib.util
+import math
 from pathlib import Path
 
 from torchrl_koap.envs.mjcf import mjcf
@@ -205,11 +206,16 @@ def _mesh(folder: Path, name: str) -> Path:
 
 
 def _add_rod(hand: mjcf.Element) -> None:
+    # D3IL leaves the inertia of rod and tip to their shapes, at the density of water
+    radius, length, density = 0.01, 0.3, 1000.0
+    mass = density * math.pi * radius**2 * length
+    across, along = mass * (3 * radius**2 + length**2) / 12, mass * radius**2 / 2
     rod = hand.add("body", name="rod")
-    rod.add("inertial", mass=0.09424778, pos=(0, 0, 0.075), diaginertia=(7.092145e-4, 7.092145e-4, 4.712389e-6))
+    rod.add("inertial", mass=mass, pos=(0, 0, 0.075), diaginertia=(across, across, along))
     rod.add("geom", name="rod", type="cylinder", size=(0.01, 0.15), pos=(0, 0, 0.075), rgba=(0.2, 0.4, 0.8, 1))
     tip = rod.add("body", name="rod_tip")
-    tip.add("inertial", mass=0.00418879, pos=(0, 0, 0.225), diaginertia=(1.675516e-7,) * 3)
+    mass = density * 4 / 3 * math.pi * radius**3
+    tip.add("inertial", mass=mass, pos=(0, 0, 0.225), diaginertia=(0.4 * mass * radius**2,) * 3)
     drawn = {"contype": 0, "conaffinity": 0, "rgba": (0.2, 0.4, 0.8, 1)}
     tip.add("geom", name="rod_tip", type="sphere", size=(0.01,), pos=(0, 0, 0.225), **drawn)
 

@@ -162,7 +162,7 @@ class SimulationBatch:
         Returns:
             dict: physics state (``mjSTATE_INTEGRATION``), force bias, TCP pose, joint targets, finger targets.
         """
-        data, spec = self.data[row], mujoco.mjtState.mjSTATE_INTEGRATION
+        data, spec = self.data[row], mujoco.mjtState.mjSTATE_INTEGRATION.value
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
         mujoco.mj_getState(self.model, data, physics, spec)
         return {
@@ -181,7 +181,10 @@ class SimulationBatch:
         """Restores what :meth:`get_state` returned; the simulation then continues bit for bit."""
         data = self.data[row]
         mujoco.mj_resetData(self.model, data)
-        mujoco.mj_setState(self.model, data, state["physics"], mujoco.mjtState.mjSTATE_INTEGRATION)
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
+        mujoco.mj_setState(self.model, data, state["physics"], spec)
+        mujoco.mj_forward(self.model, data)  # poses for pictures, contacts; what it changes is put back below
+        mujoco.mj_setState(self.model, data, state["physics"], spec)
         data.qfrc_bias[:] = state["bias"]
         data.xpos[self._tcp] = state["tcp_position"]
         data.xquat[self._tcp] = state["tcp_quaternion"]
