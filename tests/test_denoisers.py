@@ -25,7 +25,11 @@ def denoiser(request):
 
 def inputs(*batch, horizon=14, dtype=torch.float32, device="cpu"):
     options = {"dtype": dtype, "device": device}
-    return torch.randn(*batch, horizon, 3, **options), 50 * torch.rand(batch, **options), torch.randn(*batch, 6, **options)
+    return (
+        torch.randn(*batch, horizon, 3, **options),
+        50 * torch.rand(batch, **options),
+        torch.randn(*batch, 6, **options),
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -100,14 +104,17 @@ def test_embeddings_in_closed_form():
     torch.testing.assert_close(encoder(torch.tensor([[0.5]])), torch.tensor([[0.5, 1.0, 0.0, 0.0, -1.0]]))
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    ({"channels": (30,)}, r"channels must be multiples of groups \(8\), got \(30,\)"),
-    ({"kernel_size": 4}, "kernel_size must be odd, got 4"),
-    ({"blocks_per_level": 0}, "blocks_per_level must be at least 1"),
-    ({"multiple": 3}, "multiple must be a multiple of 2"),
-    ({"activation": "swish"}, "unknown activation 'swish'"),
-    ({"embedding_dim": 5}, "embedding_dim must be even"),
-])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"channels": (30,)}, r"channels must be multiples of groups \(8\), got \(30,\)"),
+        ({"kernel_size": 4}, "kernel_size must be odd, got 4"),
+        ({"blocks_per_level": 0}, "blocks_per_level must be at least 1"),
+        ({"multiple": 3}, "multiple must be a multiple of 2"),
+        ({"activation": "swish"}, "unknown activation 'swish'"),
+        ({"embedding_dim": 5}, "embedding_dim must be even"),
+    ],
+)
 def test_impossible_sizes_are_explained(options, message):
     with pytest.raises(ValueError, match=message):
         TemporalUnet(3, 6, **options)

@@ -221,7 +221,7 @@ class StatePlanner(TensorDictModuleBase):
         )
         return self.decode_plan(history, sequence)
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the plan into the tensordict."""
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)

@@ -122,7 +122,7 @@ class PlannerLoss(LossModule):
     def in_keys(self, values: list[NestedKey]) -> None:
         self._in_keys = values
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes ``loss_planner``; the input is not changed."""
         names = self.tensor_keys
