@@ -24,7 +24,9 @@ ANCHOR = 26.0
 def straight_on(env: AvoidingEnv):
     """A policy that moves at human speed through the scene, so that controller and contacts have work to do."""
     generator = torch.Generator().manual_seed(0)
-    aim = torch.rand(env.batch_size[0], 2, generator=generator) * torch.tensor([0.012, 0.006]) - torch.tensor([0.006, 0])
+    aim = torch.rand(env.batch_size[0], 2, generator=generator) * torch.tensor([0.012, 0.006]) - torch.tensor(
+        [0.006, 0]
+    )
 
     def policy(tensordict):
         return tensordict.set("action", aim)

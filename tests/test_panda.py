@@ -55,9 +55,9 @@ def test_plain_variant_has_no_rod():
 @pytest.mark.parametrize("link_collisions", [False, True])
 def test_what_collides(link_collisions):
     model = compiled(rod=True, link_collisions=link_collisions)
-    for name in ("rod", "finger_left", "finger_right", "pad_left", "pad_right"):
+    for name in ("rod", "finger_left", "finger_right", "pad_left", "pad_right", "hand"):
         assert model.geom(name).contype == 1
-    for name in ("link0", "link5", "link7", "hand"):
+    for name in ("link0", "link5", "link7"):
         assert model.geom(name).contype == int(link_collisions)
     assert model.nexclude == 9
 

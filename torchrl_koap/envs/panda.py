@@ -135,15 +135,16 @@ def mesh_folder() -> Path:
 def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0) -> mjcf.RootElement:
     """Builds the arm: 7 hinge joints, 2 finger slides, 9 motors, TCP body, wrist camera, optionally a rod in the hand.
 
-    What can touch something always collides: rod, fingers and finger pads. Links 0-7 and the hand ride 4 cm and more
-    above every obstacle and are drawn only, unless ``link_collisions`` is set.
+    What can touch something always collides: rod, fingers, finger pads and the hand (which comes down on a cylinder
+    when the rod is pressed against it). Links 0-7 are drawn only, unless ``link_collisions`` is set: commands all over
+    the table never brought one into contact, and leaving them out saves time.
 
     Names: joints ``joint1`` ... ``joint7``, ``finger_left``, ``finger_right`` (motors alike), bodies ``link0`` ...
     ``link8``, ``hand``, ``tcp``, geom ``rod``, camera ``wrist``.
 
     Args:
         rod (bool): the hand holds a rod (Avoiding, Aligning, Sorting) or nothing (Stacking).
-        link_collisions (bool): the convex hulls of links and hand collide too, as in the original.
+        link_collisions (bool): the convex hulls of links 0-7 collide too, as in the original.
         alpha (float): opacity of the arm when drawn.
 
     Raises:
@@ -183,7 +184,7 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
         diaginertia=(0.00227632, 0.00206087, 0.000456542),
         quat=(0.697945, 0.716151, -0.000242485, 8.47563e-5),
     )
-    hand.add("geom", name="hand", type="mesh", mesh="hand", rgba=colour, solimp=(1.998, 1.999, 0.0), **hull)
+    hand.add("geom", name="hand", type="mesh", mesh="hand", rgba=colour, solimp=(1.998, 1.999, 0.0))
     hand.add("camera", name="wrist", pos=(0.1, 0, 0), euler=(0, 3.14, 1.57), fovy=60)
     hand.add("body", name="tcp", pos=(0, 0, TCP_OFFSET))
     if rod:

@@ -27,7 +27,7 @@ def scene(*, rod: bool = True, image_size: int = 96, arm_alpha: float = 0.1, lin
         rod (bool): the hand holds a rod.
         image_size (int): width and height in pixels of the off-screen picture buffer's default.
         arm_alpha (float): opacity of the arm when drawn.
-        link_collisions (bool): links and hand collide too, see :func:`~torchrl_koap.envs.panda.panda`.
+        link_collisions (bool): links 0-7 collide too, see :func:`~torchrl_koap.envs.panda.panda`.
 
     Returns:
         mjcf.RootElement: the scene.

@@ -342,9 +342,7 @@ def _write_log(row, pointers, qpos, qvel, q_des, v_des, a_des, tcp, quat):
 
 
 @njit(nogil=True, cache=True)
-def track_pose(
-    step, model, data, pointers, rows, commands, widths, grasping, substeps, targets, speeds, started, log
-):
+def track_pose(step, model, data, pointers, rows, commands, widths, grasping, substeps, targets, speeds, started, log):
     """Tracks Cartesian commands for ``substeps`` physics steps in each of the simulations ``rows`` (spec 3.1, 3.3).
 
     Args:
