@@ -76,11 +76,17 @@ def test_batch_size():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d["observation"][5].fill_(float("nan")), "'observation' is NaN or infinite in 1 steps, first at step 5"),
+        (
+            lambda d: d["observation"][5].fill_(float("nan")),
+            "'observation' is NaN or infinite in 1 steps, first at step 5",
+        ),
         (lambda d: d["next", "observation"][2, 1].fill_(float("inf")), "('next', 'observation') is NaN"),
         (lambda d: d["action"][2].fill_(float("nan")), "labelled steps, first at step 2"),
         (lambda d: d["has_action"][3].fill_(False), "outside the label budget must be NaN"),
-        (lambda d: d["step_count"][1].fill_(7), "'step_count' must count 0, 1, 2, ... in a trajectory, first fault at step 1"),
+        (
+            lambda d: d["step_count"][1].fill_(7),
+            "'step_count' must count 0, 1, 2, ... in a trajectory, first fault at step 1",
+        ),
         (lambda d: d["step_count"][3].fill_(1), "first fault at step 3"),
         (lambda d: d["episode"][-1].fill_(0), "one after the other"),
         (lambda d: d["next", "done"][2].fill_(False), "False at the end of the trajectory at step 2"),

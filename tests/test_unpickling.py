@@ -94,7 +94,9 @@ def test_names_of_numpy_1_and_2():
     new = pickle.dumps(np.arange(3.0), 2)
     assert b"numpy._core.multiarray" in new or b"numpy.core.multiarray" in new
     for module in (b"numpy.core.multiarray", b"numpy._core.multiarray"):
-        content = new.replace(b"numpy._core.multiarray", b"numpy.core.multiarray").replace(b"numpy.core.multiarray", module)
+        content = new.replace(b"numpy._core.multiarray", b"numpy.core.multiarray").replace(
+            b"numpy.core.multiarray", module
+        )
         np.testing.assert_array_equal(loads_pickle(content), [0, 1, 2])
 
 

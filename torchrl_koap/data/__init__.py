@@ -1,14 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Demonstrations: reading, storing, hiding labels, normalising, cutting into windows."""
 
-from torchrl_koap.data.d3il import (
-    CONVERTERS,
-    Converter,
-    D3ILExperienceReplay,
-    RawFolderError,
-    convert_raw_files,
-    find_raw_files,
-)
+from torchrl_koap.data.conversion import CONVERTERS, Converter, RawFolderError, convert_raw_files, find_raw_files
+from torchrl_koap.data.d3il import D3ILExperienceReplay
 from torchrl_koap.data.labels import LabelBudget, LabelReport, hide_commands
 from torchrl_koap.data.normalizers import Normalizer
 from torchrl_koap.data.raw import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
@@ -16,13 +10,9 @@ from torchrl_koap.data.saving import replacing_file, replacing_folder
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state, trajectory_lengths
 from torchrl_koap.data.unpickling import DamagedPickleError, UnsafePickleError, load_pickle, loads_pickle
+from torchrl_koap.data.window_buffer import make_window_buffer
 from torchrl_koap.data.window_table import WindowTable
-from torchrl_koap.data.windows import (
-    WindowSampler,
-    WindowSamplerWithoutReplacement,
-    WindowUnit,
-    make_window_buffer,
-)
+from torchrl_koap.data.windows import WindowSampler, WindowSamplerWithoutReplacement, WindowUnit
 
 __all__ = [
     "CONVERTERS",

@@ -8,17 +8,14 @@ are never written to.
 
 from __future__ import annotations
 
-import fnmatch
 import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torchrl._utils import logger as torchrl_logger
@@ -27,61 +24,14 @@ from torchrl.data.datasets import register_dataset
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 
 from torchrl_koap import keys
+from torchrl_koap.data.conversion import convert_raw_files, find_raw_files, get_converter
 from torchrl_koap.data.labels import LabelBudget, LabelReport
-from torchrl_koap.data.raw import RawEpisode, RawEpisodeError, read_raw_episode
+from torchrl_koap.data.saving import one_at_a_time
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
-from torchrl_koap.data.trajectories import flatten_trajectories, select_state
-from torchrl_koap.data.unpickling import load_pickle
+from torchrl_koap.data.trajectories import select_state
 from torchrl_koap.tasks import Task, get_task
 
 _CONVERSION = 1  # raise it when the same raw files convert to other data
-_NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.pkl")
-
-OBJECTS = {
-    "avoiding": (),
-    "aligning": ("push-box", "target-box"),
-    "sorting": ("red-box1", "red-box2", "blue-box1", "blue-box2"),
-    "stacking": ("red-box", "green-box", "blue-box", "target-box"),
-}
-
-
-@dataclass(frozen=True)
-class Converter:
-    """How the raw episodes of one task become observations and actions.
-
-    Args:
-        robot (tuple of str): entries of ``robot`` that are read.
-        objects (tuple of str): objects whose pose is read.
-        folder (str): where D3IL keeps the files, seen from its data folder.
-        convert (callable): from a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``,
-            as float64 arrays.
-    """
-
-    robot: tuple[str, ...]
-    objects: tuple[str, ...]
-    folder: str
-    convert: Callable[[RawEpisode], tuple[np.ndarray, np.ndarray]]
-
-
-def _avoiding(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
-    desired = np.asarray(episode.robot["des_c_pos"], dtype=np.float64)[:, :2]
-    measured = np.asarray(episode.robot["c_pos"], dtype=np.float64)[:, :2]
-    return np.concatenate([desired, measured], axis=1), np.diff(desired, axis=0)
-
-
-CONVERTERS = {
-    "avoiding": Converter(
-        robot=("des_c_pos", "c_pos"), objects=OBJECTS["avoiding"], folder="avoiding/data", convert=_avoiding
-    ),
-}
-
-
-class RawFolderError(ValueError):
-    """A folder of demonstrations that cannot be used; ``problems`` lists those of all its files."""
-
-    def __init__(self, folder: Path, problems: list[str]):
-        self.problems = problems
-        super().__init__(f"{len(problems)} problem(s) in {folder}:\n  - " + "\n  - ".join(problems))
 
 
 class D3ILExperienceReplay(BaseDatasetExperienceReplay):
@@ -137,12 +87,14 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         label_budget: LabelBudget | None = None,
         **kwargs: Any,
     ):
-        facts, converter = get_task(task), _converter(task)
+        facts, converter = get_task(task), get_converter(task)
         folder, files = find_raw_files(task, root, split_file=split_file)
         self.root = folder
         self._cache = _cache_folder(cache)
         self._data_path = self._cache / "d3il" / f"{task}-{_fingerprint(facts, files, dtype)}"
-        data = self._open(facts, converter, files, dtype)
+        # several processes may open the same folder at the same time: one converts, the others wait for it
+        with one_at_a_time(self._data_path.with_name(f".{self._data_path.name}.lock")):
+            data = self._open(facts, converter, files, dtype)
         self._begin(facts, data, label_budget, kwargs)
 
     @classmethod
@@ -249,117 +201,6 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         if self._data_path is None or self._data_path == self.root:
             raise RuntimeError("only data converted from raw files are kept in a cache that can be deleted")
         shutil.rmtree(self._data_path)
-
-
-def find_raw_files(
-    task: str, root: str | Path, *, split_file: str | Path | None = None
-) -> tuple[Path, list[Path]]:
-    """Finds the raw demonstrations of a task.
-
-    Args:
-        task (str): name of the task.
-        root (str or Path): the folder of the pickles or one above it.
-        split_file (str or Path, optional): a pickled list of file names.
-
-    Returns:
-        tuple: the folder, and its files in the order of their names.
-
-    Raises:
-        FileNotFoundError: if nothing is there; the message lists the places looked at.
-        ValueError: if the split file is no list of plain file names.
-    """
-    root, inside = Path(root).expanduser(), _converter(task).folder
-    places = [root, root / PurePosixPath(inside).name, root / inside, root / "environments/dataset/data" / inside]
-    for folder in places:
-        files = _pickles(folder)
-        if files:
-            break
-    else:
-        if not root.is_dir():
-            raise FileNotFoundError(f"no folder {root}")
-        raise FileNotFoundError("no demonstrations (*.pkl) in " + ", ".join(map(str, places)))
-    if split_file is not None:
-        names = _read_split([Path(split_file), root / split_file, folder / split_file, folder.parent / split_file])
-        files = [folder / name for name in names]
-        absent = [file.name for file in files if not file.is_file()]
-        if absent:
-            raise FileNotFoundError(f"{folder} lacks {len(absent)} files of {split_file}: {', '.join(absent[:10])}")
-    return folder, files
-
-
-def convert_raw_files(
-    converter: Converter, files: Sequence[Path], folder: Path, *, dtype: torch.dtype = torch.float32
-) -> TensorDictBase:
-    """Converts raw demonstrations to flat TED data.
-
-    Args:
-        converter (Converter): that of the task.
-        files (sequence of Path): the demonstrations, one trajectory each.
-        folder (Path): what to call the whole in an error message.
-        dtype (torch.dtype): floating type of the entries.
-
-    Raises:
-        RawFolderError: with the problems of all files.
-    """
-    problems, observations, actions = [], [], []
-    for file in files:
-        try:
-            episode = read_raw_episode(file, robot=converter.robot, objects=converter.objects)
-            _refuse_other_task(file, episode, converter)
-            observation, action = converter.convert(episode)
-        except RawEpisodeError as error:
-            problems += error.problems
-            continue
-        except OSError as error:
-            problems.append(f"{file}: cannot be read: {error}")
-            continue
-        observations.append(torch.from_numpy(observation))
-        actions.append(torch.from_numpy(action))
-    if problems:
-        raise RawFolderError(folder, problems)
-    return flatten_trajectories(observations, actions, dtype=dtype)
-
-
-def _converter(task: str) -> Converter:
-    get_task(task)
-    if task not in CONVERTERS:
-        raise ValueError(f"raw demonstrations of task {task!r} cannot be read yet; known: {', '.join(CONVERTERS)}")
-    return CONVERTERS[task]
-
-
-def _refuse_other_task(file: Path, episode: RawEpisode, converter: Converter) -> None:
-    if set(episode.objects) == set(converter.objects):
-        return
-    logged = ", ".join(map(str, episode.objects)) or "no objects"
-    others = [task for task, objects in OBJECTS.items() if set(objects) == set(episode.objects)]
-    origin = f"a demonstration of {others[0]!r}" if others else "of an unknown task"
-    wanted = ", ".join(converter.objects) or "no objects"
-    raise RawEpisodeError([f"{file}: {origin}: it logs {logged}, wanted {wanted}"])
-
-
-def _pickles(folder: Path) -> list[Path]:
-    """The demonstrations of a folder in the order of their names, without D3IL's lists of files and contexts."""
-    return [
-        file
-        for file in sorted(folder.glob("*.pkl"))
-        if not file.name.startswith(".") and not any(fnmatch.fnmatch(file.name, other) for other in _NO_EPISODES)
-    ]
-
-
-def _read_split(places: Sequence[Path]) -> list[str]:
-    for file in places:
-        if file.is_file():
-            break
-    else:
-        raise FileNotFoundError("no split file at " + ", ".join(map(str, places)))
-    names = load_pickle(file)
-    names = names.tolist() if isinstance(names, np.ndarray) else names
-    if not isinstance(names, (list, tuple)) or not names:
-        raise ValueError(f"{file}: a split file is a list of file names, got {type(names).__name__}")
-    for name in names:
-        if not isinstance(name, str) or PurePosixPath(name).name != name:
-            raise ValueError(f"{file}: {name!r} is no plain file name")
-    return sorted(set(names))
 
 
 def _cache_folder(cache: str | Path | None) -> Path:

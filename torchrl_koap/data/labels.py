@@ -149,9 +149,7 @@ class LabelBudget:
                 raise ValueError(
                     f"no trajectory is as long as a window of {self.window} steps (longest: {lengths.max()})"
                 )
-            units = np.concatenate(
-                [start + np.arange(count) for start, count in zip(starts, counts, strict=True)]
-            )
+            units = np.concatenate([start + np.arange(count) for start, count in zip(starts, counts, strict=True)])
             labels = range(self.history - 1, self.window - 1)
 
         number = self._number_of(len(units))

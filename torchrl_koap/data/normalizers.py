@@ -18,11 +18,15 @@ def _standard(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return values.mean(0), values.std(0, correction=0)
 
 
+def _rms(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.zeros_like(values[0]), values.square().mean(0).sqrt()
+
+
 def _identity(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.zeros_like(values[0]), torch.ones_like(values[0])
 
 
-MODES = {"minmax": _minmax, "standard": _standard, "identity": _identity}
+MODES = {"minmax": _minmax, "standard": _standard, "rms": _rms, "identity": _identity}
 
 
 class Normalizer(nn.Module):
@@ -78,7 +82,7 @@ class Normalizer(nn.Module):
         Args:
             values (Tensor): ``[*N, d]``.
             mode (str): ``"minmax"`` maps the range of each column to [-1, 1], ``"standard"`` its mean and standard
-                deviation to 0 and 1, ``"identity"`` changes nothing. A column that is constant, up to rounding, is only
+                deviation to 0 and 1, ``"rms"`` its root mean square to 1 and 0 to 0, ``"identity"`` changes nothing. A column that is constant, up to rounding, is only
                 shifted.
             mask (Tensor, optional): ``[*N]`` or ``[*N, 1]`` bool, rows to use; the others may hold NaN. For actions
                 this is ``has_action``.

@@ -175,7 +175,8 @@ def _problems(episode: RawEpisode, *, robot, objects, min_length) -> list[str]:
         counts = ", ".join(f"{key} {length}" for key, length in lengths.items())
         problems.append(f"unequal lengths: {counts}")
     elif not lengths:
-        problems.append("'robot' holds none of the known arrays: " + ", ".join(ROBOT_COLUMNS))
+        if not problems:  # else the faults of the arrays say more
+            problems.append("'robot' holds none of the known arrays: " + ", ".join(ROBOT_COLUMNS))
     elif min(lengths.values()) < min_length:
         problems.append(f"too short: {min(lengths.values())} rows, at least {min_length} are needed")
     return problems

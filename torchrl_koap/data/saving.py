@@ -7,6 +7,7 @@ A full disk or an interrupt in the middle of a save leaves what was there before
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import shutil
 import tempfile
@@ -82,19 +83,53 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
         raise
 
 
+@contextlib.contextmanager
+def one_at_a_time(path: str | Path) -> Iterator[None]:
+    """Lets one process, or thread, at a time into the block; the others wait.
+
+    Where the system has no ``fcntl`` (Windows) nobody waits.
+
+    Args:
+        path (str or Path): the lock file; it stays.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_koap.data.saving import one_at_a_time
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with one_at_a_time(f"{folder}/.lock"):
+        ...         "alone"
+        'alone'
+    """
+    if importlib.util.find_spec("fcntl") is None:
+        yield
+        return
+    import fcntl
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a") as file:  # closing the file gives the lock back
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def _exchange(new: Path, path: Path) -> None:
     """Renames ``new`` to ``path``; a folder cannot be renamed onto a full one, so the old one steps aside first."""
-    if not path.exists():
-        os.replace(new, path)
-        return
-    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
-    os.replace(path, old)
     try:
         os.replace(new, path)
+        return
+    except OSError:
+        if not path.is_dir():
+            raise
+    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
+    try:
+        os.replace(path, old)
+        os.replace(new, path)
     except BaseException:
-        os.replace(old, path)
+        if any(old.iterdir()) and not path.exists():
+            os.replace(old, path)
         raise
-    shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def _umask() -> int:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 
 from torchrl_koap import keys
 from torchrl_koap.data.saving import replacing_folder
@@ -68,7 +68,8 @@ def save_ted(
     folder = Path(folder)
     command = TASKS[task].observation[TASKS[task].command] if task in TASKS else None
     keys.validate(data, command=command)
-    strange = [key for key, value in data.items(True, True) if not isinstance(value, torch.Tensor)]
+    entries = data.items(True, True, is_leaf=is_leaf_nontensor)
+    strange = [key for key, value in entries if not isinstance(value, torch.Tensor)]
     if strange:  # they would be written as pickles
         raise TypeError(f"only tensors can be saved, {strange} are none")
     if folder.exists() and not (folder.is_dir() and ((folder / _ABOUT).is_file() or not any(folder.iterdir()))):

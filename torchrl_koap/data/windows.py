@@ -10,20 +10,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from safetensors.torch import load_file, save_file
-from tensordict import NestedKey, TensorDictBase
-from torchrl.data import (
-    ImmutableDatasetWriter,
-    ReplayBuffer,
-    Storage,
-    TensorDictReplayBuffer,
-    TensorStorage,
-)
+from torchrl.data import Storage
 from torchrl.data.replay_buffers import SampleUnit
 from torchrl.data.replay_buffers.samplers import Sampler
 
@@ -355,77 +347,3 @@ class WindowSamplerWithoutReplacement(WindowSampler):
             order = state_dict[f"order_{pool}"]
             self._orders[pool] = order.clone() if len(order) else None
             self._cursors[pool] = int(state_dict[f"cursor_{pool}"])
-
-
-def make_window_buffer(
-    data: TensorDictBase | ReplayBuffer,
-    window: int,
-    batch_size: int,
-    *,
-    select: Sequence[NestedKey] | None = None,
-    replacement: bool = True,
-    drop_last: bool = True,
-    device: torch.device | str | None = None,
-    **options: Any,
-) -> ReplayBuffer:
-    """A replay buffer of windows over flat data.
-
-    Args:
-        data (TensorDictBase or ReplayBuffer): flat data ``[N]``, in memory, memory-mapped or on a GPU, or a buffer
-            over such data, for example a :class:`D3ILExperienceReplay`. Not copied.
-        window (int): frames per window.
-        batch_size (int): windows per batch.
-        select (sequence of keys, optional): the entries to return; the fewer the faster. Default: all.
-        replacement (bool): draw with replacement, or in epochs.
-        drop_last (bool): see :class:`WindowSamplerWithoutReplacement`.
-        device (optional): move the data there first. Default: where they are.
-        **options: ``history``, ``labelled_share``, ``pad_before``, ``pad_after``, ``short``: see
-            :class:`WindowSampler`.
-
-    Returns:
-        ReplayBuffer: samples are tensordicts ``[batch_size, window]``. With padding, a
-        :class:`~torchrl.data.TensorDictReplayBuffer` whose samples also hold ``padded`` and ``index``.
-
-    Raises:
-        KeyError: if a selected entry does not exist.
-        ValueError: if an option is out of range, a trajectory is too short for a window, or labelled windows are asked
-            for and there are none.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer
-        >>> data = flatten_trajectories([torch.rand(61, 4)] * 10, [torch.rand(60, 2)] * 10)
-        >>> data, _ = LabelBudget(2).apply(data)
-        >>> entries = ["observation", "action", "has_action"]
-        >>> buffer = make_window_buffer(data, 16, 8, select=entries, labelled_share=0.25)
-        >>> batch = buffer.sample()
-        >>> batch.shape, int(batch["has_action"].any(1).sum())
-        (torch.Size([8, 16]), 2)
-    """
-    if isinstance(data, ReplayBuffer):
-        data = data.storage.get(slice(None))
-    if data.batch_dims != 1:
-        raise ValueError(f"windows are cut from flat data [N], got batch size {list(data.batch_size)}")
-    if device is not None:
-        data = data.to(device)
-    table_options = {name: options[name] for name in ("history", "pad_before", "pad_after", "short") if name in options}
-    table = WindowTable.build(data, window, **table_options)
-    if select is not None:
-        absent = [key for key in select if data.get(key, None) is None]
-        if absent:
-            raise KeyError(f"the data have no entries {absent}")
-        data = data.select(*select)
-    if replacement:
-        sampler = WindowSampler(window, table=table, **options)
-    else:
-        sampler = WindowSamplerWithoutReplacement(window, table=table, drop_last=drop_last, **options)
-    storage = TensorStorage(data)
-    sampler.check(storage, batch_size)
-    buffer_class = TensorDictReplayBuffer if sampler.pad_before or sampler.pad_after else ReplayBuffer
-    return buffer_class(
-        storage=storage,
-        sampler=sampler,
-        sample_unit=sampler.unit(),
-        writer=ImmutableDatasetWriter(),
-        batch_size=batch_size,
-    )
