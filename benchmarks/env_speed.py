@@ -24,9 +24,8 @@ ANCHOR = 26.0
 def straight_on(env: AvoidingEnv):
     """A policy that moves at human speed through the scene, so that controller and contacts have work to do."""
     generator = torch.Generator().manual_seed(0)
-    aim = torch.rand(env.batch_size[0], 2, generator=generator) * torch.tensor([0.012, 0.006]) - torch.tensor(
-        [0.006, 0]
-    )
+    aim = torch.rand(env.batch_size[0], 2, generator=generator) * torch.tensor([0.012, 0.006])
+    aim[:, 0] -= 0.006
 
     def policy(tensordict):
         return tensordict.set("action", aim)
@@ -53,7 +52,7 @@ def shares(env: AvoidingEnv, steps: int) -> dict[str, float]:
     rows = np.arange(env.batch_size[0])
     substeps = steps * env.substeps
     start = time.perf_counter()
-    env.sims.track_pose(rows, env._commands, substeps)
+    env.sims.track_pose(rows, env.commands, substeps)
     both = (time.perf_counter() - start) / (len(rows) * substeps)
     start = time.perf_counter()
     for data in env.sims.data:

@@ -81,10 +81,11 @@ class AvoidingEnv(ManipulationEnv):
     ============== ========== ================= ===============================================================
 
     Kept from the original because policies experience it: the measured xy is one control step old (the first step
-    repeats the reset's), ``success``, ``collision`` and ``done`` come one step after the state that caused them, collisions are
-    looked at once per control step (a graze in between is missed), and crossing the line while touching is a success. The outcome
-    is latched: ``success`` and ``collision`` are never both True and the last frame of an episode tells which it was
-    (neither: out of time). Unlike the original, collisions are seen in every environment, not only in the first one of the process.
+    repeats the reset's), ``success``, ``collision`` and ``done`` come one step after the state that caused them,
+    collisions are looked at once per control step (a graze in between is missed), and crossing the line while touching
+    is a success. The outcome is latched: ``success`` and ``collision`` are never both True and the last frame of an
+    episode tells which it was (neither: out of time). Unlike the original, collisions are seen in every environment,
+    not only in the first one of the process.
 
     The commanded height is held at the TCP height after the reset, the orientation at (0, 1, 0, 0). Commands are
     accumulated in float64. Every episode starts in the same state; nothing is random.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The order of events in one control step, shared by all tasks (spec section 3.4), as a native-batch TorchRL environment.
+"""The order of events in one control step, shared by all tasks (spec section 3.4): a native-batch TorchRL environment.
 
 One control step of the original, kept as it is because a policy experiences it::
 
@@ -219,6 +219,11 @@ class ManipulationEnv(EnvBase):
 
     def _tensor(self, array: np.ndarray, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.tensor(array, dtype=dtype, device=self.device)  # a copy: the arrays change with the next step
+
+    @property
+    def commands(self) -> np.ndarray:
+        """Present commands in float64 [n, 7]: TCP position (m) and quaternion."""
+        return self._commands.copy()
 
     def get_state(self, index: int) -> dict:
         """Full state of one environment: simulation, controller, command, mode, outcome and step count.

@@ -5,8 +5,8 @@ One call advances one simulation by all substeps of a control step without comin
 computes the motor commands and calls ``mj_step`` of the MuJoCo library through its address. It holds no interpreter
 lock, so calls for different simulations run in parallel threads. Compiled code is cached on disk by numba.
 
-Everything here works on one simulation at a time and with plain float64 arithmetic in a fixed order; results therefore do not
-depend on how many simulations or threads there are.
+Everything here works on one simulation at a time, with plain float64 arithmetic in a fixed order; results therefore do
+not depend on how many simulations or threads there are.
 """
 
 from __future__ import annotations
