@@ -36,12 +36,16 @@ def test_standard_and_identity(dtype):
     torch.testing.assert_close(normalizer.offset, values.mean(0))
     torch.testing.assert_close(normalizer.scale, values.std(0, correction=0))
     assert torch.equal(Normalizer.fit(values, mode="identity")(values), values)
+    normalizer = Normalizer.fit(values, mode="rms")
+    assert not normalizer.offset.any()
+    torch.testing.assert_close(normalizer(values).square().mean(0), torch.ones(2, dtype=dtype))
+    assert Normalizer.fit(torch.zeros(3, 1), mode="rms").scale.item() == 1.0
 
 
 @settings(max_examples=50, deadline=None)
 @given(
     st.lists(st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3), min_size=1, max_size=20),
-    st.sampled_from(["minmax", "standard", "identity"]),
+    st.sampled_from(["minmax", "standard", "rms", "identity"]),
 )
 def test_always_finite_and_invertible(rows, mode):
     values = torch.tensor(rows, dtype=torch.float64)
@@ -66,6 +70,14 @@ def test_constant_columns_are_only_shifted(mode, constant):
     assert normalizer(values)[:, 1].abs().max() <= 1e-7 * max(constant, 1)
     unseen = normalizer(torch.tensor([[0.5, constant + 1.0]]))
     assert abs(unseen[0, 1].item() - 1) < 1e-2
+
+
+@pytest.mark.parametrize("mode", ["minmax", "standard"])
+def test_columns_constant_up_to_rounding_are_only_shifted(mode):
+    values = torch.full((10, 1), 12345.678)
+    values[3] = torch.nextafter(values[3], torch.tensor([torch.inf]))
+    assert values[3] != values[0]
+    assert Normalizer.fit(values, mode=mode).scale.item() == 1.0
 
 
 def test_a_tiny_but_real_range_is_scaled():

@@ -82,8 +82,8 @@ class Normalizer(nn.Module):
         Args:
             values (Tensor): ``[*N, d]``.
             mode (str): ``"minmax"`` maps the range of each column to [-1, 1], ``"standard"`` its mean and standard
-                deviation to 0 and 1, ``"rms"`` its root mean square to 1 and 0 to 0, ``"identity"`` changes nothing. A column that is constant, up to rounding, is only
-                shifted.
+                deviation to 0 and 1, ``"rms"`` its root mean square to 1 and 0 to 0, ``"identity"`` changes nothing.
+                A column whose scale would be zero, up to rounding, keeps the scale 1.
             mask (Tensor, optional): ``[*N]`` or ``[*N, 1]`` bool, rows to use; the others may hold NaN. For actions
                 this is ``has_action``.
 
