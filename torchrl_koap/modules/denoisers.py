@@ -99,8 +99,8 @@ class ConditionEncoder(nn.Module):
 class MLPDenoiser(nn.Module):
     """Residual network on the flattened plan: the cheapest denoiser, for one fixed horizon.
 
-    On Avoiding its plans collide where those of :class:`~torchrl_koap.modules.unet.TemporalUnet` do not; it serves
-    comparisons and toy problems.
+    On Avoiding its plans touch obstacles more often than those of :class:`~torchrl_koap.modules.unet.TemporalUnet`; it
+    serves comparisons and toy problems.
 
     Args:
         state_dim (int): number ``d`` of state columns.
