@@ -142,8 +142,10 @@ class AvoidingExpert:
         self._commanded = np.concatenate([commanded[:, None], self._commanded[:, :-1]], axis=1)
         self._measured = np.concatenate([measured[:, None], self._measured[:, :-1]], axis=1)
         pushed_since = commanded - self._commanded[:, _GLANCE + _ROBOT_LAG]
+        surprise = self._measured[:, _GLANCE] + pushed_since - commanded
         to_come = np.einsum("nkd,k->nd", self._decisions, _HAND_REST)
-        return self._measured[:, _GLANCE] + pushed_since + to_come + self._misjudgement[:, self._time % _HORIZON]
+        slip = self._misjudgement[:, self._time % _HORIZON]
+        return commanded + to_come + self._attention[:, None] * surprise + slip
 
     def _decide(self, seen: np.ndarray, height: np.ndarray) -> np.ndarray:
         count = np.arange(len(seen))
@@ -159,12 +161,13 @@ class AvoidingExpert:
         self._push_sideways(way, room / cruise, count)
 
         steps_sideways = np.abs(way) / FULL_PUSH
-        late = (steps_sideways > room / cruise + self._patience) & (self._row < 3)
+        off = np.abs(way) > 2 * self._tolerance[count, self._row]
+        late = off & (steps_sideways > room / cruise + self._patience) & (self._row < 3)
         forward = np.where(late, room / np.maximum(steps_sideways, 1e-9), cruise)
         forward = np.where(forward < LEAST_PUSH * self._creep, 0.0, forward)
         decision = np.stack([self._side * self._grip[:, self._time % _HORIZON], forward], axis=1)
         decision[:, 0] = np.clip(decision[:, 0], -FULL_PUSH, FULL_PUSH)
-        decision = self._avoid(seen, decision)
+        decision = self._avoid(seen, decision, cruise)
         behind = (self._crossed >= 0)[:, None]
         decision = np.where(behind, np.stack([self._last_side, self._last_forward * cruise], axis=1), decision)
         return np.where((self._time < self._pause)[:, None], 0.0, decision)
@@ -182,7 +185,7 @@ class AvoidingExpert:
         change = begin | harder
         self._side[change] = (np.sign(way) * push)[change]
 
-    def _avoid(self, seen: np.ndarray, decision: np.ndarray) -> np.ndarray:
+    def _avoid(self, seen: np.ndarray, decision: np.ndarray, cruise: np.ndarray) -> np.ndarray:
         """Takes back the part of a decision that would run into a cylinder within the next steps."""
         ahead = np.arange(1, 9)[None, :, None] * decision[:, None] + seen[:, None]  # [n, 8, 2]
         decision = decision.copy()
@@ -190,7 +193,9 @@ class AvoidingExpert:
             near = np.linalg.norm(ahead - (x, y), axis=-1).min(1) < radius + ROD_RADIUS + self._margin
             towards = decision[:, 0] * (x - seen[:, 0]) > 0
             in_front = seen[:, 1] < y - 0.6 * radius
-            decision[near & ~in_front & towards, 0] = 0.0
+            beside = near & ~in_front & towards
+            decision[beside, 0] = 0.0
+            decision[beside, 1] = cruise[beside]
             decision[near & in_front, 1] = 0.0
         return decision
 
@@ -209,20 +214,21 @@ def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
     turns = generator.random() < 0.5
     return {
         "gap_x": np.array([*gap_x, gap_x[-1] + normal(0, 0.012)]),
-        "gate": np.append(uniform(0.035, 0.060, 3), 0.0),
+        "gate": np.append(uniform(0.020, 0.055, 3), 0.0),
         "release": np.append(uniform(0.012, 0.045, 3), 0.0),
-        "tolerance": np.append(uniform(0.006, 0.014, 3), 0.02),
+        "tolerance": np.append(uniform(0.006, 0.010, 3), 0.02),
         "haste": np.append(uniform(0.95, 1.5, 3), 1.0),
+        "attention": np.array(uniform(0.1, 0.4)),
         "patience": np.array(uniform(0.0, 3.0)),
         "creep": np.array(uniform(0.6, 1.1)),
-        "margin": np.array(uniform(0.008, 0.016)),
+        "margin": np.array(uniform(0.004, 0.010)),
         "pause": np.array(generator.integers(8, 20) if long_pause else generator.integers(0, 4)),
         "linger": np.array(7 + generator.geometric(0.35)),
         "last_side": np.array(uniform(-0.008, 0.008) if turns else 0.0),
         "last_forward": np.array(uniform(-0.1, 0.2) if lets_go else 1.0),
         "cruise": np.clip(cruise, 0.4, 1.0) * FULL_PUSH,
         "grip": 1 + _drift(generator, 8, 0.06),
-        "misjudgement": np.stack([_drift(generator, 10, 0.004), _drift(generator, 10, 0.004)], axis=1),
+        "misjudgement": np.stack([_drift(generator, 12, 0.003), _drift(generator, 12, 0.003)], axis=1),
         "tremor": np.stack([_drift(generator, 2, 0.0002), _drift(generator, 2, 0.0002)], axis=1),
     }
 
