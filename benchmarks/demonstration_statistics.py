@@ -1,0 +1,201 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""How human-like are the scripted demonstrations of Avoiding? Prints a table and draws both sets over the obstacles.
+
+    python benchmarks/demonstration_statistics.py --human ../shared/d3il_avoiding_human --picture demonstrations.png
+
+Each quantity is computed per demonstration; the table shows the median and the range from the 5th to the 95th percentile
+over demonstrations. Commands are changes of the commanded xy per control step (mm).
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+from torchrl_koap.data import RawEpisode, read_raw_episode
+from torchrl_koap.demonstrations import record_episodes
+from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES
+from torchrl_koap.envs.avoiding_expert import ROD_RADIUS
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402  (the backend comes first)
+
+MOVING = 3.0  # mm per step
+LOOK_AHEAD = 8
+
+
+def statistics(episode: RawEpisode) -> dict[str, float]:
+    """Quantities of one demonstration, by the name they have in the table."""
+    command, measured = paths(episode)
+    steps = np.diff(command, axis=0) * 1e3
+    speed = np.linalg.norm(steps, axis=1)
+    size = np.abs(steps)
+    moving = speed > MOVING
+    begin = int(np.argmax(moving))
+    end = int(np.argmax(measured[:, 1] > FINISH_Y))
+    run = slice(begin, end)
+    jerk = np.abs(np.diff(steps, axis=0))
+    lag = np.linalg.norm(command - measured, axis=1) * 1e3
+    values = {
+        "rows": len(command),
+        "rows before the first movement": begin,
+        "rows after the finish line": len(command) - end,
+        "length of the measured path (m)": np.linalg.norm(np.diff(measured, axis=0), axis=1).sum(),
+        "last measured y (m)": measured[-1, 1],
+        "least clearance (mm)": clearance(measured),
+        "speed, mean while moving (mm/step)": speed[run].mean(),
+        "speed, variation (std / mean)": speed[run].std() / speed[run].mean(),
+        "command to measured, median (mm)": np.median(lag),
+        "wobble of the measured path, rms (mm)": wobble(measured[run]),
+        "wobble of the command, rms (mm)": wobble(command[run]),
+        "sideways pushes": pushes(steps[:, 0]),
+        "slow-downs": int(
+            ((size[1:-1, 1] < size[:-2, 1]) & (size[1:-1, 1] <= size[2:, 1]) & (size[1:-1, 1] < 8))[run].sum()
+        ),
+    }
+    for axis, name in enumerate("xy"):
+        values |= {
+            f"{name} step, 95th percentile (mm)": np.percentile(size[:, axis], 95),
+            f"{name} idle (< 1 mm), share (%)": 100 * (size[:, axis] < 1).mean(),
+            f"{name} in between (1 to 5 mm), share (%)": 100 * ((size[:, axis] >= 1) & (size[:, axis] < 5)).mean(),
+            f"{name} partial (5 to 11.5 mm), share (%)": 100 * ((size[:, axis] >= 5) & (size[:, axis] < 11.5)).mean(),
+            f"{name} full (11.5 mm and more), share (%)": 100 * (size[:, axis] >= 11.5).mean(),
+            f"{name} change of step, mean (mm)": jerk[:, axis].mean(),
+            f"{name} change of step, 95th percentile (mm)": np.percentile(jerk[:, axis], 95),
+            f"{name} autocorrelation of steps, lag 1": autocorrelation(steps[run, axis], 1),
+            f"{name} autocorrelation of steps, lag 5": autocorrelation(steps[run, axis], 5),
+            f"{name} autocorrelation of steps, lag 10": autocorrelation(steps[run, axis], 10),
+        }
+    return values
+
+
+def paths(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
+    """Commanded and measured xy [T, 2] (m)."""
+    return episode.robot["des_c_pos"][:, :2], episode.robot["c_pos"][:, :2]
+
+
+def clearance(measured: np.ndarray) -> float:
+    """Least distance between rod and any cylinder (mm)."""
+    distances = [np.linalg.norm(measured - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
+    return 1e3 * (min(distances) - ROD_RADIUS)
+
+
+def wobble(path: np.ndarray, width: float = 4.0) -> float:
+    """Rms distance (mm) across the direction of travel between a path and itself smoothed over ``width`` steps."""
+    reach = int(3 * width)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    weights /= weights.sum()
+    smooth = np.stack([np.convolve(path[:, axis], weights, mode="valid") for axis in (0, 1)], axis=1)
+    travel = np.gradient(smooth, axis=0)
+    normal = np.stack([-travel[:, 1], travel[:, 0]], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    return 1e3 * np.sqrt((((path[reach:-reach] - smooth) * normal).sum(1) ** 2).mean())
+
+
+def pushes(steps: np.ndarray, threshold: float = 4.0) -> int:
+    """Number of separate sideways pushes."""
+    direction = np.where(np.abs(steps) > threshold, np.sign(steps), 0)
+    return int(((direction[1:] != direction[:-1]) & (direction[1:] != 0)).sum())
+
+
+def autocorrelation(values: np.ndarray, lag: int) -> float:
+    """Correlation of a series with itself ``lag`` steps later."""
+    centred = values - values.mean()
+    return float((centred[lag:] * centred[:-lag]).sum() / max((centred**2).sum(), 1e-12))
+
+
+def ridge_error(episodes: list[RawEpisode], strength: float = 1e-6) -> float:
+    """Error (mm, rms) of a linear guess of the command from measured positions before, now and ahead, per axis.
+
+    Fitted on all demonstrations but one and tested on that one; a measure of how abrupt the commands are.
+    """
+    features, targets = [], []
+    for episode in episodes:
+        command, measured = paths(episode)
+        now = np.arange(1, len(command) - 1)
+        ahead = np.minimum(now + LOOK_AHEAD, len(measured) - 1)
+        seen = np.concatenate([measured[now - 1], measured[now], measured[ahead], np.ones((len(now), 1))], axis=1)
+        features.append(seen)
+        targets.append(np.diff(command, axis=0)[now])
+    products = [x.T @ x for x in features]
+    moments = [x.T @ y for x, y in zip(features, targets, strict=True)]
+    errors = []
+    for index, (x, y) in enumerate(zip(features, targets, strict=True)):
+        gram = sum(products) - products[index] + strength * np.eye(x.shape[1])
+        errors.append(((x @ np.linalg.solve(gram, sum(moments) - moments[index]) - y) ** 2).ravel())
+    return 1e3 * float(np.sqrt(np.concatenate(errors).mean()))
+
+
+def table(sets: dict[str, list[RawEpisode]]) -> str:
+    """Markdown table of the quantities, one column per set."""
+    columns = {name: [statistics(episode) for episode in episodes] for name, episodes in sets.items()}
+    lines = [f"| median (5 to 95 %) | {' | '.join(f'{name}, {len(rows)}' for name, rows in columns.items())} |"]
+    lines.append("|---" * (1 + len(columns)) + "|")
+    for quantity in next(iter(columns.values()))[0]:
+        cells = []
+        for rows in columns.values():
+            low, middle, high = np.percentile([row[quantity] for row in rows], [5, 50, 95])
+            cells.append(f"{middle:.3g} ({low:.3g} to {high:.3g})")
+        lines.append(f"| {quantity} | {' | '.join(cells)} |")
+    errors = [f"{ridge_error(episodes[:24]):.2f}" for episodes in sets.values()]
+    lines.append(f"| linear guess of the command, error on left-out demonstrations of 24 (mm) | {' | '.join(errors)} |")
+    return "\n".join(lines)
+
+
+def mode_of(episode: RawEpisode) -> int:
+    """Number of the mode, from the measured x at the rows."""
+    _, measured = paths(episode)
+    x = [measured[np.argmax(measured[:, 1] >= y), 0] for y in (-0.1, 0.08, 0.26)]
+    edges = ([0.5], [0.425, 0.575], [0.35, 0.5, 0.65])
+    row1, row2, row3 = (int(np.searchsorted(edge, at)) for edge, at in zip(edges, x, strict=True))
+    return 12 * row1 + 4 * row2 + row3
+
+
+def draw(sets: dict[str, list[RawEpisode]], path: Path) -> None:
+    """Draws measured paths over the obstacles, coloured by mode, and four command traces of every set."""
+    figure, axes = plt.subplots(
+        2, len(sets), figsize=(7 * len(sets), 12), height_ratios=(2.2, 1), squeeze=False, layout="constrained"
+    )
+    for (name, episodes), column in zip(sets.items(), axes.T, strict=True):
+        for episode in episodes:
+            _, measured = paths(episode)
+            column[0].plot(*measured.T, ".-", color=plt.cm.hsv(mode_of(episode) / 24), linewidth=0.9, markersize=2.5)
+        for _, x, y, radius, _ in OBSTACLES:
+            column[0].add_patch(plt.Circle((x, y), radius, color="dimgray"))
+        column[0].axhline(FINISH_Y, color="green")
+        column[0].set(xlim=(0.2, 0.8), ylim=(-0.3, 0.52), aspect="equal", xlabel="x (m)", ylabel="y (m)")
+        column[0].set_title(f"{name}: {len(episodes)} demonstrations, coloured by mode")
+        chosen = sorted(episodes, key=mode_of)
+        for offset, index in enumerate(np.linspace(0, len(chosen) - 1, 5).astype(int)):
+            steps = np.diff(paths(chosen[index])[0], axis=0) * 1e3
+            column[1].plot(steps[:, 0] - 40 * offset, color="tab:blue", label="x" if offset == 0 else None)
+            column[1].plot(steps[:, 1] - 40 * offset, color="tab:orange", label="y" if offset == 0 else None)
+            column[1].axhline(-40 * offset, color="black", linewidth=0.4)
+        column[1].set(xlim=(0, 110), xlabel="row", ylabel="command step (mm), five demonstrations", yticks=[])
+        column[1].legend(loc="upper right")
+    figure.savefig(path, dpi=70)
+
+
+def main() -> None:
+    """Prints the table and writes the picture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--human", type=Path, help="folder of human raw pickles; without it only ours are shown")
+    parser.add_argument("--picture", type=Path, help="file to draw into")
+    parser.add_argument("--episodes", type=int, default=96)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    sets = {}
+    if options.human:
+        sets["human"] = [read_raw_episode(file) for file in sorted(options.human.glob("env_*.pkl"))]
+    sets["scripted"], report = record_episodes("avoiding", options.episodes, seed=options.seed)
+    print(report, end="\n\n")
+    print(table(sets))
+    if options.picture:
+        draw(sets, options.picture)
+
+
+if __name__ == "__main__":
+    main()
