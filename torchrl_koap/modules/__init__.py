@@ -1,0 +1,40 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
+
+from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.denoisers import MLPDenoiser, TransformerDenoiser
+from torchrl_koap.modules.diffusion import NoiseSchedule
+from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
+from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
+from torchrl_koap.modules.latent_action import (
+    LatentActionFourier,
+    LatentActionLSTM,
+    LatentActionMLP,
+    LatentActionModule,
+)
+from torchrl_koap.modules.planner import StatePlanner
+from torchrl_koap.modules.policies import EpisodeNoise, PlanThenControl, policy_transforms
+from torchrl_koap.modules.presets import PRESETS, make_koopman_inverse_dynamics
+from torchrl_koap.modules.unet import TemporalUnet
+
+__all__ = [
+    "PRESETS",
+    "EpisodeNoise",
+    "KoopmanInverseDynamics",
+    "KoopmanLifting",
+    "KoopmanOperator",
+    "LatentActionFourier",
+    "LatentActionLSTM",
+    "LatentActionMLP",
+    "LatentActionModule",
+    "LinearActionDecoder",
+    "MLPDenoiser",
+    "NoiseSchedule",
+    "PlanThenControl",
+    "RidgeFit",
+    "StatePlanner",
+    "TemporalUnet",
+    "TransformerDenoiser",
+    "make_koopman_inverse_dynamics",
+    "policy_transforms",
+]

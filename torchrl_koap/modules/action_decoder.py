@@ -1,0 +1,181 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The linear decoder from latent actions to robot actions, trained by gradients or fitted in closed form."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from torchrl_koap.keys import ACTION, LATENT_ACTION
+
+
+@dataclass(frozen=True)
+class RidgeFit:
+    """What :meth:`LinearActionDecoder.fit_ridge` found.
+
+    Args:
+        penalty (float): the ridge, in units of the mean square norm of the latent actions.
+        errors (dict): root of the mean squared held-out error of every candidate, in the units of the targets.
+        num_labels (int): labelled steps used.
+        noise_variance (Tensor): held-out residual variance per action dimension ``[act]``.
+    """
+
+    penalty: float
+    errors: dict[float, float]
+    num_labels: int
+    noise_variance: Tensor
+
+
+class LinearActionDecoder(TensorDictModuleBase):
+    r"""Decodes latent actions linearly.
+
+    .. math::
+        a_t = D u_t + b
+
+    Args:
+        latent_dim (int): size ``m`` of a latent action.
+        action_dim (int): size of an action.
+
+    Keyword Args:
+        in_key (NestedKey): latent actions ``[*B, T, m]``. Defaults to ``"latent_action"``.
+        out_key (NestedKey): actions ``[*B, T, act]``. Defaults to ``"action"``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import LinearActionDecoder
+        >>> latent, true = torch.randn(200, 4), torch.randn(2, 4)
+        >>> decoder = LinearActionDecoder(4, 2)
+        >>> fit = decoder.fit_ridge(latent, latent @ true.T, torch.ones(200, dtype=torch.bool))
+        >>> bool((decoder.linear.weight - true).abs().max() < 1e-3), fit.num_labels
+        (True, 200)
+    """
+
+    covariance: Tensor
+    noise_variance: Tensor
+    latent_mean: Tensor
+
+    def __init__(
+        self, latent_dim: int, action_dim: int, *, in_key: NestedKey = LATENT_ACTION, out_key: NestedKey = ACTION
+    ):
+        super().__init__()
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        self.linear = nn.Linear(latent_dim, action_dim)
+        self.register_buffer("covariance", torch.full((latent_dim, latent_dim), torch.nan))
+        self.register_buffer("noise_variance", torch.full((action_dim,), torch.nan))
+        self.register_buffer("latent_mean", torch.zeros(latent_dim))
+
+    def forward(self, tensordict):
+        """Writes the decoded actions."""
+        return tensordict.set(self.out_keys[0], self.linear(tensordict.get(self.in_keys[0])))
+
+    @torch.no_grad()
+    def fit_ridge(
+        self,
+        latent: Tensor,
+        action: Tensor,
+        mask: Tensor,
+        *,
+        groups: Tensor | None = None,
+        penalties: Sequence[float] = tuple(10.0 ** (p / 2) for p in range(-12, 3)),
+        default_penalty: float | None = None,
+        bias: bool = True,
+    ) -> RidgeFit:
+        r"""Sets ``D`` and ``b`` by ridge regression on frozen latent actions.
+
+        The penalty is chosen by leaving out one step at a time, :math:`e_i = (a_i - \hat a_i) / (1 - h_i)` with the
+        leverage ``h_i``, which is exact for least squares. With ``groups`` all steps of a group are left out together
+        (exact as well): steps of one trajectory resemble each other so much that leaving out one says little.
+
+        Args:
+            latent (Tensor): latent actions ``[*B, m]``.
+            action (Tensor): actions ``[*B, act]``; anything, NaN included, where ``mask`` is False.
+            mask (Tensor): labelled steps, bool ``[*B]``.
+            groups (Tensor, optional): group of every step, int64 ``[*B]``.
+            penalties (sequence of float): candidates, in units of the mean square norm of the latent actions: the ratio
+                of noise to signal variance that the fit assumes.
+            default_penalty (float, optional): used instead of the choice where there are fewer than three groups.
+            bias (bool): fit ``b``; otherwise it is 0 and a latent action of 0 decodes to 0. Defaults to ``True``.
+
+        Returns:
+            RidgeFit: the choice and its held-out errors.
+
+        Raises:
+            ValueError: if nothing is labelled, a labelled action is not finite, or shapes disagree.
+        """
+        if latent.shape[:-1] != action.shape[:-1] or mask.shape != latent.shape[:-1]:
+            raise ValueError(
+                f"latent {list(latent.shape)}, action {list(action.shape)} and mask {list(mask.shape)} must share"
+                " their leading shape"
+            )
+        if not mask.any():
+            raise ValueError("fit_ridge needs at least one labelled step, the mask selects none")
+        x, y = latent[mask].double(), action[mask].double()
+        if not y.isfinite().all():
+            raise ValueError("fit_ridge got a labelled action that is not finite")
+        rows = torch.arange(len(x), device=x.device)
+        groups = rows if groups is None else groups[mask].unique(return_inverse=True)[1]
+        num_groups = int(groups.max()) + 1
+        if default_penalty is not None and num_groups < 3:
+            penalties = (default_penalty,)
+        if num_groups == 1:  # its steps are all there is to leave out
+            groups = rows
+
+        mean_x, mean_y = (x.mean(0), y.mean(0)) if bias else (torch.zeros_like(x[0]), torch.zeros_like(y[0]))
+        centred, target = x - mean_x, y - mean_y
+        left, singular, right = torch.linalg.svd(centred, full_matrices=False)
+        unit = centred.square().sum(-1).mean().clamp_min(torch.finfo(x.dtype).tiny)
+        projected = left.mT @ target
+
+        def held_out(penalty: float) -> Tensor:
+            shrink = singular.square() / (singular.square() + penalty * unit)
+            return _held_out(left, shrink, projected, target, groups, centred=bias)
+
+        errors = {float(penalty): held_out(penalty).square().mean().sqrt().item() for penalty in penalties}
+        best = min(errors, key=errors.get)
+        scaled = singular.square() + best * unit
+        weight = (right.mT * (singular / scaled)) @ projected  # [m, act]
+        self.linear.weight.copy_(weight.mT)
+        self.linear.bias.copy_(mean_y - mean_x @ weight)
+        self.noise_variance.copy_(held_out(best).square().mean(0))
+        prior = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device) / (best * unit)
+        self.covariance.copy_(prior + (right.mT * (1 / scaled - 1 / (best * unit))) @ right)
+        self.latent_mean.copy_(mean_x)
+        return RidgeFit(best, errors, len(x), self.noise_variance.clone())
+
+    def predictive_variance(self, latent: Tensor) -> Tensor:
+        r"""Variance of a predicted action: noise times :math:`1 + (u - \bar u)^T (U^T U + \lambda)^{-1} (u - \bar u)`.
+
+        Args:
+            latent (Tensor): latent actions ``[*B, m]``.
+
+        Returns:
+            Tensor: variances ``[*B, act]``, in the squared units of the fitted targets.
+
+        Raises:
+            RuntimeError: if the decoder was not fitted in closed form.
+        """
+        if self.covariance.isnan().any():
+            raise RuntimeError("predictive_variance needs a decoder fitted by fit_ridge()")
+        centred = latent - self.latent_mean
+        leverage = ((centred @ self.covariance) * centred).sum(-1, keepdim=True)
+        return (1 + leverage.clamp_min(0)) * self.noise_variance
+
+
+def _held_out(
+    left: Tensor, shrink: Tensor, projected: Tensor, target: Tensor, groups: Tensor, *, centred: bool
+) -> Tensor:
+    """Residuals of every step, predicted without its group; a fitted mean counts as one more, unpenalised column."""
+    residual = target - left @ (shrink[:, None] * projected)
+    held_out = torch.empty_like(residual)
+    for group in range(int(groups.max()) + 1):
+        rows = groups == group
+        part = left[rows]
+        hat = (part * shrink) @ part.mT + (1 / len(left) if centred else 0.0)
+        keep = torch.eye(len(part), dtype=part.dtype, device=part.device) - hat
+        held_out[rows] = torch.linalg.lstsq(keep, residual[rows]).solution
+    return held_out

@@ -1,0 +1,180 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The Koopman inverse dynamics model: state windows in, latent actions and robot actions out."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+
+from torchrl_koap.keys import ACTION, STATE
+from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
+from torchrl_koap.modules.latent_action import LatentActionModule
+
+
+class KoopmanInverseDynamics(TensorDictSequential):
+    r"""Infers latent actions from a window of states and decodes them linearly to robot actions.
+
+    The *sequence* is the inference path: normalise, :math:`u_t = f_\theta(\cdot)`, :math:`a_t = D u_t + b`,
+    de-normalise. Lifting and operator take no part in it; they are attributes that shape the latent actions in
+    training through :math:`z_{t+1} = K z_t + u_t`.
+
+    Args:
+        latent_action (LatentActionModule): the network ``f``.
+        action_decoder (LinearActionDecoder): the decoder ``d``.
+
+    Keyword Args:
+        lifting (KoopmanLifting): the networks ``g``.
+        operator (KoopmanOperator): the matrix ``K``.
+        state_normalizer (nn.Module, optional): maps raw states to the networks' units.
+        action_normalizer (nn.Module, optional): its ``inverse`` maps decoded actions to raw units.
+        state_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
+        action_key (NestedKey): raw actions ``[*B, T, act]``; frame ``t`` holds the action from ``x_t`` to
+            ``x_{t+1}``. Defaults to ``"action"``.
+
+    Raises:
+        ValueError: if the sizes of the parts do not fit together.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> model = make_koopman_inverse_dynamics(2, 2, preset="paper", latent_dim=16, hidden_dim=32)
+        >>> td = model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))
+        >>> td["action"].shape, td["latent_action"].shape
+        (torch.Size([3, 16, 2]), torch.Size([3, 16, 16]))
+    """
+
+    def __init__(
+        self,
+        latent_action: LatentActionModule,
+        action_decoder: LinearActionDecoder,
+        *,
+        lifting: KoopmanLifting,
+        operator: KoopmanOperator,
+        state_normalizer: nn.Module | None = None,
+        action_normalizer: nn.Module | None = None,
+        state_key: NestedKey = STATE,
+        action_key: NestedKey = ACTION,
+    ):
+        sizes = {
+            "latent_action": latent_action.latent_dim,
+            "action_decoder": action_decoder.linear.in_features,
+            "operator input": operator.input_dim,
+        }
+        if len(set(sizes.values())) > 1:
+            raise ValueError(f"the sizes of a latent action differ: {sizes}")
+        if lifting.latent_dim != operator.latent_dim:
+            raise ValueError(f"latent_dim differs: lifting {lifting.latent_dim}, operator {operator.latent_dim}")
+        if latent_action.state_dim != lifting.state_dim:
+            raise ValueError(f"state_dim differs: latent_action {latent_action.state_dim}, lifting {lifting.state_dim}")
+
+        # every part keeps its own keys; the sequence adapts to them
+        steps = []
+        if state_normalizer is not None or latent_action.in_keys != [state_key]:
+            steps.append(TensorDictModule(state_normalizer or nn.Identity(), [state_key], latent_action.in_keys))
+        steps += [latent_action, action_decoder]
+        if action_normalizer is not None or action_decoder.out_keys != [action_key]:
+            inverse = _Inverse(action_normalizer) if action_normalizer is not None else nn.Identity()
+            steps.append(TensorDictModule(inverse, action_decoder.out_keys, [action_key]))
+        super().__init__(*steps)
+        self.latent_action, self.action_decoder = latent_action, action_decoder
+        self.lifting, self.operator = lifting, operator
+        self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
+        self.state_key, self.action_key = state_key, action_key
+
+    def normalize_state(self, state: Tensor) -> Tensor:
+        """Raw states to the networks' units."""
+        return state if self.state_normalizer is None else self.state_normalizer(state)
+
+    def normalize_action(self, action: Tensor) -> Tensor:
+        """Raw actions to the decoder's units."""
+        return action if self.action_normalizer is None else self.action_normalizer(action)
+
+    def lift(self, state: Tensor) -> Tensor:
+        """Lifted states ``[*B, T, m]`` of raw states ``[*B, T, d]``."""
+        return self.lifting.encode(self.normalize_state(state))
+
+    def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Latent actions ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
+        return self.latent_action.infer(self.latent_action.gather(self.normalize_state(state), frames))
+
+    @torch.no_grad()
+    def fit_scales(self, windows: Tensor) -> None:
+        """Sets input scales from windows of raw states ``[*B, T, d]`` (:meth:`LatentActionModule.fit_scales`)."""
+        self.latent_action.fit_scales(self.normalize_state(windows))
+
+    def decode(self, latent_action: Tensor) -> Tensor:
+        """Raw actions ``[*B, T, act]`` of latent actions."""
+        action = self.action_decoder.linear(latent_action)
+        return action if self.action_normalizer is None else self.action_normalizer.inverse(action)
+
+    def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
+        """``K z_t + u_t``, the prediction of ``z_{t+1}``."""
+        return self.operator.step(lifted, latent_action)
+
+    def rollout_latent(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
+        """Rolls the linear dynamics out from one lifted state.
+
+        Args:
+            lifted (Tensor): first lifted state ``[*B, m]``.
+            latent_action (Tensor): latent actions ``[*B, T, m]`` of the following steps.
+
+        Returns:
+            Tensor: lifted states ``[*B, T, m]`` after each of the steps.
+        """
+        states = []
+        for step in latent_action.unbind(-2):
+            lifted = self.predict_next(lifted, step)
+            states.append(lifted)
+        return torch.stack(states, -2)
+
+    @torch.no_grad()
+    def fit_decoder(
+        self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None, batch_size: int = 4096, **kwargs
+    ) -> RidgeFit:
+        """Fits the decoder in closed form on the labelled frames of windows (:meth:`LinearActionDecoder.fit_ridge`).
+
+        Args:
+            windows (TensorDictBase): ``state_key`` ``[N, T, d]`` and ``action_key`` ``[N, T, act]``.
+            mask (Tensor): labelled frames to use, bool ``[N, T]``; no action outside of it is read. Frames that do
+                not count in the losses (:meth:`LatentActionModule.span`) are left out.
+            groups (Tensor, optional): trajectory of every window, int64 ``[N]``, to be left out together.
+            batch_size (int): windows per forward pass.
+            **kwargs: options of :meth:`LinearActionDecoder.fit_ridge`.
+
+        Returns:
+            RidgeFit: the ridge chosen and its held-out error in normalised units.
+
+        Raises:
+            ValueError: if no labelled frame counts.
+        """
+        span = self.latent_action.span(mask.shape[-1])
+        mask = mask[:, span.start : span.stop]
+        rows = mask.any(-1)
+        if not rows.any():
+            raise ValueError(f"no labelled frame lies in frames {span.start}..{span.stop - 1} of any window")
+        windows, mask = windows[rows], mask[rows]
+        was_training = self.training
+        self.eval()  # dropout would blur the latent actions that the decoder is fitted to
+        latent = torch.cat([self.infer(part.get(self.state_key), span) for part in windows.split(batch_size)])
+        self.train(was_training)
+        # unlabelled entries are zeroed before the normaliser sees them: it may refuse NaN
+        action = windows.get(self.action_key)[:, span.start : span.stop]
+        action = self.normalize_action(torch.where(mask.unsqueeze(-1), action, 0.0))
+        if groups is not None:
+            groups = groups[rows].unsqueeze(-1).expand_as(mask)
+        return self.action_decoder.fit_ridge(latent, action, mask, groups=groups, **kwargs)
+
+
+class _Inverse(nn.Module):
+    """The inverse of a normaliser, as a module whose buffers live where the normaliser's do."""
+
+    def __init__(self, normalizer: nn.Module):
+        super().__init__()
+        self.normalizer = normalizer
+
+    def forward(self, value: Tensor) -> Tensor:
+        return self.normalizer.inverse(value)

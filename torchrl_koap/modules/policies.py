@@ -1,0 +1,201 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Planner and controller as one policy: plan states, turn them into actions, re-plan every few steps."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.transforms import CatFrames, Compose, InitTracker, UnsqueezeTransform
+from torchrl.modules import MultiStepActorWrapper
+
+from torchrl_koap.keys import ACTION, OBSERVATION, PLAN
+from torchrl_koap.modules.planner import StatePlanner
+
+EXECUTIONS = ("feedback", "open_loop")
+OBSERVATION_HISTORY = "observation_history"
+NOISE = "noise"
+
+
+def policy_transforms(history: int, *, observation_key: NestedKey = OBSERVATION) -> Compose:
+    """Environment transforms that :class:`PlanThenControl` needs: ``is_init`` and the last ``history`` observations.
+
+    At the start of an episode the first observation is repeated.
+
+    Examples:
+        >>> from torchrl_koap.modules import policy_transforms
+        >>> len(policy_transforms(5))
+        3
+    """
+    return Compose(
+        InitTracker(),
+        UnsqueezeTransform(-2, in_keys=[observation_key], out_keys=[OBSERVATION_HISTORY]),
+        CatFrames(N=history, dim=-2, in_keys=[OBSERVATION_HISTORY], out_keys=[OBSERVATION_HISTORY]),
+    )
+
+
+class PlanThenControl(TensorDictModuleBase):
+    """Plans future states every few steps and decodes actions from observed history and plan.
+
+    ``"feedback"`` decodes at every step from the history observed by then towards the plan that is in force; the plan
+    alone is cached. ``"open_loop"`` (the paper) decodes a chunk of actions once per plan and executes its beginning::
+
+        step            0          1          2          3          4
+        plan made at    0                                           4
+        feedback        a(x_0,P)   a(x_1,P)   a(x_2,P)   a(x_3,P)   a(x_4,P')
+        open loop       a_0(x_0,P) a_1(x_0,P) a_2(x_0,P) a_3(x_0,P) a_0(x_4,P')
+
+    Every environment of a batch re-plans in its own rhythm, counted from its own reset
+    (:class:`torchrl.modules.MultiStepActorWrapper`).
+
+    Args:
+        planner (StatePlanner): plans states from the last observed ones.
+        controller (TensorDictModuleBase): reads a window of states ``[*B, T, d]`` and writes actions
+            ``[*B, T, act]``; the :class:`KoopmanInverseDynamics` or any other inverse dynamics.
+
+    Keyword Args:
+        state_columns (sequence of int): columns of the observation that make up the state.
+        history (int): observed frames handed to the controller (and, of these, the planner's own last ones).
+        execution (str): ``"feedback"`` or ``"open_loop"``. Defaults to ``"feedback"``.
+        replan_interval (int): steps per plan. Defaults to ``4``.
+        history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
+        action_key (NestedKey): action of the current step ``[*B, act]``.
+
+    Raises:
+        ValueError: for an unknown execution, or a history shorter than the planner's.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import PlanThenControl, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> policy = PlanThenControl(
+        ...     planner, make_koopman_inverse_dynamics(2, 2), state_columns=(2, 3), history=5)
+        >>> td = TensorDict({"observation_history": torch.zeros(3, 5, 4),
+        ...                  "is_init": torch.ones(3, 1, dtype=torch.bool)}, [3])
+        >>> policy(td)["action"].shape
+        torch.Size([3, 2])
+    """
+
+    def __init__(
+        self,
+        planner: StatePlanner,
+        controller: TensorDictModuleBase,
+        *,
+        state_columns: Sequence[int],
+        history: int,
+        execution: str = "feedback",
+        replan_interval: int = 4,
+        history_key: NestedKey = OBSERVATION_HISTORY,
+        action_key: NestedKey = ACTION,
+    ):
+        super().__init__()
+        if execution not in EXECUTIONS:
+            near = difflib.get_close_matches(execution, EXECUTIONS, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(EXECUTIONS)}"
+            raise ValueError(f"unknown execution {execution!r}; {hint}")
+        if history < planner.history:
+            raise ValueError(f"the planner reads {planner.history} observed frames, history is only {history}")
+        if not 1 <= replan_interval <= planner.horizon:
+            raise ValueError(f"replan_interval must be in 1..{planner.horizon} (the horizon), got {replan_interval}")
+        self.in_keys, self.out_keys = [history_key, "is_init"], [action_key, PLAN]
+        self.execution, self.history, self.replan_interval = execution, history, replan_interval
+        self.register_buffer("state_columns", torch.as_tensor(state_columns), persistent=False)
+        self.planner, self.controller = planner, controller
+        # the chunk that the wrapper caches and hands out step by step: remaining plans, or actions
+        cached = ["remaining_plan"] if execution == "feedback" else [action_key]
+        chunk = "remaining_plan_chunk" if execution == "feedback" else "action_chunk"
+        self.receding = MultiStepActorWrapper(
+            _Chunk(planner, self._remaining_plans if execution == "feedback" else self._decode_chunk, chunk),
+            n_steps=replan_interval,
+            action_keys=cached,
+            chunk_keys=[chunk],
+            init_key="is_init",
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action of the current step (and the caches that the next one continues from)."""
+        observed = tensordict.get(self.in_keys[0])
+        if observed is None:
+            raise KeyError(f"the policy reads {self.in_keys[0]!r}: append policy_transforms() to the environment")
+        if observed.shape[-2] != self.history:
+            raise ValueError(
+                f"{self.in_keys[0]!r} must hold {self.history} frames on axis -2, got {list(observed.shape)}"
+            )
+        tensordict.set("state_history", observed[..., self.state_columns])
+        tensordict = self.receding(tensordict)
+        if self.execution == "feedback":
+            actions = self._actions(tensordict.get("state_history"), tensordict.get("remaining_plan"))
+            tensordict.set(self.out_keys[0], actions[..., self.history - 1, :])
+        return tensordict
+
+    def _actions(self, history: Tensor, plan: Tensor) -> Tensor:
+        """Actions ``[*B, T, act]`` of the window made of history and plan."""
+        window = torch.cat([history, plan], -2)
+        name = self.controller.in_keys[0]
+        out = self.controller(TensorDict({name: window}, batch_size=window.shape[:-2]))
+        return out.get(self.out_keys[0])
+
+    def _remaining_plans(self, history: Tensor, plan: Tensor) -> Tensor:
+        """What is left of the plan after 0, 1, ... steps, its last state repeated: ``[*B, interval, H, d]``."""
+        steps = torch.arange(plan.shape[-2], device=plan.device)
+        shifted = steps + torch.arange(self.replan_interval, device=plan.device)[:, None]
+        return plan[..., shifted.clamp_max(plan.shape[-2] - 1), :]
+
+    def _decode_chunk(self, history: Tensor, plan: Tensor) -> Tensor:
+        """The actions of the next steps ``[*B, interval, act]``, decoded once."""
+        now = self.history - 1
+        return self._actions(history, plan)[..., now : now + self.replan_interval, :]
+
+
+class _Chunk(TensorDictModuleBase):
+    """The part that runs only when a new plan is due."""
+
+    def __init__(self, planner: StatePlanner, make_chunk, chunk_key: str):
+        super().__init__()
+        self.planner, self.make_chunk = planner, make_chunk
+        self.in_keys, self.out_keys = ["state_history"], [PLAN, chunk_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        history = tensordict.get("state_history")
+        plan = self.planner.plan(history[..., -self.planner.history :, :], tensordict.get(NOISE, None))
+        tensordict.set(PLAN, plan)
+        return tensordict.set(self.out_keys[1], self.make_chunk(history, plan))
+
+
+class EpisodeNoise(TensorDictModuleBase):
+    """Start noise of the planner that depends on an episode's seed and step alone, not on the batch it runs in.
+
+    Args:
+        seeds (sequence of int): one per environment.
+        shape (sequence of int): shape of one draw, ``[H, d]`` or ``[1 + solver steps, H, d]``.
+        num_steps (int): control steps to draw for.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import EpisodeNoise
+        >>> noise = EpisodeNoise([7, 8], (14, 2), num_steps=3)
+        >>> first = noise(TensorDict(batch_size=[2]))["noise"]
+        >>> bool((EpisodeNoise([8], (14, 2), num_steps=3)(TensorDict(batch_size=[1]))["noise"] == first[1]).all())
+        True
+    """
+
+    def __init__(self, seeds: Sequence[int], shape: Sequence[int], *, num_steps: int):
+        super().__init__()
+        self.in_keys, self.out_keys = [], [NOISE]
+        draws = [torch.randn(num_steps, *shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        self.register_buffer("draws", torch.stack(draws), persistent=False)  # [E, steps, *shape]
+        self.step = 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the noise of the current step and moves on to the next."""
+        if self.step == self.draws.shape[1]:
+            raise RuntimeError(f"noise was drawn for {self.step} steps only")
+        tensordict.set(NOISE, self.draws[:, self.step])
+        self.step += 1
+        return tensordict

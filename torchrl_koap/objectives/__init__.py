@@ -1,0 +1,12 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Loss modules."""
+
+from torchrl_koap.objectives.koopman import (
+    KOAPLoss,
+    KoopmanDynamicsLoss,
+    KoopmanReconstructionLoss,
+    LatentActionLoss,
+)
+from torchrl_koap.objectives.planner import PlannerLoss
+
+__all__ = ["KOAPLoss", "KoopmanDynamicsLoss", "KoopmanReconstructionLoss", "LatentActionLoss", "PlannerLoss"]

@@ -1,0 +1,247 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+r"""Losses of the Koopman inverse dynamics model.
+
+.. math::
+    L = L_{recon} + \lambda_1 L_{kpm} + \lambda_2 L_a, \quad
+    L_{recon} = \overline{|g_\psi(g_\theta(x_t)) - x_t|^2}, \quad
+    L_{kpm} = \overline{|K g(x_t) + u_t - g(x_{t+1})|^2}, \quad
+    L_a = \overline{|D u_t + b - a_t|^2}
+
+(design section 2). All residuals are in normalised units. ``L_a`` averages over the labelled frames alone; a batch
+without labels gives exactly 0, and an unlabelled (NaN) action reaches neither value nor gradient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams, dispatch
+from torch import Tensor
+from torchrl.objectives.common import LossModule
+
+from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
+from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
+
+
+class _KoopmanLoss(LossModule):
+    """What the four losses share: the network, its keys, and one pass that computes the wanted terms."""
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys read from the input.
+
+        Attributes:
+            state (NestedKey): window of raw states ``[*B, T, d]``.
+            action (NestedKey): raw actions ``[*B, T, act]``, NaN where unlabelled.
+            has_action (NestedKey): labelled frames, bool ``[*B, T, 1]``.
+            padded (NestedKey): optional; frames that repeat an edge of the trajectory, bool ``[*B, T, 1]``. A
+                transition into or out of one counts in no loss.
+        """
+
+        state: NestedKey = STATE
+        action: NestedKey = ACTION
+        has_action: NestedKey = HAS_ACTION
+        padded: NestedKey = "padded"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    network: KoopmanInverseDynamics
+    network_params: TensorDictParams
+    target_network_params: TensorDictParams
+
+    uses_labels = False
+
+    def __init__(self, network: KoopmanInverseDynamics, *, reduction: str = "mean"):
+        if reduction not in ("none", "mean", "sum"):
+            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
+        super().__init__()
+        self.convert_to_functional(network, "network", create_target_params=False)
+        self.reduction = reduction
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys read from the input, as renamed by ``set_keys``."""
+        keys = [self.tensor_keys.state]
+        if self.uses_labels:
+            keys += [self.tensor_keys.action, self.tensor_keys.has_action]
+        return keys
+
+    @in_keys.setter
+    def in_keys(self, values) -> None:
+        raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        """There is no value estimator."""
+
+    def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """The raw states and the transitions between two recorded frames ``[*B, T - 1]``."""
+        state = tensordict.get(self.tensor_keys.state)
+        if state is None:
+            raise KeyError(f"the loss needs states under {self.tensor_keys.state!r}; found {list(tensordict.keys())}")
+        padded = tensordict.get(self.tensor_keys.padded, None)
+        if padded is None:
+            recorded = torch.ones(state.shape[:-2] + (state.shape[-2] - 1,), dtype=torch.bool, device=state.device)
+        else:
+            padded = padded.squeeze(-1)
+            recorded = ~(padded[..., 1:] | padded[..., :-1])
+        return state, recorded
+
+    def _reconstruction(self, state: Tensor, lifted: Tensor) -> Tensor:
+        target = self.network.normalize_state(state)
+        error = (self.network.lifting.decode(lifted) - target).square().mean(-1)
+        return self._reduce(error, torch.ones_like(error, dtype=torch.bool))
+
+    def _latent(self, state: Tensor) -> tuple[Tensor, range]:
+        span = self.network.latent_action.span(state.shape[-2])
+        return self.network.infer(state, span), span
+
+    def _dynamics(self, lifted: Tensor, latent: Tensor, span: range, recorded: Tensor) -> Tensor:
+        predicted = self.network.predict_next(lifted[..., span.start : span.stop, :], latent)
+        error = (predicted - lifted[..., span.start + 1 : span.stop + 1, :]).square().mean(-1)
+        return self._reduce(error, recorded[..., span.start : span.stop])
+
+    def _action(self, tensordict: TensorDictBase, latent: Tensor, span: range) -> Tensor:
+        action = tensordict.get(self.tensor_keys.action)[..., span.start : span.stop, :]
+        labelled = tensordict.get(self.tensor_keys.has_action).squeeze(-1)[..., span.start : span.stop]
+        # zeroed before the residual: masking afterwards would leave NaN in the gradient
+        target = self.network.normalize_action(torch.where(labelled.unsqueeze(-1), action, 0.0))
+        error = (self.network.action_decoder.linear(latent) - target).square().mean(-1)
+        return self._reduce(error, labelled)
+
+    def _reduce(self, error: Tensor, mask: Tensor) -> Tensor:
+        error = torch.where(mask, error, 0.0)
+        if self.reduction == "none":
+            return error
+        if self.reduction == "sum":
+            return error.sum()
+        return error.sum() / mask.sum().clamp_min(1)
+
+
+class KoopmanReconstructionLoss(_KoopmanLoss):
+    """Error of lifting and mapping back, ``loss_reconstruction``, over all frames of the window.
+
+    Args:
+        network (KoopmanInverseDynamics): the model.
+
+    Keyword Args:
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, T]``).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KoopmanReconstructionLoss
+        >>> loss = KoopmanReconstructionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4]))["loss_reconstruction"].shape
+        torch.Size([])
+    """
+
+    out_keys = ["loss_reconstruction"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Computes the loss from ``state``."""
+        state, _ = self._inputs(tensordict)
+        with self.network_params.to_module(self.network, preserve_module_state=False):
+            loss = self._reconstruction(state, self.network.lift(state))
+        return TensorDict({"loss_reconstruction": loss})
+
+
+class KoopmanDynamicsLoss(_KoopmanLoss):
+    """One-step error of the linear latent dynamics, ``loss_koopman``, over the frames that count (:meth:`LatentActionModule.span`).
+
+    Args:
+        network (KoopmanInverseDynamics): the model.
+
+    Keyword Args:
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+    """
+
+    out_keys = ["loss_koopman"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Computes the loss from ``state``."""
+        state, recorded = self._inputs(tensordict)
+        with self.network_params.to_module(self.network, preserve_module_state=False):
+            loss = self._dynamics(self.network.lift(state), *self._latent(state), recorded)
+        return TensorDict({"loss_koopman": loss})
+
+
+class LatentActionLoss(_KoopmanLoss):
+    """Error of the decoded actions, ``loss_action``, over the labelled frames that count.
+
+    Args:
+        network (KoopmanInverseDynamics): the model.
+
+    Keyword Args:
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where unlabelled).
+    """
+
+    out_keys = ["loss_action"]
+    uses_labels = True
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Computes the loss from ``state``, ``action`` and ``has_action``."""
+        state, _ = self._inputs(tensordict)
+        with self.network_params.to_module(self.network, preserve_module_state=False):
+            loss = self._action(tensordict, *self._latent(state))
+        return TensorDict({"loss_action": loss})
+
+
+class KOAPLoss(_KoopmanLoss):
+    """Weighted sum of the three terms, from one pass through the networks.
+
+    The coefficients are already applied to the returned terms, so their sum is the total.
+
+    Args:
+        network (KoopmanInverseDynamics): the model.
+
+    Keyword Args:
+        koopman_coeff (float): ``lambda_1``. Defaults to ``1``. Assigning to it later is an in-place buffer write.
+        action_coeff (float): ``lambda_2``. Defaults to ``1``.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KOAPLoss
+        >>> loss = KOAPLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> batch = TensorDict({"state": torch.randn(4, 16, 2), "action": torch.full((4, 16, 2), torch.nan),
+        ...                     "has_action": torch.zeros(4, 16, 1, dtype=torch.bool)}, [4])
+        >>> loss(batch)["loss_action"].item()
+        0.0
+    """
+
+    out_keys = ["loss_reconstruction", "loss_koopman", "loss_action"]
+    uses_labels = True
+    _schedulable_buffers = frozenset({"koopman_coeff", "action_coeff"})
+
+    def __init__(
+        self,
+        network: KoopmanInverseDynamics,
+        *,
+        koopman_coeff: float = 1.0,
+        action_coeff: float = 1.0,
+        reduction: str = "mean",
+    ):
+        super().__init__(network, reduction=reduction)
+        self.register_coeff_buffer("koopman_coeff", koopman_coeff)
+        self.register_coeff_buffer("action_coeff", action_coeff)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Computes the three terms from ``state``, ``action`` and ``has_action``."""
+        state, recorded = self._inputs(tensordict)
+        with self.network_params.to_module(self.network, preserve_module_state=False):
+            lifted, (latent, span) = self.network.lift(state), self._latent(state)
+            losses = {
+                "loss_reconstruction": self._reconstruction(state, lifted),
+                "loss_koopman": self.koopman_coeff * self._dynamics(lifted, latent, span, recorded),
+                "loss_action": self.action_coeff * self._action(tensordict, latent, span),
+            }
+        return TensorDict(losses)
