@@ -3,8 +3,8 @@
 
     python benchmarks/demonstration_statistics.py --human ../shared/d3il_avoiding_human --picture demonstrations.png
 
-Each quantity is computed per demonstration; the table shows the median and the range from the 5th to the 95th percentile
-over demonstrations. Commands are changes of the commanded xy per control step (mm).
+Each quantity is computed per demonstration; the table shows the median and the range from the 5th to the 95th
+percentile over demonstrations. Commands are changes of the commanded xy per control step (mm).
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from torchrl_koap import demonstrations
 from torchrl_koap.data import D3ILExperienceReplay, read_raw_episode, trajectory_lengths
 from torchrl_koap.data.raw import ROBOT_COLUMNS
 from torchrl_koap.demonstrations import (
+    LEAST_CLEARANCE,
     RecordingError,
     balanced_modes,
     episodes_to_ted,
@@ -62,7 +63,7 @@ def test_demonstrations_are_successes_with_clearance(recording):
         path = episode.robot["c_pos"][:, :2]
         assert path[-1, 1] > FINISH_Y
         for _, x, y, radius, _ in OBSTACLES:
-            assert np.linalg.norm(path - (x, y), axis=1).min() > radius + ROD_RADIUS - 0.001  # the rod tilts a little
+            assert np.linalg.norm(path - (x, y), axis=1).min() > radius + ROD_RADIUS + LEAST_CLEARANCE
 
 
 def test_replayed_actions_give_the_same_episode(recording):
@@ -138,6 +139,14 @@ def test_failed_attempts_are_counted_and_given_up_on(monkeypatch):
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 2)
     with pytest.raises(RecordingError, match=r"episodes \[0, 1\].*'collision': 4"):
         record_demonstrations(episodes=2)
+
+
+@pytest.mark.parametrize(("limit", "value", "reason"), [("LEAST_CLEARANCE", 1.0, "close"), ("MOST_ROWS", 30, "slow")])
+def test_attempts_unlike_human_ones_are_discarded(monkeypatch, limit, value, reason):
+    monkeypatch.setattr(demonstrations, limit, value)
+    monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 1)
+    with pytest.raises(RecordingError, match=f"'{reason}': 1"):
+        record_demonstrations(episodes=1)
 
 
 @pytest.mark.parametrize(

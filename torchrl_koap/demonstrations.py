@@ -1,8 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Recording demonstrations: scripted experts play the library's own environments, all episodes in one batch.
 
-An attempt that touches a cylinder, takes another mode than asked for, or does not finish is played again with other
-random draws; nothing else is selected, and every discarded attempt is counted in the report.
+An attempt that touches a cylinder, takes another mode than asked for, does not finish, or is unlike any human one (all
+but touches, takes too long) is played again with other random draws; nothing else is selected, and every discarded
+attempt is counted in the report.
 """
 
 from __future__ import annotations
@@ -19,10 +20,14 @@ from tensordict import TensorDict
 from torchrl_koap import keys
 from torchrl_koap.data import CONVERTERS, RawEpisode, flatten_trajectories, write_raw_episode
 from torchrl_koap.envs import AvoidingEnv, mode_index
-from torchrl_koap.envs.avoiding_expert import AvoidingExpert
+from torchrl_koap.envs.avoiding import OBSTACLES
+from torchrl_koap.envs.avoiding_expert import ROD_RADIUS, AvoidingExpert
 from torchrl_koap.tasks import get_task
 
 MAX_ATTEMPTS = 20
+# the human demonstrations have at most 104 rows and pass the cylinders at 3 mm or more
+MOST_ROWS = 120
+LEAST_CLEARANCE = 0.003
 _RECORDERS = {}
 
 
@@ -40,7 +45,8 @@ class RecordingReport:
         modes (list of int): mode of each demonstration as the environment saw it.
         rows (list of int): control steps of each demonstration.
         attempts (list of int): attempts each demonstration took, 1 if the first one was good.
-        failures (dict): number of discarded attempts by reason: ``collision``, ``mode``, ``unfinished``.
+        failures (dict): number of discarded attempts by reason: ``collision``, ``mode``, ``unfinished``,
+            ``close`` (nearly touched a cylinder), ``slow``.
         seconds (float): wall-clock time.
     """
 
@@ -189,7 +195,7 @@ def _record_avoiding(episodes, seed, num_threads, progress) -> tuple[list[RawEpi
     env = AvoidingEnv(episodes, num_threads=num_threads, dtype=torch.float64)
     raw: list[RawEpisode | None] = [None] * episodes
     attempts = [0] * episodes
-    failures = {"collision": 0, "mode": 0, "unfinished": 0}
+    failures = dict.fromkeys(("collision", "mode", "unfinished", "close", "slow"), 0)
     try:
         for attempt in range(MAX_ATTEMPTS):
             rows = np.array([index for index in range(episodes) if raw[index] is None])
@@ -239,10 +245,24 @@ def _play(env: AvoidingEnv, expert: AvoidingExpert, rows, modes, progress) -> li
     success = data[keys.SUCCESS].squeeze(-1).numpy()
     results = []
     for row in rows:
-        fault = "collision" if touched[row] else "unfinished" if active[row] or not success[row] else ""
-        fault = fault or ("mode" if mode[row] != modes[row] else "")
-        results.append((None if fault else _episode(logs[: lengths[row]], row), fault))
+        episode = _episode(logs[: lengths[row]], row)
+        faults = {
+            "collision": touched[row],
+            "unfinished": active[row] or not success[row],
+            "mode": mode[row] != modes[row],
+            "close": _clearance(episode) < LEAST_CLEARANCE,
+            "slow": len(episode) > MOST_ROWS,
+        }
+        fault = next((name for name, found in faults.items() if found), "")
+        results.append((None if fault else episode, fault))
     return results
+
+
+def _clearance(episode: RawEpisode) -> float:
+    """Least distance between the rod, taken as upright, and any cylinder (m)."""
+    path = episode.robot["c_pos"][:, :2]
+    gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
+    return min(gaps) - ROD_RADIUS
 
 
 def _episode(logs: list[dict[str, np.ndarray]], row: int) -> RawEpisode:

@@ -28,9 +28,9 @@ LEAST_PUSH = 0.0053  # smaller deflections fall into the dead zone
 ROD_RADIUS = 0.01
 # x of the gaps that humans take, low and high end, from small to large x (m)
 GAPS = (
-    ((0.412, 0.447), (0.566, 0.600)),
-    ((0.345, 0.372), (0.485, 0.515), (0.632, 0.680)),
-    ((0.262, 0.302), (0.418, 0.438), (0.556, 0.585), (0.705, 0.735)),
+    ((0.414, 0.446), (0.556, 0.597)),
+    ((0.345, 0.376), (0.485, 0.515), (0.626, 0.670)),
+    ((0.262, 0.304), (0.412, 0.440), (0.552, 0.588), (0.700, 0.735)),
 )
 _ROBOT_LAG = 3  # control steps by which the measured position follows the command
 _GLANCE = 4  # control steps between an event and the player's picture of it
@@ -39,9 +39,9 @@ _HORIZON = 300  # control steps for which hand noise is drawn
 
 
 def _hand_response() -> np.ndarray:
-    """Weights [11] by which the deflection follows the decisions of the last steps; rings a little, like a hand."""
-    time = np.arange(-5, 6)
-    weights = np.sinc(time / 3.4) * np.hanning(13)[1:-1]
+    """Weights [13] by which the deflection follows the decisions of the last steps; rings a little, like a hand."""
+    time = np.arange(-6, 7)
+    weights = np.sinc(time / 3.6) * np.hanning(17)[2:-2]
     return weights / weights.sum()
 
 
@@ -100,6 +100,8 @@ class AvoidingExpert:
         count = len(modes)
         self._time = 0
         self._row = np.zeros(count, dtype=np.int64)  # the row whose gap is aimed at; 3 behind the last one
+        self._forward = self._cruise[:, 0].copy()  # forwards push that is held
+        self._blocked = np.zeros(count, dtype=bool)  # a cylinder was straight ahead
         self._side = np.zeros(count)  # sideways push that is held, m per step
         self._crossed = np.full(count, -1)  # time at which the finish line was seen crossed
         self._decisions = np.zeros((count, len(_HAND), 2))  # latest first
@@ -129,6 +131,9 @@ class AvoidingExpert:
         seen = self._look(observation)
         decision = self._decide(seen, observation[:, 3])
         self._decisions = np.concatenate([decision[:, None], self._decisions[:, :-1]], axis=1)
+        if self._time == 0:  # some had begun to push before the recording started
+            begun = np.arange(len(_HAND)) <= self._head_start[:, None]
+            self._decisions = np.where(begun[..., None], decision[:, None], 0.0)
         push = np.einsum("nkd,k->nd", self._decisions, _HAND) + self._tremor[:, self._time % _HORIZON]
         self._time += 1
         return push
@@ -150,7 +155,7 @@ class AvoidingExpert:
     def _decide(self, seen: np.ndarray, height: np.ndarray) -> np.ndarray:
         count = np.arange(len(seen))
         passed = np.array([*ROW_Y, np.inf])[self._row] + self._release[count, self._row]
-        self._row += (seen[:, 1] > passed) & (self._row < 3)
+        self._row += ((seen[:, 1] > passed) | self._may_go_on(seen[:, 0])) & (self._row < 3)
         newly = (height > FINISH_Y) & (self._crossed < 0)
         self._crossed[newly] = self._time
 
@@ -165,6 +170,8 @@ class AvoidingExpert:
         late = off & (steps_sideways > room / cruise + self._patience) & (self._row < 3)
         forward = np.where(late, room / np.maximum(steps_sideways, 1e-9), cruise)
         forward = np.where(forward < LEAST_PUSH * self._creep, 0.0, forward)
+        self._forward += self._ease * (forward - self._forward)
+        forward = np.where(self._forward < 0.3 * LEAST_PUSH, 0.0, self._forward)
         decision = np.stack([self._side * self._grip[:, self._time % _HORIZON], forward], axis=1)
         decision[:, 0] = np.clip(decision[:, 0], -FULL_PUSH, FULL_PUSH)
         decision = self._avoid(seen, decision, cruise)
@@ -172,31 +179,47 @@ class AvoidingExpert:
         decision = np.where(behind, np.stack([self._last_side, self._last_forward * cruise], axis=1), decision)
         return np.where((self._time < self._pause)[:, None], 0.0, decision)
 
+    def _may_go_on(self, x: np.ndarray) -> np.ndarray:
+        """Whether the gap is reached with a push that may go on: it is the open side, and the next gap lies there."""
+        count = np.arange(len(x))
+        following = self._gap_x[count, np.minimum(self._row + 1, 3)] - x
+        direction = np.sign(self._side)
+        reached = (self._gap_x[count, self._row] - x) * direction < 0
+        open_side = self._open[count, self._row] == direction
+        return reached & open_side & (direction != 0) & (following * direction > 0.02) & (self._row < 2)
+
     def _push_sideways(self, way: np.ndarray, steps: np.ndarray, count: np.ndarray) -> None:
         """Begins, hardens and ends the sideways push, given the way to the gap and the steps left until its row."""
         holding = self._side != 0
         there = way * np.sign(self._side) < self._tolerance[count, self._row] * 0.3
         self._side[holding & there] = 0.0
-        begin = (self._side == 0) & (np.abs(way) > self._tolerance[count, self._row])
+        begin = (self._side == 0) & (np.abs(way) > np.where(self._blocked, 0.003, self._tolerance[count, self._row]))
         needed = np.abs(way) / np.maximum(steps, 1.0)
         push = np.clip(needed * self._haste[count, self._row], LEAST_PUSH * 1.06, FULL_PUSH)
-        push = np.where(push > 0.75 * FULL_PUSH, FULL_PUSH, push)
-        harder = holding & ~there & (needed > 1.15 * np.abs(self._side))
+        push = np.where(push > 0.92 * FULL_PUSH, FULL_PUSH, push)
+        harder = holding & ~there & (needed > 1.35 * np.abs(self._side))
         change = begin | harder
         self._side[change] = (np.sign(way) * push)[change]
+        self._side[self._time < self._side_pause] = 0.0
 
     def _avoid(self, seen: np.ndarray, decision: np.ndarray, cruise: np.ndarray) -> np.ndarray:
         """Takes back the part of a decision that would run into a cylinder within the next steps."""
-        ahead = np.arange(1, 9)[None, :, None] * decision[:, None] + seen[:, None]  # [n, 8, 2]
+        margin = self._margin + self._caution * np.abs(decision[:, 0]) / FULL_PUSH
+        self._blocked[:] = False
+        ahead = np.arange(1, 5)[None, :, None] * decision[:, None] + seen[:, None]  # [n, 4, 2]
         decision = decision.copy()
         for _, x, y, radius, _ in OBSTACLES:
-            near = np.linalg.norm(ahead - (x, y), axis=-1).min(1) < radius + ROD_RADIUS + self._margin
+            near = np.linalg.norm(ahead - (x, y), axis=-1).min(1) < radius + ROD_RADIUS + margin
             towards = decision[:, 0] * (x - seen[:, 0]) > 0
             in_front = seen[:, 1] < y - 0.6 * radius
             beside = near & ~in_front & towards
             decision[beside, 0] = 0.0
             decision[beside, 1] = cruise[beside]
             decision[near & in_front, 1] = 0.0
+            self._blocked |= near & in_front
+            cramped = near & in_front & (self._side == 0)  # aims too near to the cylinder: more room on the next try
+            rows = self._row[cramped]
+            self._gap_x[cramped, rows] += 0.0015 * np.sign(self._gap_x[cramped, rows] - x)
         return decision
 
 
@@ -205,28 +228,35 @@ def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
     uniform, normal = generator.uniform, generator.normal
     gaps = [GAPS[row][gap] for row, gap in enumerate(mode_gaps(mode))]
     gap_x = [uniform(low, high) for low, high in gaps]
-    long_pause = generator.random() < 0.15
+    long_pause = generator.random() < 0.13
+    row1, row2, _ = mode_gaps(mode)
+    pause = generator.integers(7, 19) if long_pause else generator.integers(-3, 4)
     brisk = generator.random() < 0.6
-    start = uniform(0.80, 1.0) if brisk else uniform(0.60, 0.85)
+    start = uniform(0.88, 1.02) if brisk else uniform(0.66, 0.88)
     warm_up = np.clip(np.arange(_HORIZON) / uniform(10, 45), 0, 1)
-    cruise = (start + (uniform(0.95, 1.06) - start) * warm_up) + _drift(generator, 15, 0.05)
+    cruise = (start + (uniform(0.98, 1.06) - start) * warm_up) + _drift(generator, 15, 0.05)
     lets_go = generator.random() < 0.35
     turns = generator.random() < 0.5
     return {
         "gap_x": np.array([*gap_x, gap_x[-1] + normal(0, 0.012)]),
-        "gate": np.append(uniform(0.020, 0.055, 3), 0.0),
-        "release": np.append(uniform(0.012, 0.045, 3), 0.0),
-        "tolerance": np.append(uniform(0.006, 0.010, 3), 0.02),
-        "haste": np.append(uniform(0.95, 1.5, 3), 1.0),
+        "gate": np.append(uniform(-0.005, 0.040, 3), 0.0),
+        "release": np.append(uniform(0.010, 0.042, 3), 0.0),
+        "tolerance": np.append(uniform(0.008, 0.014, 3), 0.02),
+        "haste": np.append(uniform(0.9, 1.15, 3), 1.0),
         "attention": np.array(uniform(0.1, 0.4)),
-        "patience": np.array(uniform(0.0, 3.0)),
+        "caution": np.array(uniform(0.005, 0.011)),
+        "ease": np.array(uniform(0.3, 0.8)),
+        "patience": np.array(uniform(1.0, 5.0)),
         "creep": np.array(uniform(0.6, 1.1)),
-        "margin": np.array(uniform(0.004, 0.010)),
-        "pause": np.array(generator.integers(8, 20) if long_pause else generator.integers(0, 4)),
-        "linger": np.array(7 + generator.geometric(0.35)),
+        "margin": np.array(uniform(0.010, 0.014)),
+        "open": np.array([2 * row1 - 1, row2 - 1, 0, 0]),  # sign of the side without further cylinders
+        "pause": np.array(max(pause, 0)),
+        "head_start": np.array(max(-pause, 0)),
+        "side_pause": np.array(max(pause, 0) + (generator.integers(2, 8) if generator.random() < 0.5 else 0)),
+        "linger": np.array(4 + generator.geometric(0.3)),
         "last_side": np.array(uniform(-0.008, 0.008) if turns else 0.0),
         "last_forward": np.array(uniform(-0.1, 0.2) if lets_go else 1.0),
-        "cruise": np.clip(cruise, 0.4, 1.0) * FULL_PUSH,
+        "cruise": np.clip(cruise, 0.4, uniform(1.0, 1.05)) * FULL_PUSH,
         "grip": 1 + _drift(generator, 8, 0.06),
         "misjudgement": np.stack([_drift(generator, 12, 0.003), _drift(generator, 12, 0.003)], axis=1),
         "tremor": np.stack([_drift(generator, 2, 0.0002), _drift(generator, 2, 0.0002)], axis=1),
