@@ -51,7 +51,7 @@ def test_hidden_parts_are_no_state():
 def test_unknown_names_suggest_the_nearest():
     with pytest.raises(ValueError, match="did you mean 'avoiding'"):
         get_task("avoidng")
-    with pytest.raises(ValueError, match="known tasks: .*avoiding"):
+    with pytest.raises(ValueError, match="known: .*avoiding"):
         get_task("xyz")
     for wrong in (None, 3, ["avoiding"]):
         with pytest.raises(ValueError, match="unknown task"):

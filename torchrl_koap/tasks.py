@@ -6,8 +6,9 @@ Environments and readers of recorded data share these facts, so they live in nei
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, field
+
+from torchrl_koap.lookup import lookup
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,4 @@ def get_task(name: str) -> Task:
         >>> get_task("avoiding").state_columns
         (2, 3)
     """
-    if isinstance(name, str) and name in TASKS:
-        return TASKS[name]
-    near = difflib.get_close_matches(str(name), TASKS, n=1)
-    hint = f"did you mean {near[0]!r}?" if near else f"known tasks: {', '.join(TASKS)}"
-    raise ValueError(f"unknown task {name!r}; {hint}")
+    return lookup(TASKS, name, "task")

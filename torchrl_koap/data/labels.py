@@ -21,6 +21,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.lookup import lookup
 
 Unit = Literal["trajectory", "window", "transition"]
 
@@ -105,8 +106,7 @@ class LabelBudget:
     history: int = 2
 
     def __post_init__(self):
-        if self.unit not in get_args(Unit):
-            raise ValueError(f"unknown unit {self.unit!r}; wanted one of {', '.join(get_args(Unit))}")
+        lookup(get_args(Unit), self.unit, "unit")
         if isinstance(self.amount, bool) or not isinstance(self.amount, numbers.Real):
             raise ValueError(f"amount must be a fraction in (0, 1] or a count >= 1, got {self.amount!r}")
         if isinstance(self.amount, numbers.Integral):

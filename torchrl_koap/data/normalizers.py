@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-import difflib
-
 import torch
 from torch import nn
+
+from torchrl_koap.lookup import lookup
 
 
 def _minmax(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -93,10 +93,7 @@ class Normalizer(nn.Module):
         Raises:
             ValueError: if the mode is unknown, the mask does not fit or selects nothing, or a used row is not finite.
         """
-        if mode not in MODES:
-            near = difflib.get_close_matches(str(mode), MODES, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"wanted one of {', '.join(MODES)}"
-            raise ValueError(f"unknown normalisation {mode!r}; {hint}")
+        statistics = lookup(MODES, mode, "normalisation")
         if values.ndim < 2 or not values.is_floating_point():
             raise ValueError(f"values must be a float tensor [*N, d], got {values.dtype} {list(values.shape)}")
         rows = values.detach().flatten(0, -2)
@@ -115,7 +112,7 @@ class Normalizer(nn.Module):
             raise ValueError(f"{count} of {len(rows)} rows are NaN or infinite, in columns {columns}")
 
         rows = rows.double()
-        offset, scale = MODES[mode](rows)
+        offset, scale = statistics(rows)
         rounding = 4 * torch.finfo(values.dtype).eps * rows.abs().amax(0)
         scale = torch.where(scale <= rounding, 1.0, scale)
         scale = torch.where(scale.to(values.dtype) > 0, scale, 1.0)  # too small for the type of the values

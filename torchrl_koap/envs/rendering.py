@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 import sys
@@ -11,6 +10,8 @@ import warnings
 
 import mujoco
 import numpy as np
+
+from torchrl_koap.lookup import lookup
 
 _SWITCHED_OFF = ("disable", "disabled", "off", "false", "0")
 _INSTALL = (
@@ -110,9 +111,7 @@ class Renderer:
         for candidate in (name, f"panda/{name}"):
             if candidate in names:
                 return names.index(candidate)
-        near = difflib.get_close_matches(name, [n.removeprefix("panda/") for n in names], n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"known cameras: {', '.join(names)}"
-        raise ValueError(f"unknown camera {name!r}; {hint}")
+        return lookup({known.removeprefix("panda/"): names.index(known) for known in names}, name, "camera")
 
     def close(self) -> None:
         """Frees the graphics memory; the renderer cannot be used afterwards."""

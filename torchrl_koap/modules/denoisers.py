@@ -13,14 +13,15 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from torchrl_koap.lookup import lookup
+
 Tensor = torch.Tensor
 ACTIVATIONS = {"silu": nn.SiLU, "mish": nn.Mish, "gelu": nn.GELU, "relu": nn.ReLU}
 
 
 def check_activation(name: str) -> None:
     """Raises a ``ValueError`` for a name that is not in ``ACTIVATIONS``."""
-    if name not in ACTIVATIONS:
-        raise ValueError(f"unknown activation {name!r}; known: {', '.join(ACTIVATIONS)}")
+    lookup(ACTIVATIONS, name, "activation")
 
 
 def check_input(sequence: Tensor, condition: Tensor, state_dim: int, condition_dim: int) -> None:

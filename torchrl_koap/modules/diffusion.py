@@ -12,13 +12,14 @@ from much noise to none.
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import nn
+
+from torchrl_koap.lookup import lookup
 
 Tensor = torch.Tensor
 Network = Callable[[Tensor, Tensor], Tensor]
@@ -173,11 +174,10 @@ class NoiseSchedule(nn.Module):
 
     def __init__(self, schedule: str = "squared_cosine", prediction: str | None = None, num_train_steps: int = 50):
         super().__init__()
-        kind = _look_up(SCHEDULES, schedule, "schedule")
+        kind = lookup(SCHEDULES, schedule, "schedule")
         if prediction is None:
             prediction = "velocity" if kind.path == "flow" else "epsilon"
-        if prediction not in PREDICTIONS:
-            raise ValueError(_unknown("prediction", prediction, PREDICTIONS))
+        lookup(PREDICTIONS, prediction, "prediction")
         if kind.path == "flow" and prediction == "epsilon":
             raise ValueError(
                 "prediction 'epsilon' does not fit schedule 'flow' (no signal at its start); use 'velocity'"
@@ -307,7 +307,7 @@ class NoiseSchedule(nn.Module):
 
     def check_solver(self, solver: str) -> None:
         """Raises a ``ValueError`` if the solver is unknown or walks the other kind of path."""
-        kind = _look_up(SOLVERS, solver, "solver")
+        kind = lookup(SOLVERS, solver, "solver")
         if kind.path != self.path:
             fitting = ", ".join(repr(name) for name, other in SOLVERS.items() if other.path == self.path)
             raise ValueError(
@@ -325,15 +325,3 @@ class _Draws:
     def __getitem__(self, index: int) -> Tensor:
         like = self.like
         return torch.randn(like.shape, dtype=like.dtype, device=like.device, generator=self.generator)
-
-
-def _unknown(what: str, name: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-    return f"unknown {what} {name!r}; {hint}"
-
-
-def _look_up(table: dict, name: str, what: str):
-    if name not in table:
-        raise ValueError(_unknown(what, name, list(table)))
-    return table[name]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 
 import torch
@@ -12,9 +11,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_koap.keys import LATENT_ACTION, LIFTED_STATE, STATE
+from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.recurrent import SequenceLSTM, mlp
 
 STRUCTURES = ("dense", "diagonal", "block_diagonal")
+INITS = ("identity", "normal")
 
 
 class KoopmanLifting(TensorDictModuleBase):
@@ -120,7 +121,7 @@ class KoopmanOperator(TensorDictModuleBase):
         out_key (NestedKey): predicted next lifted state ``[*B, T, m]``.
 
     Raises:
-        ValueError: for an unknown structure or a ``latent_dim`` that ``block_dim`` does not divide.
+        ValueError: for an unknown structure or init, or a ``latent_dim`` that ``block_dim`` does not divide.
 
     Examples:
         >>> import torch
@@ -143,12 +144,8 @@ class KoopmanOperator(TensorDictModuleBase):
         out_key: NestedKey = ("next", LIFTED_STATE),
     ):
         super().__init__()
-        if structure not in STRUCTURES:
-            near = difflib.get_close_matches(structure, STRUCTURES, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(STRUCTURES)}"
-            raise ValueError(f"unknown operator structure {structure!r}; {hint}")
-        if init not in ("identity", "normal"):
-            raise ValueError(f"init must be 'identity' or 'normal', got {init!r}")
+        lookup(STRUCTURES, structure, "operator structure")
+        lookup(INITS, init, "operator init")
         if structure == "block_diagonal" and latent_dim % block_dim:
             raise ValueError(f"latent_dim {latent_dim} is not a multiple of block_dim {block_dim}")
         self.in_keys, self.out_keys = list(in_keys), [out_key]

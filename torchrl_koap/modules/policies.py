@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 
 import torch
@@ -14,6 +13,7 @@ from torchrl.envs.transforms import CatFrames, Compose, InitTracker, UnsqueezeTr
 from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_koap.keys import ACTION, OBSERVATION, PLAN
+from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.planner import StatePlanner
 
 EXECUTIONS = ("feedback", "open_loop")
@@ -94,10 +94,7 @@ class PlanThenControl(TensorDictModuleBase):
         action_key: NestedKey = ACTION,
     ):
         super().__init__()
-        if execution not in EXECUTIONS:
-            near = difflib.get_close_matches(execution, EXECUTIONS, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"choose one of {', '.join(EXECUTIONS)}"
-            raise ValueError(f"unknown execution {execution!r}; {hint}")
+        lookup(EXECUTIONS, execution, "execution")
         if history < planner.history:
             raise ValueError(f"the planner reads {planner.history} observed frames, history is only {history}")
         if not 1 <= replan_interval <= planner.horizon:

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import difflib
-
 from torch import nn
 
+from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
@@ -62,6 +61,13 @@ PRESETS = {
     },
 }
 
+# what only one kind of latent-action network takes, and its value where a preset does not name it
+NETWORK_OPTIONS = {
+    "fourier": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0},
+    "lstm": {"relative": False},
+    "mlp": {"relative": False, "linear_skip": False, "dropout": 0.0},
+}
+
 
 def make_koopman_inverse_dynamics(
     state_dim: int,
@@ -82,7 +88,7 @@ def make_koopman_inverse_dynamics(
         preset (str): ``"default"``, ``"paper"`` or ``"released"``.
         state_normalizer (nn.Module, optional): see :class:`KoopmanInverseDynamics`.
         action_normalizer (nn.Module, optional): see :class:`KoopmanInverseDynamics`.
-        **overrides: any entry of ``PRESETS[preset]``.
+        **overrides: any entry of ``PRESETS[preset]``, and of ``NETWORK_OPTIONS`` for the network chosen.
 
     Raises:
         ValueError: for an unknown preset or option; the message suggests the nearest.
@@ -93,23 +99,25 @@ def make_koopman_inverse_dynamics(
         >>> sum(p.numel() for p in model.parameters())
         1387524
     """
-    choice = dict(_lookup(PRESETS, preset, "preset"))
+    choice = lookup(PRESETS, preset, "preset")
+    network = overrides.get("network", choice["network"])
+    options = lookup(NETWORK_OPTIONS, network, "network")
+    foreign = {name for others in NETWORK_OPTIONS.values() for name in others} - set(options)
+    choice = {**options, **{name: value for name, value in choice.items() if name not in foreign}}
     for name in overrides:
-        _lookup(choice, name, "option of the inverse dynamics")
+        lookup(choice, name, f"option of the inverse dynamics with network {network!r}:")
     choice.update(overrides)
 
     latent_dim, hidden = choice["latent_dim"], choice["hidden_dim"]
     normalized_state = "normalized_state" if state_normalizer is not None else "state"
     frames = {key: choice[key] for key in ("history", "look_ahead", "clamped")} | {"in_key": normalized_state}
-    if choice["network"] == "fourier":
-        latent_action = LatentActionFourier(state_dim, choice["num_features"], **frames)
-    elif choice["network"] == "lstm":
-        latent_action = LatentActionLSTM(
-            state_dim, latent_dim, hidden_dim=hidden, relative=choice["relative"], **frames
-        )
+    frames |= {key: choice[key] for key in options}
+    if network == "fourier":
+        latent_action = LatentActionFourier(state_dim, **frames)
+    elif network == "lstm":
+        latent_action = LatentActionLSTM(state_dim, latent_dim, hidden_dim=hidden, **frames)
     else:
-        extra = {key: choice[key] for key in ("relative", "linear_skip", "dropout")}
-        latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=(hidden, hidden), **extra, **frames)
+        latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=(hidden, hidden), **frames)
     lifting = KoopmanLifting(
         state_dim,
         latent_dim,
@@ -120,7 +128,7 @@ def make_koopman_inverse_dynamics(
     )
     operator = KoopmanOperator(
         latent_dim,
-        input_dim=latent_action.latent_dim if choice["network"] == "fourier" else None,
+        input_dim=latent_action.latent_dim if network == "fourier" else None,
         structure=choice["structure"],
         init=choice["operator_init"],
     )
@@ -135,11 +143,3 @@ def make_koopman_inverse_dynamics(
         state_normalizer=state_normalizer,
         action_normalizer=action_normalizer,
     )
-
-
-def _lookup(table: dict, name: str, what: str):
-    if name not in table:
-        near = difflib.get_close_matches(name, table, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(table)}"
-        raise ValueError(f"unknown {what} {name!r}; {hint}")
-    return table[name]

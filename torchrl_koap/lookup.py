@@ -1,0 +1,36 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Looking a name up in a table; the error for an unknown one suggests the nearest."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Mapping
+from typing import Any
+
+
+def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) -> Any:
+    """Returns the entry ``name`` of a table, or ``name`` itself where the table is a plain collection of names.
+
+    Args:
+        table (mapping or collection of str): what there is.
+        name (object): what is asked for; anything that is not a string of the table is unknown.
+        what (str): what the names stand for; the message begins with it.
+
+    Raises:
+        ValueError: if the name is unknown. The message suggests the nearest name, or else lists them all.
+
+    Examples:
+        >>> from torchrl_koap.lookup import lookup
+        >>> lookup({"dense": 1, "diagonal": 2}, "dense", "structure")
+        1
+        >>> lookup({"dense": 1, "diagonal": 2}, "diagnoal", "structure")
+        Traceback (most recent call last):
+        ...
+        ValueError: unknown structure 'diagnoal'; did you mean 'diagonal'?
+    """
+    if isinstance(name, str) and name in table:
+        return table[name] if isinstance(table, Mapping) else name
+    lowered = {known.lower(): known for known in table}
+    near = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5) if isinstance(name, str) else []
+    hint = f"did you mean {lowered[near[0]]!r}?" if near else f"known: {', '.join(table)}"
+    raise ValueError(f"unknown {what} {name!r}; {hint}")
