@@ -226,7 +226,7 @@ class AvoidingExpert:
 def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
     """Habits and slips of one episode: everything that is random about it (m and control steps).
 
-    ``gap_x`` is aimed at in each row (entry 3: behind the last one), to be reached ``gate`` before the row; the next gap
+    ``gap_x`` is aimed at in each row (entry 3: behind the last one), reached ``gate`` before the row; the next gap
     counts once the row is ``release`` behind. ``tolerance``, ``haste``, ``patience``, ``creep`` and ``ease`` shape the
     pushes; ``margin`` (``+ caution`` at full sideways push) is the distance kept from cylinders; ``attention`` is the
     weight of what is seen of the robot against what was pushed; series over time are drifting noise.
