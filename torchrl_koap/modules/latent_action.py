@@ -73,6 +73,11 @@ class LatentActionModule(TensorDictModuleBase):
         """
         return frame_span(num_frames, self.history, self.look_ahead, clamped=self.clamped)
 
+    @property
+    def num_window_frames(self) -> int:
+        """Frames of the shortest window in which a frame (``history``) has all it reads and its successor."""
+        return self.history + 1 + self.look_ahead[-1]
+
     def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
         """What each latent action reads.
 
@@ -102,9 +107,8 @@ class LatentActionModule(TensorDictModuleBase):
         """Sets the spread (root mean square) of every offset from windows ``[*B, T, d]``; no label is read."""
         if not self.relative:
             return
-        self.scales.fill_(1.0)
         read = self.gather(windows, self.span(windows.shape[-2])).flatten(0, -3)
-        spread = read.square().mean(0).sqrt()
+        spread = read.square().mean(0).sqrt() * self.scales
         spread[self.history] = 1.0  # the current frame stays in the normaliser's units
         self.scales.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
 
@@ -144,7 +148,7 @@ class LatentActionLSTM(LatentActionModule):
         flat = frames.reshape(-1, *frames.shape[-2:])  # [B * T, F, d]
         zeros = flat.new_zeros(1, flat.shape[0], self.lstm.hidden_size)
         out, _ = self.lstm(flat, (zeros, zeros))
-        return self.readout(out[:, -1]).reshape(*frames.shape[:-2], -1)
+        return self.readout(out[:, -1]).reshape(*frames.shape[:-2], self.latent_dim)
 
 
 class LatentActionMLP(LatentActionModule):

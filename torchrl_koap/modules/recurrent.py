@@ -49,4 +49,4 @@ class SequenceLSTM(nn.Module):
         flat = sequence.reshape(-1, *sequence.shape[-2:])
         zeros = flat.new_zeros(1, flat.shape[0], self.lstm.hidden_size)
         out, _ = self.lstm(flat, (zeros, zeros))
-        return self.readout(out).unflatten(0, sequence.shape[:-2])
+        return self.readout(out).reshape(*sequence.shape[:-1], self.readout.out_features)
