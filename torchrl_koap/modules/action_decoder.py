@@ -55,9 +55,10 @@ class LinearActionDecoder(TensorDictModuleBase):
         (True, 200)
     """
 
-    covariance: Tensor
+    covariance_root: Tensor
     noise_variance: Tensor
     latent_mean: Tensor
+    mean_leverage: Tensor
 
     def __init__(
         self, latent_dim: int, action_dim: int, *, in_key: NestedKey = LATENT_ACTION, out_key: NestedKey = ACTION
@@ -65,9 +66,10 @@ class LinearActionDecoder(TensorDictModuleBase):
         super().__init__()
         self.in_keys, self.out_keys = [in_key], [out_key]
         self.linear = nn.Linear(latent_dim, action_dim)
-        self.register_buffer("covariance", torch.full((latent_dim, latent_dim), torch.nan))
+        self.register_buffer("covariance_root", torch.full((latent_dim, latent_dim), torch.nan))
         self.register_buffer("noise_variance", torch.full((action_dim,), torch.nan))
         self.register_buffer("latent_mean", torch.zeros(latent_dim))
+        self.register_buffer("mean_leverage", torch.zeros(()))
 
     def forward(self, tensordict):
         """Writes the decoded actions."""
@@ -102,21 +104,32 @@ class LinearActionDecoder(TensorDictModuleBase):
             bias (bool): fit ``b``; otherwise it is 0 and a latent action of 0 decodes to 0. Defaults to ``True``.
 
         Returns:
-            RidgeFit: the choice and its held-out errors.
+            RidgeFit: the choice and its held-out errors; they are infinite where a single step leaves nothing to fit
+                the mean to.
 
         Raises:
-            ValueError: if nothing is labelled, a labelled action is not finite, or shapes disagree.
+            ValueError: if nothing is labelled, a labelled action or latent action is not finite, a penalty is not
+                positive, or shapes disagree.
         """
+        if mask.dtype != torch.bool:
+            raise ValueError(f"mask must be bool, got {mask.dtype}")
         if latent.shape[:-1] != action.shape[:-1] or mask.shape != latent.shape[:-1]:
             raise ValueError(
                 f"latent {list(latent.shape)}, action {list(action.shape)} and mask {list(mask.shape)} must share"
                 " their leading shape"
             )
+        if groups is not None and groups.shape != mask.shape:
+            raise ValueError(f"groups must have the shape of mask {list(mask.shape)}, got {list(groups.shape)}")
+        candidates = tuple(penalties) if default_penalty is None else (*penalties, default_penalty)
+        if not candidates or not all(0 < penalty < float("inf") for penalty in candidates):
+            raise ValueError(f"penalties must be positive and finite, got {candidates}")
         if not mask.any():
             raise ValueError("fit_ridge needs at least one labelled step, the mask selects none")
         x, y = latent[mask].double(), action[mask].double()
         if not y.isfinite().all():
             raise ValueError("fit_ridge got a labelled action that is not finite")
+        if not x.isfinite().all():
+            raise ValueError("fit_ridge got a latent action that is not finite")
         rows = torch.arange(len(x), device=x.device)
         groups = rows if groups is None else groups[mask].unique(return_inverse=True)[1]
         num_groups = int(groups.max()) + 1
@@ -128,7 +141,8 @@ class LinearActionDecoder(TensorDictModuleBase):
         mean_x, mean_y = (x.mean(0), y.mean(0)) if bias else (torch.zeros_like(x[0]), torch.zeros_like(y[0]))
         centred, target = x - mean_x, y - mean_y
         left, singular, right = torch.linalg.svd(centred, full_matrices=False)
-        unit = centred.square().sum(-1).mean().clamp_min(torch.finfo(x.dtype).tiny)
+        unit = centred.square().sum(-1).mean()
+        unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # constant latent actions: any scale will do
         projected = left.mT @ target
 
         def held_out(penalty: float) -> Tensor:
@@ -142,13 +156,24 @@ class LinearActionDecoder(TensorDictModuleBase):
         self.linear.weight.copy_(weight.mT)
         self.linear.bias.copy_(mean_y - mean_x @ weight)
         self.noise_variance.copy_(held_out(best).square().mean(0))
-        prior = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device) / (best * unit)
-        self.covariance.copy_(prior + (right.mT * (1 / scaled - 1 / (best * unit))) @ right)
+        # a root, column by column along the singular directions: in float32 the covariance itself would drown the
+        # well-determined directions (1e-4) in the rounding of the undetermined ones (1e6)
+        missing = torch.linalg.svd(right, full_matrices=True)[2][len(right) :]  # [m - r, m]
+        basis = torch.cat([right, missing])
+        spectrum = torch.cat([scaled, (best * unit).expand(len(missing))])
+        self.covariance_root.copy_(basis.mT / spectrum.sqrt())
         self.latent_mean.copy_(mean_x)
+        self.mean_leverage.fill_(1 / len(x) if bias else 0.0)
         return RidgeFit(best, errors, len(x), self.noise_variance.clone())
 
     def predictive_variance(self, latent: Tensor) -> Tensor:
-        r"""Variance of a predicted action: noise times :math:`1 + (u - \bar u)^T (U^T U + \lambda)^{-1} (u - \bar u)`.
+        r"""Variance of a predicted action.
+
+        .. math::
+            \sigma^2 \big(1 + 1/n + (u - \bar u)^T (\bar U^T \bar U + \lambda)^{-1} (u - \bar u)\big)
+
+        with the ``n`` centred latent actions :math:`\bar U` of the fit: the noise, the uncertainty of ``b`` (left out
+        with ``bias=False``) and that of ``D``.
 
         Args:
             latent (Tensor): latent actions ``[*B, m]``.
@@ -159,11 +184,10 @@ class LinearActionDecoder(TensorDictModuleBase):
         Raises:
             RuntimeError: if the decoder was not fitted in closed form.
         """
-        if self.covariance.isnan().any():
+        if self.covariance_root.isnan().any():
             raise RuntimeError("predictive_variance needs a decoder fitted by fit_ridge()")
-        centred = latent - self.latent_mean
-        leverage = ((centred @ self.covariance) * centred).sum(-1, keepdim=True)
-        return (1 + leverage.clamp_min(0)) * self.noise_variance
+        leverage = ((latent - self.latent_mean) @ self.covariance_root).square().sum(-1, keepdim=True)
+        return (1 + self.mean_leverage + leverage) * self.noise_variance
 
 
 def _held_out(
@@ -176,6 +200,9 @@ def _held_out(
         rows = groups == group
         part = left[rows]
         hat = (part * shrink) @ part.mT + (1 / len(left) if centred else 0.0)
+        if centred and len(part) == len(left):  # nothing is left to take a mean of
+            held_out[rows] = torch.inf
+            continue
         keep = torch.eye(len(part), dtype=part.dtype, device=part.device) - hat
-        held_out[rows] = torch.linalg.lstsq(keep, residual[rows]).solution
+        held_out[rows] = torch.linalg.solve(keep, residual[rows])
     return held_out
