@@ -35,7 +35,7 @@ class KoopmanInverseDynamics(TensorDictSequential):
             ``x_{t+1}``. Defaults to ``"action"``.
 
     Raises:
-        ValueError: if the sizes of the parts do not fit together.
+        ValueError: if the sizes of the parts do not fit together, or the decoder does not read what the network writes.
 
     Examples:
         >>> import torch
@@ -71,6 +71,10 @@ class KoopmanInverseDynamics(TensorDictSequential):
         if latent_action.state_dim != lifting.state_dim:
             raise ValueError(f"state_dim differs: latent_action {latent_action.state_dim}, lifting {lifting.state_dim}")
 
+        if latent_action.out_keys != action_decoder.in_keys:
+            written, read = latent_action.out_keys[0], action_decoder.in_keys[0]
+            raise ValueError(f"latent_action writes {written!r}, but action_decoder reads {read!r}")
+
         # every part keeps its own keys; the sequence adapts to them
         steps = []
         if state_normalizer is not None or latent_action.in_keys != [state_key]:
@@ -84,6 +88,24 @@ class KoopmanInverseDynamics(TensorDictSequential):
         self.lifting, self.operator = lifting, operator
         self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
         self.state_key, self.action_key = state_key, action_key
+
+    def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
+        """Renames the entries read and written."""
+        if state is not None:
+            self.state_key, self.module[0].in_keys = state, [state]
+        if action is not None:
+            self.action_key, self.module[-1].out_keys = action, [action]
+        self.in_keys, self.out_keys = self._compute_in_and_out_keys(self.module)
+
+    @property
+    def history(self) -> int:
+        """Frames before the current one that are read."""
+        return self.latent_action.history
+
+    @property
+    def num_window_frames(self) -> int:
+        """Frames of the shortest complete window (:attr:`LatentActionModule.num_window_frames`)."""
+        return self.latent_action.num_window_frames
 
     def normalize_state(self, state: Tensor) -> Tensor:
         """Raw states to the networks' units."""
@@ -138,10 +160,10 @@ class KoopmanInverseDynamics(TensorDictSequential):
         """Fits the decoder in closed form on the labelled frames of windows (:meth:`LinearActionDecoder.fit_ridge`).
 
         Args:
-            windows (TensorDictBase): ``state_key`` ``[N, T, d]`` and ``action_key`` ``[N, T, act]``.
-            mask (Tensor): labelled frames to use, bool ``[N, T]``; no action outside of it is read. Frames that do
+            windows (TensorDictBase): ``state_key`` ``[*B, T, d]`` and ``action_key`` ``[*B, T, act]``.
+            mask (Tensor): labelled frames to use, bool ``[*B, T]``; no action outside of it is read. Frames that do
                 not count in the losses (:meth:`LatentActionModule.span`) are left out.
-            groups (Tensor, optional): trajectory of every window, int64 ``[N]``, to be left out together.
+            groups (Tensor, optional): trajectory of every window, int64 ``[*B]``, to be left out together.
             batch_size (int): windows per forward pass.
             **kwargs: options of :meth:`LinearActionDecoder.fit_ridge`.
 
@@ -149,20 +171,27 @@ class KoopmanInverseDynamics(TensorDictSequential):
             RidgeFit: the ridge chosen and its held-out error in normalised units.
 
         Raises:
-            ValueError: if no labelled frame counts.
+            ValueError: if no labelled frame counts, or shapes disagree.
         """
+        shape = windows.get(self.state_key).shape[:-1]
+        if mask.shape != shape or mask.dtype != torch.bool:
+            raise ValueError(f"mask must be bool {list(shape)} ([*B, T]), got {mask.dtype} {list(mask.shape)}")
+        if groups is not None and groups.shape != shape[:-1]:
+            raise ValueError(f"groups must be {list(shape[:-1])} ([*B]), got {list(groups.shape)}")
         span = self.latent_action.span(mask.shape[-1])
-        mask = mask[:, span.start : span.stop]
+        mask = mask[..., span.start : span.stop]
         rows = mask.any(-1)
         if not rows.any():
             raise ValueError(f"no labelled frame lies in frames {span.start}..{span.stop - 1} of any window")
-        windows, mask = windows[rows], mask[rows]
-        was_training = self.training
-        self.eval()  # dropout would blur the latent actions that the decoder is fitted to
-        latent = torch.cat([self.infer(part.get(self.state_key), span) for part in windows.split(batch_size)])
-        self.train(was_training)
+        states, action, mask = windows.get(self.state_key)[rows], windows.get(self.action_key)[rows], mask[rows]
+        was_training = self.latent_action.training
+        self.latent_action.eval()  # dropout would blur the latent actions that the decoder is fitted to
+        try:
+            latent = torch.cat([self.infer(part, span) for part in states.split(batch_size)])
+        finally:
+            self.latent_action.train(was_training)
         # unlabelled entries are zeroed before the normaliser sees them: it may refuse NaN
-        action = windows.get(self.action_key)[:, span.start : span.stop]
+        action = action[:, span.start : span.stop]
         action = self.normalize_action(torch.where(mask.unsqueeze(-1), action, 0.0))
         if groups is not None:
             groups = groups[rows].unsqueeze(-1).expand_as(mask)

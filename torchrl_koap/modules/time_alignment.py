@@ -58,10 +58,8 @@ def frame_span(num_frames: int, history: int, look_ahead: int | Sequence[int], *
     return span
 
 
-def frame_index(
-    frames: range, num_frames: int, history: int, look_ahead: int | Sequence[int], device=None
-) -> Tensor:
-    """Frames read by ``f`` for each of ``frames``, clamped to the window: int64 ``[len(frames), history + 1 + len(k)]``.
+def frame_index(frames: range, num_frames: int, history: int, look_ahead: int | Sequence[int], device=None) -> Tensor:
+    """Frames read by ``f`` for each of ``frames``, clamped to the window: ``[len(frames), history + 1 + len(k)]``.
 
     Examples:
         >>> from torchrl_koap.modules.time_alignment import frame_index
