@@ -36,8 +36,10 @@ class _KoopmanLoss(LossModule):
             state (NestedKey): window of raw states ``[*B, T, d]``.
             action (NestedKey): raw actions ``[*B, T, act]``, NaN where unlabelled.
             has_action (NestedKey): labelled frames, bool ``[*B, T, 1]``.
-            padded (NestedKey): optional; frames that repeat an edge of the trajectory, bool ``[*B, T, 1]``. A
-                transition into or out of one counts in no loss.
+            padded (NestedKey): optional; frames that repeat an edge of the trajectory, bool ``[*B, T]``. A transition
+                into or out of one counts in no loss, labelled or not.
+
+        The two masks may have a trailing 1 or not.
         """
 
         state: NestedKey = STATE
@@ -59,6 +61,20 @@ class _KoopmanLoss(LossModule):
         super().__init__()
         self.convert_to_functional(network, "network", create_target_params=False)
         self.reduction = reduction
+        super().set_keys(state=network.state_key, action=network.action_key)
+
+    def set_keys(self, **kwargs) -> None:
+        """Renames entries (None: back to the default); ``state`` and ``action`` are renamed in the network too."""
+        super().set_keys(**kwargs)
+        self.network.set_keys(
+            **{name: getattr(self.tensor_keys, name) for name in ("state", "action") if name in kwargs}
+        )
+
+    def train(self, mode: bool = True):
+        """Sets the mode of the loss, and of the network, which is no submodule of it: dropout is off in ``eval()``."""
+        super().train(mode)
+        self.network.train(mode)
+        return self
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -77,16 +93,29 @@ class _KoopmanLoss(LossModule):
 
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The raw states and the transitions between two recorded frames ``[*B, T - 1]``."""
-        state = tensordict.get(self.tensor_keys.state)
-        if state is None:
-            raise KeyError(f"the loss needs states under {self.tensor_keys.state!r}; found {list(tensordict.keys())}")
-        padded = tensordict.get(self.tensor_keys.padded, None)
-        if padded is None:
+        state = self._read(tensordict, self.tensor_keys.state)
+        if tensordict.get(self.tensor_keys.padded, None) is None:
             recorded = torch.ones(state.shape[:-2] + (state.shape[-2] - 1,), dtype=torch.bool, device=state.device)
         else:
-            padded = padded.squeeze(-1)
+            padded = self._read_mask(tensordict, self.tensor_keys.padded, state)
             recorded = ~(padded[..., 1:] | padded[..., :-1])
         return state, recorded
+
+    @staticmethod
+    def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        value = tensordict.get(key, None)
+        if value is None:
+            raise KeyError(f"the loss needs the entry {key!r}; there are {sorted(map(str, tensordict.keys(True)))}")
+        return value
+
+    def _read_mask(self, tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
+        """A mask of frames as bool ``[*B, T]``."""
+        mask = self._read(tensordict, key)
+        if mask.shape == (*state.shape[:-1], 1):
+            mask = mask.squeeze(-1)
+        if mask.shape != state.shape[:-1] or mask.dtype != torch.bool:
+            raise ValueError(f"{key!r} must be bool {[*state.shape[:-1], 1]}, got {mask.dtype} {list(mask.shape)}")
+        return mask
 
     def _reconstruction(self, state: Tensor, lifted: Tensor) -> Tensor:
         target = self.network.normalize_state(state)
@@ -102,9 +131,12 @@ class _KoopmanLoss(LossModule):
         error = (predicted - lifted[..., span.start + 1 : span.stop + 1, :]).square().mean(-1)
         return self._reduce(error, recorded[..., span.start : span.stop])
 
-    def _action(self, tensordict: TensorDictBase, latent: Tensor, span: range) -> Tensor:
-        action = tensordict.get(self.tensor_keys.action)[..., span.start : span.stop, :]
-        labelled = tensordict.get(self.tensor_keys.has_action).squeeze(-1)[..., span.start : span.stop]
+    def _action(
+        self, tensordict: TensorDictBase, state: Tensor, latent: Tensor, span: range, recorded: Tensor
+    ) -> Tensor:
+        action = self._read(tensordict, self.tensor_keys.action)[..., span.start : span.stop, :]
+        labelled = self._read_mask(tensordict, self.tensor_keys.has_action, state)[..., span.start : span.stop]
+        labelled = labelled & recorded[..., span.start : span.stop]
         # zeroed before the residual: masking afterwards would leave NaN in the gradient
         target = self.network.normalize_action(torch.where(labelled.unsqueeze(-1), action, 0.0))
         error = (self.network.action_decoder.linear(latent) - target).square().mean(-1)
@@ -150,7 +182,9 @@ class KoopmanReconstructionLoss(_KoopmanLoss):
 
 
 class KoopmanDynamicsLoss(_KoopmanLoss):
-    """One-step error of the linear latent dynamics, ``loss_koopman``, over the frames that count (:meth:`LatentActionModule.span`).
+    """One-step error of the linear latent dynamics, ``loss_koopman``, over the frames that count.
+
+    Which frames count: :meth:`LatentActionModule.span`.
 
     Args:
         network (KoopmanInverseDynamics): the model.
@@ -173,6 +207,8 @@ class KoopmanDynamicsLoss(_KoopmanLoss):
 class LatentActionLoss(_KoopmanLoss):
     """Error of the decoded actions, ``loss_action``, over the labelled frames that count.
 
+    A batch without labels gives exactly 0, and exactly zero gradients.
+
     Args:
         network (KoopmanInverseDynamics): the model.
 
@@ -186,9 +222,9 @@ class LatentActionLoss(_KoopmanLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Computes the loss from ``state``, ``action`` and ``has_action``."""
-        state, _ = self._inputs(tensordict)
+        state, recorded = self._inputs(tensordict)
         with self.network_params.to_module(self.network, preserve_module_state=False):
-            loss = self._action(tensordict, *self._latent(state))
+            loss = self._action(tensordict, state, *self._latent(state), recorded)
         return TensorDict({"loss_action": loss})
 
 
@@ -242,6 +278,6 @@ class KOAPLoss(_KoopmanLoss):
             losses = {
                 "loss_reconstruction": self._reconstruction(state, lifted),
                 "loss_koopman": self.koopman_coeff * self._dynamics(lifted, latent, span, recorded),
-                "loss_action": self.action_coeff * self._action(tensordict, latent, span),
+                "loss_action": self.action_coeff * self._action(tensordict, state, latent, span, recorded),
             }
         return TensorDict(losses)
