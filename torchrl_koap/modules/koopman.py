@@ -121,7 +121,8 @@ class KoopmanOperator(TensorDictModuleBase):
         out_key (NestedKey): predicted next lifted state ``[*B, T, m]``.
 
     Raises:
-        ValueError: for an unknown structure or init, or a ``latent_dim`` that ``block_dim`` does not divide.
+        ValueError: for an unknown structure or init, a ``latent_dim`` that ``block_dim`` does not divide, or a
+            bound that is not positive.
 
     Examples:
         >>> import torch
@@ -146,6 +147,10 @@ class KoopmanOperator(TensorDictModuleBase):
         super().__init__()
         lookup(STRUCTURES, structure, "operator structure")
         lookup(INITS, init, "operator init")
+        if max_spectral_radius is not None and not max_spectral_radius > 0:
+            raise ValueError(f"max_spectral_radius must be positive, got {max_spectral_radius}")
+        if block_dim < 1:
+            raise ValueError(f"block_dim must be at least 1, got {block_dim}")
         if structure == "block_diagonal" and latent_dim % block_dim:
             raise ValueError(f"latent_dim {latent_dim} is not a multiple of block_dim {block_dim}")
         self.in_keys, self.out_keys = list(in_keys), [out_key]
