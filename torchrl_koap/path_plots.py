@@ -1,0 +1,326 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Pictures of paths over the scene from above: rollouts, plans against execution, demonstrations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+
+from torchrl_koap.plot_scenes import FAINT, INK, MUTED, draw_scene, mode_choices, mode_colors, mode_name, set_title
+from torchrl_koap.plots import BLUE, as_array, save_figure
+
+TIMEOUT, SUCCESS, COLLISION = 0, 1, 2
+OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision"}
+FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X"}
+NO_MODE = "#8a919c"
+
+
+def executed_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
+    """Positions of each episode, without the padding.
+
+    Args:
+        rollouts (mapping): ``position`` [E, T, 2] (m) and ``length`` [E].
+
+    Returns:
+        list: an array [length, 2] per episode.
+
+    Raises:
+        ValueError: if an entry is missing or has a wrong shape.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.path_plots import executed_paths
+        >>> [len(path) for path in executed_paths({"position": torch.zeros(2, 9, 2), "length": torch.tensor([4, 9])})]
+        [4, 9]
+    """
+    position = as_array("position", _entry(rollouts, "position"), [None, None, 2])
+    length = as_array("length", _entry(rollouts, "length"), [len(position)])
+    paths = [row[: max(int(number), 0)] for row, number in zip(position, length, strict=True)]
+    return [path[np.isfinite(path).all(1)] for path in paths]
+
+
+def plot_rollouts(
+    rollouts: Mapping[str, Any], path: str | Path, *, task: str | None = "avoiding", num_modes: int | None = None
+) -> Path:
+    """Executed paths over the scene, coloured by mode; failures are black and marked where they end.
+
+    Args:
+        rollouts (mapping): ``position`` [E, T, 2] (m, NaN after the end), ``length`` [E], ``mode`` [E] (-1 none),
+            ``outcome`` [E] (0 out of time, 1 success, 2 collision).
+        path (str or Path): png to write.
+        task (str, optional): task whose scene and modes are drawn.
+        num_modes (int, optional): number of modes, needed where the task names no choices.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from torchrl_koap.path_plots import plot_rollouts
+        >>> one = {"position": torch.rand(1, 9, 2), "length": [9], "mode": [3], "outcome": [1]}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_rollouts(one, f"{folder}/rollouts.png").name
+        'rollouts.png'
+    """
+    paths, mode, outcome = _read(rollouts)
+    choices, colors = mode_choices(task, num_modes), mode_colors(task, num_modes)
+    figure = Figure(figsize=(8.4, 5.9), layout="constrained")
+    axes, side = figure.subplots(1, 2, width_ratios=(2.15, 1))
+    draw_scene(axes, task)
+    good = outcome == SUCCESS
+    axes.add_collection(
+        LineCollection(
+            [paths[index] for index in np.flatnonzero(good)],
+            colors=[_color(mode[index], colors) for index in np.flatnonzero(good)],
+            linewidths=1.1,
+            alpha=0.85,
+            zorder=2,
+        )
+    )
+    for index in np.flatnonzero(~good):
+        _draw_failure(axes, paths[index], outcome[index])
+    if task is None:
+        axes.autoscale()
+    counts = [f"{int(good.sum())} of {len(good)} rollouts succeed"]
+    counts += [f"{OUTCOMES[kind]}: {int((outcome == kind).sum())}" for kind in FAILURE_MARKS if (outcome == kind).any()]
+    set_title(axes, ", ".join(counts))
+    _draw_mode_table(side, mode[good], choices, colors)
+    marks = [
+        Line2D([], [], color=INK, linewidth=1.2, marker=mark, markersize=7, label=OUTCOMES[kind])
+        for kind, mark in FAILURE_MARKS.items()
+        if (outcome == kind).any()
+    ]
+    if marks:
+        below = {"bbox_to_anchor": (side.get_xlim()[0], side.dataLim.y0 - 0.2), "bbox_transform": side.transData}
+        side.legend(handles=marks, frameon=False, fontsize=8.5, loc="upper left", **below)
+    return save_figure(figure, path)
+
+
+def plot_plans(
+    rollouts: Mapping[str, Any],
+    path: str | Path,
+    *,
+    task: str | None = "avoiding",
+    num_modes: int | None = None,
+    episodes: Sequence[int] | None = None,
+    count: int = 6,
+) -> Path:
+    """Every plan of a few episodes over the path that was executed.
+
+    Args:
+        rollouts (mapping): the entries of :func:`plot_rollouts`, ``plan`` [E, P, H, 2] (m, NaN padded) and
+            ``plan_step`` [E, P], the control step at which each plan was made (-1 padding).
+        path (str or Path): png to write.
+        task (str, optional): task whose scene and modes are drawn.
+        num_modes (int, optional): number of modes, needed where the task names no choices.
+        episodes (sequence of int, optional): episodes to draw. Default: up to two failures, then successes of as many
+            different modes as possible.
+        count (int): number of episodes drawn by default.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from torchrl_koap.path_plots import plot_plans
+        >>> one = {"position": torch.rand(1, 9, 2), "length": [9], "mode": [3], "outcome": [1]}
+        >>> one |= {"plan": torch.rand(1, 2, 14, 2), "plan_step": torch.tensor([[0, 4]])}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_plans(one, f"{folder}/plans.png").name
+        'plans.png'
+    """
+    paths, mode, outcome = _read(rollouts)
+    plan = as_array("plan", _entry(rollouts, "plan"), [len(paths), None, None, 2])
+    plan_step = as_array("plan_step", _entry(rollouts, "plan_step"), plan.shape[:2])
+    colors = mode_colors(task, num_modes)
+    if episodes is None:
+        episodes = choose_episodes(mode, outcome, count)
+    wrong = [index for index in episodes if not 0 <= index < len(paths)]
+    if wrong:
+        raise ValueError(f"episodes must be 0 to {len(paths) - 1}, got {wrong[0]}")
+    across = min(len(episodes), 3)
+    down = math.ceil(len(episodes) / max(across, 1))
+    figure = Figure(figsize=(3.5 * across + 0.3, 4.25 * down + 0.3), layout="constrained")
+    for place, index in enumerate(episodes):
+        axes = draw_scene(figure.add_subplot(down, across, place + 1), task)
+        color = INK if outcome[index] != SUCCESS else _color(mode[index], colors)
+        axes.plot(*paths[index].T, color=color, linewidth=5, alpha=0.4, zorder=2, solid_capstyle="round")
+        made = [(plan[index, row], int(plan_step[index, row])) for row in np.flatnonzero(plan_step[index] >= 0)]
+        lines = [points[np.isfinite(points).all(1)] for points, _ in made]
+        axes.add_collection(LineCollection(lines, colors=[INK], linewidths=0.6, zorder=3))
+        starts = np.array([paths[index][step] for _, step in made if step < len(paths[index])]).reshape(-1, 2)
+        axes.scatter(*starts.T, s=5, color=INK, linewidths=0, zorder=4)
+        if outcome[index] in FAILURE_MARKS and len(paths[index]):
+            mark = FAILURE_MARKS[outcome[index]]
+            axes.scatter(*paths[index][-1], s=70, marker=mark, color=INK, edgecolors="white", linewidths=0.8, zorder=6)
+        if task is None:
+            axes.autoscale()
+        stray = plan_deviation(paths[index], lines)
+        what = mode_name(int(mode[index]), task, num_modes) if outcome[index] == SUCCESS else OUTCOMES[outcome[index]]
+        note = "no plan within the path"
+        if len(stray):
+            middle, most = 1e3 * np.quantile(stray, [0.5, 0.95])
+            note = f"off the path: median {middle:.1f}, 95 % within {most:.1f} mm"
+        set_title(axes, f"episode {index}: {what}\n{note}")
+        axes.label_outer()
+    return save_figure(figure, path)
+
+
+def choose_episodes(mode: Any, outcome: Any, count: int) -> list[int]:
+    """Up to two failures, then successes, a new mode each as long as there are any; modes spread over their range.
+
+    Examples:
+        >>> from torchrl_koap.path_plots import choose_episodes
+        >>> choose_episodes([0, 0, 5, 9, -1], [1, 1, 1, 1, 2], 4)
+        [4, 0, 2, 3]
+    """
+    mode, outcome = as_array("mode", mode, [None]), as_array("outcome", outcome, [None])
+    chosen = np.flatnonzero(outcome != SUCCESS)[: min(2, count)].tolist()
+    good = np.flatnonzero(outcome == SUCCESS)
+    firsts = [int(good[mode[good] == value][0]) for value in np.unique(mode[good])]
+    room = count - len(chosen)
+    if len(firsts) > room:
+        firsts = [firsts[int(index)] for index in np.linspace(0, len(firsts) - 1, max(room, 0)).round()]
+    rest = [int(index) for index in good if index not in firsts]
+    return chosen + (firsts + rest)[: max(room, 0)]
+
+
+def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:
+    """Distance of every planned point from the nearest point of the executed path, whatever the time (m).
+
+    Points planned beyond the path's end are left out: nothing was executed there.
+
+    Args:
+        path (np.ndarray): executed positions [L, 2].
+        plans (sequence): planned positions [H, 2] each.
+
+    Returns:
+        np.ndarray: distances, one per planned point that was reached.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.path_plots import plan_deviation
+        >>> path = np.stack([np.arange(5.0), np.zeros(5)], axis=1)
+        >>> plan_deviation(path, [np.array([[1.5, 0.25], [6.0, 0.0]])]).tolist()
+        [0.25]
+    """
+    points = np.concatenate([np.zeros((0, 2)), *plans])
+    if len(path) < 2 or not len(points):
+        return np.zeros(0)
+    start, along = path[:-1], np.diff(path, axis=0)
+    square = np.maximum(np.square(along).sum(1), 1e-18)
+    offset = points[:, None] - start  # [points, L-1, 2]
+    share = (offset * along).sum(-1) / square
+    distance = np.linalg.norm(offset - np.clip(share, 0, 1)[..., None] * along, axis=-1)
+    nearest = distance.argmin(1)
+    beyond = (nearest == len(along) - 1) & (share[:, -1] > 1)
+    return distance.min(1)[~beyond]
+
+
+def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, task: str | None = "avoiding") -> Path:
+    """Paths of the demonstrations; transitions with an action label are emphasised, the others grey.
+
+    Args:
+        demonstrations (mapping): ``state`` [N, 2] (m), ``episode`` [N], ``labelled`` [N].
+        path (str or Path): png to write.
+        task (str, optional): task whose scene is drawn.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from torchrl_koap.path_plots import plot_demonstrations
+        >>> data = {"state": torch.rand(6, 2), "episode": [0, 0, 0, 1, 1, 1], "labelled": [True] * 3 + [False] * 3}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_demonstrations(data, f"{folder}/demonstrations.png").name
+        'demonstrations.png'
+    """
+    state = as_array("state", _entry(demonstrations, "state"), [None, 2])
+    episode = as_array("episode", _entry(demonstrations, "episode"), [len(state)])
+    labelled = as_array("labelled", _entry(demonstrations, "labelled"), [len(state)]).astype(bool)
+    figure = Figure(figsize=(5.9, 6.4), layout="constrained")
+    axes = draw_scene(figure.add_subplot(), task)
+    borders = np.flatnonzero(np.diff(episode) != 0) + 1
+    paths = np.split(state, borders)
+    axes.add_collection(LineCollection(paths, colors="#9aa1ab", linewidths=0.7, alpha=0.8, zorder=2))
+    same = np.flatnonzero(labelled[:-1] & (episode[1:] == episode[:-1]))
+    segments = np.stack([state[same], state[same + 1]], axis=1)
+    axes.add_collection(LineCollection(segments, colors=BLUE, linewidths=1.7, capstyle="round", zorder=3))
+    if task is None:
+        axes.autoscale()
+    touched = len(np.unique(episode[labelled]))
+    share = f"{labelled.mean():.1%}" if len(labelled) else "none"
+    head = f"{len(paths)} demonstrations; labels on {int(labelled.sum()):,} of {len(labelled):,} transitions ({share})"
+    set_title(axes, f"{head}\nin {touched} of {len(paths)} demonstrations")
+    handles = [
+        Line2D([], [], color=BLUE, linewidth=1.7, label="with action label"),
+        Line2D([], [], color="#9aa1ab", linewidth=0.9, label="states only"),
+    ]
+    axes.legend(handles=handles, fontsize=8.5, loc="lower right", frameon=False)
+    return save_figure(figure, path)
+
+
+def _draw_failure(axes: Axes, path: np.ndarray, outcome: int) -> None:
+    axes.plot(*path.T, color=INK, linewidth=1.2, zorder=4)
+    if len(path):
+        mark = FAILURE_MARKS.get(int(outcome), "D")
+        axes.scatter(*path[-1], s=75, marker=mark, color=INK, edgecolors="white", linewidths=0.9, zorder=5)
+
+
+def _draw_mode_table(axes: Axes, mode: np.ndarray, choices: tuple, colors: np.ndarray) -> None:
+    """A cell per mode in its colour, with the number of rollouts; columns are the last choice."""
+    across = len(choices[-1][1])
+    down = len(colors) // across
+    if len(choices) == 1:  # no structure: a compact grid
+        across = min(across, 6)
+        down = math.ceil(len(colors) / across)
+    counts = np.bincount(mode[(mode >= 0) & (mode < len(colors))].astype(int), minlength=len(colors))
+    top = 1.0
+    for index, color in enumerate(colors):
+        row, column = divmod(index, across)
+        used = counts[index] > 0
+        style = {"facecolor": color, "edgecolor": "white"} if used else {"facecolor": "none", "edgecolor": FAINT}
+        axes.add_patch(Rectangle((column, top - row - 1), 0.92, 0.9, linewidth=0.8, **style))
+        text = str(counts[index]) if used else "0"
+        shade = "white" if used else FAINT
+        axes.text(column + 0.46, top - row - 0.56, text, ha="center", va="center", size=9, color=shade)
+    label = {"size": 8, "color": MUTED}
+    if len(choices) > 1:
+        for column, name in enumerate(choices[-1][1]):
+            axes.text(column + 0.46, top + 0.12, name.split()[-1], ha="center", va="bottom", **label)
+        axes.text(0, top + 0.62, f"{choices[-1][0]}: gap from left to right", ha="left", va="bottom", **label)
+        for row in range(down):
+            words, rest = [], row
+            for _, names in reversed(choices[:-1]):
+                rest, digit = divmod(rest, len(names))
+                words.append(names[digit])
+            axes.text(-0.15, top - row - 0.56, " / ".join(reversed(words)), ha="right", va="center", **label)
+        heads = " / ".join(name for name, _ in choices[:-1])
+        axes.text(-0.15, top + 0.12, heads, ha="right", va="bottom", **label)
+    axes.set_xlim(-2.1 if len(choices) > 1 else -0.1, across + 0.1)
+    axes.set_ylim(top - down - 4, top + 1.6)
+    axes.set_aspect("equal")
+    axes.set_anchor("NW")
+    axes.set_axis_off()
+    set_title(axes, "successes by mode")
+
+
+def _read(rollouts: Mapping[str, Any]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    paths = executed_paths(rollouts)
+    mode = as_array("mode", _entry(rollouts, "mode"), [len(paths)]).astype(int)
+    outcome = as_array("outcome", _entry(rollouts, "outcome"), [len(paths)]).astype(int)
+    return paths, mode, outcome
+
+
+def _entry(data: Mapping[str, Any], key: str) -> Any:
+    if key not in data:
+        raise ValueError(f"missing entry {key!r}; got {', '.join(sorted(map(str, data))) or 'nothing'}")
+    return data[key]
+
+
+def _color(mode: int, colors: np.ndarray) -> Any:
+    return colors[mode] if 0 <= mode < len(colors) else NO_MODE
