@@ -1,0 +1,259 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What every loss module must do, as a base class: ``class TestMyLoss(LossTestBase)`` inherits the tests.
+
+A subclass says how to build its loss and a batch, and what the defaults are. Batches must hold everything random
+(noise, times), so that a loss is a function of its input.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+
+class LossTestBase:
+    """Tests of a loss module; override the two makers and the facts below them."""
+
+    default_keys: dict = {}  # name in set_keys -> default entry
+    in_names: tuple = ()  # names (as in set_keys) of the entries that must be there, in the order of in_keys
+    out_keys: tuple = ()
+    coefficients: dict = {}  # coefficient -> the loss that it scales
+    still: tuple = ()  # ends of the names of parameters that a reset sets to a constant
+    learning_rate = 3e-3
+    decrease = 0.7  # of the first value, after 60 steps of Adam
+
+    def make_loss(self, seed: int = 0, **options):
+        """The loss, the same for the same seed."""
+        raise NotImplementedError
+
+    def make_batch(self, *batch: int, dtype: torch.dtype = torch.float32) -> TensorDict:
+        """A batch of that shape, always the same."""
+        raise NotImplementedError
+
+    def counted(self, batch: TensorDict, key: str, elements: torch.Tensor) -> int:
+        """How many elements the mean of a loss is taken over."""
+        return elements.numel()
+
+    def entry(self, name: str):
+        return self.default_keys[name]
+
+    def total(self, result) -> torch.Tensor:
+        return sum(value.sum() for key, value in result.items() if key.startswith("loss_"))
+
+    def assert_same(self, left, right, **tolerance) -> None:
+        assert set(left.keys()) == set(right.keys())
+        for key, value in left.items():
+            if tolerance:
+                torch.testing.assert_close(value, right[key], **tolerance)
+            else:
+                assert torch.equal(value, right[key]), key
+
+    # keys
+
+    def test_unknown_key_is_refused(self):
+        with pytest.raises(ValueError, match="not an accepted tensordict key"):
+            self.make_loss().set_keys(nonsense="x")
+
+    def test_default_keys(self):
+        loss = self.make_loss()
+        accepted = {name: getattr(loss.tensor_keys, name) for name in loss._AcceptedKeys.__dataclass_fields__}
+        assert accepted == self.default_keys
+        assert list(loss.in_keys) == [self.entry(name) for name in self.in_names]
+        assert list(loss.out_keys) == list(self.out_keys)
+
+    @pytest.mark.parametrize("nested", [False, True])
+    def test_keys_are_renamed_one_by_one_and_back(self, nested):
+        loss, batch = self.make_loss(), self.make_batch(4)
+        expected = loss(batch)
+        for name, old in self.default_keys.items():
+            new = ("some", "where", name) if nested else f"renamed_{name}"
+            renamed = batch.clone()
+            if old in renamed.keys(True):
+                renamed.rename_key_(old, new)
+            loss.set_keys(**{name: new})
+            assert getattr(loss.tensor_keys, name) == new
+            assert list(loss.in_keys) == [new if other == name else self.entry(other) for other in self.in_names]
+            self.assert_same(loss(renamed), expected)
+            if name in self.in_names:
+                with pytest.raises(KeyError, match=name):
+                    loss(batch)
+            loss.set_keys(**{name: None})
+            assert getattr(loss.tensor_keys, name) == old
+        self.assert_same(loss(batch), expected)
+
+    def test_all_keys_are_renamed_at_once(self):
+        loss, batch = self.make_loss(), self.make_batch(4)
+        expected = loss(batch)
+        names = {name: ("nest", name) for name in self.default_keys}
+        loss.set_keys(**names)
+        renamed = TensorDict(batch_size=batch.batch_size)
+        for name, old in self.default_keys.items():
+            if old in batch.keys(True):
+                renamed[names[name]] = batch[old]
+        self.assert_same(loss(renamed), expected)
+
+    def test_keys_of_one_loss_are_not_those_of_another(self):
+        loss, other = self.make_loss(), self.make_loss()
+        loss.set_keys(**dict.fromkeys(self.in_names, "elsewhere"))
+        assert list(other.in_keys) == [self.entry(name) for name in self.in_names]
+
+    # input and output
+
+    def test_the_input_is_not_changed(self):
+        loss, batch = self.make_loss(), self.make_batch(4)
+        before = batch.clone()
+        loss(batch)
+        assert set(batch.keys(True)) == set(before.keys(True))
+        for key, value in before.items(True, True):
+            torch.testing.assert_close(batch[key], value, rtol=0, atol=0, equal_nan=True)
+
+    def test_it_returns_its_out_keys_and_they_have_gradients(self):
+        loss = self.make_loss()
+        result = loss(self.make_batch(4))
+        assert set(result.keys()) == set(self.out_keys)
+        for key in self.out_keys:
+            if key.startswith("loss_"):
+                assert result[key].shape == () and result[key].requires_grad and result[key] > 0, key
+        self.total(result).backward()
+        gradients = [p.grad for p in loss.parameters() if p.requires_grad and p.grad is not None]
+        assert gradients and all(gradient.isfinite().all() for gradient in gradients)
+
+    def test_keywords_give_what_a_tensordict_gives(self):
+        loss = self.make_loss()
+        batch = self.make_batch(4).select(*loss.in_keys)
+        torch.manual_seed(1)
+        expected = loss(batch)
+        torch.manual_seed(1)
+        values = loss(**{key: batch[key] for key in loss.in_keys})
+        values = values if isinstance(values, tuple) else (values,)
+        for key, value in zip(self.out_keys, values, strict=True):
+            assert torch.equal(value, expected[key])
+
+    def test_out_keys_can_be_selected(self):
+        loss = self.make_loss()
+        loss.select_out_keys(self.out_keys[-1])
+        assert list(loss(self.make_batch(4)).keys()) == [self.out_keys[-1]]
+
+    def test_a_missing_entry_is_named(self):
+        loss = self.make_loss()
+        for name in self.in_names:
+            with pytest.raises(KeyError, match=f"{name}.*there are"):
+                loss(self.make_batch(4).exclude(self.entry(name)))
+
+    # reductions and shapes
+
+    def test_reductions_agree(self):
+        batch = self.make_batch(5)
+        elements = self.make_loss(reduction="none")(batch)
+        mean, total = self.make_loss(reduction="mean")(batch), self.make_loss(reduction="sum")(batch)
+        for key in self.out_keys:
+            if key.startswith("loss_"):
+                assert elements[key].shape[0] == 5
+                torch.testing.assert_close(total[key], elements[key].sum())
+                torch.testing.assert_close(mean[key], elements[key].sum() / self.counted(batch, key, elements[key]))
+        self.assert_same(self.make_loss()(batch), mean)  # the default
+        with pytest.raises(ValueError, match="reduction must be"):
+            self.make_loss(reduction="median")
+
+    def test_extra_and_absent_batch_dimensions(self):
+        batch = self.make_batch(2, 3, 2)
+        nested, flat = (self.make_loss(reduction="none")(data) for data in (batch, batch.reshape(-1)))
+        single = self.make_loss(reduction="none")(batch[1, 2, 0])
+        for key in self.out_keys:
+            if key.startswith("loss_"):
+                assert nested[key].shape[:3] == (2, 3, 2)
+                torch.testing.assert_close(nested[key].flatten(0, 2), flat[key])
+                torch.testing.assert_close(nested[key][1, 2, 0], single[key])
+
+    def test_an_empty_batch_gives_zero(self):
+        loss = self.make_loss(reduction="sum")
+        assert self.total(loss(self.make_batch(2)[:0])) == 0
+
+    def test_float64(self):
+        single = self.make_loss()(self.make_batch(4))
+        double = self.make_loss().double()(self.make_batch(4, dtype=torch.float64))
+        for key, value in double.items():
+            assert value.dtype == torch.float64
+            torch.testing.assert_close(value.float(), single[key], rtol=1e-3, atol=1e-5)
+
+    # training
+
+    def test_loss_decreases_on_a_fixed_batch(self):
+        loss, batch = self.make_loss(), self.make_batch(16)
+        optimizer = torch.optim.Adam(loss.parameters(), lr=self.learning_rate)
+        values = []
+        for _ in range(60):
+            value = self.total(loss(batch))
+            optimizer.zero_grad()
+            value.backward()
+            optimizer.step()
+            values.append(float(value.detach()))
+        assert values[-1] < self.decrease * values[0], values[::10]
+
+    def test_coefficients_are_scheduled_in_place(self):
+        loss, batch = self.make_loss(), self.make_batch(4)
+        before = loss(batch)
+        assert set(loss._schedulable_buffers) == set(self.coefficients)
+        for name, key in self.coefficients.items():
+            assert name in inspect.signature(type(loss).__init__).parameters
+            buffer = getattr(loss, name)
+            setattr(loss, name, 0.25)
+            assert getattr(loss, name) is buffer and name in dict(loss.named_buffers())
+            scaled = loss(batch)
+            for other in self.out_keys:
+                torch.testing.assert_close(scaled[other], before[other] * (0.25 if other == key else 1.0))
+            setattr(loss, name, 1.0)
+            self.assert_same(self.make_loss(**{name: 0.25})(batch), scaled)
+
+    def test_reset_parameters_recursive(self):
+        loss, batch = self.make_loss(), self.make_batch(4)
+        before = {name: value.clone() for name, value in loss.named_parameters() if value.requires_grad}
+        identities = {name: id(value) for name, value in loss.named_parameters()}
+        loss.reset_parameters_recursive()
+        assert identities == {name: id(value) for name, value in loss.named_parameters()}
+        for name, value in loss.named_parameters():
+            if value.requires_grad and not name.endswith(self.still):
+                assert not torch.equal(value, before[name]), name
+        assert self.total(loss(batch)).isfinite()
+
+    # saving
+
+    def test_state_dict_round_trip(self):
+        loss, other, batch = self.make_loss(), self.make_loss(seed=1), self.make_batch(4)
+        expected = loss(batch)
+        assert any(not torch.equal(value, expected[key]) for key, value in other(batch).items())
+        other.load_state_dict(loss.state_dict())
+        self.assert_same(other(batch), expected)
+
+    def test_a_deep_copy_is_equal_and_independent(self):
+        loss, batch = self.make_loss(), self.make_batch(4)
+        expected = loss(batch)
+        copied = copy.deepcopy(loss)
+        self.assert_same(copied(batch), expected)
+        optimizer = torch.optim.SGD(copied.parameters(), lr=0.1)
+        self.total(copied(batch)).backward()
+        optimizer.step()
+        assert any(not torch.equal(value, expected[key]) for key, value in copied(batch).items())
+        self.assert_same(loss(batch), expected)
+
+    # compilation
+
+    def test_compiled_equals_eager(self):
+        torch._dynamo.reset()  # TorchRL wraps every loss in one function: their graphs share its recompilation limit
+        loss, batch = self.make_loss(), self.make_batch(4)
+        compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+        self.total(loss(batch)).backward()
+        eager = {name: value.grad.clone() for name, value in loss.named_parameters() if value.grad is not None}
+        loss.zero_grad()
+        result = compiled(batch)
+        self.assert_same(result, loss(batch), rtol=1e-5, atol=1e-6)
+        self.total(result).backward()
+        for name, gradient in eager.items():
+            torch.testing.assert_close(loss.get_parameter(name).grad, gradient, rtol=1e-4, atol=1e-6)
+        for name in self.coefficients:  # a scheduled coefficient reaches the compiled graph
+            setattr(loss, name, 0.5)
+        self.assert_same(compiled(batch), loss(batch), rtol=1e-5, atol=1e-6)
