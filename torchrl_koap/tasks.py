@@ -20,6 +20,7 @@ class Task:
         observation (dict): slice of the observation per part, in the order of the columns.
         command (str): the part that repeats the last command. Its differences *are* the actions, so it is never
             shown to planner or controller.
+        position (str): the part that pictures draw, ``x, y`` first.
         action_dim (int): number of action columns.
         max_steps (int): control steps after which an episode is truncated.
         control_hz (float): control steps per second.
@@ -30,6 +31,7 @@ class Task:
     name: str
     observation: dict[str, slice]
     command: str
+    position: str
     action_dim: int
     max_steps: int
     control_hz: float
@@ -58,6 +60,7 @@ TASKS = {
         name="avoiding",
         observation={"desired_xy": slice(0, 2), "measured_xy": slice(2, 4)},
         command="desired_xy",
+        position="measured_xy",
         action_dim=2,
         max_steps=250,
         control_hz=1 / 0.035,

@@ -1,6 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Demonstrations: reading, storing, hiding labels, normalising, cutting into windows."""
 
+from torchrl_koap.data.augmentation import RecoveryAugmentation, extrapolate_ends
 from torchrl_koap.data.conversion import CONVERTERS, Converter, RawFolderError, convert_raw_files, find_raw_files
 from torchrl_koap.data.d3il import D3ILExperienceReplay
 from torchrl_koap.data.labels import LabelBudget, LabelReport, hide_commands
@@ -10,7 +11,7 @@ from torchrl_koap.data.saving import replacing_file, replacing_folder
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state, trajectory_lengths
 from torchrl_koap.data.unpickling import DamagedPickleError, UnsafePickleError, load_pickle, loads_pickle
-from torchrl_koap.data.window_buffer import make_window_buffer
+from torchrl_koap.data.window_buffer import cut_windows, make_window_buffer
 from torchrl_koap.data.window_table import WindowTable
 from torchrl_koap.data.windows import WindowSampler, WindowSamplerWithoutReplacement, WindowUnit
 
@@ -26,12 +27,15 @@ __all__ = [
     "RawEpisode",
     "RawEpisodeError",
     "RawFolderError",
+    "RecoveryAugmentation",
     "UnsafePickleError",
     "WindowSampler",
     "WindowSamplerWithoutReplacement",
     "WindowTable",
     "WindowUnit",
     "convert_raw_files",
+    "cut_windows",
+    "extrapolate_ends",
     "find_raw_files",
     "flatten_trajectories",
     "hide_commands",

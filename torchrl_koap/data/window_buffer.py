@@ -86,3 +86,35 @@ def make_window_buffer(
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
     )
+
+
+def cut_windows(
+    data: TensorDictBase, window: int, *, select: Sequence[NestedKey] | None = None, pad_before: int = 0
+) -> TensorDictBase:
+    """All windows of flat data at once.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` with ``episode``.
+        window (int): frames per window.
+        select (sequence of keys, optional): the entries to return. Default: all.
+        pad_before (int): frames by which a window may begin before its trajectory; they repeat its first frame.
+
+    Returns:
+        TensorDictBase: ``[M, window]`` in the order of the data, with ``padded`` ``[M, window, 1]``.
+
+    Raises:
+        ValueError: if a trajectory is too short for a window.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import cut_windows
+        >>> data = TensorDict({"state": torch.arange(4.0)[:, None], "episode": torch.zeros(4, dtype=torch.int64)}, [4])
+        >>> cut_windows(data, 3, pad_before=1)["state"].squeeze(-1).tolist()
+        [[0.0, 0.0, 1.0], [0.0, 1.0, 2.0], [1.0, 2.0, 3.0]]
+    """
+    table = WindowTable.build(data, window, pad_before=pad_before)
+    frames = table.starts[:, None] + torch.arange(window, device=table.starts.device)
+    inside = frames.clamp(table.first[:, None], table.last[:, None])
+    windows = (data if select is None else data.select(*select))[inside]
+    return windows.set("padded", (frames != inside).unsqueeze(-1))

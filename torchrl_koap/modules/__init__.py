@@ -2,6 +2,7 @@
 """Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
 
 from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.controllers import LinearInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.denoisers import MLPDenoiser, TransformerDenoiser
 from torchrl_koap.modules.diffusion import NoiseSchedule
 from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
@@ -28,11 +29,13 @@ __all__ = [
     "LatentActionMLP",
     "LatentActionModule",
     "LinearActionDecoder",
+    "LinearInverseDynamics",
     "MLPDenoiser",
     "NoiseSchedule",
     "PlanThenControl",
     "RidgeFit",
     "StatePlanner",
+    "SupervisedInverseDynamics",
     "TemporalUnet",
     "TransformerDenoiser",
     "make_koopman_inverse_dynamics",

@@ -1,6 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Loss modules."""
 
+from torchrl_koap.objectives.controllers import InverseDynamicsLoss
 from torchrl_koap.objectives.koopman import (
     KOAPLoss,
     KoopmanDynamicsLoss,
@@ -9,4 +10,11 @@ from torchrl_koap.objectives.koopman import (
 )
 from torchrl_koap.objectives.planner import PlannerLoss
 
-__all__ = ["KOAPLoss", "KoopmanDynamicsLoss", "KoopmanReconstructionLoss", "LatentActionLoss", "PlannerLoss"]
+__all__ = [
+    "InverseDynamicsLoss",
+    "KOAPLoss",
+    "KoopmanDynamicsLoss",
+    "KoopmanReconstructionLoss",
+    "LatentActionLoss",
+    "PlannerLoss",
+]

@@ -1,0 +1,77 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What is measured about a finished controller with labels outside its budget: for analysis only, and counted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_koap.checkpoints import save_tensors
+from torchrl_koap.closed_form import fit_closed_form
+from torchrl_koap.data import cut_windows
+from torchrl_koap.modules import LinearInverseDynamics
+from torchrl_koap.run_directory import RunDirectory
+from torchrl_koap.tasks import Task
+
+# frames of the evaluation windows: enough history and look-ahead for every controller compared
+BEFORE, AFTER = 4, 11
+
+
+@torch.no_grad()
+def hidden_action_errors(
+    controller: nn.Module, data: TensorDictBase, labelled: TensorDictBase
+) -> tuple[Tensor, Tensor]:
+    """Predicted and true actions on the trajectories of which no label was in the budget.
+
+    The first action decoded from a window of recorded states, ``BEFORE`` frames of history (the first frame of a
+    trajectory repeated where there is none) and ``AFTER`` frames of future: the same steps for every controller.
+
+    Args:
+        controller (nn.Module): writes actions ``[*B, T, act]`` for windows of states ``[*B, T, d]``.
+        data (TensorDictBase): flat, fully labelled.
+        labelled (TensorDictBase): the same after the budget was applied.
+
+    Returns:
+        tuple of Tensor: both ``[N, act]``, raw units; ``N = 0`` if every trajectory has a label.
+    """
+    touched = labelled["episode"][labelled["has_action"].squeeze(-1)].unique()
+    windows = cut_windows(data, BEFORE + 1 + AFTER, select=["state", "action", "episode"], pad_before=BEFORE)
+    windows = windows[~torch.isin(windows["episode"][:, -1], touched.to(windows["episode"].device))]
+    device = next(iter(controller.state_dict().values())).device
+    states = windows["state"][:, BEFORE - min(controller.history, BEFORE) :].to(device)
+    predicted = controller(TensorDict({"state": states}, batch_size=[len(states)]))["action"]
+    return predicted[:, min(controller.history, BEFORE)].cpu(), windows["action"][:, BEFORE]
+
+
+def rmse_mm(predicted: Tensor, true: Tensor) -> float:
+    """Root of the mean squared error over steps and axes, m to mm."""
+    return (predicted - true).square().mean().sqrt().item() * 1e3
+
+
+def write_analysis(
+    run: RunDirectory, task: Task, data: TensorDictBase, labelled: TensorDictBase, controller: nn.Module
+) -> dict[str, Any]:
+    """Action error of the controller, and of a ridge on raw frames with the same labels, on hidden trajectories.
+
+    Writes ``actions.safetensors`` and ``demonstrations.safetensors`` for the report.
+    """
+    labelled = labelled.cpu()
+    predicted, true = hidden_action_errors(controller, data, labelled)
+    has_action = labelled["has_action"].squeeze(-1)
+    save_tensors(
+        run.path / "demonstrations.safetensors",
+        {"state": data["state"], "episode": data["episode"], "labelled": has_action},
+    )
+    if not len(true):
+        return {"note": "every trajectory has a label in the budget: there is nothing to measure on"}
+    save_tensors(run.path / "actions.safetensors", {"predicted": predicted, "true": true})
+    ridge = LinearInverseDynamics(data["state"].shape[-1], task.action_dim).to(data["state"].dtype)
+    fit_closed_form(ridge, labelled)
+    return {
+        "controller": rmse_mm(predicted, true),
+        "ridge": rmse_mm(*hidden_action_errors(ridge, data, labelled)),
+        "analysis_labels_read": len(true),
+    }

@@ -1,0 +1,168 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Builds data, planner and controllers from the plain options that a run directory keeps in ``config.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+
+from torchrl_koap.data import D3ILExperienceReplay, Normalizer, load_ted, select_state
+from torchrl_koap.demonstrations import record_demonstrations
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import (
+    LinearInverseDynamics,
+    MLPDenoiser,
+    NoiseSchedule,
+    StatePlanner,
+    SupervisedInverseDynamics,
+    TemporalUnet,
+    TransformerDenoiser,
+    make_koopman_inverse_dynamics,
+)
+from torchrl_koap.tasks import Task
+
+# what every preset was designed with: how states and actions are normalised
+NORMALIZATION = {
+    "default": {"state": "standard", "action": "rms"},
+    "paper": {"state": "minmax", "action": "minmax"},
+    "released": {"state": "minmax", "action": "minmax"},
+}
+
+
+def load_demonstrations(
+    dataset: str, task: Task, *, episodes: int = 96, seed: int = 0, progress: Callable[[int, int], None] | None = None
+) -> TensorDictBase:
+    """Fully labelled demonstrations, flat, with the columns that a policy may see as ``state``.
+
+    Args:
+        dataset (str): ``"scripted"``, or a folder: of D3IL's raw pickles, or written by ``koap demos``.
+        task (Task): the task.
+        episodes (int): number of scripted demonstrations to record.
+        seed (int): seed of the scripted demonstrations.
+        progress (callable, optional): called with recorded and wanted scripted demonstrations.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or it holds no demonstrations.
+    """
+    if dataset == "scripted":
+        data, _ = record_demonstrations(task.name, episodes=episodes, seed=seed, progress=progress)
+    elif not Path(dataset).is_dir():
+        raise FileNotFoundError(f"dataset {dataset!r} is neither 'scripted' nor a folder")
+    elif (Path(dataset) / "ted").is_dir():
+        data = load_ted(Path(dataset) / "ted", task=task.name, memmap=False)
+    else:
+        data = D3ILExperienceReplay(task.name, dataset).data.clone()
+    return select_state(data, task.state_columns)
+
+
+def _unet(state_dim: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    return TemporalUnet(state_dim, condition_dim, channels=tuple(options["channels"]))
+
+
+def _mlp(state_dim: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    return MLPDenoiser(state_dim, condition_dim, horizon=options["horizon"])
+
+
+def _transformer(state_dim: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    return TransformerDenoiser(state_dim, condition_dim)
+
+
+def _released(state_dim: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    return TemporalUnet.released(state_dim, condition_dim)
+
+
+DENOISERS = {"unet": _unet, "mlp": _mlp, "transformer": _transformer, "released": _released}
+
+
+def build_planner(options: Mapping[str, Any], state_dim: int) -> StatePlanner:
+    """A planner without statistics (:meth:`StatePlanner.fit_normalizers`, or weights, bring them).
+
+    Args:
+        options (mapping): the ``planner`` entry of ``config.json``: denoiser, channels, schedule, prediction, history,
+            horizon, relative, solver, solver_steps, clip.
+        state_dim (int): number of state columns.
+
+    Raises:
+        ValueError: for an unknown denoiser, schedule, prediction or solver.
+    """
+    denoiser = lookup(DENOISERS, options["denoiser"], "denoiser")
+    return StatePlanner(
+        denoiser(state_dim, options["history"] * state_dim, options),
+        NoiseSchedule(options["schedule"], options["prediction"]),
+        state_dim=state_dim,
+        history=options["history"],
+        horizon=options["horizon"],
+        relative=options["relative"],
+        solver=options["solver"],
+        num_steps=options["solver_steps"],
+        clip=options["clip"],
+    )
+
+
+def _koap(state_dim, action_dim, state_normalizer, action_normalizer, options):
+    return make_koopman_inverse_dynamics(
+        state_dim,
+        action_dim,
+        preset=options["preset"],
+        state_normalizer=state_normalizer,
+        action_normalizer=action_normalizer,
+    )
+
+
+def _linear(state_dim, action_dim, state_normalizer, action_normalizer, options):
+    return LinearInverseDynamics(state_dim, action_dim)
+
+
+def _supervised(state_dim, action_dim, state_normalizer, action_normalizer, options):
+    return SupervisedInverseDynamics(
+        state_dim, action_dim, state_normalizer=state_normalizer, action_normalizer=action_normalizer
+    )
+
+
+METHODS = {"koap": _koap, "linear": _linear, "supervised": _supervised}
+
+
+def build_controller(
+    options: Mapping[str, Any], state_dim: int, action_dim: int, labelled: TensorDictBase | None = None
+) -> nn.Module:
+    """A controller, with statistics of the data if these are given, else without (weights bring them).
+
+    Args:
+        options (mapping): the ``controller`` entry of ``config.json``: method and preset.
+        state_dim (int): number of state columns.
+        action_dim (int): number of action columns.
+        labelled (TensorDictBase, optional): flat data after the label budget was applied. State statistics come from
+            all of it, action statistics from the labelled steps alone.
+
+    Raises:
+        ValueError: for an unknown method or preset.
+    """
+    make = lookup(METHODS, options["method"], "method")
+    modes = lookup(NORMALIZATION, options["preset"], "preset")
+    if labelled is None:
+        state_normalizer, action_normalizer = Normalizer(), Normalizer()
+    else:
+        state_normalizer = Normalizer.fit(labelled["state"], mode=modes["state"])
+        action_normalizer = Normalizer.fit(labelled["action"], mode=modes["action"], mask=labelled["has_action"])
+    return make(state_dim, action_dim, state_normalizer, action_normalizer, options)
+
+
+def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
+    """A function that makes an environment of the task with a given number of parallel episodes."""
+    from torchrl_koap.envs import AvoidingEnv  # the simulator is not needed to train from recorded data
+
+    makers = {"avoiding": AvoidingEnv}
+    return partial(lookup(makers, task.name, "task with an environment"), num_threads=num_threads)
+
+
+def mode_index_of(task: Task) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The function that turns a task's mode flags into a number."""
+    from torchrl_koap.envs import mode_index
+
+    return lookup({"avoiding": mode_index}, task.name, "task with an environment")

@@ -1,0 +1,65 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The command line ``koap``: sub-commands are dataclasses, their fields are the options."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import tyro
+
+from torchrl_koap.commands.demos import Demos, run_demos
+from torchrl_koap.commands.doctor import Doctor, Validate, run_doctor, run_validate
+from torchrl_koap.commands.eval import Eval, run_eval
+from torchrl_koap.commands.train import Train, run_train
+
+RUNNERS = {Demos: run_demos, Train: run_train, Eval: run_eval, Doctor: run_doctor, Validate: run_validate}
+# errors that speak for themselves; anything else is a fault of ours and keeps its traceback
+EXPECTED = (ValueError, FileNotFoundError, FileExistsError, RuntimeError, KeyError, OSError)
+
+Command = (
+    Annotated[Demos, tyro.conf.subcommand("demos")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[Validate, tyro.conf.subcommand("validate")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a sub-command; returns the exit status, 2 for a wrong call and 1 for a job that could not be done."""
+    options = tyro.cli(Command, args=arguments, prog="koap")
+    try:
+        result = RUNNERS[type(options)](options)
+    except EXPECTED as error:
+        if os.environ.get("KOAP_TRACEBACK"):
+            raise
+        message = error.args[0] if isinstance(error, KeyError) and error.args else error
+        print(f"koap: {message}", file=sys.stderr)
+        return 1
+    show(result)
+    return 0
+
+
+def show(result: Any) -> None:
+    """Prints a result: a table of names and values, without the rows of single episodes."""
+    if not isinstance(result, Mapping):
+        print(result)
+        return
+    flat = {key: value for key, value in result.items() if key != "episode"}
+    width = max(len(key) for key in flat)
+    for key, value in flat.items():
+        if isinstance(value, Mapping):
+            value = json.dumps({k: _short(v) for k, v in value.items()})
+        print(f"{key:<{width}}  {_short(value)}")
+
+
+def _short(value: Any) -> Any:
+    return float(f"{value:.4g}") if isinstance(value, float) else value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,29 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Fitting a controller's linear decoder on all labelled steps of a data set."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import TensorDictBase
+from torch import nn
+
+from torchrl_koap.data import cut_windows
+from torchrl_koap.modules import KoopmanInverseDynamics
+
+# one or two labelled trajectories cannot be left out to choose the penalty; benchmarks/RESULTS.md tells where it is from
+DEFAULT_PENALTY = 0.017
+
+
+def fit_closed_form(controller: nn.Module, data: TensorDictBase) -> dict[str, Any]:
+    """Fits a controller's linear decoder on every labelled step that sees its whole look-ahead, each used once."""
+    keys = ["state", "action", "has_action", "episode"]
+    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.history)
+    mask = windows["has_action"].squeeze(-1) & ~windows["padded"].squeeze(-1)
+    mask[:, : controller.history] = False  # as the current frame of another window these count already
+    extra = {}
+    if isinstance(controller, KoopmanInverseDynamics):
+        through_zero = not controller.action_normalizer.offset.any()
+        extra = {"default_penalty": DEFAULT_PENALTY, "bias": not through_zero}
+    fit = controller.fit_decoder(windows, mask, groups=windows["episode"][:, -1], **extra)
+    return {"penalty": fit.penalty, "labels_used": fit.num_labels, "held_out_error": fit.errors[fit.penalty]}

@@ -1,0 +1,88 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap doctor`` and ``koap validate``: what this machine offers, and whether data are sound."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+
+from torchrl_koap.assembly import load_demonstrations
+from torchrl_koap.keys import validate
+from torchrl_koap.tasks import get_task
+
+
+@dataclass
+class Doctor:
+    """Print versions, processors, graphics and optional packages: the first thing to attach to a question."""
+
+
+@dataclass
+class Validate:
+    """Check a folder of demonstrations and report every problem found.
+
+    Attributes:
+        dataset: folder of D3IL raw pickles, or one written by `koap demos`.
+        task: name of the task.
+    """
+
+    dataset: tyro.conf.Positional[str]
+    task: str = "avoiding"
+
+
+def run_doctor(options: Doctor) -> dict[str, str]:
+    """Facts about this machine, name to value."""
+    facts = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in (
+        "torchrl_koap",
+        "torch",
+        "torchrl",
+        "tensordict",
+        "mujoco",
+        "dm-control",
+        "gymnasium-robotics",
+        "numba",
+    ):
+        try:
+            facts[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            facts[name] = "MISSING"
+    facts["processors"] = str(os.cpu_count())
+    facts["torch threads"] = str(torch.get_num_threads())
+    facts["CUDA"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
+    facts["rendering (3-D pictures)"] = _rendering()
+    for extra, module in {"wandb": "wandb", "video": "imageio"}.items():
+        found = importlib.util.find_spec(module) is not None
+        facts[f"extra {extra}"] = "installed" if found else f"not installed (pip install 'torchrl_koap[{extra}]')"
+    return facts
+
+
+def _rendering() -> str:
+    from torchrl_koap.envs.rendering import backends
+
+    usable = backends()
+    return ", ".join(usable) if usable else "no OpenGL library (apt install libegl1, then MUJOCO_GL=egl)"
+
+
+def run_validate(options: Validate) -> dict[str, str]:
+    """Reads and checks demonstrations.
+
+    Raises:
+        LayoutError, RawFolderError: with all problems.
+    """
+    task = get_task(options.task)
+    data = validate(load_demonstrations(options.dataset, task))
+    lengths = data["episode"].unique(return_counts=True)[1]
+    return {
+        "trajectories": str(len(lengths)),
+        "steps": str(len(data)),
+        "shortest, longest": f"{int(lengths.min())}, {int(lengths.max())}",
+        "observation, action columns": f"{data['observation'].shape[-1]}, {data['action'].shape[-1]}",
+        "verdict": "no problem found",
+    }

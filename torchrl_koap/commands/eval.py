@@ -1,0 +1,131 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap eval``: closed-loop rollouts of a trained run, scored with intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from torch import nn
+from tqdm import tqdm
+
+from torchrl_koap.assembly import build_controller, build_planner, make_env_of, mode_index_of
+from torchrl_koap.checkpoints import load_weights, save_tensors
+from torchrl_koap.evaluation import make_policy, measure_latency, roll_out, rollouts_to_tensors, score
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import StatePlanner
+from torchrl_koap.modules.policies import EXECUTIONS
+from torchrl_koap.report import write_report
+from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.tasks import Task, get_task
+
+
+@dataclass
+class Eval:
+    """Evaluate a trained run in closed loop and write its report.
+
+    Attributes:
+        run: run directory of `koap train`.
+        episodes: number of rollouts.
+        seed: seed of the first rollout; the others count on from it.
+        execution: "feedback" (decode at every step) or "open_loop" (decode once per plan).
+        solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
+        solver_steps: another number of solver steps.
+        replan_interval: control steps per plan.
+        batch_size: episodes at a time; results do not depend on it.
+        task: refuse a run of another task than this.
+        threads: torch and simulator threads.
+        device: "cpu" or "cuda".
+        animate: make an animation of the rollouts for the report.
+    """
+
+    run: tyro.conf.Positional[Path]
+    episodes: int = 60
+    seed: int = 100
+    execution: str = "feedback"
+    solver: str | None = None
+    solver_steps: int | None = None
+    replan_interval: int = 4
+    batch_size: int | None = None
+    task: str | None = None
+    threads: int = 2
+    device: str = "cpu"
+    animate: bool = True
+
+
+def load_run(run: RunDirectory, task: str | None = None) -> tuple[Task, StatePlanner, nn.Module]:
+    """Planner and controller of a finished run, in evaluation mode.
+
+    Raises:
+        RunDirectoryError: if the folder is no finished run, or one of another task than asked for.
+        CheckpointError: if weights are damaged, of another task or without their statistics.
+    """
+    config = run.read_json("config.json")
+    if task is not None and task != config.get("task"):
+        raise RunDirectoryError(f"{run.path} was trained on task {config.get('task')!r}, not on {task!r}")
+    facts = get_task(config["task"])
+    state_dim = len(facts.state_columns)
+    planner = build_planner(config["planner"], state_dim)
+    controller = build_controller(config["controller"], state_dim, facts.action_dim)
+    for name, module in (("planner", planner), ("controller", controller)):
+        load_weights(run.path / f"{name}.safetensors", module, task=facts.name)
+    return facts, planner.eval(), controller.eval()
+
+
+def run_eval(options: Eval) -> dict[str, Any]:
+    """Evaluates; returns what is written to ``eval.json``.
+
+    Raises:
+        ValueError: for unknown options or fewer than one episode.
+    """
+    if options.episodes < 1:
+        raise ValueError(f"episodes must be >= 1, got {options.episodes}")
+    lookup(EXECUTIONS, options.execution, "execution")
+    torch.set_num_threads(options.threads)
+    run = RunDirectory(options.run)
+    task, planner, controller = load_run(run, options.task)
+    if options.solver is not None:
+        planner.solver = options.solver
+    if options.solver_steps is not None:
+        planner.num_steps = options.solver_steps
+    policy = make_policy(
+        planner,
+        controller,
+        state_columns=task.state_columns,
+        execution=options.execution,
+        replan_interval=options.replan_interval,
+    ).to(options.device)
+    seeds = list(range(options.seed, options.seed + options.episodes))
+    mode_index = mode_index_of(task)
+    with tqdm(total=options.episodes, desc="rollouts", unit="episode") as bar:
+        episodes = roll_out(
+            policy,
+            make_env_of(task, num_threads=options.threads),
+            seeds,
+            max_steps=task.max_steps,
+            batch_size=options.batch_size,
+            progress=lambda finished: bar.update(finished - bar.n),
+        )
+    result = score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index)
+    rows = result.pop("episode")
+    result |= measure_latency(policy, task.observation_dim)
+    result |= {
+        "execution": options.execution,
+        "solver": planner.solver,
+        "solver_steps": planner.num_steps,
+        "replan_interval": options.replan_interval,
+        "episode": rows,
+    }
+    rollouts = rollouts_to_tensors(
+        [episode.cpu() for episode in episodes],
+        position=task.observation[task.position],
+        mode_index=mode_index,
+        interval=options.replan_interval,
+    )
+    save_tensors(run.path / "rollouts.safetensors", rollouts, {"task": task.name})
+    run.write_json("eval.json", result)
+    write_report(run.path, animation=options.animate)
+    return result

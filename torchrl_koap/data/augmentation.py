@@ -1,0 +1,89 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What demonstrations do not show: how to come back from a little beside them, and where they were heading."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.keys import EPISODE, STATE
+
+
+class RecoveryAugmentation(TensorDictModuleBase):
+    r"""Moves the observed frames of a window aside and lets the future come back.
+
+    .. math::
+        x'_{t-j} = x_{t-j} + \delta, \qquad x'_{t+i} = x_{t+i} + \rho^i \delta, \qquad
+        \delta = 2 \sigma\, r\, n, \; r \sim U(0, 1), \; n \sim N(0, I)
+
+    A planner trained on demonstrations alone has never seen a state beside them; executed in closed loop it drifts
+    there. The augmentation shows it such states together with the way back.
+
+    Args:
+        sigma (float): typical size of the shift, in the units of the state.
+
+    Keyword Args:
+        history (int): observed frames of the window. Defaults to ``2``.
+        decay (float): share ``rho`` of the shift that remains after each planned frame. Defaults to ``0.7``.
+        key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import RecoveryAugmentation
+        >>> td = RecoveryAugmentation(0.004)(TensorDict({"state": torch.zeros(8, 16, 2)}, [8]))
+        >>> torch.allclose(td["state"][:, 2], 0.7 * td["state"][:, 1])
+        True
+    """
+
+    def __init__(self, sigma: float, *, history: int = 2, decay: float = 0.7, key: NestedKey = STATE):
+        super().__init__()
+        if sigma < 0 or not 0 <= decay < 1:
+            raise ValueError(f"sigma must be >= 0 and decay in [0, 1), got {sigma} and {decay}")
+        self.in_keys, self.out_keys = [key], [key]
+        self.sigma, self.history, self.decay = sigma, history, decay
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replaces the windows by shifted ones."""
+        state = tensordict.get(self.in_keys[0])
+        size = torch.rand(*state.shape[:-2], 1, 1, dtype=state.dtype, device=state.device)
+        shift = torch.randn(*state.shape[:-2], 1, state.shape[-1], dtype=state.dtype, device=state.device)
+        frames = torch.arange(state.shape[-2], device=state.device) - (self.history - 1)
+        remaining = self.decay ** frames.clamp_min(0).to(state.dtype)
+        return tensordict.set(self.in_keys[0], state + 2 * self.sigma * size * shift * remaining[:, None])
+
+
+def extrapolate_ends(data: TensorDictBase, frames: int, *, key: NestedKey = STATE, over: int = 3) -> TensorDict:
+    """Continues every trajectory at its last mean velocity, so that a plan made near the end has a future.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` with states ``[N, d]`` and ``episode``.
+        frames (int): frames to append to each trajectory.
+
+    Keyword Args:
+        key (NestedKey): states. Defaults to ``"state"``.
+        over (int): steps whose mean is the velocity. Defaults to ``3``.
+
+    Returns:
+        TensorDict: ``key`` and ``episode``, flat ``[N + trajectories * frames]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import extrapolate_ends
+        >>> line = TensorDict({"state": torch.arange(5.0)[:, None], "episode": torch.zeros(5, dtype=torch.int64)}, [5])
+        >>> extrapolate_ends(line, 2)["state"].flatten().tolist()
+        [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    """
+    lengths = trajectory_lengths(data).tolist()
+    states, episodes = [], []
+    for state, episode in zip(data.get(key).split(lengths), data.get(EPISODE).split(lengths), strict=True):
+        steps = min(over, len(state) - 1)
+        velocity = (state[-1] - state[-1 - steps]) / max(steps, 1)
+        ahead = torch.arange(1, frames + 1, dtype=state.dtype, device=state.device)[:, None]
+        states.append(torch.cat([state, state[-1] + ahead * velocity]))
+        episodes.append(episode[:1].expand(len(state) + frames))
+    states = torch.cat(states)
+    return TensorDict({key: states, EPISODE: torch.cat(episodes)}, batch_size=[len(states)])
