@@ -1,0 +1,264 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The time picture of the design: which frames are read, which count, replayed on a known linear system."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.modules import (
+    KoopmanInverseDynamics,
+    KoopmanLifting,
+    KoopmanOperator,
+    LatentActionFourier,
+    LatentActionLSTM,
+    LatentActionMLP,
+    LinearActionDecoder,
+)
+from torchrl_koap.modules.time_alignment import check_offsets, frame_index, frame_span
+from torchrl_koap.objectives import KOAPLoss, KoopmanDynamicsLoss
+
+T = 16
+CASES = [(1, 8), (0, 2), (4, (2, 3, 4, 6, 8)), (2, (5, 3)), (1, 7)]
+
+
+def offsets(history, look_ahead):
+    ahead = [look_ahead] if isinstance(look_ahead, int) else sorted(look_ahead)
+    return [*range(-history, 1), *ahead]
+
+
+# the table
+
+
+def test_table_of_the_design():
+    """Section 3: f for a_1 reads x_0, x_1 and x_{1+k}; the last index is clamped to the window's end."""
+    index = frame_index(range(T), T, 1, 8)
+    assert index.dtype == torch.int64
+    assert index[1].tolist() == [0, 1, 9]
+    assert index[7].tolist() == [6, 7, 15]
+    assert [row[-1] for row in index[7:].tolist()] == [15] * 9
+    assert index[0].tolist() == [0, 0, 8]
+    assert frame_span(T, 1, 8) == range(1, 8)
+    assert frame_span(T, 1, 8, clamped=True) == range(1, 14)
+
+
+@pytest.mark.parametrize("num_frames", [11, 14, 16])
+@pytest.mark.parametrize(("history", "look_ahead"), CASES)
+def test_clamping_and_spans_by_brute_force(history, look_ahead, num_frames):
+    rows = frame_index(range(num_frames), num_frames, history, look_ahead).tolist()
+    wanted = offsets(history, look_ahead)
+    unclamped, clamped = [], []
+    for t, row in enumerate(rows):
+        assert row == [min(max(t + offset, 0), num_frames - 1) for offset in wanted]
+        whole = all(0 <= t + offset < num_frames for offset in wanted)
+        ahead = row[history + 1 :]
+        if whole:
+            unclamped.append(t)
+        if t - history >= 0 and t + 1 < num_frames and all(frame > t + 1 for frame in ahead):
+            clamped.append(t)
+    if unclamped:
+        assert list(frame_span(num_frames, history, look_ahead)) == unclamped
+    assert list(frame_span(num_frames, history, look_ahead, clamped=True)) == clamped
+    part = range(2, 6)
+    assert frame_index(part, num_frames, history, look_ahead).tolist() == rows[2:6]
+
+
+@pytest.mark.parametrize(("history", "look_ahead"), CASES)
+def test_the_next_state_is_read_in_no_frame_that_counts(history, look_ahead):
+    for clamped in (False, True):
+        for t in frame_span(T, history, look_ahead, clamped=clamped):
+            assert t + 1 not in frame_index(range(t, t + 1), T, history, look_ahead).flatten().tolist()
+    leak = frame_index(range(T - 2, T - 1), T, history, look_ahead).flatten().tolist()
+    assert T - 1 in leak and T - 2 not in frame_span(T, history, look_ahead, clamped=True)
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+@pytest.mark.parametrize(("history", "look_ahead"), CASES)
+def test_the_shortest_window_holds_one_frame_and_one_less_is_an_error(history, look_ahead, clamped):
+    needed = history + 1 + (2 if clamped else max(offsets(history, look_ahead)))
+    assert frame_span(needed, history, look_ahead, clamped=clamped) == range(history, history + 1)
+    for number in (needed - 1, 1, 0):
+        with pytest.raises(ValueError, match=f"a window of {number} frames is too short .* at least {needed} frames"):
+            frame_span(number, history, look_ahead, clamped=clamped)
+
+
+@pytest.mark.parametrize("look_ahead", [1, 0, -3, (8, 1), ()])
+def test_offsets_that_would_read_the_answer_are_refused(look_ahead):
+    with pytest.raises(ValueError, match=r"x_\(t\+1\) is never an input"):
+        check_offsets(1, look_ahead)
+
+
+def test_history_must_not_be_negative():
+    with pytest.raises(ValueError, match="history must be >= 0 frames, got -1"):
+        LatentActionMLP(2, 2, history=-1)
+    assert check_offsets(0, [8, 2, 4]) == (2, 4, 8)
+
+
+# what is really read: the gradient's sparsity
+
+
+@pytest.mark.parametrize(
+    ("kind", "relative"),
+    [(LatentActionMLP, False), (LatentActionMLP, True), (LatentActionLSTM, False), (LatentActionLSTM, True)]
+    + [(LatentActionFourier, True)],
+)
+@pytest.mark.parametrize(("history", "look_ahead"), CASES)
+def test_gradients_reach_the_documented_frames_and_no_others(kind, history, look_ahead, relative):
+    torch.manual_seed(0)
+    more = {} if kind is LatentActionFourier else {"relative": relative}
+    network = kind(2, 6, history=history, look_ahead=look_ahead, **more)
+    state = torch.randn(T, 2, requires_grad=True)
+    latent = network(TensorDict({"state": state}))["latent_action"]
+    weights = torch.randn(latent.shape[-1])
+    index = frame_index(range(T), T, history, look_ahead)
+    for t in range(T):
+        (gradient,) = torch.autograd.grad(latent[t] @ weights, state, retain_graph=True)
+        read = {frame for frame in range(T) if gradient[frame].abs().max() > 0}
+        assert read == set(index[t].tolist())
+        if t in frame_span(T, history, look_ahead, clamped=True):
+            assert (gradient[t + 1] == 0).all()
+
+
+@pytest.mark.parametrize("kind", [LatentActionMLP, LatentActionLSTM, LatentActionFourier])
+def test_gathering_some_frames_is_a_slice_of_gathering_all(kind):
+    network = kind(2, 6, history=2, look_ahead=(2, 5))
+    state = torch.randn(3, 4, T, 2)
+    every, some = network.gather(state), network.gather(state, range(3, 9))
+    assert every.shape == (3, 4, T, 5, 2)
+    assert torch.equal(every[..., 3:9, :, :], some)
+    torch.testing.assert_close(network.infer(every)[..., 3:9, :], network.infer(some))
+
+
+# replay: x_{t+1} = A x_t + B a_t with a state that holds the last k actions, so that x_{t+k} tells a_t apart
+
+
+def linear_system(k, seed=0):
+    """A delay line of ``k`` two-dimensional actions in skew coordinates; ``A^{k-1} B, ..., B`` spans the space."""
+    rng = np.random.default_rng(seed)
+    d = 2 * k
+    shift = np.eye(d, k=-2) * 0.9 + 0.1 * np.eye(d)
+    entry = np.zeros((d, 2))
+    entry[:2] = np.eye(2)
+    turn = np.linalg.qr(rng.normal(size=(d, d)))[0] * rng.uniform(0.5, 2.0, size=d)
+    return turn @ shift @ np.linalg.inv(turn), turn @ entry
+
+
+def replay(k, *batch, num_frames=T):
+    transition, entry = linear_system(k)
+    rng = np.random.default_rng(1)
+    action = rng.normal(size=(*batch, num_frames, 2))
+    state = [rng.normal(size=(*batch, 2 * k))]
+    for t in range(num_frames - 1):
+        state.append(state[-1] @ transition.T + action[..., t, :] @ entry.T)
+    data = {"state": torch.from_numpy(np.stack(state, -2)), "action": torch.from_numpy(action)}
+    return TensorDict({**data, "has_action": torch.ones(*batch, num_frames, 1, dtype=torch.bool)}, batch)
+
+
+def exact_model(k, *, history=1, clamped=False):
+    """Identity lifting, ``K = A``, ``f = B a_t`` written down from the system and ``D`` the pseudo-inverse of ``B``."""
+    transition, entry = linear_system(k)
+    d = 2 * k
+    network = LatentActionMLP(d, d, hidden_dims=(), history=history, look_ahead=k, clamped=clamped)
+    model = KoopmanInverseDynamics(
+        network,
+        LinearActionDecoder(d, 2),
+        lifting=KoopmanLifting(d, d, include_state=True),
+        operator=KoopmanOperator(d),
+    ).double()
+    # x_{t+k} = A^k x_t + sum_j A^{k-1-j} B a_{t+j}: the first two rows of the inverse reach back to a_t
+    reach = np.concatenate([np.linalg.matrix_power(transition, k - 1 - j) @ entry for j in range(k)], 1)
+    first = entry @ np.linalg.inv(reach)[:2]
+    weight = np.zeros((d, history + 2, d))
+    weight[:, history] = -first @ np.linalg.matrix_power(transition, k)
+    weight[:, -1] = first
+    with torch.no_grad():
+        layer = network.network[0]
+        layer.weight.copy_(torch.from_numpy(weight.reshape(d, -1)))
+        layer.bias.zero_()
+        model.operator.weight.copy_(torch.from_numpy(transition))
+        model.action_decoder.linear.weight.copy_(torch.from_numpy(np.linalg.pinv(entry)))
+        model.action_decoder.linear.bias.zero_()
+    return model
+
+
+@pytest.mark.parametrize("history", [0, 1, 3])
+@pytest.mark.parametrize("k", [2, 4, 8])
+def test_a_known_linear_system_gives_its_own_actions_back(k, history):
+    data = replay(k, 3, 2)
+    model = exact_model(k, history=history)
+    span = frame_span(T, history, k)
+    action = model(data.select("state"))["action"]
+    frames = slice(span.start, span.stop)
+    torch.testing.assert_close(action[..., frames, :], data["action"][..., frames, :], rtol=1e-6, atol=1e-6)
+    losses = KOAPLoss(model)(data)
+    assert losses["loss_koopman"] < 1e-12 and losses["loss_action"] < 1e-12
+    # one frame earlier or later it is another action
+    error = {}
+    for shift in (-1, 0, 1):
+        t = torch.tensor([t for t in span if 0 <= t + shift < T])
+        error[shift] = (action[..., t, :] - data["action"][..., t + shift, :]).square().mean().item()
+        moved = data.clone()
+        moved["action"] = data["action"].roll(-shift, -2)
+        loss = KOAPLoss(model)(moved)["loss_action"].item()
+        assert (loss < 1e-12) == (shift == 0), (shift, loss)
+    assert error[0] < 1e-12 and min(error[-1], error[1]) > 0.1
+    # beyond the span the look-ahead is cut and the action is another one
+    beyond = range(span.stop, T - 1)
+    for t in beyond:
+        assert (action[..., t, :] - data["action"][..., t, :]).abs().max() > 1e-3, t
+
+
+@pytest.mark.parametrize("k", [2, 8])
+def test_latent_actions_of_a_linear_system_drive_its_rollout(k):
+    data, model = replay(k, 4), exact_model(k)
+    span = frame_span(T, 1, k)
+    latent = model.infer(data["state"], span)
+    rolled = model.rollout_latent(model.lift(data["state"])[:, span.start], latent)
+    torch.testing.assert_close(rolled, data["state"][:, span.start + 1 : span.stop + 1], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("k", [2, 8])
+def test_a_decoder_fitted_in_closed_form_finds_the_actions_of_a_linear_system(k):
+    data, model = replay(k, 60), exact_model(k)
+    with torch.no_grad():  # a network that only passes on what it reads
+        layer = torch.nn.Linear(6 * k, 6 * k).double()
+        layer.weight.copy_(torch.eye(6 * k))
+        layer.bias.zero_()
+    network = LatentActionMLP(2 * k, 6 * k, hidden_dims=(), history=1, look_ahead=k).double()
+    network.network[0] = layer
+    model = KoopmanInverseDynamics(
+        network,
+        LinearActionDecoder(6 * k, 2),
+        lifting=KoopmanLifting(2 * k, 6 * k),
+        operator=KoopmanOperator(6 * k),
+    ).double()
+    mask = data["has_action"].squeeze(-1)
+    span = frame_span(T, 1, k)
+    frames = slice(span.start, span.stop)
+    model.fit_decoder(data, mask, penalties=(1e-14,))
+    test = replay(k, 5)
+    action = model(test.select("state"))["action"]
+    torch.testing.assert_close(action[:, frames], test["action"][:, frames], rtol=1e-4, atol=1e-4)
+    for shift in (-1, 1):
+        moved = data.clone()
+        moved["action"] = data["action"].roll(-shift, -2)
+        fit = model.fit_decoder(moved, mask, penalties=(1e-14,))
+        shifted = model(test.select("state"))["action"]
+        inside = range(span.start + 1, span.stop - 1)
+        assert (shifted[:, inside] - test["action"][:, inside]).square().mean() > 0.1
+        assert fit.num_labels == 60 * len(span)
+
+
+def test_clamped_frames_beyond_the_last_are_where_the_answer_leaks():
+    """At T - 2 the cut look-ahead is x_{t+1}: a network trained there would read the answer, so it never counts."""
+    k = 8
+    data = replay(k, 2)
+    model = exact_model(k, clamped=True)
+    before = KoopmanDynamicsLoss(model, reduction="none")(data)["loss_koopman"]
+    assert before.shape[-1] == T - 3
+    data["state"][:, -1] += 1.0
+    after = KoopmanDynamicsLoss(model, reduction="none")(data)["loss_koopman"]
+    changed = (before != after).any(0)
+    assert changed.tolist() == [False] * 6 + [True] * 7  # frames 1..6 end before x_15; 7..13 look at it
