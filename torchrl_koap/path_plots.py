@@ -172,7 +172,7 @@ def plot_plans(
 
 
 def choose_episodes(mode: Any, outcome: Any, count: int) -> list[int]:
-    """Up to two failures, then successes, a new mode each as long as there are any; modes spread over their range.
+    """Up to two failures, then successes, a new mode each as long as there are any, then what is left.
 
     Examples:
         >>> from torchrl_koap.path_plots import choose_episodes
@@ -180,14 +180,15 @@ def choose_episodes(mode: Any, outcome: Any, count: int) -> list[int]:
         [4, 0, 2, 3]
     """
     mode, outcome = as_array("mode", mode, [None]), as_array("outcome", outcome, [None])
-    chosen = np.flatnonzero(outcome != SUCCESS)[: min(2, count)].tolist()
+    bad = np.flatnonzero(outcome != SUCCESS).tolist()
+    chosen, spare = bad[: min(2, count)], bad[2:]
     good = np.flatnonzero(outcome == SUCCESS)
     firsts = [int(good[mode[good] == value][0]) for value in np.unique(mode[good])]
     room = count - len(chosen)
     if len(firsts) > room:
         firsts = [firsts[int(index)] for index in np.linspace(0, len(firsts) - 1, max(room, 0)).round()]
     rest = [int(index) for index in good if index not in firsts]
-    return chosen + (firsts + rest)[: max(room, 0)]
+    return chosen + (firsts + rest + spare)[: max(room, 0)]
 
 
 def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:

@@ -108,12 +108,17 @@ def plot_losses(metrics: Mapping[str, Sequence[float]], path: str | Path) -> Pat
             axes.plot(x, y, color=BLUE, alpha=0.25, linewidth=0.7)
             axes.plot(x, smooth, color=BLUE, linewidth=1.6)
             axes.set_yscale("log")
+            low, high = np.nanmin(y), np.nanmax(y)
+            widen = max(1.0, 4 * low / high) ** 0.5  # a flat curve looks flat
+            axes.set_ylim(low / widen / 1.15, high * widen * 1.15)
             axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
             axes.annotate(
                 f"{last:.3g}", (1, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize=9, color=BLUE
             )
         else:
-            axes.text(0.5, 0.5, "0 throughout (no labels)", transform=axes.transAxes, ha="center", color=MUTED)
+            axes.text(
+                0.5, 0.5, "0 throughout: no label entered this loss", transform=axes.transAxes, ha="center", color=MUTED
+            )
             axes.set_yticks([])
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=_ROUND))
         tidy(axes)

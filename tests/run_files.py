@@ -1,0 +1,93 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Small run directories for the tests of pictures and report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+
+LABELS = {
+    "unit": "trajectory",
+    "requested": 0.5,
+    "selected_units": 1,
+    "total_units": 2,
+    "labelled_transitions": 20,
+    "total_transitions": 40,
+    "trajectories_touched": 1,
+    "total_trajectories": 2,
+    "seed": 7,
+}
+EVALUATION = {
+    "success_rate": 0.5,
+    "success_low": 0.15,
+    "success_high": 0.85,
+    "mode_entropy": 0.218,
+    "distinct_modes": 2,
+    "collisions": 1,
+    "mean_steps": 19.5,
+    "episodes": 4,
+    "plan_ms": 8.5,
+    "control_ms": 0.5,
+    "control_hz": 400.0,
+    "execution": "feedback",
+    "solver": "flow_euler",
+    "solver_steps": 8,
+    "episode": [{"seed": 100 + e, "outcome": "success", "mode": e, "steps": 20} for e in range(4)],
+}
+
+
+def make_rollouts(episodes: int = 4, steps: int = 20) -> dict[str, torch.Tensor]:
+    """Straight paths from the start to the line, beside each other; the last two collide and run out of time."""
+    share = torch.linspace(0, 1, steps)[:, None]
+    goals = torch.stack([torch.linspace(0.26, 0.72, episodes), torch.full((episodes,), 0.36)], 1)
+    position = torch.tensor([0.525, -0.28]) + share * (goals[:, None] - torch.tensor([0.525, -0.28]))
+    length = torch.full((episodes,), steps)
+    length[-1] = steps // 2
+    position[-1, steps // 2 :] = torch.nan
+    plan = torch.full((episodes, steps // 4, 14, 2), torch.nan)
+    plan_step = torch.full((episodes, steps // 4), -1)
+    for row in range(steps // 4 - 1):
+        plan[:, row, :4] = position[:, 4 * row + 1 : 4 * row + 5]
+        plan_step[:, row] = 4 * row
+    outcome = torch.tensor([1] * (episodes - 2) + [0, 2])
+    mode = torch.where(outcome == 1, torch.arange(episodes), -1)
+    return {
+        "position": position,
+        "length": length,
+        "mode": mode,
+        "outcome": outcome,
+        "plan": plan,
+        "plan_step": plan_step,
+    }
+
+
+def make_demonstrations() -> dict[str, torch.Tensor]:
+    """Two straight demonstrations of 20 steps, the first one labelled."""
+    y = torch.linspace(-0.28, 0.36, 20)
+    state = torch.cat([torch.stack([torch.full((20,), x), y], 1) for x in (0.3, 0.7)])
+    episode = torch.arange(2).repeat_interleave(20)
+    return {"state": state, "episode": episode, "labelled": episode == 0, "mode": torch.tensor([0, 23])}
+
+
+def write_run(folder: Path) -> Path:
+    """Every file that training and evaluation leave."""
+    config = {"task": "avoiding", "method": "koap", "preset": "default", "seed": 0, "sizes": {"planner": [32, 64]}}
+    config |= {"command": ["koap", "train", "--out", "a folder"], "versions": {"torch": "2.13.0"}}
+    summary = {"labels": LABELS, "planner_parameters": 812345, "train_seconds": {"planner": 65.0, "controller": 20.0}}
+    summary["action_error_mm"] = {"koap": 0.91, "ridge": 1.04, "analysis_labels_read": 20}
+    for name, content in (("config", config), ("summary", summary), ("eval", EVALUATION)):
+        (folder / f"{name}.json").write_text(json.dumps(content))
+    head = "phase,step,loss_planner,loss_reconstruction,loss_koopman,loss_action,learning_rate,iterations_per_second\n"
+    rows = [f"planner,{step},{1 / step},,,,0.001,30\n" for step in range(1, 50)]
+    rows += [f"controller,{step},,{1 / step},{2 / step},0,0.001,30\n" for step in range(1, 50)]
+    (folder / "metrics.csv").write_text(head + "".join(rows))
+    true = torch.from_numpy(np.random.default_rng(0).normal(size=(20, 2)) * 0.005)
+    save_file(make_rollouts(), folder / "rollouts.safetensors")
+    save_file(make_demonstrations(), folder / "demonstrations.safetensors")
+    save_file({"real": torch.linspace(0, 1, 8), "imag": torch.zeros(8)}, folder / "eigenvalues.safetensors")
+    save_file({"predicted": true + 0.001, "true": true}, folder / "actions.safetensors")
+    return folder

@@ -1,0 +1,182 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The report: right numbers, nothing dropped, everything escaped, absent and damaged files said."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from run_files import write_run
+
+from torchrl_koap.mode_plots import even_entropy
+from torchrl_koap.pictures import PICTURES, draw_pictures
+from torchrl_koap.report import CAPTIONS, write_report
+from torchrl_koap.report_html import definition, interval_bar
+
+_VOID = {"meta", "img", "rect", "br"}
+
+
+class Page(HTMLParser):
+    """Text, tags and links of a page; fails on tags that do not close."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.source = path.read_text()
+        self.open, self.tags, self.links, self.words = [], [], [], []
+        self.feed(self.source)
+        assert not self.open, f"not closed: {self.open}"
+        self.text = re.sub(r"\s+", " ", " ".join(self.words))
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.links += [value for name, value in attributes if name in ("src", "href")]
+        if tag not in _VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in _VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = write_run(tmp_path_factory.mktemp("run"))
+    write_report(folder)
+    return folder
+
+
+def test_headline_has_intervals_and_n(run):
+    text = Page(run / "index.html").text
+    for wanted in (
+        "50.0 % interval 95 % interval 15.0 to 85.0 %, 2 of 4 rollouts",
+        f"0.22 2 of 24 modes; an even choice averages {even_entropy(2, 24):.2f}, n = 2",
+        "action error, koap 0.91 mm ridge 1.04 mm, n = 20 unlabelled steps",
+        "action labels 20 50.00 % of 40 transitions, in 1 of 2 demonstrations",
+        "400 Hz 8.5 ms per plan, 0.5 ms per control step",
+        "1 min 25 s planner 1 min 5 s, controller 20.0 s",
+        "Outside the budget, for analysis only: 20 labels",
+    ):
+        assert wanted in text
+
+
+def test_order_headline_labels_pictures_commands(run):
+    text = Page(run / "index.html").text
+    places = [text.index(word) for word in ("Result", "Labels", "Executed rollouts", "All numbers", "Do it again")]
+    assert places == sorted(places)
+    assert "koap train --out 'a folder'" in text
+    solver = "--episodes 4 --seed 100 --execution feedback --solver flow_euler --solver-steps 8"
+    assert f"koap eval {run} {solver}" in text
+
+
+def test_pictures_are_there_with_captions_and_no_outside_resource(run):
+    page = Page(run / "index.html")
+    assert {f"plots/{picture.name}" for picture in PICTURES} <= set(page.links)
+    for link in page.links:
+        assert (run / link).is_file()
+    for picture in PICTURES:
+        assert CAPTIONS[picture.name][0] in page.text
+    assert "http" not in page.source and "script" not in page.tags
+    assert "Not drawn" not in page.text and 'class="warning"' not in page.source
+
+
+def test_no_key_is_dropped(tmp_path):
+    write_run(tmp_path)
+    for name in ("config", "summary", "eval"):
+        path = tmp_path / f"{name}.json"
+        content = json.loads(path.read_text())
+        content[f"odd_{name}"] = {"deep": {"list": [{"a": 1.25}, {"b_mm": None}], "flag": True}, "text": f"only {name}"}
+        path.write_text(json.dumps(content))
+    page = Page(write_report(tmp_path, draw=False))
+    for name in ("config", "summary", "eval"):
+        assert f"odd {name} deep list a b (mm) 1.25 – – – flag yes text only {name}" in page.text
+    assert "planner 32, 64" in page.text and "812,345" in page.text
+
+
+def test_everything_from_files_is_escaped(tmp_path):
+    evil = "<script>alert('1')</script>&\""
+    content = {evil: evil, "command": evil, "task": evil, "method": evil, "seed": evil, "versions": {evil: evil}}
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    labels = {evil: evil, "labelled_transitions": 1, "total_transitions": 2}
+    summary = {"labels": labels, "action_error_mm": {evil: 1.0, "ridge": 2.0}, "train_seconds": {evil: 1.0}}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    evaluation = {"success_rate": 0.5, "execution": evil, "distinct_modes": evil, "mode_entropy": 0.1}
+    evaluation["episode"] = [{"seed": evil, evil: evil}]
+    (tmp_path / "eval.json").write_text(json.dumps(evaluation))
+    page = Page(write_report(tmp_path))
+    assert "script" not in page.tags and "<script" not in page.source
+    assert page.source.count("&lt;script&gt;") > 12
+
+
+def test_empty_run_says_which_commands_make_the_sections(tmp_path):
+    folder = tmp_path / "my run"
+    folder.mkdir()
+    page = Page(write_report(folder))
+    assert f"koap eval '{folder}' --episodes 60 --seed 100" in page.text
+    assert f"koap train --out '{folder}'" in page.text
+    assert "img" not in page.tags and not (folder / "plots").exists()
+
+
+@pytest.mark.parametrize("name", ["config.json", "summary.json", "eval.json"])
+@pytest.mark.parametrize("content", ['{"task": ', "[1, 2]", ""])
+def test_damaged_json_is_named_and_the_rest_is_shown(name, content, tmp_path):
+    write_run(tmp_path)
+    (tmp_path / name).write_text(content)
+    page = Page(write_report(tmp_path, draw=False))
+    assert page.source.count('class="warning"') == 1 and str(tmp_path / name) in page.text
+    assert ("success rate" in page.text) == (name != "eval.json")
+
+
+@pytest.mark.parametrize("name", ["rollouts.safetensors", "actions.safetensors", "metrics.csv"])
+def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path):
+    write_run(tmp_path)
+    draw_pictures(tmp_path, animation=False)
+    data = tmp_path / name
+    data.write_bytes(data.read_bytes()[: -len(data.read_bytes()) // 2] if name != "metrics.csv" else b"phase,step\n")
+    problems = draw_pictures(tmp_path, animation=False)
+    wanted = {p.name for p in PICTURES if p.source == name and not p.name.endswith(".gif")}
+    assert set(problems) == wanted and all(message.startswith(f"{name}: ") for message in problems.values())
+    page = Page(write_report(tmp_path, animation=False))
+    assert page.source.count('class="warning"') == len(wanted)
+    assert not {f"plots/{picture}" for picture in wanted} & set(page.links)
+    assert "plots/eigenvalues.png" in page.links
+
+
+def test_odd_values_do_not_stop_the_report(tmp_path):
+    odd = {"success_rate": None, "episodes": "many", "mode_entropy": float("nan"), "control_hz": [], "episode": "none"}
+    (tmp_path / "eval.json").write_text(json.dumps(odd | {"plan_ms": "x"}))
+    (tmp_path / "summary.json").write_text(json.dumps({"labels": 3, "action_error_mm": 1.0, "train_seconds": 12.0}))
+    page = Page(write_report(tmp_path))
+    assert "not a number" in page.text and "training time 12.0 s" in page.text
+
+
+def test_camera_film_is_shown_if_there(tmp_path):
+    (tmp_path / "plots").mkdir()
+    (tmp_path / "plots" / "film.mp4").write_bytes(b"")
+    page = Page(write_report(tmp_path))
+    assert "video" in page.tags and "plots/film.mp4" in page.links
+
+
+def test_no_such_directory(tmp_path):
+    for function in (write_report, draw_pictures):
+        with pytest.raises(FileNotFoundError, match="no run directory"):
+            function(tmp_path / "none")
+
+
+def test_interval_bar_is_to_scale():
+    bar = interval_bar(0.9, 0.75, 0.96)
+    assert 'x="75.0" y="2" width="21.0"' in bar and 'x="89.8"' in bar
+    assert 'width="0.4"' in interval_bar(1.0, 1.0, 1.0)
+
+
+def test_long_lists_are_cut_and_counted():
+    assert definition("a", list(range(100))).endswith("39 … (100 in all)")
