@@ -13,6 +13,9 @@ from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.latent_action import LatentActionModule
 
+NORMALIZED_STATE = "normalized_state"
+NORMALIZED_ACTION = "normalized_action"
+
 
 class KoopmanInverseDynamics(TensorDictSequential):
     r"""Infers latent actions from a window of states and decodes them linearly to robot actions.
@@ -28,11 +31,15 @@ class KoopmanInverseDynamics(TensorDictSequential):
     Keyword Args:
         lifting (KoopmanLifting): the networks ``g``.
         operator (KoopmanOperator): the matrix ``K``.
-        state_normalizer (nn.Module, optional): maps raw states to the networks' units.
-        action_normalizer (nn.Module, optional): its ``inverse`` maps decoded actions to raw units.
+        state_normalizer (nn.Module, optional): maps raw states to the networks' units, which are written under
+            ``"normalized_state"``.
+        action_normalizer (nn.Module, optional): its ``inverse`` maps decoded actions, under ``"normalized_action"``, to
+            raw units.
         state_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
         action_key (NestedKey): raw actions ``[*B, T, act]``; frame ``t`` holds the action from ``x_t`` to
             ``x_{t+1}``. Defaults to ``"action"``.
+
+    The in-key of the network and the out-key of the decoder are set to fit.
 
     Raises:
         ValueError: if the sizes of the parts do not fit together, or the decoder does not read what the network writes.
@@ -75,14 +82,14 @@ class KoopmanInverseDynamics(TensorDictSequential):
             written, read = latent_action.out_keys[0], action_decoder.in_keys[0]
             raise ValueError(f"latent_action writes {written!r}, but action_decoder reads {read!r}")
 
-        # every part keeps its own keys; the sequence adapts to them
-        steps = []
-        if state_normalizer is not None or latent_action.in_keys != [state_key]:
-            steps.append(TensorDictModule(state_normalizer or nn.Identity(), [state_key], latent_action.in_keys))
-        steps += [latent_action, action_decoder]
-        if action_normalizer is not None or action_decoder.out_keys != [action_key]:
-            inverse = _Inverse(action_normalizer) if action_normalizer is not None else nn.Identity()
-            steps.append(TensorDictModule(inverse, action_decoder.out_keys, [action_key]))
+        # normalised values get entries of their own: written over raw ones they would be normalised twice
+        latent_action.in_keys = [state_key] if state_normalizer is None else [NORMALIZED_STATE]
+        action_decoder.out_keys = [action_key] if action_normalizer is None else [NORMALIZED_ACTION]
+        steps = [latent_action, action_decoder]
+        if state_normalizer is not None:
+            steps.insert(0, TensorDictModule(state_normalizer, [state_key], [NORMALIZED_STATE]))
+        if action_normalizer is not None:
+            steps.append(TensorDictModule(_Inverse(action_normalizer), [NORMALIZED_ACTION], [action_key]))
         super().__init__(*steps)
         self.latent_action, self.action_decoder = latent_action, action_decoder
         self.lifting, self.operator = lifting, operator

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from torch import nn
 
+from torchrl_koap.keys import STATE
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.action_decoder import LinearActionDecoder
-from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
+from torchrl_koap.modules.inverse_dynamics import NORMALIZED_STATE, KoopmanInverseDynamics
 from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.latent_action import LatentActionFourier, LatentActionLSTM, LatentActionMLP
 
@@ -109,9 +110,7 @@ def make_koopman_inverse_dynamics(
     choice.update(overrides)
 
     latent_dim, hidden = choice["latent_dim"], choice["hidden_dim"]
-    normalized_state = "normalized_state" if state_normalizer is not None else "state"
-    frames = {key: choice[key] for key in ("history", "look_ahead", "clamped")} | {"in_key": normalized_state}
-    frames |= {key: choice[key] for key in options}
+    frames = {key: choice[key] for key in ("history", "look_ahead", "clamped", *options)}
     if network == "fourier":
         latent_action = LatentActionFourier(state_dim, **frames)
     elif network == "lstm":
@@ -124,7 +123,7 @@ def make_koopman_inverse_dynamics(
         hidden_dims=(hidden, hidden),
         include_state=choice["include_state"],
         recurrent=choice["recurrent_lifting"],
-        in_key=normalized_state,
+        in_key=NORMALIZED_STATE if state_normalizer is not None else STATE,
     )
     operator = KoopmanOperator(
         latent_dim,
@@ -132,9 +131,7 @@ def make_koopman_inverse_dynamics(
         structure=choice["structure"],
         init=choice["operator_init"],
     )
-    decoder = LinearActionDecoder(
-        latent_action.latent_dim, action_dim, out_key="normalized_action" if action_normalizer is not None else "action"
-    )
+    decoder = LinearActionDecoder(latent_action.latent_dim, action_dim)
     return KoopmanInverseDynamics(
         latent_action,
         decoder,
