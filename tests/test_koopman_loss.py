@@ -65,7 +65,6 @@ def span(clamped):
 
 class KoopmanLossTests(LossTestBase):
     default_keys = {"state": "state", "action": "action", "has_action": "has_action", "padded": "padded"}
-    still = ("operator.input", "operator__input")
     learning_rate = 1e-2
     loss_class: type
 
@@ -73,8 +72,8 @@ class KoopmanLossTests(LossTestBase):
         kind = options.pop("kind", "fourier")
         return self.loss_class(make_network(kind, seed=seed), **options)
 
-    def make_batch(self, *batch, dtype=torch.float32):
-        data = make_batch(*batch, dtype=dtype)
+    def make_batch(self, *batch):
+        data = make_batch(*batch)
         padded = torch.zeros(*batch, T, dtype=torch.bool)
         padded[..., :2] = torch.rand(*batch, 1, generator=torch.Generator().manual_seed(1)) < 0.4
         return data.set("padded", padded)
@@ -93,17 +92,20 @@ class KoopmanLossTests(LossTestBase):
 class TestReconstruction(KoopmanLossTests):
     loss_class = KoopmanReconstructionLoss
     in_names, out_keys = ("state",), ("loss_reconstruction",)
+    test_compiled_equals_eager = None  # TestKOAP compiles the same terms
 
 
 class TestDynamics(KoopmanLossTests):
     loss_class = KoopmanDynamicsLoss
     in_names, out_keys = ("state",), ("loss_koopman",)
+    test_compiled_equals_eager = None  # TestKOAP compiles the same terms
 
 
 class TestLatentAction(KoopmanLossTests):
     loss_class = LatentActionLoss
     in_names, out_keys = ("state", "action", "has_action"), ("loss_action",)
     decrease = 0.8
+    test_compiled_equals_eager = None
 
 
 class TestKOAP(KoopmanLossTests):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from loss_test_base import LossTestBase
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
@@ -22,8 +23,8 @@ KINDS = [
 ]
 
 
-def make_loss(schedule="squared_cosine", prediction=None, dtype=torch.float32, **options):
-    torch.manual_seed(0)
+def make_loss(schedule="squared_cosine", prediction=None, dtype=torch.float32, seed=0, **options):
+    torch.manual_seed(seed)
     denoiser = MLPDenoiser(2, 4, horizon=6, width=32, depth=1)
     planner = StatePlanner(denoiser, NoiseSchedule(schedule, prediction), state_dim=2, horizon=6)
     planner.fit_normalizers(windows(64))
@@ -46,6 +47,37 @@ def batch_of(*batch, dtype=torch.float32, **more):
         },
         batch,
     )
+
+
+class TestPlannerLoss(LossTestBase):
+    default_keys = {
+        "state": "state",
+        "history": "history",
+        "plan": "plan",
+        "mask": "mask",
+        "noise": "planner_noise",
+        "time": "planner_time",
+    }
+    in_names, out_keys = ("state",), ("loss_planner",)
+
+    def make_loss(self, seed=0, **options):
+        return make_loss(seed=seed, **options)
+
+    def make_batch(self, *batch):
+        return batch_of(*batch)
+
+
+class TestPlannerLossOfHistoryAndPlan(TestPlannerLoss):
+    in_names = ("history", "plan")
+    test_compiled_equals_eager = None  # compiled above, with windows
+
+    def make_loss(self, seed=0, **options):
+        return make_loss(seed=seed, window=False, **options)
+
+    def make_batch(self, *batch):
+        data = batch_of(*batch)
+        state = data.pop("state")
+        return data.set("history", state[..., :2, :]).set("plan", state[..., 2:, :])
 
 
 @pytest.mark.parametrize(("schedule", "prediction"), KINDS)
@@ -243,6 +275,7 @@ def test_bad_input_is_explained():
 
 @pytest.mark.parametrize("network", ["mlp", "unet"])
 def test_forward_and_plan_compile_without_a_graph_break(network):
+    torch._dynamo.reset()  # TorchRL wraps every loss in one function: their graphs share its recompilation limit
     loss = make_loss()
     if network == "unet":
         planner = StatePlanner(TemporalUnet(2, 4, channels=(8,)), state_dim=2, horizon=6, num_steps=2, clip=1.0)
