@@ -47,7 +47,8 @@ def load_weights(path: str | Path, module: nn.Module, *, task: str) -> dict[str,
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:
-        raise CheckpointError(f"{path} does not fit the model: {error}") from error
+        problems = " ".join(str(error).split("\n", 1)[-1].split())
+        raise CheckpointError(f"{path} does not fit the model: {problems}") from error
     return about
 
 
@@ -77,6 +78,8 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     try:
         with safe_open(path, "pt") as file:
             about = json.loads((file.metadata() or {}).get("about", "{}"))
+        if not isinstance(about, dict):
+            raise ValueError(f"its facts are no object but {type(about).__name__}")
         return load_file(path), about
     except (SafetensorError, ValueError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
@@ -110,9 +113,11 @@ def load_training_state(path: str | Path, loss: nn.Module, optimizer: torch.opti
         dict: the facts given when it was saved.
 
     Raises:
-        CheckpointError: if the file is damaged or does not fit the loss module.
+        CheckpointError: if the file is damaged, no training state, or does not fit the loss module.
     """
     tensors, about = load_tensors(path)
+    if "rng.cpu" not in tensors or "param_groups" not in about:
+        raise CheckpointError(f"{path} is no state of a training")
     wanted = {name: value for name, value in loss.state_dict().items() if isinstance(value, Tensor)}
     saved = {name.removeprefix("loss."): value for name, value in tensors.items() if name.startswith("loss.")}
     if wanted.keys() != saved.keys() or any(wanted[name].shape != saved[name].shape for name in wanted):

@@ -20,7 +20,8 @@ def fit_closed_form(controller: nn.Module, data: TensorDictBase) -> dict[str, An
     keys = ["state", "action", "has_action", "episode"]
     windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.history)
     mask = windows["has_action"].squeeze(-1) & ~windows["padded"].squeeze(-1)
-    mask[:, : controller.history] = False  # as the current frame of another window these count already
+    # every step is frame `history` of one window; at other frames a clamped look-ahead would count it again
+    mask[:, : controller.history], mask[:, controller.history + 1 :] = False, False
     extra = {}
     if isinstance(controller, KoopmanInverseDynamics):
         through_zero = not controller.action_normalizer.offset.any()

@@ -65,9 +65,12 @@ class RunDirectory:
         if not path.is_file():
             raise RunDirectoryError(f"{path} is missing: is {self.path} the folder of a finished `koap train`?")
         try:
-            return json.loads(path.read_text())
+            content = json.loads(path.read_text())
         except ValueError as error:
             raise RunDirectoryError(f"{path} is damaged: {error}") from error
+        if not isinstance(content, dict):
+            raise RunDirectoryError(f"{path} is damaged: expected an object, got {type(content).__name__}")
+        return content
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
         """Appends a row to ``metrics.csv``."""
@@ -81,15 +84,27 @@ class RunDirectory:
             writer.writerow({"phase": phase, "step": step, **values})
 
     def read_metrics(self) -> list[dict[str, str]]:
-        """All rows of ``metrics.csv``; none if there is no such file."""
+        """All complete rows of ``metrics.csv``; none if there is no such file.
+
+        A row that was cut off when a process was killed or the disk was full is left out.
+        """
         path = self.path / "metrics.csv"
         if not path.exists():
             return []
         with path.open(newline="") as file:
-            return list(csv.DictReader(file))
+            return list(csv.DictReader(line for line in file if line.endswith("\n")))
+
+    def last_metrics(self, phase: str) -> dict[str, float]:
+        """The values of the last row of a phase; none if there is none."""
+        rows = [row for row in self.read_metrics() if row["phase"] == phase]
+        if not rows:
+            return {}
+        return {key: float(value) for key, value in rows[-1].items() if value and key not in ("phase", "step")}
 
     def rewind_metrics(self, phase: str, step: int) -> None:
         """Drops the rows of ``phase`` behind ``step``, and those of later phases, before a run goes on from there."""
+        if not (self.path / "metrics.csv").exists():
+            return
         kept = []
         for row in self.read_metrics():
             if row["phase"] == phase and int(row["step"]) > step:

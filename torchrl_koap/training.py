@@ -75,16 +75,23 @@ def train(
         dict: the last logged values, ``iterations_per_second`` of the whole phase among them.
 
     Raises:
-        DivergedError: if a loss is not finite; the message names step and term. The last checkpoint is kept.
+        DivergedError: if a loss is not finite where it is logged, or a parameter is not where a checkpoint is due;
+            the message names step and term. The last checkpoint is kept.
+        CheckpointError: if the checkpoint is damaged or that of another model.
+        ValueError: if a number of steps is below 1.
     """
+    for name, value in {"num_steps": num_steps, "log_every": log_every, "checkpoint_every": checkpoint_every}.items():
+        if value < 1:
+            raise ValueError(f"{name} must be >= 1, got {value}")
     # fused AdamW is the quickest on CPU and on CUDA, and its state is plain tensors
     optimizer = torch.optim.AdamW(loss_module.parameters(), learning_rate, weight_decay=weight_decay, fused=True)
     checkpoint = None if run is None else run.path / "checkpoints" / f"{phase}.safetensors"
     start = 0
-    if resume and checkpoint is not None and checkpoint.exists():
-        start = load_training_state(checkpoint, loss_module, optimizer)["step"]
+    if resume and checkpoint is not None:
+        if checkpoint.exists():
+            start = load_training_state(checkpoint, loss_module, optimizer)["step"]
         run.rewind_metrics(phase, start)
-    values: dict[str, float] = {}
+    values: dict[str, float] = {} if run is None else run.last_metrics(phase)
     began, mark, marked = time.perf_counter(), time.perf_counter(), start
     for step in range(start, num_steps):
         rate = learning_rate * warmup_cosine(step, num_steps, warmup)
@@ -115,6 +122,8 @@ def train(
         if progress is not None:
             progress(done, values)
         if checkpoint is not None and (done % checkpoint_every == 0 or done == num_steps):
+            if not all(parameter.isfinite().all() for parameter in loss_module.parameters()):
+                raise DivergedError(f"{phase}: parameters are not finite at step {done}; lower the learning rate")
             save_training_state(checkpoint, loss_module, optimizer, {"phase": phase, "step": done})
     elapsed = time.perf_counter() - began
     if num_steps > start:
