@@ -43,7 +43,7 @@ class Picture:
 def draw_pictures(
     run_dir: str | Path, *, animation: bool = True, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, str]:
-    """Draws every picture whose data are there into ``plots/``; one that fails does not stop the others.
+    r"""Draws every picture whose data are there into ``plots/``; one that fails does not stop the others.
 
     Args:
         run_dir (str or Path): the run directory.
@@ -62,7 +62,7 @@ def draw_pictures(
         >>> from pathlib import Path
         >>> from torchrl_koap.pictures import draw_pictures
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = Path(folder, "metrics.csv").write_text("phase,step,loss_planner\\nplanner,1,0.5\\nplanner,2,0.4\\n")
+        ...     _ = Path(folder, "metrics.csv").write_text("phase,step,loss_planner\nplanner,1,0.5\nplanner,2,0.4\n")
         ...     draw_pictures(folder), sorted(path.name for path in Path(folder, "plots").iterdir())
         ({}, ['losses.png'])
     """

@@ -97,8 +97,7 @@ def tidy(axes: Axes) -> Axes:
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color(FAINT)
-    axes.tick_params(which="both", color=FAINT)
-    axes.tick_params(labelsize=8, labelcolor=MUTED)
+    axes.tick_params(which="both", color=FAINT, labelsize=8, labelcolor=MUTED)
     for label in (axes.xaxis.label, axes.yaxis.label):
         label.set_size(9)
         label.set_color(INK)

@@ -189,19 +189,36 @@ def plot_eigenvalues(real: Any, imag: Any, path: str | Path, *, control_hz: floa
     rank.set_xlabel("rank")
     rank.set_ylabel("magnitude")
     set_title(rank, f"largest magnitude {size.max():.4f}")
-    rank.set_ylim(0, 1.05 * max(1.0, float(size.max())))
+    low, high = max(0.0, size.min() - 0.02), max(1.0, size.max()) + 0.02
+    rank.set_ylim(low - 0.05 * (high - low) if low else 0, high + 0.05 * (high - low))
+    panels = [plane]
+    spread = max(np.ptp(real), np.ptp(imag), 0.02)
+    if spread < 0.4 and real.min() > 0.25:  # the empty half has room for a closer look
+        inset = plane.inset_axes((0.1, 0.53, 0.35, 0.35))
+        centre = np.array([real.min() + real.max(), imag.min() + imag.max()]) / 2
+        inset.set_xlim(centre[0] - 0.6 * spread, centre[0] + 0.6 * spread)
+        inset.set_ylim(centre[1] - 0.6 * spread, centre[1] + 0.6 * spread)
+        inset.plot(np.cos(angle), np.sin(angle), color=MUTED, linewidth=1, zorder=1)
+        inset.tick_params(labelsize=6.5, color=FAINT, labelcolor=MUTED)
+        inset.locator_params(nbins=3)
+        plane.indicate_inset_zoom(inset, edgecolor=MUTED)
+        panels.append(inset)
     ranks = np.arange(1, len(size) + 1)
     for subset, color in ((~outside, BLUE), (outside, ORANGE)):
         style = {"s": 20, "color": color, "alpha": 0.6, "linewidths": 0}
-        plane.scatter(real[subset], imag[subset], zorder=2, **style)
+        for axes in panels:
+            axes.scatter(real[subset], imag[subset], zorder=2, **style)
         rank.scatter(ranks[subset[order]], size[order][subset[order]], **style)
     tidy(plane), tidy(rank)
     if control_hz is not None:
-        times = np.array([0.01, 0.03, 0.1, 0.3, 1])
-        places = np.exp(-1 / (times * control_hz))
-        apart = np.diff(places, append=2 * places[-1]) > 0.04  # labels need room
+        bottom, top = rank.get_ylim()
+        ticks: dict[float, str] = {}
+        for time in (0.01, 0.03, 0.1, 0.3, 1, 3, 10):
+            place = math.exp(-1 / (time * control_hz))
+            if place > max([bottom, *(tick + 0.045 * (top - bottom) for tick in ticks)]):  # labels need room
+                ticks[place] = f"{time:g} s"
         fades = rank.secondary_yaxis("right")
-        fades.set_yticks(places[apart], [f"{time:g} s" for time in times[apart]])
+        fades.set_yticks(list(ticks), list(ticks.values()))
         fades.tick_params(labelsize=8, color=FAINT, labelcolor=MUTED)
         fades.set_ylabel("fades to 1/e within", size=9, color=INK)
         fades.spines["right"].set_visible(False)

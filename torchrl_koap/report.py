@@ -61,7 +61,7 @@ CAPTIONS = {
     "eigenvalues.png": (
         "Koopman eigenvalues",
         "Left: eigenvalues of the latent operator; outside the unit circle (orange) predictions blow up. Right: their"
-        " magnitudes in order, with the time in which such a mode fades.",
+        " magnitudes in order, with the time in which such a part of the state fades.",
     ),
 }
 _BESIDE_LABELS = "demonstrations.png"

@@ -40,7 +40,8 @@ code { background: var(--pale); padding: .05rem .3rem; border-radius: 4px; font-
 .absent { color: var(--muted); font-size: .92rem; }
 details { margin: .8rem 0; } summary { cursor: pointer; }
 @media print { body { font-size: 10.5pt; } main { max-width: none; padding: 0; } h2, h3 { break-after: avoid; }
-  .tiles { grid-template-columns: repeat(3, 1fr); } .beside > a { flex-basis: 45%; } }
+  .tiles { grid-template-columns: repeat(3, 1fr); } .beside > a { flex-basis: 45%; }
+  figure img, figure:not(.beside) img { width: auto; max-height: 11cm; } .account > figure img { max-height: 9cm; } }
 """
 _UNITS = {"_ms": "ms", "_mm": "mm", "_hz": "Hz", "_seconds": "s"}
 _PERCENT = {"success_rate", "success_low", "success_high"}
