@@ -153,6 +153,22 @@ def build_controller(
     return make(state_dim, action_dim, state_normalizer, action_normalizer, options)
 
 
+def set_up_torch(threads: int, device: str) -> None:
+    """Sets the number of threads and checks that the device is there.
+
+    Raises:
+        ValueError: if the number is below 1, or this machine has no such device.
+    """
+    if threads < 1:
+        raise ValueError(f"threads must be >= 1, got {threads}")
+    kind = device.partition(":")[0]
+    if kind not in ("cpu", "cuda"):
+        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device {device!r} was asked for, but torch finds no CUDA here (see `koap doctor`)")
+    torch.set_num_threads(threads)
+
+
 def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
     """A function that makes an environment of the task with a given number of parallel episodes."""
     from torchrl_koap.envs import AvoidingEnv  # the simulator is not needed to train from recorded data

@@ -18,7 +18,7 @@ from torchrl_koap.commands.train import Train, run_train
 
 RUNNERS = {Demos: run_demos, Train: run_train, Eval: run_eval, Doctor: run_doctor, Validate: run_validate}
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
-EXPECTED = (ValueError, FileNotFoundError, FileExistsError, RuntimeError, KeyError, OSError)
+EXPECTED = (ValueError, RuntimeError, KeyError, OSError)
 
 Command = (
     Annotated[Demos, tyro.conf.subcommand("demos")]
@@ -30,18 +30,30 @@ Command = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a sub-command; returns the exit status, 2 for a wrong call and 1 for a job that could not be done."""
+    """Runs a sub-command; returns the exit status.
+
+    It is 1 for a job that could not be done and 130 for one that was interrupted, each with one line that says why. A
+    wrong call leaves with 2. ``KOAP_TRACEBACK=1`` shows where an error is from.
+    """
     options = tyro.cli(Command, args=arguments, prog="koap")
     try:
         result = RUNNERS[type(options)](options)
     except EXPECTED as error:
         if os.environ.get("KOAP_TRACEBACK"):
             raise
-        message = error.args[0] if isinstance(error, KeyError) and error.args else error
-        print(f"koap: {message}", file=sys.stderr)
+        print(f"koap: {one_line(error)}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("koap: interrupted; `koap train` goes on from its last checkpoint with --resume", file=sys.stderr)
+        return 130
     show(result)
     return 0
+
+
+def one_line(error: Exception) -> str:
+    """The message of an error, the problems it lists one after the other."""
+    message = str(error.args[0] if isinstance(error, KeyError) and error.args else error)
+    return "; ".join(line.strip().removeprefix("- ") for line in message.splitlines()) or type(error).__name__
 
 
 def show(result: Any) -> None:

@@ -11,7 +11,7 @@ from torch import nn
 from torchrl_koap.data import cut_windows
 from torchrl_koap.modules import KoopmanInverseDynamics
 
-# one or two labelled trajectories cannot be left out to choose the penalty; benchmarks/RESULTS.md tells where it is from
+# one or two labelled trajectories cannot be left out to choose the penalty; measured in benchmarks/RESULTS.md
 DEFAULT_PENALTY = 0.017
 
 

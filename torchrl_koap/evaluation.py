@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_koap.keys import ACTION, COLLISION, MODE, OBSERVATION, SUCCESS
 from torchrl_koap.metrics import mode_entropy, wilson_interval
+from torchrl_koap.modules.diffusion import SOLVERS
 from torchrl_koap.modules.planner import StatePlanner
 from torchrl_koap.modules.policies import NOISE, OBSERVATION_HISTORY, EpisodeNoise, PlanThenControl, policy_transforms
 
@@ -65,9 +66,14 @@ def roll_out(
 
     Returns:
         list of TensorDict: one per episode, ``[steps]``, cut at its end.
+
+    Raises:
+        ValueError: if there are no seeds, or the batch size is below 1.
     """
+    if not len(seeds) or (batch_size is not None and batch_size < 1):
+        raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
     planner = policy.planner
-    draws = (1 + planner.num_steps,) if planner.solver == "ddpm" else ()
+    draws = (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
     shape = (*draws, planner.horizon, planner.state_dim)
     size, episodes = batch_size or len(seeds), []
     for begin in range(0, len(seeds), size):

@@ -72,6 +72,17 @@ class RunDirectory:
             raise RunDirectoryError(f"{path} is damaged: expected an object, got {type(content).__name__}")
         return content
 
+    def read_entry(self, name: str, key: str) -> Any:
+        """Reads one entry of a JSON file.
+
+        Raises:
+            RunDirectoryError: if the file or the entry is not there; the message names both.
+        """
+        content = self.read_json(name)
+        if key not in content:
+            raise RunDirectoryError(f"{self.path / name} has no entry {key!r}")
+        return content[key]
+
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
         """Appends a row to ``metrics.csv``."""
         path = self.path / "metrics.csv"

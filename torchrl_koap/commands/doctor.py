@@ -8,7 +8,6 @@ import importlib.util
 import os
 import platform
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 import tyro

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import tyro
 from torch import nn
 from tqdm import tqdm
 
-from torchrl_koap.assembly import build_controller, build_planner, make_env_of, mode_index_of
+from torchrl_koap.assembly import build_controller, build_planner, make_env_of, mode_index_of, set_up_torch
 from torchrl_koap.checkpoints import load_weights, save_tensors
 from torchrl_koap.evaluation import make_policy, measure_latency, roll_out, rollouts_to_tensors, score
 from torchrl_koap.lookup import lookup
@@ -63,13 +62,13 @@ def load_run(run: RunDirectory, task: str | None = None) -> tuple[Task, StatePla
         RunDirectoryError: if the folder is no finished run, or one of another task than asked for.
         CheckpointError: if weights are damaged, of another task or without their statistics.
     """
-    config = run.read_json("config.json")
-    if task is not None and task != config.get("task"):
-        raise RunDirectoryError(f"{run.path} was trained on task {config.get('task')!r}, not on {task!r}")
-    facts = get_task(config["task"])
+    trained_on, *parts = (run.read_entry("config.json", name) for name in ("task", "planner", "controller"))
+    if task is not None and task != trained_on:
+        raise RunDirectoryError(f"{run.path} was trained on task {trained_on!r}, not on {task!r}")
+    facts = get_task(trained_on)
     state_dim = len(facts.state_columns)
-    planner = build_planner(config["planner"], state_dim)
-    controller = build_controller(config["controller"], state_dim, facts.action_dim)
+    planner = build_planner(parts[0], state_dim)
+    controller = build_controller(parts[1], state_dim, facts.action_dim)
     for name, module in (("planner", planner), ("controller", controller)):
         load_weights(run.path / f"{name}.safetensors", module, task=facts.name)
     return facts, planner.eval(), controller.eval()
@@ -81,10 +80,11 @@ def run_eval(options: Eval) -> dict[str, Any]:
     Raises:
         ValueError: for unknown options or fewer than one episode.
     """
-    if options.episodes < 1:
-        raise ValueError(f"episodes must be >= 1, got {options.episodes}")
+    for name, value in {"episodes": options.episodes, "batch_size": options.batch_size}.items():
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be >= 1, got {value}")
     lookup(EXECUTIONS, options.execution, "execution")
-    torch.set_num_threads(options.threads)
+    set_up_torch(options.threads, options.device)
     run = RunDirectory(options.run)
     task, planner, controller = load_run(run, options.task)
     if options.solver is not None:

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
+import os
 import platform
 import sys
 import time
@@ -17,13 +19,14 @@ from torch import nn
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from torchrl_koap.analysis import write_analysis
-from torchrl_koap.assembly import METHODS, build_controller, build_planner, load_demonstrations
+from torchrl_koap.analysis import AFTER, BEFORE, write_analysis
+from torchrl_koap.assembly import METHODS, build_controller, build_planner, load_demonstrations, set_up_torch
 from torchrl_koap.checkpoints import load_weights, save_tensors, save_weights
 from torchrl_koap.closed_form import fit_closed_form
 from torchrl_koap.data import (
     LabelBudget,
     RecoveryAugmentation,
+    WindowTable,
     cut_windows,
     extrapolate_ends,
     make_window_buffer,
@@ -69,6 +72,7 @@ class Train:
         episodes: number of scripted demonstrations.
         threads: torch threads.
         device: "cpu" or "cuda".
+        checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run.
         logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
@@ -102,6 +106,7 @@ class Train:
     episodes: int = 96
     threads: int = 2
     device: str = "cpu"
+    checkpoint_every: int = 500
     resume: bool = False
     logger: str = "csv"
     analysis: bool = True
@@ -123,13 +128,21 @@ def run_train(options: Train) -> dict[str, Any]:
     lookup(PRESETS, options.preset, "preset")
     lookup(("ridge", "sgd"), options.decoder, "decoder")
     lookup(("csv", "wandb"), options.logger, "logger")
+    if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
+        raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
     if options.decoder == "sgd" and options.method == "linear":
         raise ValueError("method 'linear' is a closed form: it has no decoder 'sgd'")
     if options.steps < 1 or options.controller_steps < 0:
         raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
-    torch.set_num_threads(options.threads)
+    for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
+    set_up_torch(options.threads, options.device)
     run = RunDirectory(options.out)
     config = _configure(run, options)
+    planner = build_planner(config["planner"], len(task.state_columns))  # finds unknown names before any work is done
+    if options.planner_from is not None:
+        load_planner(options.planner_from / "planner.safetensors", planner, task)
 
     with tqdm(desc="demonstrations", unit="episode", disable=options.dataset != "scripted") as bar:
         data = load_demonstrations(
@@ -143,17 +156,23 @@ def run_train(options: Train) -> dict[str, Any]:
     command = task.observation[task.command]
     labelled, report = budget.apply(data, command=command)
     labelled = labelled.to(options.device)
+    _check_lengths(options, config, task, labelled)
+    run.write_json("config.json", config)  # not before the data are known to be good: a wrong call leaves nothing
 
     began = time.perf_counter()
     logger = _make_logger(options)
-    torch.manual_seed(options.seed)
-    planner, planner_values = _train_planner(run, options, config, task, labelled, logger)
-    planned = time.perf_counter()
-    torch.manual_seed(options.seed)  # the controller is the same, whether the planner was trained here or taken over
-    controller, fit, controller_values = _train_controller(run, options, config, task, labelled, logger)
+    try:
+        torch.manual_seed(options.seed)
+        trained, planner_values = _train_planner(run, options, config, task, labelled, logger)
+        planned = time.perf_counter()
+        torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
+        controller, fit, controller_values = _train_controller(run, options, config, task, labelled, logger)
+    finally:
+        if logger is not None:
+            logger.close()
     summary = {
         "labels": report.as_dict(),
-        "planner_parameters": sum(p.numel() for p in planner.parameters()),
+        "planner_parameters": sum(p.numel() for p in trained.parameters()),
         "controller_parameters": sum(p.numel() for p in controller.parameters()),
         "train_seconds": {"planner": planned - began, "controller": time.perf_counter() - planned},
         "planner": planner_values,
@@ -166,7 +185,16 @@ def run_train(options: Train) -> dict[str, Any]:
     return summary
 
 
+def _check_lengths(options: Train, config: dict[str, Any], task: Task, data: TensorDictBase) -> None:
+    """Finds trajectories that are too short now rather than after the planner was trained."""
+    controller = build_controller(config["controller"], data["state"].shape[-1], task.action_dim)
+    WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.history)
+    if options.analysis:
+        WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
+
+
 def _configure(run: RunDirectory, options: Train) -> dict[str, Any]:
+    """Everything that ``config.json`` holds; compared with what is there already."""
     config = asdict(options)
     config |= {name: str(config[name]) for name in ("out", "planner_from") if config[name] is not None}
     config["planner"] = {
@@ -182,7 +210,7 @@ def _configure(run: RunDirectory, options: Train) -> dict[str, Any]:
         "clip": 1.2 if options.prediction == "sample" else 1.0,
     }
     if options.planner_from is not None:
-        config["planner"] = RunDirectory(options.planner_from).read_json("config.json")["planner"]
+        config["planner"] = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     config["controller"] = {"method": options.method, "preset": options.preset}
     config["channels"] = list(options.channels)
     config["command"] = "koap " + " ".join(sys.argv[1:])
@@ -193,13 +221,12 @@ def _configure(run: RunDirectory, options: Train) -> dict[str, Any]:
         if not options.resume:
             raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
         earlier = run.read_json("config.json")
-        free = {"resume", "command", "versions", "threads", "out"}
+        free = {"resume", "command", "versions", "threads", "out", "checkpoint_every"}
         changed = [key for key in config if key not in free and config[key] != earlier.get(key)]
         if changed:
             raise RunDirectoryError(
                 f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so"
             )
-    run.write_json("config.json", config)
     return config
 
 
@@ -208,9 +235,8 @@ def _make_logger(options: Train):
         return None
     from torchrl.record.loggers import get_logger
 
-    return get_logger(
-        "wandb", str(options.out / "wandb"), options.out.name, wandb_kwargs={"mode": "offline", "project": "koap"}
-    )
+    mode = os.environ.get("WANDB_MODE", "offline")
+    return get_logger("wandb", str(options.out), options.out.name, wandb_kwargs={"mode": mode, "project": "koap"})
 
 
 def _train_planner(
@@ -222,7 +248,7 @@ def _train_planner(
         load_planner(source / "planner.safetensors", planner, task)
         if options.planner_from is not None:
             save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
-        return planner, {}
+        return planner, run.last_metrics("planner")
     # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
     extended = extrapolate_ends(data, HORIZON - 1)
     planner.fit_normalizers(cut_windows(extended, WINDOW, select=["state"], pad_before=1)["state"])
@@ -241,6 +267,7 @@ def _train_planner(
             target_update=SoftUpdate(loss, eps=min(0.998, 1 - 10 / (options.steps + 10))),
             run=run,
             logger=logger,
+            checkpoint_every=options.checkpoint_every,
             resume=options.resume,
             progress=_progress(bar),
         )
@@ -287,6 +314,7 @@ def _train_controller(
                 weight_decay=1e-3,
                 run=run,
                 logger=logger,
+                checkpoint_every=options.checkpoint_every,
                 resume=options.resume,
                 progress=_progress(bar),
             )

@@ -55,7 +55,8 @@ class PlanThenControl(TensorDictModuleBase):
     Args:
         planner (StatePlanner): plans states from the last observed ones.
         controller (TensorDictModuleBase): reads a window of states ``[*B, T, d]`` and writes actions
-            ``[*B, T, act]``; the :class:`KoopmanInverseDynamics` or any other inverse dynamics.
+            ``[*B, T, act]`` as the last of its out-keys; the :class:`KoopmanInverseDynamics` or any other inverse
+            dynamics.
 
     Keyword Args:
         state_columns (sequence of int): columns of the observation that make up the state.
@@ -66,7 +67,9 @@ class PlanThenControl(TensorDictModuleBase):
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
     Raises:
-        ValueError: for an unknown execution, or a history shorter than the planner's.
+        ValueError: for an unknown execution, a history shorter than the planner's, or an interval longer than the
+            horizon. At the first call for a history of another length.
+        KeyError: at the first call, if the environment lacks :func:`policy_transforms`.
 
     Examples:
         >>> import torch
@@ -99,13 +102,14 @@ class PlanThenControl(TensorDictModuleBase):
             raise ValueError(f"the planner reads {planner.history} observed frames, history is only {history}")
         if not 1 <= replan_interval <= planner.horizon:
             raise ValueError(f"replan_interval must be in 1..{planner.horizon} (the horizon), got {replan_interval}")
-        self.in_keys, self.out_keys = [history_key, "is_init"], [action_key, PLAN]
+        self.in_keys = [history_key, "is_init"]
         self.execution, self.history, self.replan_interval = execution, history, replan_interval
         self.register_buffer("state_columns", torch.as_tensor(state_columns), persistent=False)
         self.planner, self.controller = planner, controller
         # the chunk that the wrapper caches and hands out step by step: remaining plans, or actions
         cached = ["remaining_plan"] if execution == "feedback" else [action_key]
         chunk = "remaining_plan_chunk" if execution == "feedback" else "action_chunk"
+        self.out_keys = [action_key, chunk]
         self.receding = MultiStepActorWrapper(
             _Chunk(planner, self._remaining_plans if execution == "feedback" else self._decode_chunk, chunk),
             n_steps=replan_interval,
@@ -116,9 +120,11 @@ class PlanThenControl(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of the current step (and the caches that the next one continues from)."""
-        observed = tensordict.get(self.in_keys[0])
+        observed = tensordict.get(self.in_keys[0], None)
         if observed is None:
             raise KeyError(f"the policy reads {self.in_keys[0]!r}: append policy_transforms() to the environment")
+        if tensordict.get("is_init", None) is None:
+            raise KeyError("the policy reads 'is_init': append policy_transforms() to the environment")
         if observed.shape[-2] != self.history:
             raise ValueError(
                 f"{self.in_keys[0]!r} must hold {self.history} frames on axis -2, got {list(observed.shape)}"
@@ -135,7 +141,7 @@ class PlanThenControl(TensorDictModuleBase):
         window = torch.cat([history, plan], -2)
         name = self.controller.in_keys[0]
         out = self.controller(TensorDict({name: window}, batch_size=window.shape[:-2]))
-        return out.get(self.out_keys[0])
+        return out.get(self.controller.out_keys[-1])
 
     def _remaining_plans(self, history: Tensor, plan: Tensor) -> Tensor:
         """What is left of the plan after 0, 1, ... steps, its last state repeated: ``[*B, interval, H, d]``."""
