@@ -141,6 +141,13 @@ class SupervisedInverseDynamics(TensorDictModuleBase):
         self.network = SequenceLSTM(state_dim, hidden_dim, action_dim)
         self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
 
+    def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
+        """Renames the entries read and written."""
+        if state is not None:
+            self.in_keys = [state]
+        if action is not None:
+            self.out_keys = [action]
+
     @property
     def num_window_frames(self) -> int:
         """Frames of the shortest complete window."""
