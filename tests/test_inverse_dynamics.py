@@ -211,6 +211,23 @@ def test_actions_outside_the_mask_are_not_read(poison):
         assert torch.equal(value, models[1].state_dict()[name]), name
 
 
+class RefusesNaN(Normalizer):
+    """A normaliser that checks what it gets."""
+
+    def forward(self, values):
+        assert values.isfinite().all()
+        return super().forward(values)
+
+
+def test_normalisers_never_see_an_action_outside_the_mask():
+    data, mask = labelled(20)
+    models = make_model(), make_model(action_normalizer=RefusesNaN(**ACTION_NORMALIZER))
+    for model in models:
+        model.fit_decoder(data, mask)
+    for name, value in models[0].state_dict().items():
+        assert torch.equal(value, models[1].state_dict()[name]), name
+
+
 def test_scales_are_fitted_in_normalised_units():
     model, state = make_model(), windows(100)
     model.fit_scales(state)
