@@ -195,11 +195,15 @@ def _held_out(
 ) -> Tensor:
     """Residuals of every step, predicted without its group; a fitted mean counts as one more, unpenalised column."""
     residual = target - left @ (shrink[:, None] * projected)
+    constant = 1 / len(left) if centred else 0.0
+    if len(left) > 1 and int(groups.max()) + 1 == len(left):  # single steps: the leverages are all that is needed
+        leverage = (left.square() * shrink).sum(-1, keepdim=True) + constant
+        return residual / (1 - leverage)
     held_out = torch.empty_like(residual)
     for group in range(int(groups.max()) + 1):
         rows = groups == group
         part = left[rows]
-        hat = (part * shrink) @ part.mT + (1 / len(left) if centred else 0.0)
+        hat = (part * shrink) @ part.mT + constant
         if centred and len(part) == len(left):  # nothing is left to take a mean of
             held_out[rows] = torch.inf
             continue
