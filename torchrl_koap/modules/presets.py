@@ -16,14 +16,14 @@ PRESETS = {
     # best measured (benchmarks/RESULTS.md): observables of the frames relative to the current one, an input matrix
     # B, no clamped look-ahead, a decoder in closed form
     "default": {
-        "latent_dim": 64,
-        "hidden_dim": 128,
+        "latent_dim": 32,
+        "hidden_dim": 64,
         "recurrent_lifting": False,
         "include_state": True,
         "structure": "dense",
         "operator_init": "identity",
         "network": "fourier",
-        "num_features": 256,
+        "num_features": 512,
         "history": 4,
         "look_ahead": (2, 3, 4, 6, 8),
         "clamped": False,

@@ -1,0 +1,123 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""
+Imitation with few action labels
+================================
+
+**What you will learn**
+
+* how demonstrations with and without action labels lie in one replay buffer,
+* how a Koopman inverse dynamics model turns state sequences into latent actions, and a handful of labels into actions,
+* how planner and controller become one policy in a TorchRL environment.
+
+Run it with ``python tutorials/few_labels.py``; it takes about a minute and leaves ``few_labels.png`` behind.
+"""
+
+# %%
+# Demonstrations, most of them without actions
+# --------------------------------------------
+# Scripted players steer the Panda's rod around six cylinders. The label budget keeps the actions of two of the 48
+# trajectories. Everywhere else the action is NaN and ``has_action`` is False: a leak would be loud.
+
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+
+from torchrl_koap.closed_form import fit_closed_form
+from torchrl_koap.data import (
+    LabelBudget,
+    Normalizer,
+    RecoveryAugmentation,
+    cut_windows,
+    extrapolate_ends,
+    make_window_buffer,
+    select_state,
+)
+from torchrl_koap.demonstrations import record_demonstrations
+from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.evaluation import make_policy, roll_out, rollouts_to_tensors, score
+from torchrl_koap.modules import NoiseSchedule, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+from torchrl_koap.objectives import KOAPLoss, PlannerLoss
+from torchrl_koap.path_plots import plot_rollouts
+from torchrl_koap.tasks import get_task
+
+torch.manual_seed(0)
+task = get_task("avoiding")
+demonstrations, _ = record_demonstrations("avoiding", episodes=48)
+demonstrations = select_state(demonstrations, task.state_columns)
+data, report = LabelBudget(2, unit="trajectory").apply(demonstrations, command=task.observation[task.command])
+
+# %%
+# Latent actions from states alone
+# --------------------------------
+# ``KOAPLoss`` trains lifting, operator and latent actions on *all* windows; without labels its action term is exactly
+# zero. Normalisers see states of all trajectories, but actions only within the budget.
+
+inverse_dynamics = make_koopman_inverse_dynamics(
+    2,
+    2,
+    state_normalizer=Normalizer.fit(data["state"], mode="standard"),
+    action_normalizer=Normalizer.fit(data["action"], mode="rms", mask=data["has_action"]),
+)
+history = inverse_dynamics.history
+inverse_dynamics.fit_scales(cut_windows(data, 16, select=["state"], pad_before=history)["state"])
+loss = KOAPLoss(inverse_dynamics, action_coeff=0.0)
+buffer = make_window_buffer(data, 16, 256, select=["state", "action", "has_action"], pad_before=history)
+optimizer = torch.optim.AdamW(loss.parameters(), 1e-3)
+for _ in range(200):
+    sum(loss(buffer.sample()).values()).backward()
+    optimizer.step()
+    optimizer.zero_grad()
+
+# %%
+# The labels are spent last: the linear decoder is fitted to them in closed form.
+
+fit = fit_closed_form(inverse_dynamics, data)
+
+# %%
+# A planner over states
+# ---------------------
+# It never sees an action. Recovery augmentation shows it states beside the demonstrations together with the way back.
+
+planner = StatePlanner(
+    TemporalUnet(2, 4), NoiseSchedule("squared_cosine", "sample"), state_dim=2, relative=False, clip=1.2, num_steps=5
+)
+extended = extrapolate_ends(data, 13)
+planner.fit_normalizers(cut_windows(extended, 16, select=["state"], pad_before=1)["state"])
+planner_loss = PlannerLoss(planner)
+average = SoftUpdate(planner_loss, eps=0.99)
+windows = make_window_buffer(extended, 16, 128, select=["state"], pad_before=1)
+augment = RecoveryAugmentation(0.004)
+optimizer = torch.optim.AdamW(planner_loss.parameters(), 3e-3)
+for _ in range(1000):
+    planner_loss(augment(windows.sample()))["loss_planner"].backward()
+    optimizer.step()
+    optimizer.zero_grad()
+    average.step()
+planner_loss.target_planner_params.to_module(planner)
+
+# %%
+# Rollouts
+# --------
+# One episode per environment, all in one batch, each with its own seed. A thousand updates make a planner that is far
+# from finished: compare the picture with the one that ``make demo`` draws.
+
+policy = make_policy(planner, inverse_dynamics, state_columns=task.state_columns)
+seeds = list(range(24))
+episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
+result = score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index)
+rollouts = rollouts_to_tensors(episodes, position=task.observation[task.position], mode_index=mode_index, interval=4)
+plot_rollouts(rollouts, "few_labels.png", task="avoiding", num_modes=task.num_modes)
+
+# %%
+# Every module works alone as well: the latent actions of any window of states are one call away.
+
+latent = inverse_dynamics(TensorDict({"state": extended["state"][None, :16]}, batch_size=[1]))["latent_action"]
+
+# %%
+# Conclusion
+# ----------
+# Two labelled trajectories out of 48 were enough to act on plans made from states alone. ``result`` holds the success
+# rate with its Wilson interval, ``report`` every label that was touched, ``fit`` the penalty of the decoder.
+#
+# Further reading: ``koap train --help`` for the same in one command, ``benchmarks/RESULTS.md`` for what each choice is
+# worth.
