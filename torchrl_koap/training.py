@@ -91,7 +91,7 @@ def train(
         if checkpoint.exists():
             start = load_training_state(checkpoint, loss_module, optimizer)["step"]
         run.rewind_metrics(phase, start)
-    values: dict[str, float] = {} if run is None else run.last_metrics(phase)
+    values: dict[str, float] = run.last_metrics(phase) if start else {}
     began, mark, marked = time.perf_counter(), time.perf_counter(), start
     for step in range(start, num_steps):
         rate = learning_rate * warmup_cosine(step, num_steps, warmup)
