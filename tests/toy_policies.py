@@ -1,0 +1,127 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Planners, controllers and environments whose outputs say where they are from."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_koap.modules import NoiseSchedule, StatePlanner
+
+
+class CountingPlanner(nn.Module):
+    """Planned frame ``i`` of a plan made at state ``x`` is ``(x + 1000 (i + 1), x)``."""
+
+    history, horizon, num_steps, solver, state_dim = 2, 6, 1, "ddim", 2
+
+    def __init__(self):
+        super().__init__()
+        self.calls = []
+
+    def plan(self, history, noise=None):
+        assert history.shape[-2:] == (2, 2)
+        self.calls.append(history[..., -1, 0].flatten().tolist())
+        ahead = 1000.0 * torch.arange(1, self.horizon + 1)
+        now = history[..., -1:, 0]
+        return torch.stack([now + ahead, now.expand(*now.shape[:-1], self.horizon)], -1)
+
+
+class EchoController(TensorDictModuleBase):
+    """The action of frame ``t`` is what the window holds: ``x_{t-1}``, ``x_t`` and both columns of ``x_{t+1}``."""
+
+    def __init__(self, history=1, in_key="state", out_key="action"):
+        super().__init__()
+        self.in_keys, self.out_keys, self.history = [in_key], ["something_else", out_key], history
+
+    def forward(self, tensordict):
+        state = tensordict.get(self.in_keys[0])
+        before = torch.cat([state[..., :1, :1], state[..., :-1, :1]], -2)
+        after = torch.cat([state[..., 1:, :], state[..., -1:, :]], -2)
+        return tensordict.set(self.out_keys[-1], torch.cat([before, state[..., :1], after], -1))
+
+
+def state_number(env, episode, step):
+    """The first state column: another number for every environment, episode and step, below 1000."""
+    return float(100 * env + 20 * episode + step)
+
+
+class EpisodesOfRandomLength(EnvBase):
+    """Observations count environment, episode and step; episodes end after a number of steps of their own."""
+
+    def __init__(self, num_envs, lengths, action_dim=4):
+        super().__init__(batch_size=[num_envs])
+        self.lengths = lengths  # [env][episode], repeated from the beginning when used up
+        self.episode = [-1] * num_envs
+        self.step_number = [0] * num_envs
+        shape = (num_envs,)
+        self.observation_spec = Composite({"observation": Unbounded((num_envs, 3))}, shape=shape)
+        self.action_spec = Bounded(-1e6, 1e6, (num_envs, action_dim))
+        self.reward_spec = Unbounded((num_envs, 1))
+
+    def _observation(self):
+        rows = [
+            [-1.0, state_number(env, episode % 5, step), 7.0]
+            for env, (episode, step) in enumerate(zip(self.episode, self.step_number, strict=True))
+        ]
+        return torch.tensor(rows)
+
+    def _reset(self, tensordict):
+        flags = None if tensordict is None else tensordict.get("_reset", None)
+        for env in range(self.batch_size[0]):
+            if flags is None or flags[env].item():
+                self.episode[env] += 1
+                self.step_number[env] = 0
+        return TensorDict(
+            {"observation": self._observation(), "done": torch.zeros(*self.batch_size, 1, dtype=torch.bool)},
+            self.batch_size,
+        )
+
+    def _step(self, tensordict):
+        done = torch.zeros(*self.batch_size, 1, dtype=torch.bool)
+        for env in range(self.batch_size[0]):
+            self.step_number[env] += 1
+            lengths = self.lengths[env]
+            done[env] = self.step_number[env] >= lengths[self.episode[env] % len(lengths)]
+        reward = torch.zeros(*self.batch_size, 1)
+        return TensorDict(
+            {"observation": self._observation(), "reward": reward, "done": done, "terminated": done.clone()},
+            self.batch_size,
+        )
+
+    def _set_seed(self, seed):
+        pass
+
+
+class Wandering(nn.Module):
+    """A denoiser whose plan is straight ahead, with a sideways speed read off the noise."""
+
+    def forward(self, x, time, condition):
+        now = condition[..., -2:]
+        ahead = torch.arange(1, x.shape[-2] + 1, dtype=x.dtype, device=x.device)
+        speed = torch.stack([0.004 * x[..., 0, 0], torch.full_like(x[..., 0, 0], 0.007)], -1)
+        # the schedule reads the output as the derivative of a straight path: noise minus plan
+        return x - (now[..., None, :] + ahead[:, None] * speed[..., None, :])
+
+
+def wandering_planner():
+    """Plans that lead into different gaps, or into cylinders, depending on the noise alone."""
+    return StatePlanner(
+        Wandering(), NoiseSchedule("flow"), state_dim=2, horizon=14, relative=False, solver="euler", num_steps=1
+    )
+
+
+class PlannedStep(TensorDictModuleBase):
+    """The action is the difference of the next two frames: a controller without parameters."""
+
+    def __init__(self):
+        super().__init__()
+        self.in_keys, self.out_keys, self.history = ["state"], ["action"], 1
+
+    def forward(self, tensordict):
+        state = tensordict["state"]
+        step = torch.cat([state[..., 1:, :], state[..., -1:, :]], -2)
+        return tensordict.set("action", torch.cat([step[..., 1:, :], step[..., -1:, :]], -2) - step)
