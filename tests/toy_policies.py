@@ -10,6 +10,7 @@ from torch import nn
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_koap.envs.avoiding import OBSTACLES
 from torchrl_koap.modules import NoiseSchedule, StatePlanner
 
 
@@ -97,12 +98,17 @@ class EpisodesOfRandomLength(EnvBase):
 
 
 class Wandering(nn.Module):
-    """A denoiser whose plan is straight ahead, with a sideways speed read off the noise."""
+    """A denoiser whose plan is straight ahead, away from the next cylinder, and to a side read off the noise."""
 
     def forward(self, x, time, condition):
         now = condition[..., -2:]
         ahead = torch.arange(1, x.shape[-2] + 1, dtype=x.dtype, device=x.device)
-        speed = torch.stack([0.004 * x[..., 0, 0], torch.full_like(x[..., 0, 0], 0.007)], -1)
+        sideways = 0.003 * x[..., 0, 0]
+        for _, *centre, _, _ in OBSTACLES:
+            gap = now - now.new_tensor(centre)
+            push = 0.008 * torch.exp(-((gap[..., 0] / 0.05) ** 2)) * torch.sign(gap[..., 0])
+            sideways = sideways + push * ((gap[..., 1] > -0.13) & (gap[..., 1] < 0.02))
+        speed = torch.stack([sideways, torch.full_like(sideways, 0.009)], -1)
         # the schedule reads the output as the derivative of a straight path: noise minus plan
         return x - (now[..., None, :] + ahead[:, None] * speed[..., None, :])
 

@@ -1,0 +1,33 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""One thread per test process, a cache of its own, and tiny demonstrations and runs shared by all tests."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tiny_runs import TINY, koap, write_demonstrations
+
+# two processes with two threads each on two cores wait for each other most of the time
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory):
+    """Converted demonstrations are never written to the home folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("KOAP_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session")
+def demonstrations(tmp_path_factory):
+    """A folder of eight short demonstrations in D3IL's raw layout."""
+    return write_demonstrations(tmp_path_factory.mktemp("demonstrations"))
+
+
+@pytest.fixture(scope="session")
+def trained_run(tmp_path_factory, demonstrations):
+    """A run directory of `koap train`; not to be written to."""
+    folder = tmp_path_factory.mktemp("runs") / "trained"
+    assert koap("train", "--out", folder, "--dataset", demonstrations, *TINY) == 0
+    return folder

@@ -1,0 +1,50 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Demonstrations and options with which `koap` is through in a second."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_koap.cli import main
+from torchrl_koap.data import RawEpisode, write_raw_episode
+
+TINY = (
+    *("--steps", "20", "--batch-size", "8", "--controller-batch-size", "8", "--threads", "1"),
+    *("--denoiser", "unet", "--channels", "8", "16", "--label-count", "2"),
+)
+START = np.array([0.525, -0.28])
+
+
+def koap(*arguments) -> int:
+    """The exit status of a command run in this process."""
+    return main([str(argument) for argument in arguments])
+
+
+def grid(values: np.ndarray) -> np.ndarray:
+    """Rounded so that sums and differences of positions are exact."""
+    return np.round(values * 2**20) / 2**20
+
+
+def demonstration(index: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Commanded and measured path (rows, 2): upwards in an arc of its own; the arm follows the command with a lag."""
+    time = np.linspace(0, 1, rows)
+    bend = np.sin(np.pi * time) * (index - 3.5) / 40 + 0.004 * np.sin(9 * time + index)
+    commanded = grid(START + np.stack([bend, 0.6 * time**1.5], 1))
+    measured = commanded.copy()
+    for row in range(1, rows):
+        measured[row] = 0.6 * measured[row - 1] + 0.4 * commanded[row - 1]
+    return commanded, measured
+
+
+def write_demonstrations(folder: Path, *, episodes: int = 8, rows: int = 30, change=None) -> Path:
+    """Writes raw pickles; ``change(index, commanded, measured)`` may alter both paths."""
+    for index in range(episodes):
+        commanded, measured = demonstration(index, rows + index)
+        if change is not None:
+            commanded, measured = change(index, commanded, measured)
+        height = np.full((len(commanded), 1), 0.12)
+        paths = {"des_c_pos": np.hstack([commanded, height]), "c_pos": np.hstack([measured, height])}
+        write_raw_episode(Path(folder) / f"env_{index:03d}_00.pkl", RawEpisode(robot=paths))
+    return Path(folder)
