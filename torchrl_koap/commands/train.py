@@ -9,7 +9,7 @@ import os
 import platform
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +73,7 @@ class Train:
         threads: torch threads.
         device: "cpu" or "cuda".
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
-        resume: go on with an interrupted run.
+        resume: go on with an interrupted run; options left at their defaults are those it was started with.
         logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
     """
@@ -114,6 +114,8 @@ class Train:
 
 HISTORY, HORIZON = 2, 14
 WINDOW = HISTORY + HORIZON
+# options with which a run may be resumed differently; with other threads sums are rounded differently
+FREE = ("out", "threads", "checkpoint_every", "resume")
 
 
 def run_train(options: Train) -> dict[str, Any]:
@@ -123,6 +125,8 @@ def run_train(options: Train) -> dict[str, Any]:
         ValueError: for unknown options and budgets that select nothing.
         RunDirectoryError: if the folder holds another run, or one that was not asked to be resumed.
     """
+    run = RunDirectory(options.out)
+    options = _started_with(run, options)
     task = get_task(options.task)
     lookup(METHODS, options.method, "method")
     lookup(PRESETS, options.preset, "preset")
@@ -138,7 +142,6 @@ def run_train(options: Train) -> dict[str, Any]:
         if getattr(options, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
     set_up_torch(options.threads, options.device)
-    run = RunDirectory(options.out)
     config = _configure(run, options)
     planner = build_planner(config["planner"], len(task.state_columns))  # finds unknown names before any work is done
     if options.planner_from is not None:
@@ -185,6 +188,20 @@ def run_train(options: Train) -> dict[str, Any]:
     return summary
 
 
+def _started_with(run: RunDirectory, options: Train) -> Train:
+    """The options of a resumed run: what was not asked for otherwise is as it was."""
+    if not (options.resume and (run.path / "config.json").exists()):
+        return options
+    earlier = run.read_json("config.json")
+    left = [field.name for field in fields(options) if getattr(options, field.name) == field.default]
+    kept = {name: earlier[name] for name in left if name in earlier}
+    if "channels" in kept:
+        kept["channels"] = tuple(kept["channels"])
+    if kept.get("planner_from") is not None:
+        kept["planner_from"] = Path(kept["planner_from"])
+    return replace(options, **kept)
+
+
 def _check_lengths(options: Train, config: dict[str, Any], task: Task, data: TensorDictBase) -> None:
     """Finds trajectories that are too short now rather than after the planner was trained."""
     controller = build_controller(config["controller"], data["state"].shape[-1], task.action_dim)
@@ -221,7 +238,7 @@ def _configure(run: RunDirectory, options: Train) -> dict[str, Any]:
         if not options.resume:
             raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
         earlier = run.read_json("config.json")
-        free = {"resume", "command", "versions", "threads", "out", "checkpoint_every"}
+        free = {*FREE, "command", "versions"}
         changed = [key for key in config if key not in free and config[key] != earlier.get(key)]
         if changed:
             raise RunDirectoryError(

@@ -1,0 +1,86 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What the README says can be done: its commands parse, its code runs, its links lead somewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import tyro
+
+from torchrl_koap.cli import Command
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+SHELL = [
+    shlex.split(line, comments=True)
+    for language, block in BLOCKS
+    if language in ("bash", "sh", "console")
+    for line in block.replace("\\\n", " ").splitlines()
+]
+MAKEFILE = (ROOT / "Makefile").read_text()
+RECIPES = [
+    shlex.split(line.replace("$(BIN)/", "").replace("$(OUT)", "runs/demo"))
+    for line in MAKEFILE.splitlines()
+    if "/koap " in line
+]
+CALLS = [words[1:] for words in (*SHELL, *RECIPES) if words and words[0] == "koap"]
+
+
+def test_set_up_demo_and_tests_come_first():
+    language, block = BLOCKS[0]
+    assert language == "bash"
+    assert [line.split("#")[0].strip() for line in block.splitlines()] == ["make demo", "make test"]
+
+
+@pytest.mark.parametrize("target", sorted({words[1] for words in SHELL if words[:1] == ["make"]}))
+def test_targets_exist(target):
+    assert re.search(rf"^{target}:", MAKEFILE, re.MULTILINE)
+
+
+@pytest.mark.parametrize("arguments", CALLS, ids=" ".join)
+def test_commands_parse(arguments):
+    options = tyro.cli(Command, args=arguments, prog="koap")
+    assert type(options).__name__.lower() == arguments[0]
+
+
+def test_every_command_is_shown():
+    assert {"demos", "train", "eval", "validate", "doctor"} <= {arguments[0] for arguments in CALLS}
+    assert len(CALLS) >= 8  # the two of `make demo` among them
+
+
+def test_the_demo_is_the_contract():
+    """`make demo` trains on 2 % of the trajectories and rolls out 60 times."""
+    train, evaluation = (tyro.cli(Command, args=words[1:], prog="koap") for words in RECIPES)
+    assert (train.label_fraction, train.label_unit, train.dataset) == (0.02, "trajectory", "scripted")
+    assert (evaluation.run, evaluation.episodes, train.out) == (train.out, 60, evaluation.run)
+
+
+@pytest.mark.parametrize("code", [block for language, block in BLOCKS if language == "python"])
+def test_python_runs(code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
+
+
+LINKS = [link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+PATHS = re.findall(r"`((?:torchrl_koap|tutorials|benchmarks|tests)/[\w./]*)`", README)
+
+
+@pytest.mark.parametrize("path", sorted({path for path in (*LINKS, *PATHS) if path}))
+def test_links_lead_somewhere(path):
+    assert (ROOT / path).exists()
+
+
+def test_options_named_in_the_text_exist():
+    """Every ``--option`` in running text is one of some command."""
+    text = re.sub(r"^```.*?^```", "", README, flags=re.MULTILINE | re.DOTALL)
+    sources = "".join(path.read_text() for path in (ROOT / "torchrl_koap" / "commands").glob("*.py"))
+    for option in re.findall(r"`--([a-z][a-z-]*)", text):
+        assert re.search(rf"^    {option.replace('-', '_')}:", sources, re.MULTILINE), option
+
+
+def test_nothing_is_left_to_fill_in():
+    assert not re.findall(r"@@|TODO|XXX|FIXME", README)
