@@ -82,6 +82,12 @@ def test_json_round_trip_and_entries(run):
         run.read_entry("config.json", "controller")
 
 
+def test_numbers_that_json_does_not_know_become_null(run):
+    run.write_json("summary.json", {"error": float("inf"), "rows": [{"x": float("nan")}, (1.5, -float("inf"))]})
+    assert run.read_json("summary.json") == {"error": None, "rows": [{"x": None}, [1.5, None]]}
+    assert "Infinity" not in (run.path / "summary.json").read_text()
+
+
 @pytest.mark.parametrize("text", ["", '{"task": "avo', "[1, 2]", "\x00\x01"])
 def test_damaged_json_is_named(run, text):
     (run.path / "config.json").write_text(text)
