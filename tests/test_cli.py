@@ -81,6 +81,15 @@ def test_what_a_training_writes(trained_run, demonstrations):
     assert {".tmp" in name for name in contents(trained_run)} == {False}
 
 
+def test_the_planner_kept_is_the_moving_average(trained_run):
+    state, _ = load_tensors(trained_run / "checkpoints" / "planner.safetensors")
+    kept, _ = load_tensors(trained_run / "planner.safetensors")
+    weights = [name for name in kept if name.startswith("denoiser.")]
+    assert len(weights) > 10
+    assert all(torch.equal(kept[name], state[f"loss.target_planner_params.{name}"]) for name in weights)
+    assert any(not torch.equal(kept[name], state[f"loss.planner_params.{name}"]) for name in weights)
+
+
 def test_the_same_seed_gives_the_same_run_another_seed_another(trained_run, demonstrations, tmp_path):
     for seed in (0, 1):
         assert koap("train", "--out", tmp_path / str(seed), "--dataset", demonstrations, *TINY, "--seed", seed) == 0
