@@ -13,6 +13,7 @@ import argparse
 import time
 
 import torch
+
 from torchrl_koap.data import Normalizer, flatten_trajectories, make_window_buffer, select_state
 from torchrl_koap.modules import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss

@@ -38,9 +38,7 @@ def run_cell(arguments: argparse.Namespace, method: str, count: int, seed: int) 
             )
         )
     if arguments.episodes and not (out / "eval.json").exists():
-        run_eval(
-            Eval(run=out, episodes=arguments.episodes, seed=1000 * seed, threads=arguments.threads, animate=False)
-        )
+        run_eval(Eval(run=out, episodes=arguments.episodes, seed=1000 * seed, threads=arguments.threads, animate=False))
     cell = json.loads((out / "summary.json").read_text())
     if arguments.episodes:
         cell["eval"] = json.loads((out / "eval.json").read_text())
@@ -51,7 +49,9 @@ def row(method: str, count: int, cells: list[dict]) -> str:
     """One line of the table."""
     errors = [cell["action_error_mm"]["controller"] for cell in cells]
     ridge = statistics.fmean(cell["action_error_mm"]["ridge"] for cell in cells)
-    text = f"{method:<14}{count:>6}  {statistics.fmean(errors):6.3f} ({min(errors):.3f}-{max(errors):.3f})  {ridge:6.3f}"
+    text = (
+        f"{method:<14}{count:>6}  {statistics.fmean(errors):6.3f} ({min(errors):.3f}-{max(errors):.3f})  {ridge:6.3f}"
+    )
     if "eval" not in cells[0]:
         return text
     episodes = [episode for cell in cells for episode in cell["eval"]["episode"]]
@@ -82,7 +82,9 @@ def main() -> None:
         for method in arguments.methods:
             cells = [run_cell(arguments, method, count, seed) for seed in range(arguments.seeds)]
             rows.append(row(method, count, cells))
-    print(f"{'method':<14}{'labels':>6}  {'error mm (range)':<21}  {'ridge':>6}  {'success (95 %)':<32}  entropy (pooled)")
+    print(
+        f"{'method':<14}{'labels':>6}  {'error mm (range)':<21}  {'ridge':>6}  {'success (95 %)':<32}  entropy (pooled)"
+    )
     print("\n".join(rows))
 
 

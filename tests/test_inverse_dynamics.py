@@ -50,7 +50,7 @@ def test_inference_is_normalise_infer_decode_denormalise():
     td = model(TensorDict({"state": state}, [2, 5]))
     x = (state - STATE_NORMALIZER["offset"]) / STATE_NORMALIZER["scale"]
     for t in range(1, 6):
-        read = torch.cat([x[..., t - 1, :] - x[..., t, :], x[..., t, :], x[..., t + 3, :] - x[..., t, :]], -1)
+        read = torch.cat([x[..., t, :] - x[..., t - 1, :], x[..., t, :], x[..., t + 3, :] - x[..., t, :]], -1)
         u = model.latent_action.network(read)
         torch.testing.assert_close(td["latent_action"][..., t, :], u)
         a = u @ model.action_decoder.linear.weight.T + model.action_decoder.linear.bias

@@ -67,7 +67,8 @@ def test_relative_frames_have_unit_spread_and_the_current_one_is_untouched(kind)
     span = network.span(16)
     plain = network.gather(state, span)
     for t in span:
-        expected = torch.stack([state[:, t + o] - (state[:, t] if o else 0) for o in (-2, -1, 0, 2, 4)], 1)
+        x = {offset: state[:, t + offset] for offset in (-2, -1, 0, 2, 4)}
+        expected = torch.stack([x[-1] - x[-2], x[0] - x[-1], x[0], x[2] - x[0], x[4] - x[2]], 1)
         torch.testing.assert_close(plain[:, t - span.start], expected)
     network.fit_scales(state)
     network.fit_scales(state.reshape(20, 10, 16, 2))  # again, with other batch dimensions: the same
@@ -186,3 +187,13 @@ def test_frequencies_are_drawn_anew_and_trained():
     assert not torch.equal(before, network.frequency)
     network.infer(network.gather(windows(3))).square().sum().backward()
     assert network.frequency.grad.abs().max() > 0 and network.phase.grad.abs().max() > 0
+
+
+def test_steps_tells_where_a_latent_action_holds_the_steps_of_an_axis():
+    network = LatentActionFourier(3, 8, history=2, look_ahead=(2, 5))
+    state = torch.randn(40, 16, 3, generator=torch.Generator().manual_seed(0)).cumsum(1)
+    network.fit_scales(state)
+    latent = network.infer(network.gather(state, range(4, 5)))[:, 0]
+    entries, factors = network.steps((2, 0))
+    expected = torch.stack([state[:, b] - state[:, a] for a, b in ((2, 3), (3, 4), (4, 6), (6, 9))], 1)[..., [2, 0]]
+    torch.testing.assert_close(latent[:, entries] * factors, expected)

@@ -3,20 +3,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
 from torch import nn
 
 from torchrl_koap.data import cut_windows
-from torchrl_koap.modules import KoopmanInverseDynamics
+from torchrl_koap.modules import KoopmanInverseDynamics, LatentActionFourier
 
 # one or two labelled trajectories cannot be left out to choose the penalty; measured in benchmarks/RESULTS.md
-DEFAULT_PENALTY = 0.05
+DEFAULT_PENALTY = 0.15
 
 
-def fit_closed_form(controller: nn.Module, data: TensorDictBase) -> dict[str, Any]:
-    """Fits a controller's linear decoder on every labelled step that sees its whole look-ahead, each used once."""
+def fit_closed_form(controller: nn.Module, data: TensorDictBase, *, shared_axes: Sequence[int] = ()) -> dict[str, Any]:
+    """Fits a controller's linear decoder on every labelled step that sees its whole look-ahead, each used once.
+
+    Args:
+        controller (nn.Module): a :class:`KoopmanInverseDynamics` or :class:`LinearInverseDynamics`.
+        data (TensorDictBase): flat data after the label budget was applied.
+
+    Keyword Args:
+        shared_axes (sequence of int): the state column that each action entry moves (``Task.actuated``); used by
+            Fourier latent actions (:meth:`KoopmanInverseDynamics.fit_decoder`).
+
+    Returns:
+        dict: penalty, number of labels and held-out error of the fit.
+    """
     keys = ["state", "action", "has_action", "episode"]
     windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.history)
     mask = windows["has_action"].squeeze(-1) & ~windows["padded"].squeeze(-1)
@@ -26,5 +39,7 @@ def fit_closed_form(controller: nn.Module, data: TensorDictBase) -> dict[str, An
     if isinstance(controller, KoopmanInverseDynamics):
         through_zero = not controller.action_normalizer.offset.any()
         extra = {"default_penalty": DEFAULT_PENALTY, "bias": not through_zero}
+        if shared_axes and isinstance(controller.latent_action, LatentActionFourier):
+            extra["shared_axes"] = shared_axes
     fit = controller.fit_decoder(windows, mask, groups=windows["episode"][:, -1], **extra)
     return {"penalty": fit.penalty, "labels_used": fit.num_labels, "held_out_error": fit.errors[fit.penalty]}

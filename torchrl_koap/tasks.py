@@ -25,6 +25,7 @@ class Task:
         max_steps (int): control steps after which an episode is truncated.
         control_hz (float): control steps per second.
         num_modes (int): base of the logarithm of the mode entropy.
+        actuated (tuple of int): for every action entry the state column that it moves; empty if there is none.
         hidden (tuple): further parts that planner and controller must not see.
     """
 
@@ -36,6 +37,7 @@ class Task:
     max_steps: int
     control_hz: float
     num_modes: int
+    actuated: tuple[int, ...] = field(default=())
     hidden: tuple[str, ...] = field(default=())
 
     @property
@@ -65,6 +67,7 @@ TASKS = {
         max_steps=250,
         control_hz=1 / 0.035,
         num_modes=24,
+        actuated=(0, 1),
     ),
 }
 

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """
-Imitation with few action labels
-================================
+Imitation with few action labels.
+=================================
 
 **What you will learn**
 
@@ -71,7 +71,7 @@ for _ in range(200):
 # %%
 # The labels are spent last: the linear decoder is fitted to them in closed form.
 
-fit = fit_closed_form(inverse_dynamics, data)
+fit = fit_closed_form(inverse_dynamics, data, shared_axes=task.actuated)
 
 # %%
 # A planner over states

@@ -101,7 +101,7 @@ class Train:
     relative: bool = False
     recovery_sigma: float = 0.004
     solver: str = "dpm++2m"
-    solver_steps: int = 5
+    solver_steps: int = 10
     planner_from: Path | None = None
     episodes: int = 96
     threads: int = 2
@@ -335,7 +335,8 @@ def _train_controller(
                 resume=options.resume,
                 progress=_progress(bar),
             )
-    fit = fit_closed_form(controller, data) if options.decoder == "ridge" and options.method != "supervised" else {}
+    closed_form = options.decoder == "ridge" and options.method != "supervised"
+    fit = fit_closed_form(controller, data, shared_axes=task.actuated) if closed_form else {}
     save_weights(run.path / "controller.safetensors", controller, {"task": task.name, "kind": "controller"})
     if isinstance(controller, KoopmanInverseDynamics):
         eigenvalues = controller.operator.eigenvalues()

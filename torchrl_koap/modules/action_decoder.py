@@ -86,6 +86,7 @@ class LinearActionDecoder(TensorDictModuleBase):
         penalties: Sequence[float] = tuple(10.0 ** (p / 2) for p in range(-12, 3)),
         default_penalty: float | None = None,
         bias: bool = True,
+        prior: Tensor | None = None,
     ) -> RidgeFit:
         r"""Sets ``D`` and ``b`` by ridge regression on frozen latent actions.
 
@@ -102,6 +103,7 @@ class LinearActionDecoder(TensorDictModuleBase):
                 of noise to signal variance that the fit assumes.
             default_penalty (float, optional): used instead of the choice where there are fewer than three groups.
             bias (bool): fit ``b``; otherwise it is 0 and a latent action of 0 decodes to 0. Defaults to ``True``.
+            prior (Tensor, optional): ``[act, m]``, what ``D`` is shrunk towards. Defaults to 0.
 
         Returns:
             RidgeFit: the choice and its held-out errors; they are infinite where a single step leaves nothing to fit
@@ -130,6 +132,11 @@ class LinearActionDecoder(TensorDictModuleBase):
             raise ValueError("fit_ridge got a labelled action that is not finite")
         if not x.isfinite().all():
             raise ValueError("fit_ridge got a latent action that is not finite")
+        prior = torch.zeros(y.shape[-1], x.shape[-1]) if prior is None else prior
+        if prior.shape != self.linear.weight.shape:
+            raise ValueError(f"prior must be {list(self.linear.weight.shape)}, got {list(prior.shape)}")
+        prior = prior.to(x)
+        y = y - x @ prior.mT  # a ridge around the prior is a ridge around 0 on what the prior leaves over
         rows = torch.arange(len(x), device=x.device)
         groups = rows if groups is None else groups[mask].unique(return_inverse=True)[1]
         num_groups = int(groups.max()) + 1
@@ -153,7 +160,7 @@ class LinearActionDecoder(TensorDictModuleBase):
         best = min(errors, key=errors.get)
         scaled = singular.square() + best * unit
         weight = (right.mT * (singular / scaled)) @ projected  # [m, act]
-        self.linear.weight.copy_(weight.mT)
+        self.linear.weight.copy_(prior + weight.mT)
         self.linear.bias.copy_(mean_y - mean_x @ weight)
         self.noise_variance.copy_(held_out(best).square().mean(0))
         # a root, column by column along the singular directions: in float32 the covariance itself would drown the

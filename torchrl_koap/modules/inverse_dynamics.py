@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -11,7 +13,8 @@ from torch import Tensor, nn
 from torchrl_koap.keys import ACTION, STATE
 from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
-from torchrl_koap.modules.latent_action import LatentActionModule
+from torchrl_koap.modules.latent_action import LatentActionFourier, LatentActionModule
+from torchrl_koap.modules.shared_filter import fit_shared_filter
 
 NORMALIZED_STATE = "normalized_state"
 NORMALIZED_ACTION = "normalized_action"
@@ -162,7 +165,14 @@ class KoopmanInverseDynamics(TensorDictSequential):
 
     @torch.no_grad()
     def fit_decoder(
-        self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None, batch_size: int = 4096, **kwargs
+        self,
+        windows: TensorDictBase,
+        mask: Tensor,
+        *,
+        groups: Tensor | None = None,
+        shared_axes: Sequence[int] | None = None,
+        batch_size: int = 4096,
+        **kwargs,
     ) -> RidgeFit:
         """Fits the decoder in closed form on the labelled frames of windows (:meth:`LinearActionDecoder.fit_ridge`).
 
@@ -171,6 +181,9 @@ class KoopmanInverseDynamics(TensorDictSequential):
             mask (Tensor): labelled frames to use, bool ``[*B, T]``; no action outside of it is read. Frames that do
                 not count in the losses (:meth:`LatentActionModule.span`) are left out.
             groups (Tensor, optional): trajectory of every window, int64 ``[*B]``, to be left out together.
+            shared_axes (sequence of int, optional): the state column that each action entry moves. The decoder is then
+                shrunk towards one filter of the steps that all axes share, instead of towards 0; needs a
+                :class:`LatentActionFourier`.
             batch_size (int): windows per forward pass.
             **kwargs: options of :meth:`LinearActionDecoder.fit_ridge`.
 
@@ -178,7 +191,7 @@ class KoopmanInverseDynamics(TensorDictSequential):
             RidgeFit: the ridge chosen and its held-out error in normalised units.
 
         Raises:
-            ValueError: if no labelled frame counts, or shapes disagree.
+            ValueError: if no labelled frame counts, shapes disagree, or ``shared_axes`` do not fit.
         """
         shape = windows.get(self.state_key).shape[:-1]
         if mask.shape != shape or mask.dtype != torch.bool:
@@ -202,7 +215,34 @@ class KoopmanInverseDynamics(TensorDictSequential):
         action = self.normalize_action(torch.where(mask.unsqueeze(-1), action, 0.0))
         if groups is not None:
             groups = groups[rows].unsqueeze(-1).expand_as(mask)
+        if shared_axes is not None:
+            kwargs["prior"] = self._shared_prior(latent[mask], action[mask], shared_axes)
         return self.action_decoder.fit_ridge(latent, action, mask, groups=groups, **kwargs)
+
+    def _shared_prior(self, latent: Tensor, action: Tensor, axes: Sequence[int]) -> Tensor:
+        """The decoder ``[act, m]`` that applies one and the same filter to the steps of every axis."""
+        if not isinstance(self.latent_action, LatentActionFourier) or len(axes) != action.shape[-1]:
+            raise ValueError(
+                f"shared_axes need a LatentActionFourier and one state column per action entry ({action.shape[-1]}),"
+                f" got {type(self.latent_action).__name__} and {list(axes)}"
+            )
+        entries, factors = self.latent_action.steps(axes)  # [S, act]
+        size = _unit(self.state_normalizer, self.latent_action.state_dim, factors)[list(axes)]
+        action_size = _unit(self.action_normalizer, action.shape[-1], factors)
+        per_unit = (factors * size).double()
+        shared = fit_shared_filter(latent[:, entries].double() * per_unit, (action * action_size).double())
+        prior = torch.zeros(action.shape[-1], latent.shape[-1], dtype=torch.float64, device=latent.device)
+        rows = torch.arange(action.shape[-1], device=latent.device).expand_as(entries)
+        prior[rows, entries] = shared[:, None] * per_unit / action_size
+        return prior
+
+
+def _unit(normalizer: nn.Module | None, width: int, like: Tensor) -> Tensor:
+    """Raw size of one normalised unit of every column ``[width]``."""
+    if normalizer is None:
+        return torch.ones(width, dtype=like.dtype, device=like.device)
+    ones = torch.ones(width, dtype=like.dtype, device=like.device)
+    return normalizer.inverse(ones) - normalizer.inverse(torch.zeros_like(ones))
 
 
 class _Inverse(nn.Module):

@@ -30,9 +30,10 @@ class LatentActionModule(TensorDictModuleBase):
     Keyword Args:
         history (int): number ``n`` of frames before the current one.
         look_ahead (int or sequence of int): offset ``k``, or several.
-        relative (bool): read all other frames relative to the current one, each offset divided by its own spread
-            (:meth:`fit_scales`), beside the current frame itself. Steps of a few millimetres then reach the network
-            at unit scale, instead of as differences of numbers of order one.
+        relative (bool): read, beside the current frame itself, the steps between neighbouring frames, each divided by
+            its own spread (:meth:`fit_scales`): ``x_{t-n+1} - x_{t-n}, ..., x_t, x_{t+k_1} - x_t,
+            x_{t+k_2} - x_{t+k_1}, ...``. Steps of a few millimetres then reach the network at unit scale, not as
+            differences of numbers of order one, and a decoder that weighs them all alike is a local mean velocity.
         clamped (bool): let frames whose look-ahead is cut at the window's end count in the losses, as the released
             code does (:func:`~torchrl_koap.modules.time_alignment.frame_span`).
         in_key (NestedKey): window of states ``[*B, T, d]``. Defaults to ``"state"``.
@@ -40,7 +41,6 @@ class LatentActionModule(TensorDictModuleBase):
     """
 
     scales: Tensor
-    others: Tensor
 
     def __init__(
         self,
@@ -61,9 +61,6 @@ class LatentActionModule(TensorDictModuleBase):
         self.relative, self.clamped = relative, clamped
         self.num_frames = history + 1 + len(self.look_ahead)
         self.register_buffer("scales", torch.ones(self.num_frames, state_dim))
-        others = torch.ones(self.num_frames, 1)
-        others[history] = 0.0
-        self.register_buffer("others", others, persistent=False)
 
     def span(self, num_frames: int) -> range:
         """Frames of a window of ``num_frames`` that count in the losses.
@@ -99,12 +96,12 @@ class LatentActionModule(TensorDictModuleBase):
         read = state[..., index, :]
         if not self.relative:
             return read
-        current = read[..., self.history, None, :] * self.others
-        return (read - current) / self.scales
+        steps, n = read[..., 1:, :] - read[..., :-1, :], self.history
+        return torch.cat([steps[..., :n, :], read[..., n : n + 1, :], steps[..., n:, :]], -2) / self.scales
 
     @torch.no_grad()
     def fit_scales(self, windows: Tensor) -> None:
-        """Sets the spread (root mean square) of every offset from windows ``[*B, T, d]``; no label is read."""
+        """Sets the spread (root mean square) of every step from windows ``[*B, T, d]``; no label is read."""
         if not self.relative:
             return
         read = self.gather(windows, self.span(windows.shape[-2])).flatten(0, -3)
@@ -199,10 +196,10 @@ class LatentActionFourier(LatentActionModule):
     .. math::
         u_t = \big(v_t / \sqrt{D},\; \sqrt{2 c / p}\, \cos(\Omega [v_t / (\ell_v \sqrt{D}), x_t / \ell_x] + \beta)\big)
 
-    with ``v_t`` the ``D`` relative entries of the frames. A linear decoder under a ridge penalty is then Gaussian
-    process regression with a linear plus ``c`` times a squared-exponential kernel (random Fourier features): linear
-    where labels are few, curved where they are many. The frequencies and phases are trained by the Koopman loss, so the
-    operator needs an input matrix (``KoopmanOperator(input_dim=...)``).
+    with ``v_t`` the ``D`` entries of the steps between neighbouring frames. A linear decoder under a ridge penalty is
+    then Gaussian process regression with a linear plus ``c`` times a squared-exponential kernel (random Fourier
+    features): linear where labels are few, curved where they are many. The frequencies and phases are trained by the
+    Koopman loss, so the operator needs an input matrix (``KoopmanOperator(input_dim=...)``).
 
     Args and keys as in :class:`LatentActionModule`, with ``relative`` always on.
 
@@ -212,7 +209,7 @@ class LatentActionFourier(LatentActionModule):
 
     Keyword Args:
         curvature (float): prior variance ``c`` of the curved part against the linear one. Defaults to ``0.1``.
-        motion_scale (float): length ``l_v``, in spreads of the relative frames. Defaults to ``1``.
+        motion_scale (float): length ``l_v``, in spreads of the steps. Defaults to ``1``.
         position_scale (float): length ``l_x``, in units of the normalised state. Defaults to ``4``.
 
     Examples:
@@ -255,3 +252,17 @@ class LatentActionFourier(LatentActionModule):
         motion = torch.cat([frames[..., :n, :], frames[..., n + 1 :, :]], -2).flatten(-2) / math.sqrt(self.motion_dim)
         where = torch.cat([motion / self.motion_scale, frames[..., n, :] / self.position_scale], -1)
         return torch.cat([motion, self.amplitude * torch.cos(where @ self.frequency + self.phase)], -1)
+
+    def steps(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Where a latent action holds the steps along some state columns, and their size per unit of it.
+
+        Args:
+            axes (sequence of int): state columns.
+
+        Returns:
+            tuple of Tensor: entries of the latent action, int64 ``[S, len(axes)]``, and factors ``[S, len(axes)]`` that
+            turn them into steps in the networks' units; ``S = history + len(look_ahead)``.
+        """
+        scales = torch.cat([self.scales[: self.history], self.scales[self.history + 1 :]])[:, list(axes)]
+        first = torch.arange(len(scales), device=scales.device)[:, None] * self.state_dim
+        return first + torch.tensor(list(axes), device=scales.device), scales * math.sqrt(self.motion_dim)

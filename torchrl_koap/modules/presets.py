@@ -25,7 +25,7 @@ PRESETS = {
         "network": "fourier",
         "num_features": 512,
         "history": 4,
-        "look_ahead": (2, 3, 4, 6, 8),
+        "look_ahead": (2, 3, 4, 5),
         "clamped": False,
     },
     # design section 2: g MLP, f LSTM, dense K, look-ahead k = 8
