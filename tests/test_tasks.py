@@ -38,6 +38,7 @@ def test_hidden_parts_are_no_state():
         name="toy",
         observation={"desired": slice(0, 1), "measured": slice(1, 3), "yaw": slice(3, 4), "box": slice(4, 6)},
         command="desired",
+        position="measured",
         action_dim=1,
         max_steps=1,
         control_hz=1.0,

@@ -30,6 +30,7 @@ def make_policy(
     state_columns: Sequence[int],
     execution: str = "feedback",
     replan_interval: int = 4,
+    joining: float = 0.8,
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two."""
     return PlanThenControl(
@@ -39,6 +40,7 @@ def make_policy(
         history=max(planner.history, controller.history + 1),
         execution=execution,
         replan_interval=replan_interval,
+        joining=joining,
     )
 
 

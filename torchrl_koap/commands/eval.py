@@ -34,6 +34,7 @@ class Eval:
         solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
         solver_steps: another number of solver steps.
         replan_interval: control steps per plan.
+        joining: how slowly plans are joined to the present state; 0 turns it off.
         batch_size: episodes at a time; results do not depend on it.
         task: refuse a run of another task than this.
         threads: torch and simulator threads.
@@ -48,6 +49,7 @@ class Eval:
     solver: str | None = None
     solver_steps: int | None = None
     replan_interval: int = 4
+    joining: float = 0.8
     batch_size: int | None = None
     task: str | None = None
     threads: int = 2
@@ -97,6 +99,7 @@ def run_eval(options: Eval) -> dict[str, Any]:
         state_columns=task.state_columns,
         execution=options.execution,
         replan_interval=options.replan_interval,
+        joining=options.joining,
     ).to(options.device)
     seeds = list(range(options.seed, options.seed + options.episodes))
     mode_index = mode_index_of(task)
@@ -117,6 +120,7 @@ def run_eval(options: Eval) -> dict[str, Any]:
         "solver": planner.solver,
         "solver_steps": planner.num_steps,
         "replan_interval": options.replan_interval,
+        "joining": options.joining,
         "episode": rows,
     }
     rollouts = rollouts_to_tensors(

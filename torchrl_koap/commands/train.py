@@ -6,10 +6,7 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import os
-import platform
-import sys
 import time
-from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +20,7 @@ from torchrl_koap.analysis import AFTER, BEFORE, write_analysis
 from torchrl_koap.assembly import METHODS, build_controller, build_planner, load_demonstrations, set_up_torch
 from torchrl_koap.checkpoints import load_weights, save_tensors, save_weights
 from torchrl_koap.closed_form import fit_closed_form
+from torchrl_koap.commands.train_options import HISTORY, HORIZON, WINDOW, Train, configure, started_with
 from torchrl_koap.data import (
     LabelBudget,
     RecoveryAugmentation,
@@ -34,88 +32,9 @@ from torchrl_koap.data import (
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS, KoopmanInverseDynamics, StatePlanner
 from torchrl_koap.objectives import InverseDynamicsLoss, KOAPLoss, PlannerLoss
-from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training import phase_finished, train
-
-
-@dataclass
-class Train:
-    """Train planner and controller on demonstrations of which few have action labels.
-
-    Attributes:
-        out: run directory to write.
-        task: name of the task.
-        dataset: "scripted", or a folder of D3IL raw pickles, or one written by `koap demos`.
-        label_fraction: share of the trajectories, windows or transitions that keep their actions.
-        label_count: number of them instead of a share.
-        label_unit: "trajectory", "window" (the paper's levels) or "transition".
-        seed: seed of label choice, initialisation and batches.
-        method: "koap", "linear" (ridge on raw frames) or "supervised" (inverse dynamics network).
-        preset: variant of KOAP: "default", "paper" or "released".
-        decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest).
-        steps: planner updates; a smaller number than the default shortens the controller's training as well.
-        controller_steps: controller updates.
-        batch_size: windows per planner update.
-        controller_batch_size: windows per controller update.
-        planner_learning_rate: peak learning rate of the planner.
-        controller_learning_rate: peak learning rate of the controller.
-        denoiser: "unet", "mlp", "transformer" or "released" (11.9 M parameters).
-        channels: widths of the U-Net's levels.
-        schedule: "squared_cosine", "linear" or "flow".
-        prediction: "sample", "epsilon" or "velocity".
-        relative: plan displacements from the current state instead of states.
-        recovery_sigma: typical shift (m) of the recovery augmentation; 0 turns it off.
-        solver: solver used at evaluation unless told otherwise.
-        solver_steps: its number of steps.
-        planner_from: run directory whose planner is taken over instead of training one.
-        episodes: number of scripted demonstrations.
-        threads: torch threads.
-        device: "cpu" or "cuda".
-        checkpoint_every: updates between two checkpoints, from which --resume goes on.
-        resume: go on with an interrupted run; options left at their defaults are those it was started with.
-        logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
-        analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
-    """
-
-    out: Path
-    task: str = "avoiding"
-    dataset: str = "scripted"
-    label_fraction: float = 0.02
-    label_count: int | None = None
-    label_unit: str = "trajectory"
-    seed: int = 0
-    method: str = "koap"
-    preset: str = "default"
-    decoder: str = "ridge"
-    steps: int = 4000
-    controller_steps: int = 500
-    batch_size: int = 128
-    controller_batch_size: int = 256
-    planner_learning_rate: float = 3e-3
-    controller_learning_rate: float = 1e-3
-    denoiser: str = "unet"
-    channels: tuple[int, ...] = (32, 64)
-    schedule: str = "squared_cosine"
-    prediction: str = "sample"
-    relative: bool = False
-    recovery_sigma: float = 0.004
-    solver: str = "dpm++2m"
-    solver_steps: int = 10
-    planner_from: Path | None = None
-    episodes: int = 96
-    threads: int = 2
-    device: str = "cpu"
-    checkpoint_every: int = 500
-    resume: bool = False
-    logger: str = "csv"
-    analysis: bool = True
-
-
-HISTORY, HORIZON = 2, 14
-WINDOW = HISTORY + HORIZON
-# options with which a run may be resumed differently; with other threads sums are rounded differently
-FREE = ("out", "threads", "checkpoint_every", "resume")
 
 
 def run_train(options: Train) -> dict[str, Any]:
@@ -126,7 +45,7 @@ def run_train(options: Train) -> dict[str, Any]:
         RunDirectoryError: if the folder holds another run, or one that was not asked to be resumed.
     """
     run = RunDirectory(options.out)
-    options = _started_with(run, options)
+    options = started_with(run, options)
     task = get_task(options.task)
     lookup(METHODS, options.method, "method")
     lookup(PRESETS, options.preset, "preset")
@@ -142,7 +61,7 @@ def run_train(options: Train) -> dict[str, Any]:
         if getattr(options, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
     set_up_torch(options.threads, options.device)
-    config = _configure(run, options)
+    config = configure(run, options)
     planner = build_planner(config["planner"], len(task.state_columns))  # finds unknown names before any work is done
     if options.planner_from is not None:
         load_planner(options.planner_from / "planner.safetensors", planner, task)
@@ -188,63 +107,12 @@ def run_train(options: Train) -> dict[str, Any]:
     return summary
 
 
-def _started_with(run: RunDirectory, options: Train) -> Train:
-    """The options of a resumed run: what was not asked for otherwise is as it was."""
-    if not (options.resume and (run.path / "config.json").exists()):
-        return options
-    earlier = run.read_json("config.json")
-    left = [field.name for field in fields(options) if getattr(options, field.name) == field.default]
-    kept = {name: earlier[name] for name in left if name in earlier}
-    if "channels" in kept:
-        kept["channels"] = tuple(kept["channels"])
-    if kept.get("planner_from") is not None:
-        kept["planner_from"] = Path(kept["planner_from"])
-    return replace(options, **kept)
-
-
 def _check_lengths(options: Train, config: dict[str, Any], task: Task, data: TensorDictBase) -> None:
     """Finds trajectories that are too short now rather than after the planner was trained."""
     controller = build_controller(config["controller"], data["state"].shape[-1], task.action_dim)
     WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.history)
     if options.analysis:
         WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
-
-
-def _configure(run: RunDirectory, options: Train) -> dict[str, Any]:
-    """Everything that ``config.json`` holds; compared with what is there already."""
-    config = asdict(options)
-    config |= {name: str(config[name]) for name in ("out", "planner_from") if config[name] is not None}
-    config["planner"] = {
-        "denoiser": options.denoiser,
-        "channels": list(options.channels),
-        "schedule": options.schedule,
-        "prediction": options.prediction,
-        "history": HISTORY,
-        "horizon": HORIZON,
-        "relative": options.relative,
-        "solver": options.solver,
-        "solver_steps": options.solver_steps,
-        "clip": 1.2 if options.prediction == "sample" else 1.0,
-    }
-    if options.planner_from is not None:
-        config["planner"] = RunDirectory(options.planner_from).read_entry("config.json", "planner")
-    config["controller"] = {"method": options.method, "preset": options.preset}
-    config["channels"] = list(options.channels)
-    config["command"] = "koap " + " ".join(sys.argv[1:])
-    config["versions"] = {"python": platform.python_version()} | {
-        name: importlib.metadata.version(name) for name in ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
-    }
-    if (run.path / "config.json").exists():
-        if not options.resume:
-            raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
-        earlier = run.read_json("config.json")
-        free = {*FREE, "command", "versions"}
-        changed = [key for key in config if key not in free and config[key] != earlier.get(key)]
-        if changed:
-            raise RunDirectoryError(
-                f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so"
-            )
-    return config
 
 
 def _make_logger(options: Train):

@@ -14,7 +14,7 @@ from torchrl_koap.modules.latent_action import (
     LatentActionModule,
 )
 from torchrl_koap.modules.planner import StatePlanner
-from torchrl_koap.modules.policies import EpisodeNoise, PlanThenControl, policy_transforms
+from torchrl_koap.modules.policies import EpisodeNoise, PlanThenControl, join_plan, policy_transforms
 from torchrl_koap.modules.presets import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.modules.unet import TemporalUnet
 
@@ -38,6 +38,7 @@ __all__ = [
     "SupervisedInverseDynamics",
     "TemporalUnet",
     "TransformerDenoiser",
+    "join_plan",
     "make_koopman_inverse_dynamics",
     "policy_transforms",
 ]

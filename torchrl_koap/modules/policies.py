@@ -52,6 +52,10 @@ class PlanThenControl(TensorDictModuleBase):
     Every environment of a batch re-plans in its own rhythm, counted from its own reset
     (:class:`torchrl.modules.MultiStepActorWrapper`).
 
+    Before anything is decoded the plan is *joined* to the present state (:func:`join_plan`). An inverse dynamics is
+    fitted to motions that happened, in which no step leaps; a plan that begins beside the robot it tracks badly, or not
+    at all.
+
     Args:
         planner (StatePlanner): plans states from the last observed ones.
         controller (TensorDictModuleBase): reads a window of states ``[*B, T, d]`` and writes actions
@@ -63,6 +67,8 @@ class PlanThenControl(TensorDictModuleBase):
         history (int): observed frames handed to the controller (and, of these, the planner's own last ones).
         execution (str): ``"feedback"`` or ``"open_loop"``. Defaults to ``"feedback"``.
         replan_interval (int): steps per plan. Defaults to ``4``.
+        joining (float): share of the distance to the plan that remains after each frame. Defaults to ``0.8``; ``0``
+            leaves plans as they are.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -93,6 +99,7 @@ class PlanThenControl(TensorDictModuleBase):
         history: int,
         execution: str = "feedback",
         replan_interval: int = 4,
+        joining: float = 0.8,
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -102,6 +109,9 @@ class PlanThenControl(TensorDictModuleBase):
             raise ValueError(f"the planner reads {planner.history} observed frames, history is only {history}")
         if not 1 <= replan_interval <= planner.horizon:
             raise ValueError(f"replan_interval must be in 1..{planner.horizon} (the horizon), got {replan_interval}")
+        if not 0 <= joining < 1:
+            raise ValueError(f"joining must be in [0, 1), got {joining}")
+        self.joining = joining
         self.in_keys = [history_key, "is_init"]
         self.execution, self.history, self.replan_interval = execution, history, replan_interval
         self.register_buffer("state_columns", torch.as_tensor(state_columns), persistent=False)
@@ -138,7 +148,7 @@ class PlanThenControl(TensorDictModuleBase):
 
     def _actions(self, history: Tensor, plan: Tensor) -> Tensor:
         """Actions ``[*B, T, act]`` of the window made of history and plan."""
-        window = torch.cat([history, plan], -2)
+        window = torch.cat([history, join_plan(history, plan, self.joining)], -2)
         name = self.controller.in_keys[0]
         out = self.controller(TensorDict({name: window}, batch_size=window.shape[:-2]))
         return out.get(self.controller.out_keys[-1])
@@ -153,6 +163,35 @@ class PlanThenControl(TensorDictModuleBase):
         """The actions of the next steps ``[*B, interval, act]``, decoded once."""
         now = self.history - 1
         return self._actions(history, plan)[..., now : now + self.replan_interval, :]
+
+
+def join_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
+    r"""Bends the beginning of a plan so that it leaves from the present state.
+
+    .. math::
+        x'_{t+k} = x_{t+k} + \rho^k e, \qquad e = x_t - (4 x_{t+1} + x_{t+2} - 2 x_{t+3}) / 3
+
+    with the present state ``x_t`` and where the plan has the robot at present: its first three states, continued
+    backwards along their least-squares line.
+
+    Args:
+        history (Tensor): observed states ``[*B, h, d]``, the present one last.
+        plan (Tensor): planned states ``[*B, H, d]``; one shorter than three states is returned as it is.
+        decay (float): ``rho``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import join_plan
+        >>> plan = torch.tensor([[2.0], [3.0], [4.0]])
+        >>> join_plan(torch.tensor([[0.0]]), plan, 0.5).flatten().tolist()  # the plan begins at 1, the robot is at 0
+        [1.5, 2.75, 3.875]
+    """
+    if decay == 0 or plan.shape[-2] < 3:
+        return plan
+    first, second, third = plan[..., :3, :].unbind(-2)
+    behind = history[..., -1, :] - (4 * first + second - 2 * third) / 3
+    frames = torch.arange(1, plan.shape[-2] + 1, device=plan.device, dtype=plan.dtype)
+    return plan + behind.unsqueeze(-2) * (decay**frames).unsqueeze(-1)
 
 
 class _Chunk(TensorDictModuleBase):

@@ -45,4 +45,4 @@ def fit_shared_filter(steps: Tensor, action: Tensor, *, penalty: float = 0.02) -
     rows, target = steps.mT.flatten(0, 1), action.flatten()  # [N * act, S]
     unit = rows.square().sum(-1).mean()
     gram = rows.mT @ rows + penalty * unit * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
-    return torch.linalg.lstsq(gram, (rows.mT @ target)[:, None]).solution[:, 0]
+    return torch.linalg.solve(gram, rows.mT @ target)

@@ -1,0 +1,143 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Options of ``koap train`` and the ``config.json`` that a run keeps of them."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import sys
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
+
+
+@dataclass
+class Train:
+    """Train planner and controller on demonstrations of which few have action labels.
+
+    Attributes:
+        out: run directory to write.
+        task: name of the task.
+        dataset: "scripted", or a folder of D3IL raw pickles, or one written by `koap demos`.
+        label_fraction: share of the trajectories, windows or transitions that keep their actions.
+        label_count: number of them instead of a share.
+        label_unit: "trajectory", "window" (the paper's levels) or "transition".
+        seed: seed of label choice, initialisation and batches.
+        method: "koap", "linear" (ridge on raw frames) or "supervised" (inverse dynamics network).
+        preset: variant of KOAP: "default", "paper" or "released".
+        decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest).
+        steps: planner updates; a smaller number than the default shortens the controller's training as well.
+        controller_steps: controller updates.
+        batch_size: windows per planner update.
+        controller_batch_size: windows per controller update.
+        planner_learning_rate: peak learning rate of the planner.
+        controller_learning_rate: peak learning rate of the controller.
+        denoiser: "unet", "mlp", "transformer" or "released" (11.9 M parameters).
+        channels: widths of the U-Net's levels.
+        schedule: "squared_cosine", "linear" or "flow".
+        prediction: "sample", "epsilon" or "velocity".
+        relative: plan displacements from the current state instead of states.
+        recovery_sigma: typical shift (m) of the recovery augmentation; 0 turns it off.
+        solver: solver used at evaluation unless told otherwise.
+        solver_steps: its number of steps.
+        planner_from: run directory whose planner is taken over instead of training one.
+        episodes: number of scripted demonstrations.
+        threads: torch threads.
+        device: "cpu" or "cuda".
+        checkpoint_every: updates between two checkpoints, from which --resume goes on.
+        resume: go on with an interrupted run; options left at their defaults are those it was started with.
+        logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
+        analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
+    """
+
+    out: Path
+    task: str = "avoiding"
+    dataset: str = "scripted"
+    label_fraction: float = 0.02
+    label_count: int | None = None
+    label_unit: str = "trajectory"
+    seed: int = 0
+    method: str = "koap"
+    preset: str = "default"
+    decoder: str = "ridge"
+    steps: int = 5000
+    controller_steps: int = 500
+    batch_size: int = 128
+    controller_batch_size: int = 256
+    planner_learning_rate: float = 3e-3
+    controller_learning_rate: float = 1e-3
+    denoiser: str = "unet"
+    channels: tuple[int, ...] = (32, 64)
+    schedule: str = "squared_cosine"
+    prediction: str = "sample"
+    relative: bool = False
+    recovery_sigma: float = 0.004
+    solver: str = "dpm++2m"
+    solver_steps: int = 10
+    planner_from: Path | None = None
+    episodes: int = 96
+    threads: int = 1
+    device: str = "cpu"
+    checkpoint_every: int = 500
+    resume: bool = False
+    logger: str = "csv"
+    analysis: bool = True
+
+
+HISTORY, HORIZON = 2, 14
+WINDOW = HISTORY + HORIZON
+# options with which a run may be resumed differently; with other threads sums are rounded differently
+FREE = ("out", "threads", "checkpoint_every", "resume")
+
+
+def started_with(run: RunDirectory, options: Train) -> Train:
+    """The options of a resumed run: what was not asked for otherwise is as it was."""
+    if not (options.resume and (run.path / "config.json").exists()):
+        return options
+    earlier = run.read_json("config.json")
+    left = [field.name for field in fields(options) if getattr(options, field.name) == field.default]
+    kept = {name: earlier[name] for name in left if name in earlier}
+    if "channels" in kept:
+        kept["channels"] = tuple(kept["channels"])
+    if kept.get("planner_from") is not None:
+        kept["planner_from"] = Path(kept["planner_from"])
+    return replace(options, **kept)
+
+
+def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
+    """Everything that ``config.json`` holds; compared with what is there already."""
+    config = asdict(options)
+    config |= {name: str(config[name]) for name in ("out", "planner_from") if config[name] is not None}
+    config["planner"] = {
+        "denoiser": options.denoiser,
+        "channels": list(options.channels),
+        "schedule": options.schedule,
+        "prediction": options.prediction,
+        "history": HISTORY,
+        "horizon": HORIZON,
+        "relative": options.relative,
+        "solver": options.solver,
+        "solver_steps": options.solver_steps,
+        "clip": 1.2 if options.prediction == "sample" else 1.0,
+    }
+    if options.planner_from is not None:
+        config["planner"] = RunDirectory(options.planner_from).read_entry("config.json", "planner")
+    config["controller"] = {"method": options.method, "preset": options.preset}
+    config["channels"] = list(options.channels)
+    config["command"] = "koap " + " ".join(sys.argv[1:])
+    config["versions"] = {"python": platform.python_version()} | {
+        name: importlib.metadata.version(name) for name in ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
+    }
+    if (run.path / "config.json").exists():
+        if not options.resume:
+            raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
+        earlier = run.read_json("config.json")
+        free = {*FREE, "command", "versions"}
+        changed = [key for key in config if key not in free and config[key] != earlier.get(key)]
+        if changed:
+            raise RunDirectoryError(
+                f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so"
+            )
+    return config
