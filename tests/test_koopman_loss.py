@@ -148,7 +148,7 @@ def in_plain_loops(network, batch, clamped):
                 weights = dict(f.lstm.named_parameters())
                 u = f.readout(torch.func.functional_call(lstm, weights, torch.stack(read)[None])[0][0, -1])
             else:
-                motion = torch.cat([read[0] - x[t], read[2] - x[t]]) / 6**0.5
+                motion = torch.cat([x[t] - read[0], read[2] - x[t]]) / 6**0.5
                 phase = torch.cat([motion, x[t] / 4]) @ f.frequency + f.phase
                 u = torch.cat([motion, (2 * 0.1 / 16) ** 0.5 * torch.cos(phase)])
             step = u if network.operator.input is None else network.operator.input @ u
