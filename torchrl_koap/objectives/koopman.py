@@ -13,109 +13,24 @@ without labels gives exactly 0, and an unlabelled (NaN) action reaches neither v
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
 from torch import Tensor
-from torchrl.objectives.common import LossModule
 
-from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
 from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
+from torchrl_koap.objectives.windows import WindowLoss
 
 
-class _KoopmanLoss(LossModule):
-    """What the four losses share: the network, its keys, and one pass that computes the wanted terms."""
+class _KoopmanLoss(WindowLoss):
+    """What the four losses share: the network, and one pass that computes the wanted terms."""
 
-    @dataclass
-    class _AcceptedKeys:
-        """Keys read from the input.
-
-        Attributes:
-            state (NestedKey): window of raw states ``[*B, T, d]``.
-            action (NestedKey): raw actions ``[*B, T, act]``, NaN where unlabelled.
-            has_action (NestedKey): labelled frames, bool ``[*B, T, 1]``.
-            padded (NestedKey): optional; frames that repeat an edge of the trajectory, bool ``[*B, T]``. A transition
-                into or out of one counts in no loss, labelled or not.
-
-        The two masks may have a trailing 1 or not.
-        """
-
-        state: NestedKey = STATE
-        action: NestedKey = ACTION
-        has_action: NestedKey = HAS_ACTION
-        padded: NestedKey = "padded"
-
-    tensor_keys: _AcceptedKeys
-    default_keys = _AcceptedKeys
     network: KoopmanInverseDynamics
     network_params: TensorDictParams
     target_network_params: TensorDictParams
 
-    uses_labels = False
-
     def __init__(self, network: KoopmanInverseDynamics, *, reduction: str = "mean"):
-        if reduction not in ("none", "mean", "sum"):
-            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
-        super().__init__()
-        self.convert_to_functional(network, "network", create_target_params=False)
-        self.reduction = reduction
-        super().set_keys(state=network.state_key, action=network.action_key)
-
-    def set_keys(self, **kwargs) -> None:
-        """Renames entries (None: back to the default); ``state`` and ``action`` are renamed in the network too."""
-        super().set_keys(**kwargs)
-        self.network.set_keys(
-            **{name: getattr(self.tensor_keys, name) for name in ("state", "action") if name in kwargs}
-        )
-
-    def train(self, mode: bool = True):
-        """Sets the mode of the loss, and of the network, which is no submodule of it: dropout is off in ``eval()``."""
-        super().train(mode)
-        self.network.train(mode)
-        return self
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys read from the input, as renamed by ``set_keys``."""
-        keys = [self.tensor_keys.state]
-        if self.uses_labels:
-            keys += [self.tensor_keys.action, self.tensor_keys.has_action]
-        return keys
-
-    @in_keys.setter
-    def in_keys(self, values) -> None:
-        raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """There is no value estimator."""
-
-    def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """The raw states and the transitions between two recorded frames ``[*B, T - 1]``."""
-        state = self._read(tensordict, self.tensor_keys.state)
-        if tensordict.get(self.tensor_keys.padded, None) is None:
-            recorded = torch.ones(state.shape[:-2] + (state.shape[-2] - 1,), dtype=torch.bool, device=state.device)
-        else:
-            padded = self._read_mask(tensordict, self.tensor_keys.padded, state)
-            recorded = ~(padded[..., 1:] | padded[..., :-1])
-        return state, recorded
-
-    @staticmethod
-    def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            raise KeyError(f"the loss needs the entry {key!r}; there are {sorted(map(str, tensordict.keys(True)))}")
-        return value
-
-    def _read_mask(self, tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
-        """A mask of frames as bool ``[*B, T]``."""
-        mask = self._read(tensordict, key)
-        if mask.shape == (*state.shape[:-1], 1):
-            mask = mask.squeeze(-1)
-        if mask.shape != state.shape[:-1] or mask.dtype != torch.bool:
-            raise ValueError(f"{key!r} must be bool {[*state.shape[:-1], 1]}, got {mask.dtype} {list(mask.shape)}")
-        return mask
+        super().__init__(network, state_key=network.state_key, action_key=network.action_key, reduction=reduction)
 
     def _reconstruction(self, state: Tensor, lifted: Tensor) -> Tensor:
         target = self.network.normalize_state(state)
@@ -141,14 +56,6 @@ class _KoopmanLoss(LossModule):
         target = self.network.normalize_action(torch.where(labelled.unsqueeze(-1), action, 0.0))
         error = (self.network.action_decoder.linear(latent) - target).square().mean(-1)
         return self._reduce(error, labelled)
-
-    def _reduce(self, error: Tensor, mask: Tensor) -> Tensor:
-        error = torch.where(mask, error, 0.0)
-        if self.reduction == "none":
-            return error
-        if self.reduction == "sum":
-            return error.sum()
-        return error.sum() / mask.sum().clamp_min(1)
 
 
 class KoopmanReconstructionLoss(_KoopmanLoss):
