@@ -64,7 +64,7 @@ def run_train(options: Train) -> dict[str, Any]:
     config = configure(run, options)
     planner = build_planner(config["planner"], len(task.state_columns))  # finds unknown names before any work is done
     if options.planner_from is not None:
-        load_planner(options.planner_from / "planner.safetensors", planner, task)
+        load_weights(options.planner_from / "planner.safetensors", planner, task=task.name)
 
     with tqdm(desc="demonstrations", unit="episode", disable=options.dataset != "scripted") as bar:
         data = load_demonstrations(
@@ -130,7 +130,7 @@ def _train_planner(
     planner = build_planner(config["planner"], data["state"].shape[-1]).to(options.device)
     source = run.path if options.planner_from is None else Path(options.planner_from)
     if options.planner_from is not None or (options.resume and phase_finished(run, "planner")):
-        load_planner(source / "planner.safetensors", planner, task)
+        load_weights(source / "planner.safetensors", planner, task=task.name)
         if options.planner_from is not None:
             save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
         return planner, run.last_metrics("planner")
@@ -159,11 +159,6 @@ def _train_planner(
     loss.target_planner_params.to_module(planner)
     save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
     return planner, values
-
-
-def load_planner(path: Path, planner: StatePlanner, task: Task) -> None:
-    """Loads planner weights; the fitted normalisers are part of them."""
-    load_weights(path, planner, task=task.name)
 
 
 def _train_controller(
