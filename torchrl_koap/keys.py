@@ -50,6 +50,7 @@ PLAN = "plan"
 SUCCESS = "success"
 COLLISION = "collision"
 MODE = "mode"
+CONTEXT = "context"
 
 REQUIRED = (
     OBSERVATION,

@@ -1,14 +1,25 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a task *is* for learning code: names of the observation columns, the controller's mask, limits, metric base.
+"""What a task *is* for learning code: observation columns, what of them makes up the state, limits, metric bases.
 
-Environments and readers of recorded data share these facts, so they live in neither.
+Environments and readers of recorded data share these facts, so they live in neither. Everything that differs from task
+to task on the learning side is in :data:`TASKS`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
 
 from torchrl_koap.lookup import lookup
+from torchrl_koap.state_features import FEATURES
+
+CONTROL_HZ = 1 / 0.035
+# planner and controller see the same window in every task: 2 observed frames, 14 planned ones, look-ahead at most 8,
+# 4 actions of each plan executed
+HISTORY, HORIZON, LOOK_AHEAD, REPLAN_INTERVAL = 2, 14, 8, 4
+WINDOW = HISTORY + HORIZON
 
 
 @dataclass(frozen=True)
@@ -26,7 +37,19 @@ class Task:
         control_hz (float): control steps per second.
         num_modes (int): base of the logarithm of the mode entropy.
         actuated (tuple of int): for every action entry the state column that it moves; empty if there is none.
+        state (dict): part of the observation to name of its features (:mod:`torchrl_koap.state_features`), in the
+            order of the state. Empty: every part but the command and the hidden ones, unchanged.
         hidden (tuple): further parts that planner and controller must not see.
+        objects (tuple of str): what a context places: bodies that start elsewhere in every episode.
+        drawn (dict): object (as in ``objects``) to the part of the observation with its ``x, y``.
+        collides (bool): an episode can end by a collision.
+        action_unit (str): ``"m"`` or ``"rad"``.
+        entropy (str): over which episodes the entropy of the modes is taken: ``"all"`` successful ones together, or
+            per context and then averaged over ``"contexts"`` or ``"solved_contexts"`` (those with a success).
+        label_levels (tuple of float): shares of labelled windows of the label levels 1, 2, ...
+        recovery_sigma (float): typical shift of the recovery augmentation, in the units of the actuated columns.
+        noise (float): standard deviation of the noise on the measured end effector (m).
+        data (str): name of the task whose demonstrations are used.
     """
 
     name: str
@@ -38,7 +61,17 @@ class Task:
     control_hz: float
     num_modes: int
     actuated: tuple[int, ...] = field(default=())
+    state: dict[str, str] = field(default_factory=dict)
     hidden: tuple[str, ...] = field(default=())
+    objects: tuple[str, ...] = field(default=())
+    drawn: dict[str, str] = field(default_factory=dict)
+    collides: bool = False
+    action_unit: str = "m"
+    entropy: str = "all"
+    label_levels: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.25)
+    recovery_sigma: float = 0.004
+    noise: float = 0.0
+    data: str = ""
 
     @property
     def observation_dim(self) -> int:
@@ -47,29 +80,164 @@ class Task:
 
     @property
     def state_columns(self) -> tuple[int, ...]:
-        """Columns that planner and controller see: all but the command and the hidden parts."""
-        dropped = {self.command, *self.hidden}
+        """Columns that the state is made of: all but the command and the hidden parts."""
         return tuple(
-            column
-            for name, part in self.observation.items()
-            if name not in dropped
-            for column in range(part.start, part.stop)
+            column for name, _ in self._state_parts for column in range(*self.observation[name].indices(10**6))
+        )
+
+    @property
+    def state_dim(self) -> int:
+        """Number of state columns."""
+        return self.state_of(torch.zeros(1, self.observation_dim)).shape[-1]
+
+    @property
+    def _state_parts(self) -> list[tuple[str, str]]:
+        if self.state:
+            return [(name, kind) for name, kind in self.state.items() if name not in self.hidden]
+        dropped = {self.command, *self.hidden}
+        return [(name, "plain") for name in self.observation if name not in dropped]
+
+    def state_of(self, observation: Tensor) -> Tensor:
+        """The state that planner and controller see.
+
+        Args:
+            observation (Tensor): ``[*B, obs]``.
+
+        Returns:
+            Tensor: ``[*B, d]``.
+
+        Raises:
+            ValueError: if the last axis has another size than the task's observation.
+
+        Examples:
+            >>> import torch
+            >>> from torchrl_koap.tasks import get_task
+            >>> get_task("avoiding").state_of(torch.tensor([[1.0, 2.0, 3.0, 4.0]]))
+            tensor([[3., 4.]])
+        """
+        if observation.shape[-1] != self.observation_dim:
+            raise ValueError(
+                f"an observation of task {self.name!r} has {self.observation_dim} columns, got {observation.shape[-1]}"
+            )
+        return torch.cat(
+            [FEATURES[kind](observation[..., self.observation[name]]) for name, kind in self._state_parts], -1
         )
 
 
-TASKS = {
-    "avoiding": Task(
+def _parts(*named: tuple[str, int]) -> dict[str, slice]:
+    parts, start = {}, 0
+    for name, size in named:
+        parts[name] = slice(start, start + size)
+        start += size
+    return parts
+
+
+def _sorting(num_boxes: int, num_modes: int) -> Task:
+    boxes = [f"{colour}_{index + 1}" for colour in ("red", "blue") for index in range(num_boxes // 2)]
+    columns = [part for box in boxes for part in ((f"{box}_xy", 2), (f"{box}_tan_yaw", 1))]
+    return Task(
+        name="sorting" if num_boxes == 4 else f"sorting_{num_boxes}",
+        observation=_parts(("desired_xy", 2), ("measured_xy", 2), *columns),
+        command="desired_xy",
+        position="measured_xy",
+        action_dim=2,
+        max_steps=700,
+        control_hz=CONTROL_HZ,
+        num_modes=num_modes,
+        actuated=(0, 1),
+        state={"measured_xy": "plain"} | {name: "tan_yaw" if size == 1 else "plain" for name, size in columns},
+        objects=tuple(boxes),
+        drawn={box: f"{box}_xy" for box in boxes},
+        entropy="solved_contexts",
+    )
+
+
+_STACKING_BOXES = ("red", "green", "blue")
+_stacking = Task(
+    name="stacking",
+    observation=_parts(
+        ("desired_joints_and_gripper", 8),
+        *(part for box in _STACKING_BOXES for part in ((f"{box}_position", 3), (f"{box}_tan_yaw", 1))),
+        ("measured_joints", 7),
+        ("gripper_width", 1),
+        ("tcp_position", 3),
+    ),
+    command="desired_joints_and_gripper",
+    position="tcp_position",
+    action_dim=8,
+    max_steps=1000,
+    control_hz=1 / 0.03,
+    num_modes=6,
+    actuated=tuple(range(8)),
+    state={"measured_joints": "plain", "gripper_width": "plain"}
+    | {
+        name: kind
+        for box in _STACKING_BOXES
+        for name, kind in ((f"{box}_position", "plain"), (f"{box}_tan_yaw", "tan_yaw"))
+    },
+    objects=_STACKING_BOXES,
+    drawn={box: f"{box}_position" for box in _STACKING_BOXES},
+    action_unit="rad",
+    entropy="solved_contexts",
+    recovery_sigma=0.01,
+)
+
+_tasks = (
+    Task(
         name="avoiding",
-        observation={"desired_xy": slice(0, 2), "measured_xy": slice(2, 4)},
+        observation=_parts(("desired_xy", 2), ("measured_xy", 2)),
         command="desired_xy",
         position="measured_xy",
         action_dim=2,
         max_steps=250,
-        control_hz=1 / 0.035,
+        control_hz=CONTROL_HZ,
         num_modes=24,
         actuated=(0, 1),
+        collides=True,
     ),
-}
+    Task(
+        name="aligning",
+        observation=_parts(
+            ("desired_xyz", 3),
+            ("measured_xyz", 3),
+            ("box_position", 3),
+            ("box_quaternion", 4),
+            ("target_position", 3),
+            ("target_quaternion", 4),
+        ),
+        command="desired_xyz",
+        position="measured_xyz",
+        action_dim=3,
+        max_steps=400,
+        control_hz=CONTROL_HZ,
+        num_modes=2,
+        actuated=(0, 1, 2),
+        state={
+            "measured_xyz": "plain",
+            "box_position": "plane",
+            "box_quaternion": "quaternion",
+            "target_position": "plane",
+            "target_quaternion": "quaternion",
+        },
+        objects=("box", "target"),
+        drawn={"box": "box_position", "target": "target_position"},
+        entropy="contexts",
+    ),
+    _sorting(4, num_modes=6),
+    _sorting(2, num_modes=2),
+    _sorting(6, num_modes=20),
+    replace(
+        _sorting(4, num_modes=6),
+        name="po_sorting",
+        max_steps=400,
+        hidden=tuple(f"{box}_tan_yaw" for box in ("red_1", "red_2", "blue_1", "blue_2")),
+        noise=0.002,
+        data="sorting",
+    ),
+    _stacking,
+    replace(_stacking, name="stacking_1", max_steps=400, num_modes=3, data="stacking"),
+)
+TASKS = {task.name: task for task in _tasks}
 
 
 def get_task(name: str) -> Task:
@@ -80,7 +248,7 @@ def get_task(name: str) -> Task:
 
     Examples:
         >>> from torchrl_koap.tasks import get_task
-        >>> get_task("avoiding").state_columns
-        (2, 3)
+        >>> get_task("avoiding").state_columns, get_task("sorting").state_dim, get_task("po_sorting").state_dim
+        ((2, 3), 18, 10)
     """
     return lookup(TASKS, name, "task")

@@ -1,10 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """D3IL's manipulation tasks as native-batch TorchRL environments on MuJoCo; importing registers them with Gymnasium."""
 
+from torchrl_koap.envs.aligning import AligningEnv
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.gym import AvoidingGymEnv, register
 
-__all__ = ["AvoidingEnv", "AvoidingGymEnv", "ManipulationEnv", "mode_index"]
+__all__ = ["AligningEnv", "AvoidingEnv", "AvoidingGymEnv", "ManipulationEnv", "mode_index"]
 
 register()

@@ -5,7 +5,7 @@ One control step of the original, kept as it is because a policy experiences it:
 
     1. the action becomes a new command
     2. observation, success and failure are read from the state *before* this step's substeps
-    3. 35 substeps of 1 ms: the controller tracks the command
+    3. 35 substeps of 1 ms (Stacking: 30): the controller tracks the command
     4. the mode is updated from the state after the substeps
 
 so the observation is one control step old, and ``done`` comes one step after the state that caused it.
@@ -24,16 +24,25 @@ from torchrl.envs import EnvBase
 
 from torchrl_koap import keys
 from torchrl_koap.envs import tracking
+from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.rendering import Renderer
 from torchrl_koap.envs.simulation import SimulationBatch
 from torchrl_koap.tasks import Task
+
+# everything about the episodes in progress, a row per environment
+_EPISODE = ("_observation", "_commands", "_mode", "_success", "_collision", "_seen", "_steps", "_ready", "_contexts")
 
 
 class ManipulationEnv(EnvBase):
     """Base of the D3IL tasks: a batch of simulations, outcome bookkeeping, partial resets and partial steps.
 
     A task implements five hooks; each receives ``rows``, the indices of the environments concerned:
-    :meth:`_begin`, :meth:`_command`, :meth:`_observe`, :meth:`_check`, :meth:`_update_mode`.
+    :meth:`_begin`, :meth:`_command`, :meth:`_observe`, :meth:`_check`, :meth:`_update_mode`. Where objects are placed
+    is one more, :meth:`_place`; :meth:`_advance` and :meth:`_begin` differ where joints are commanded.
+
+    A task with objects has *contexts*, the poses in which an episode starts
+    (:mod:`torchrl_koap.envs.contexts`): drawn at random at every reset, or taken from a table in turn, or handed over
+    by ``reset(contexts=...)``. The leaf ``context`` ``[n, objects, 3]`` (x, y in m, yaw in rad) tells them.
 
     Success and collision are *latched*: whichever is seen first is the outcome of the episode, and at most one of them
     is ever True. They become True in the frame that also carries ``terminated``, and stay until the reset.
@@ -42,8 +51,11 @@ class ManipulationEnv(EnvBase):
         task (Task): layout of the observation.
         model (mujoco.MjModel): compiled scene.
         start_joints (sequence): arm joints [7] after a reset (rad).
-        num_mode_flags (int): number of flags of the leaf ``mode``.
-        action_bound (float): half range of random actions; actions outside are executed unchanged.
+        num_mode_flags (int): number of entries of the leaf ``mode``.
+        mode_values (int, optional): entries of ``mode`` are -1 (not decided yet) to ``mode_values - 1``, int64. By
+            default they are flags, bool.
+        action_bound (float or tuple): half range of random actions, or their least and greatest values (numbers or
+            one per entry); actions outside are executed unchanged.
         num_envs (int): number of environments, the batch size.
         num_threads (int): threads that advance them.
         max_steps (int): control steps after which an episode is truncated.
@@ -51,9 +63,12 @@ class ManipulationEnv(EnvBase):
         seed (int, optional): seed of the environments' own random generator.
         device (torch.device, optional): device of the tensors handed out; the physics runs on the CPU.
         dtype (torch.dtype): floating type of observation, action and reward.
+        contexts (array, optional): table ``[C, objects, 3]``; the ``j``-th reset of environment ``i`` takes row
+            ``(i + j num_envs) mod C``. Default: random ones.
+        reset_width (float): finger target (m) during the reset's substep.
 
     Raises:
-        ValueError: for sizes below 1 or a non-floating dtype.
+        ValueError: for sizes below 1, a non-floating dtype, or contexts of a wrong shape or out of range.
     """
 
     def __init__(
@@ -63,7 +78,8 @@ class ManipulationEnv(EnvBase):
         *,
         start_joints,
         num_mode_flags: int,
-        action_bound: float,
+        mode_values: int | None = None,
+        action_bound,
         num_envs: int,
         num_threads: int,
         max_steps: int,
@@ -71,6 +87,8 @@ class ManipulationEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
         dtype: torch.dtype = torch.float32,
+        contexts=None,
+        reset_width: float = tracking.FINGER_RESET,
     ):
         for name, value in (("num_envs", num_envs), ("num_threads", num_threads), ("max_steps", max_steps)):
             if not isinstance(value, int) or value < 1:
@@ -86,7 +104,12 @@ class ManipulationEnv(EnvBase):
         self._dtype = dtype
         self._observation = np.zeros((num_envs, task.observation_dim))
         self._commands = np.zeros((num_envs, 7))
-        self._mode = np.zeros((num_envs, num_mode_flags), dtype=bool)
+        self._mode_values = mode_values
+        self._mode = np.zeros((num_envs, num_mode_flags), dtype=bool if mode_values is None else np.int64)
+        self._contexts = np.zeros((num_envs, len(task.objects), 3))
+        self._context_table = None if contexts is None else check_contexts(task, contexts)
+        self._num_resets = np.zeros(num_envs, dtype=np.int64)
+        self._reset_width = reset_width
         self._success = np.zeros(num_envs, dtype=bool)
         self._collision = np.zeros(num_envs, dtype=bool)
         self._seen = np.zeros((num_envs, 2), dtype=bool)  # success, failure of the present state, told a step later
@@ -96,21 +119,29 @@ class ManipulationEnv(EnvBase):
         self._make_specs(action_bound)
         self._set_seed(seed)
 
-    def _make_specs(self, action_bound: float) -> None:
+    def _make_specs(self, action_bound) -> None:
         shape, device = self.batch_size, self.device
         flag = {"n": 1, "shape": (*shape, 1), "device": device, "dtype": torch.bool}
         flags = self._mode.shape[1]
-        self.observation_spec = Composite(
-            {
-                keys.OBSERVATION: Unbounded((*shape, self.task.observation_dim), device=device, dtype=self._dtype),
-                keys.SUCCESS: Binary(**flag),
-                keys.COLLISION: Binary(**flag),
-                keys.MODE: Binary(n=flags, shape=(*shape, flags), device=device, dtype=torch.bool),
-            },
-            shape=shape,
-        )
+        if self._mode_values is None:
+            mode = Binary(n=flags, shape=(*shape, flags), device=device, dtype=torch.bool)
+        else:
+            mode = Bounded(-1, self._mode_values - 1, (*shape, flags), device=device, dtype=torch.int64)
+        leaves = {
+            keys.OBSERVATION: Unbounded((*shape, self.task.observation_dim), device=device, dtype=self._dtype),
+            keys.SUCCESS: Binary(**flag),
+            keys.MODE: mode,
+        }
+        if self.task.collides:
+            leaves[keys.COLLISION] = Binary(**flag)
+        if self.task.objects:
+            size = (*shape, *self._contexts.shape[1:])
+            leaves[keys.CONTEXT] = Unbounded(size, device=device, dtype=self._dtype)
+        self.observation_spec = Composite(leaves, shape=shape)
         size = (*shape, self.task.action_dim)
-        self.action_spec = Bounded(-action_bound, action_bound, size, device=device, dtype=self._dtype)
+        bounds = action_bound if isinstance(action_bound, tuple) else (-action_bound, action_bound)
+        low, high = (torch.as_tensor(bound, dtype=self._dtype, device=device).expand(size) for bound in bounds)
+        self.action_spec = Bounded(low, high, size, device=device, dtype=self._dtype)
         self.reward_spec = Bounded(0.0, 1.0, (*shape, 1), device=device, dtype=self._dtype)
         done = Categorical(2, (*shape, 1), device=device, dtype=torch.bool)
         self.done_spec = Composite(
@@ -137,6 +168,14 @@ class ManipulationEnv(EnvBase):
     def _update_mode(self, rows: np.ndarray) -> None:
         """Updates ``self._mode[rows]`` from the present state."""
 
+    def _place(self, rows: np.ndarray) -> np.ndarray | None:
+        """Poses [len(rows), objects, 7] in which the free bodies start, from ``self._contexts[rows]``."""
+        return None
+
+    def _advance(self, rows: np.ndarray) -> None:
+        """Runs the physics of one control step under ``self._commands[rows]``."""
+        self.sims.track_pose(rows, self._commands, self.substeps)
+
     def _set_seed(self, seed: int | None) -> None:
         self.generator = np.random.default_rng(seed)
 
@@ -146,15 +185,32 @@ class ManipulationEnv(EnvBase):
             return np.arange(self.batch_size[0])
         return mask.reshape(self.batch_size[0], -1).any(-1).cpu().numpy().nonzero()[0]
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, *, contexts=None, **kwargs) -> TensorDictBase:
         rows = self._rows(tensordict, "_reset")
-        self.sims.reset(rows, self._start_joints)
+        self._draw_contexts(rows, contexts)
+        self.sims.reset(rows, self._start_joints, self._place(rows), width=self._reset_width)
         self.sims.widths[rows] = tracking.FINGER_OPEN
         self._begin_episode(rows)
         return self._leaves(np.zeros(self.batch_size[0], dtype=bool))
 
+    def _draw_contexts(self, rows: np.ndarray, contexts) -> None:
+        if contexts is not None:
+            contexts = check_contexts(self.task, contexts)
+            if len(contexts) != len(rows):
+                raise ValueError(f"one context per environment to reset: wanted {len(rows)}, got {len(contexts)}")
+        elif self._context_table is not None:
+            turn = rows + self._num_resets[rows] * self.batch_size[0]
+            contexts = self._context_table[turn % len(self._context_table)]
+        elif self.task.objects:
+            contexts = draw_contexts(self.task, len(rows), self.generator)
+        else:
+            return
+        self._contexts[rows] = contexts
+        self._num_resets[rows] += 1
+
     def _begin_episode(self, rows: np.ndarray) -> None:
-        self._success[rows] = self._collision[rows] = self._mode[rows] = False
+        self._success[rows] = self._collision[rows] = False
+        self._mode[rows] = False if self._mode_values is None else -1
         self._steps[rows] = 0
         self._ready[rows] = True
         self._begin(rows)
@@ -172,7 +228,7 @@ class ManipulationEnv(EnvBase):
         self._collision[rows] |= undecided & failure & ~success  # both at once count as success
         self._observation[rows] = self._observe(rows)
 
-        self.sims.track_pose(rows, self._commands, self.substeps)
+        self._advance(rows)
         self._steps[rows] += 1
         self._update_mode(rows)
         self._seen[rows] = np.stack(self._check(rows), axis=1)
@@ -203,19 +259,19 @@ class ManipulationEnv(EnvBase):
     def _leaves(self, stepped: np.ndarray) -> TensorDictBase:
         terminated = self._success | self._collision
         truncated = self._steps >= self.max_steps
-        return TensorDict(
-            {
-                keys.OBSERVATION: self._tensor(self._observation, self._dtype),
-                keys.SUCCESS: self._tensor(self._success[:, None]),
-                keys.COLLISION: self._tensor(self._collision[:, None]),
-                keys.MODE: self._tensor(self._mode),
-                "terminated": self._tensor(terminated[:, None]),
-                "truncated": self._tensor(truncated[:, None]),
-                "done": self._tensor((terminated | truncated)[:, None]),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
+        leaves = {
+            keys.OBSERVATION: self._tensor(self._observation, self._dtype),
+            keys.SUCCESS: self._tensor(self._success[:, None]),
+            keys.MODE: self._tensor(self._mode),
+            "terminated": self._tensor(terminated[:, None]),
+            "truncated": self._tensor(truncated[:, None]),
+            "done": self._tensor((terminated | truncated)[:, None]),
+        }
+        if self.task.collides:
+            leaves[keys.COLLISION] = self._tensor(self._collision[:, None])
+        if self.task.objects:
+            leaves[keys.CONTEXT] = self._tensor(self._contexts, self._dtype)
+        return TensorDict(leaves, batch_size=self.batch_size, device=self.device)
 
     def _tensor(self, array: np.ndarray, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.tensor(array, dtype=dtype, device=self.device)  # a copy: the arrays change with the next step
@@ -234,7 +290,17 @@ class ManipulationEnv(EnvBase):
         Returns:
             dict: arrays for :meth:`set_state`; also valid in another environment of the same task.
         """
-        names = ("_observation", "_commands", "_mode", "_success", "_collision", "_seen", "_steps", "_ready")
+        names = (
+            "_observation",
+            "_commands",
+            "_mode",
+            "_success",
+            "_collision",
+            "_seen",
+            "_steps",
+            "_ready",
+            "_contexts",
+        )
         return {"simulation": self.sims.get_state(index)} | {n: np.copy(getattr(self, n)[index]) for n in names}
 
     def set_state(self, index: int, state: dict) -> None:
@@ -248,7 +314,7 @@ class ManipulationEnv(EnvBase):
         """Starts a fresh episode of one environment from a given physics state.
 
         Args:
-            index (int): which environment.
+            index (int): which environment; its context stays.
             qpos (array): positions [nq] (m, rad).
             qvel (array, optional): velocities [nv]; zero if not given.
             qacc_warmstart (array, optional): warm start of the solver [nv].
@@ -306,7 +372,19 @@ class ManipulationEnv(EnvBase):
         """
         row = {name: self.sims.log[:, columns].copy() for name, columns in tracking.LOG_COLUMNS.items()}
         row["gripper_width"] = row["gripper_width"][:, 0]
-        row["des_c_pos"], row["des_c_quat"] = self._commands[:, :3].copy(), self._commands[:, 3:].copy()
+        row |= self._logged_command()
         row["time_stamp"] = self.sims.log_time.copy()
         row["sim_step"] = np.rint(self.sims.log_time / tracking.TIMESTEP).astype(np.int64)
         return row
+
+    def _logged_command(self) -> dict[str, np.ndarray]:
+        return {"des_c_pos": self._commands[:, :3].copy(), "des_c_quat": self._commands[:, 3:7].copy()}
+
+    def raw_objects(self) -> dict[str, np.ndarray]:
+        """Poses of the task's objects as D3IL's recorder logs them, after the first substep of the last control step.
+
+        Returns:
+            dict: pose [n, 7] (m, quaternion) per object, in the order and with the names of ``task.objects``.
+        """
+        poses = self.sims.log[:, tracking.LOG_WIDTH :].reshape(len(self.sims), -1, 7)
+        return {name: poses[:, index].copy() for index, name in enumerate(self.task.objects[: poses.shape[1]])}

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mujoco
 
 from torchrl_koap.envs.mjcf import mjcf
@@ -18,8 +20,15 @@ _STIFF = {"solref": (0.002, 1), "solimp": (0.999, 0.999, 0.001), "contype": 7, "
 _DRAWN = {"contype": 0, "conaffinity": 0}
 
 
-def scene(*, rod: bool = True, image_size: int = 96, arm_alpha: float = 0.1, link_collisions: bool = False):
-    """Builds the common scene with the arm attached at the origin; tasks add their objects to the result.
+def scene(
+    *,
+    rod: bool = True,
+    image_size: int = 96,
+    arm_alpha: float = 0.1,
+    link_collisions: bool = False,
+    add_objects: Callable[[mjcf.RootElement], None] | None = None,
+):
+    """Builds the common scene with the arm attached at the origin; tasks add what stands still to the result.
 
     World: x forward, y left, z up, robot base at the origin; the table top lies at z = -0.019 m.
 
@@ -28,6 +37,8 @@ def scene(*, rod: bool = True, image_size: int = 96, arm_alpha: float = 0.1, lin
         image_size (int): width and height in pixels of the off-screen picture buffer's default.
         arm_alpha (float): opacity of the arm when drawn.
         link_collisions (bool): links 0-7 collide too, see :func:`~torchrl_koap.envs.panda.panda`.
+        add_objects (callable, optional): adds the free bodies of the task; called before the arm is attached, so that
+            they come first in the state vector.
 
     Returns:
         mjcf.RootElement: the scene.
@@ -71,6 +82,8 @@ def scene(*, rod: bool = True, image_size: int = 96, arm_alpha: float = 0.1, lin
         for y in (-0.96, 0.96):
             bar = {"type": "box", "pos": (x, y, -0.48), "size": (0.02, 0.02, 0.459), "rgba": _ALUMINIUM}
             table.add("geom", **bar, **_DRAWN)
+    if add_objects is not None:
+        add_objects(root)
     root.attach(panda(rod=rod, alpha=arm_alpha, link_collisions=link_collisions))
     return root
 

@@ -47,7 +47,7 @@ class SimulationBatch:
         self.started = np.zeros(num_sims, dtype=bool)
         self.widths = np.full(num_sims, tracking.FINGER_RESET)
         self.grasping = np.zeros(num_sims, dtype=bool)
-        self.log = np.zeros((num_sims, tracking.LOG_WIDTH))
+        self.log = np.zeros((num_sims, tracking.LOG_WIDTH + model.nq - _NUM_JOINTS))
         self.log_time = np.zeros(num_sims)
 
         joint = model.joint(f"{PANDA}joint1")
@@ -60,6 +60,8 @@ class SimulationBatch:
         self._data_addresses = np.array([data._address for data in self.data], dtype=np.int64)
         self._pointers = np.array([self._arrays(data) for data in self.data], dtype=np.int64)
         self._tcp_views = [data.xpos[self._tcp] for data in self.data]
+        self._arm_views = [data.qpos[self._qpos_start :] for data in self.data]
+        self._object_views = [data.qpos[: self._qpos_start] for data in self.data]
         self._executor = None
         self._executor_pid = None
 
@@ -73,6 +75,7 @@ class SimulationBatch:
         arrays[tracking.TCP_QUAT] = data.xquat[self._tcp]
         arrays[tracking.ANCHORS] = data.xanchor[self._joint :]
         arrays[tracking.JOINT_AXES] = data.xaxis[self._joint :]
+        arrays[tracking.OBJECTS] = data.qpos
         return [array.ctypes.data for array in arrays]
 
     def __len__(self) -> int:
@@ -83,26 +86,49 @@ class SimulationBatch:
         """TCP positions [n, 3] (m) as the original reads them: one substep (1 ms) older than the joints."""
         return np.stack(self._tcp_views)
 
-    def reset(self, rows: np.ndarray, start_joints: np.ndarray, qpos: np.ndarray | None = None) -> None:
+    @property
+    def joint_positions(self) -> np.ndarray:
+        """Measured joints [n, 7] (rad)."""
+        return np.stack(self._arm_views)[:, :7]
+
+    @property
+    def gripper_width(self) -> np.ndarray:
+        """Distance of the fingers [n] (m)."""
+        return np.stack(self._arm_views)[:, 7:].sum(1)
+
+    @property
+    def object_poses(self) -> np.ndarray:
+        """Poses of the free bodies [n, objects, 7]: position (m) and quaternion, in the order of the state."""
+        return np.stack(self._object_views).reshape(len(self), -1, 7)
+
+    def reset(
+        self,
+        rows: np.ndarray,
+        start_joints: np.ndarray,
+        object_poses: np.ndarray | None = None,
+        *,
+        width: float = tracking.FINGER_RESET,
+    ) -> None:
         """Puts simulations into their start state (spec section 4), one substep included.
 
         Args:
             rows (np.ndarray): indices of the simulations.
             start_joints (np.ndarray): arm joints [7] (rad).
-            qpos (np.ndarray, optional): whole position vector [nq] to take the objects' poses from.
+            object_poses (np.ndarray, optional): poses of the free bodies [len(rows), objects, 7].
+            width (float): finger target (m) during that substep.
         """
         commands = np.zeros((len(self), 7))
-        for row in rows:
+        for index, row in enumerate(rows):
             data = self.data[row]
             mujoco.mj_resetData(self.model, data)
-            if qpos is not None:
-                data.qpos[:] = qpos
+            if object_poses is not None:
+                data.qpos[: self._qpos_start] = object_poses[index].ravel()
             data.qpos[self._qpos_start : self._qpos_start + 7] = start_joints
             data.qpos[self._qpos_start + 7 :] = 0.0
             mujoco.mj_forward(self.model, data)
             commands[row] = start_joints
         self.started[rows] = False
-        self.widths[rows] = tracking.FINGER_RESET
+        self.widths[rows] = width
         self.grasping[rows] = False
         self.track_joints(rows, commands, substeps=1)
 

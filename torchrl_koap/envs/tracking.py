@@ -35,9 +35,9 @@ FINGER_OPEN = 0.04
 FINGER_RESET = 0.001
 
 # Columns of the pointer table: addresses of one simulation's arrays inside its mjData.
-QPOS, QVEL, CTRL, BIAS, TCP_POS, TCP_QUAT, ANCHORS, JOINT_AXES = range(8)
-NUM_POINTERS = 8
-# Columns of the log row written after the first substep of a control step.
+QPOS, QVEL, CTRL, BIAS, TCP_POS, TCP_QUAT, ANCHORS, JOINT_AXES, OBJECTS = range(9)
+NUM_POINTERS = 9
+# Columns of the log row written after the first substep of a control step; the free bodies' poses follow them.
 LOG_COLUMNS = {
     "j_pos": slice(0, 7),
     "j_vel": slice(7, 14),
@@ -339,6 +339,9 @@ def _write_log(row, pointers, qpos, qvel, q_des, v_des, a_des, tcp, quat):
     row[35], row[36], row[37] = tcp[0], tcp[1], tcp[2]
     row[38], row[39], row[40], row[41] = quat[0], quat[1], quat[2], quat[3]
     row[45] = qpos[7] + qpos[8]
+    objects = _array(pointers[OBJECTS], len(row) - LOG_WIDTH)
+    for k in range(len(objects)):
+        row[LOG_WIDTH + k] = objects[k]
 
 
 @njit(nogil=True, cache=True)
@@ -358,7 +361,7 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
         targets (np.ndarray): joint targets [n, 7], kept between calls.
         speeds (np.ndarray): joint target velocities [n, 7], kept between calls.
         started (np.ndarray): False where the controller has not run since the reset [n], bool.
-        log (np.ndarray): receives one row per simulation after the first substep [n, LOG_WIDTH].
+        log (np.ndarray): receives one row per simulation after the first substep [n, LOG_WIDTH + 7 free bodies].
     """
     axes, origins = np.empty((8, 3, 3)), np.empty((8, 3))
     tcp, quat, target = np.empty(3), np.empty(4), np.empty(7)

@@ -1,0 +1,185 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Aligning: push a tray, from inside or outside its walls, into a target pose (spec section 6.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from torchrl_koap.envs.base import ManipulationEnv
+from torchrl_koap.envs.contexts import poses_of
+from torchrl_koap.envs.scene import compile_scene, scene
+from torchrl_koap.tasks import get_task
+
+START_JOINTS = (
+    -0.39275835987073354,
+    0.32177812339570716,
+    -0.21250285252375792,
+    -1.843581356712203,
+    0.0831488803864002,
+    2.160344058282072,
+    0.144795218196799,
+)
+DISTANCE_TOLERANCE = 0.018  # m, between the centres, height included
+ROTATION_TOLERANCE = 0.048  # of half a turn
+INSIDE_REACH = 0.051  # m; the rod is inside the tray if nearer to its centre than this
+BASE_HALF = 0.05  # half width of the tray (m)
+# name, direction from the centre, colour
+WALLS = (
+    ("wall_right", (1, 0), (0, 0, 1, 1)),
+    ("wall_far", (0, 1), (0, 1, 0, 1)),
+    ("wall_left", (-1, 0), (1, 0, 0, 1)),
+    ("wall_near", (0, -1), (0, 1, 1, 1)),
+)
+ACTION_BOUND = 0.012
+
+
+def mode_index(mode: torch.Tensor) -> torch.Tensor:
+    """Number of the mode: 0 if the tray was pushed from inside at the last instant, 1 from outside.
+
+    Args:
+        mode (torch.Tensor): leaf ``mode`` of :class:`AligningEnv`, int64 [*B, 1].
+
+    Returns:
+        torch.Tensor: int64 [*B]; -1 before the first step.
+    """
+    return mode.squeeze(-1).to(torch.int64)
+
+
+class AligningEnv(ManipulationEnv):
+    """Aligning of D3IL as a native-batch TorchRL environment on MuJoCo.
+
+    ============== ========== ================= ===============================================================
+    key            shape      dtype             meaning
+    ============== ========== ================= ===============================================================
+    ``observation`` [n, 20]   ``dtype``         0-2 last commanded TCP xyz, 3-5 measured TCP xyz, 6-8 tray position
+                                                (m), 9-12 tray quaternion, 13-15 target position, 16-19 target
+                                                quaternion; after a reset the commanded xyz is the measured one
+    ``action``      [n, 3]    ``dtype``         change of the commanded TCP xyz (m)
+    ``success``     [n, 1]    bool              the tray is in the target pose, see :meth:`errors`
+    ``mode``        [n, 1]    int64             0 pushed from inside, 1 from outside, -1 before the first step
+    ``context``     [n, 2, 3] ``dtype``         start of the tray, and target: x, y (m), yaw (rad)
+    ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
+    ============== ========== ================= ===============================================================
+
+    The order of events is that of :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one
+    control step back. There is no failure. Unlike the original, exact alignment counts (its rotation distance has no
+    clipping and becomes NaN).
+
+    Args:
+        num_envs (int): number of environments, the batch size.
+        num_threads (int): threads that advance them; results do not depend on it.
+        max_steps (int): control steps (35 ms each) after which an episode is truncated.
+        seed (int, optional): seed of the random contexts.
+        device (torch.device, optional): device of the tensors handed out.
+        dtype (torch.dtype): floating type of observation, action and reward.
+
+    Keyword Args:
+        contexts (array, optional): table of contexts [C, 2, 3] to take in turn, for example
+            ``evaluation_contexts("aligning")``; random ones by default.
+        arm_alpha (float): opacity of the arm in pictures.
+
+    Raises:
+        ValueError: for sizes below 1, contexts out of range, actions of a wrong shape or that are not finite.
+
+    Examples:
+        >>> from torchrl_koap.envs import AligningEnv
+        >>> env = AligningEnv(num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([2, 3, 20])
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        num_threads: int = 1,
+        max_steps: int = 400,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype = torch.float32,
+        *,
+        contexts=None,
+        arm_alpha: float = 0.3,
+    ):
+        super().__init__(
+            get_task("aligning"),
+            compile_scene(aligning_scene(arm_alpha=arm_alpha)),
+            start_joints=START_JOINTS,
+            num_mode_flags=1,
+            mode_values=2,
+            action_bound=ACTION_BOUND,
+            num_envs=num_envs,
+            num_threads=num_threads,
+            max_steps=max_steps,
+            seed=seed,
+            device=device,
+            dtype=dtype,
+            contexts=contexts,
+        )
+
+    def _place(self, rows: np.ndarray) -> np.ndarray:
+        return poses_of(self._contexts[rows, :1], height=0.0)
+
+    def _begin(self, rows: np.ndarray) -> None:
+        self._commands[rows, :3] = self.sims.tcp_position[rows]
+        self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
+        for row, pose in zip(rows, self.targets[rows], strict=True):
+            self.sims.data[row].mocap_pos[0], self.sims.data[row].mocap_quat[0] = pose[:3], pose[3:]
+
+    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
+        self._commands[rows, :3] += action
+
+    def _observe(self, rows: np.ndarray) -> np.ndarray:
+        parts = (self._commands[:, :3], self.sims.tcp_position, self.sims.object_poses[:, 0], self.targets)
+        return np.concatenate([part[rows] for part in parts], axis=1)
+
+    @property
+    def targets(self) -> np.ndarray:
+        """Target poses [n, 7]: position (m) and quaternion."""
+        return poses_of(self._contexts[:, 1], height=0.0)
+
+    def errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Distance of tray and target centres (m), height included, and their angle over pi; both [n]."""
+        tray, target = self.sims.object_poses[:, 0], self.targets
+        distance = np.linalg.norm(tray[:, :3] - target[:, :3], axis=1)
+        same = np.abs((tray[:, 3:] * target[:, 3:]).sum(1))
+        return distance, 2 * np.arccos(np.minimum(same, 1.0)) / np.pi
+
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        distance, rotation = self.errors()
+        aligned = (distance <= DISTANCE_TOLERANCE) & (rotation <= ROTATION_TOLERANCE)
+        return aligned[rows], np.zeros(len(rows), dtype=bool)
+
+    def _update_mode(self, rows: np.ndarray) -> None:
+        gap = self.sims.tcp_position[rows, :2] - self.sims.object_poses[rows, 0, :2]
+        self._mode[rows, 0] = np.linalg.norm(gap, axis=1) >= INSIDE_REACH
+
+    def raw_objects(self) -> dict[str, np.ndarray]:
+        """Poses of tray and target as D3IL's recorder logs them."""
+        return super().raw_objects() | {"target": self.targets}
+
+
+def aligning_scene(*, arm_alpha: float = 0.3):
+    """Scene of Aligning: table, arm with rod, tray, drawn target.
+
+    Args:
+        arm_alpha (float): opacity of the arm when drawn.
+
+    Returns:
+        mjcf.RootElement: the scene; the target is the mocap body ``target``.
+    """
+    return scene(rod=True, arm_alpha=arm_alpha, link_collisions=True, add_objects=_add_tray_and_target)
+
+
+def _add_tray_and_target(root) -> None:
+    tray = root.worldbody.add("body", name="box")
+    tray.add("freejoint", name="box")
+    base = {"size": (BASE_HALF, BASE_HALF, 0.01), "type": "box", "rgba": (0.8, 0.655, 0.45, 1)}
+    tray.add("geom", name="base", mass=1.0, friction=(0.3, 0.001, 0.0001), priority=1, **base)
+    target = root.worldbody.add("body", name="target", mocap=True)
+    target.add("site", name="target_base", **base | {"rgba": (0.8, 0.655, 0.45, 0.5)})
+    for name, (x, y), colour in WALLS:
+        size = (0.005, BASE_HALF, 0.045) if x else (BASE_HALF, 0.005, 0.045)
+        wall = {"type": "box", "size": size, "pos": (x * BASE_HALF, y * BASE_HALF, 0.0485)}
+        tray.add("geom", name=name, mass=0.001, rgba=colour, **wall)
+        target.add("site", name=f"target_{name}", rgba=(*colour[:3], 0.4), **wall)
