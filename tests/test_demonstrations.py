@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,6 @@ from torchrl_koap import demonstrations
 from torchrl_koap.data import D3ILExperienceReplay, read_raw_episode, trajectory_lengths
 from torchrl_koap.data.raw import ROBOT_COLUMNS
 from torchrl_koap.demonstrations import (
-    LEAST_CLEARANCE,
     RecordingError,
     balanced_modes,
     episodes_to_ted,
@@ -23,6 +24,7 @@ from torchrl_koap.envs import AvoidingEnv, mode_index
 from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES
 from torchrl_koap.envs.avoiding_expert import ROD_RADIUS
 from torchrl_koap.keys import validate
+from torchrl_koap.recording import RECIPES
 
 EPISODES = 26
 
@@ -63,7 +65,7 @@ def test_demonstrations_are_successes_with_clearance(recording):
         path = episode.robot["c_pos"][:, :2]
         assert path[-1, 1] > FINISH_Y
         for _, x, y, radius, _ in OBSTACLES:
-            assert np.linalg.norm(path - (x, y), axis=1).min() > radius + ROD_RADIUS + LEAST_CLEARANCE
+            assert np.linalg.norm(path - (x, y), axis=1).min() > radius + ROD_RADIUS + 0.003
 
 
 def test_replayed_actions_give_the_same_episode(recording):
@@ -127,23 +129,28 @@ def test_modes_are_balanced():
     assert balanced_modes(5, 24, 1) != balanced_modes(5, 24, 2)
 
 
+def change_recipe(monkeypatch, **changes):
+    recipe = replace(RECIPES["avoiding"](), **changes)
+    monkeypatch.setitem(RECIPES, "avoiding", lambda: recipe)
+
+
 def test_failed_attempts_are_counted_and_given_up_on(monkeypatch):
     class Blind:
-        def __init__(self, modes, seeds):
+        def __init__(self, modes, contexts, seeds):
             self.finished = np.zeros(len(modes), dtype=bool)
 
         def act(self, observation):
             return np.tile([-0.0006, 0.012], (len(observation), 1))  # straight into the first cylinder
 
-    monkeypatch.setattr(demonstrations, "AvoidingExpert", Blind)
+    change_recipe(monkeypatch, make_expert=Blind)
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 2)
     with pytest.raises(RecordingError, match=r"episodes \[0, 1\].*'collision': 4"):
         record_demonstrations(episodes=2)
 
 
-@pytest.mark.parametrize(("limit", "value", "reason"), [("LEAST_CLEARANCE", 1.0, "close"), ("MOST_ROWS", 30, "slow")])
-def test_attempts_unlike_human_ones_are_discarded(monkeypatch, limit, value, reason):
-    monkeypatch.setattr(demonstrations, limit, value)
+@pytest.mark.parametrize(("limit", "reason"), [({"least_clearance": 1.0}, "close"), ({"most_rows": 30}, "slow")])
+def test_attempts_unlike_human_ones_are_discarded(monkeypatch, limit, reason):
+    change_recipe(monkeypatch, **limit)
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 1)
     with pytest.raises(RecordingError, match=f"'{reason}': 1"):
         record_demonstrations(episodes=1)

@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Recording demonstrations: scripted experts play the library's own environments, all episodes in one batch.
 
-An attempt that touches a cylinder, takes another mode than asked for, does not finish, or is unlike any human one (all
-but touches, takes too long) is played again with other random draws; nothing else is selected, and every discarded
-attempt is counted in the report.
+An attempt that touches what it must not, takes another mode than asked for, does not finish, or is unlike any human one
+(all but touches, takes too long) is played again with other random draws, after four attempts from another context;
+nothing else is selected, and every discarded attempt is counted in the report.
 """
 
 from __future__ import annotations
@@ -17,18 +17,15 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap import keys
-from torchrl_koap.data import CONVERTERS, RawEpisode, flatten_trajectories, write_raw_episode
-from torchrl_koap.envs import AvoidingEnv, mode_index
-from torchrl_koap.envs.avoiding import OBSTACLES
-from torchrl_koap.envs.avoiding_expert import ROD_RADIUS, AvoidingExpert
+from torchrl_koap.data import RawEpisode, flatten_trajectories, write_raw_episode
+from torchrl_koap.data.conversion import get_converter
+from torchrl_koap.envs.contexts import draw_contexts
+from torchrl_koap.recording import FAULTS, RECIPES, Recipe, play
 from torchrl_koap.tasks import get_task
 
 MAX_ATTEMPTS = 20
-# the human demonstrations have at most 104 rows and pass the cylinders at 3 mm or more
-MOST_ROWS = 120
-LEAST_CLEARANCE = 0.003
-_RECORDERS = {}
+_PER_CONTEXT = 4  # attempts before an episode gets another context
+_CONTEXT_STREAM = 1  # keeps the draws of contexts apart from those of the players
 
 
 class RecordingError(RuntimeError):
@@ -47,6 +44,7 @@ class RecordingReport:
         attempts (list of int): attempts each demonstration took, 1 if the first one was good.
         failures (dict): number of discarded attempts by reason: ``collision``, ``mode``, ``unfinished``,
             ``close`` (nearly touched a cylinder), ``slow``.
+        num_modes (int): modes the task has.
         seconds (float): wall-clock time.
     """
 
@@ -57,6 +55,7 @@ class RecordingReport:
     attempts: list[int]
     failures: dict[str, int] = field(default_factory=dict)
     seconds: float = 0.0
+    num_modes: int = 0
 
     @property
     def failed_attempts(self) -> int:
@@ -65,9 +64,11 @@ class RecordingReport:
 
     def __str__(self) -> str:
         discarded = ", ".join(f"{count} {reason}" for reason, count in self.failures.items() if count) or "none"
+        counts = [self.modes.count(mode) for mode in range(self.num_modes or max(self.modes) + 1)]
         return (
-            f"{len(self.modes)} demonstrations of {self.task} in {len(set(self.modes))} modes, {min(self.rows)} to"
-            f" {max(self.rows)} rows, {self.seconds:.1f} s; discarded attempts: {discarded}"
+            f"{len(self.modes)} demonstrations of {self.task} in {len(set(self.modes))} modes"
+            f" ({', '.join(map(str, counts))}), {min(self.rows)} to {max(self.rows)} rows, {self.seconds:.1f} s;"
+            f" {self.attempts.count(1)} good at the first attempt; discarded attempts: {discarded}"
         )
 
 
@@ -122,13 +123,12 @@ def record_episodes(
     Returns:
         tuple: the episodes, for :func:`episodes_to_ted` and :func:`write_raw_episodes`, and the report.
     """
-    get_task(task)
-    if task not in _RECORDERS:
-        raise ValueError(f"there is no scripted expert of task {task!r} yet; known: {', '.join(_RECORDERS)}")
-    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_threads", num_threads, 1)):
+    facts = get_task(task)
+    name = facts.data or facts.name
+    for option, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_threads", num_threads, 1)):
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(f"{name} must be an integer of at least {least}, got {value!r}")
-    return _RECORDERS[task](episodes, seed, num_threads, progress or (lambda done, total: None))
+            raise ValueError(f"{option} must be an integer of at least {least}, got {value!r}")
+    return _record(name, RECIPES[name](), episodes, seed, num_threads, progress or (lambda done, total: None))
 
 
 def episodes_to_ted(raw: Sequence[RawEpisode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:
@@ -139,7 +139,8 @@ def episodes_to_ted(raw: Sequence[RawEpisode], task: str, *, dtype: torch.dtype 
         task (str): name of the task.
         dtype (torch.dtype): floating type of the entries.
     """
-    pairs = [CONVERTERS[task].convert(episode) for episode in raw]
+    convert = get_converter(task).convert
+    pairs = [convert(episode) for episode in raw]
     return flatten_trajectories(
         [torch.from_numpy(frames) for frames, _ in pairs], [torch.from_numpy(steps) for _, steps in pairs], dtype=dtype
     )
@@ -189,20 +190,30 @@ def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
     return [*range(num_modes)] * full + sorted(extra.tolist())
 
 
-def _record_avoiding(episodes, seed, num_threads, progress) -> tuple[list[RawEpisode], RecordingReport]:
+def _record(
+    task: str, recipe: Recipe, episodes: int, seed: int, num_threads: int, progress: Callable[[int, int], None]
+) -> tuple[list[RawEpisode], RecordingReport]:
     start = time.perf_counter()
-    modes = balanced_modes(episodes, get_task("avoiding").num_modes, seed)
-    env = AvoidingEnv(episodes, num_threads=num_threads, dtype=torch.float64)
+    modes = balanced_modes(episodes, recipe.num_modes, seed)
+    env = recipe.make_env(episodes, num_threads=num_threads, dtype=torch.float64)
     raw: list[RawEpisode | None] = [None] * episodes
     attempts = [0] * episodes
-    failures = dict.fromkeys(("collision", "mode", "unfinished", "close", "slow"), 0)
+    failures = dict.fromkeys(FAULTS, 0)
     try:
         for attempt in range(MAX_ATTEMPTS):
+            if attempt % _PER_CONTEXT == 0 and env.task.objects:
+                contexts = draw_contexts(env.task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
             rows = np.array([index for index in range(episodes) if raw[index] is None])
-            expert = AvoidingExpert([modes[row] for row in rows], [(seed, int(row), attempt) for row in rows])
             already = episodes - len(rows)
-            results = _play(
-                env, expert, rows, np.array(modes), lambda n, already=already: progress(already + n, episodes)
+            results = play(
+                env,
+                recipe,
+                task,
+                rows,
+                [modes[row] for row in rows],
+                contexts[rows] if env.task.objects else None,
+                [(seed, int(row), attempt) for row in rows],
+                lambda over, already=already: progress(already + over, episodes),
             )
             for row, (episode, fault) in zip(rows, results, strict=True):
                 attempts[row] += 1
@@ -216,59 +227,5 @@ def _record_avoiding(episodes, seed, num_threads, progress) -> tuple[list[RawEpi
     missing = [index for index in range(episodes) if raw[index] is None]
     if missing:
         raise RecordingError(f"no good attempt out of {MAX_ATTEMPTS} for episodes {missing}: {failures}")
-    rows = [len(episode) for episode in raw]
-    return raw, RecordingReport("avoiding", seed, modes, rows, attempts, failures, time.perf_counter() - start)
-
-
-def _play(env: AvoidingEnv, expert: AvoidingExpert, rows, modes, progress) -> list[tuple[RawEpisode | None, str]]:
-    """One attempt of the episodes ``rows``: for each its recording, or None and what went wrong."""
-    flags = np.zeros((env.batch_size[0], 1), dtype=bool)
-    flags[rows] = True
-    data = env.reset()
-    logs, touched = [], np.zeros(len(flags), dtype=bool)
-    active = flags[:, 0].copy()
-    lengths = np.zeros(len(flags), dtype=np.int64)
-    for _ in range(env.max_steps):
-        action = np.zeros((len(flags), 2))
-        action[rows] = expert.act(data[keys.OBSERVATION].numpy()[rows])
-        data.set(keys.ACTION, torch.from_numpy(action)).set("_step", torch.from_numpy(active[:, None].copy()))
-        data = env.step(data)["next"].clone()
-        logs.append(env.raw_log())
-        lengths += active
-        touched |= active & env.obstacle_contacts().any(1)
-        active[rows] &= ~expert.finished
-        active &= ~touched
-        progress(int(len(rows) - active[rows].sum() - touched.sum()))
-        if not active.any():
-            break
-    mode = mode_index(data[keys.MODE]).numpy()
-    success = data[keys.SUCCESS].squeeze(-1).numpy()
-    results = []
-    for row in rows:
-        episode = _episode(logs[: lengths[row]], row)
-        faults = {
-            "collision": touched[row],
-            "unfinished": active[row] or not success[row],
-            "mode": mode[row] != modes[row],
-            "close": _clearance(episode) < LEAST_CLEARANCE,
-            "slow": len(episode) > MOST_ROWS,
-        }
-        fault = next((name for name, found in faults.items() if found), "")
-        results.append((None if fault else episode, fault))
-    return results
-
-
-def _clearance(episode: RawEpisode) -> float:
-    """Least distance between the rod, taken as upright, and any cylinder (m)."""
-    path = episode.robot["c_pos"][:, :2]
-    gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
-    return min(gaps) - ROD_RADIUS
-
-
-def _episode(logs: list[dict[str, np.ndarray]], row: int) -> RawEpisode:
-    robot = {name: np.stack([log[name][row] for log in logs]) for name in logs[0]}
-    robot["wall_clock"] = np.rint(robot["time_stamp"] * 1e9).astype(np.int64)  # simulated, so that files are repeatable
-    return RawEpisode(robot=robot)
-
-
-_RECORDERS["avoiding"] = _record_avoiding
+    rows, seconds = [len(episode) for episode in raw], time.perf_counter() - start
+    return raw, RecordingReport(task, seed, modes, rows, attempts, failures, seconds, recipe.num_modes)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -22,12 +23,20 @@ from torchrl_koap.tasks import get_task
 
 _NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.pkl")
 
+_SORTING_OBJECTS = {
+    num_boxes: tuple(f"{colour}-box{index + 1}" for colour in ("red", "blue") for index in range(num_boxes // 2))
+    for num_boxes in (2, 4, 6)
+}
+# names of the logged objects, in the order of Task.objects
 OBJECTS = {
     "avoiding": (),
     "aligning": ("push-box", "target-box"),
-    "sorting": ("red-box1", "red-box2", "blue-box1", "blue-box2"),
-    "stacking": ("red-box", "green-box", "blue-box", "target-box"),
+    "sorting": _SORTING_OBJECTS[4],
+    "sorting_2": _SORTING_OBJECTS[2],
+    "sorting_6": _SORTING_OBJECTS[6],
+    "stacking": ("red-box", "green-box", "blue-box"),
 }
+_UNREAD = ("target-box",)  # Stacking logs a target that never moves
 
 
 @dataclass(frozen=True)
@@ -48,16 +57,75 @@ class Converter:
     convert: Callable[[RawEpisode], tuple[np.ndarray, np.ndarray]]
 
 
+def _robot(episode: RawEpisode, name: str) -> np.ndarray:
+    return np.asarray(episode.robot[name], dtype=np.float64)
+
+
+def _pose(episode: RawEpisode, name: str) -> tuple[np.ndarray, np.ndarray]:
+    logged = episode.objects[name]
+    return np.asarray(logged["pos"], dtype=np.float64), np.asarray(logged["quat"], dtype=np.float64)
+
+
+def _tan_yaw(quat: np.ndarray) -> np.ndarray:
+    """Tangent of the rotation about z, ``[T, 1]``."""
+    w, x, y, z = quat.T
+    return np.tan(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))[:, None]
+
+
 def _avoiding(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
-    desired = np.asarray(episode.robot["des_c_pos"], dtype=np.float64)[:, :2]
-    measured = np.asarray(episode.robot["c_pos"], dtype=np.float64)[:, :2]
+    desired, measured = _robot(episode, "des_c_pos")[:, :2], _robot(episode, "c_pos")[:, :2]
     return np.concatenate([desired, measured], axis=1), np.diff(desired, axis=0)
+
+
+def _aligning(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
+    desired = _robot(episode, "des_c_pos")
+    poses = [part for name in OBJECTS["aligning"] for part in _pose(episode, name)]
+    return np.concatenate([desired, _robot(episode, "c_pos"), *poses], axis=1), np.diff(desired, axis=0)
+
+
+def _sorting(episode: RawEpisode, boxes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    frames, actions = _avoiding(episode)
+    for name in boxes:
+        position, quat = _pose(episode, name)
+        frames = np.concatenate([frames, position[:, :2], _tan_yaw(quat)], axis=1)
+    return frames, actions
+
+
+def _stacking(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
+    desired, width = _robot(episode, "des_j_pos"), _robot(episode, "gripper_width")[:, None]
+    columns = [desired, width]
+    for name in OBJECTS["stacking"]:
+        position, quat = _pose(episode, name)
+        columns += [position, _tan_yaw(quat)]
+    columns += [_robot(episode, "j_pos"), width, _robot(episode, "c_pos")]
+    # the gripper's action is the width it is about to have
+    return np.concatenate(columns, axis=1), np.concatenate([np.diff(desired, axis=0), width[1:]], axis=1)
 
 
 CONVERTERS = {
     "avoiding": Converter(
         robot=("des_c_pos", "c_pos"), objects=OBJECTS["avoiding"], folder="avoiding/data", convert=_avoiding
     ),
+    "aligning": Converter(
+        robot=("des_c_pos", "c_pos"),
+        objects=OBJECTS["aligning"],
+        folder="aligning/all_data/state",
+        convert=_aligning,
+    ),
+    "stacking": Converter(
+        robot=("des_j_pos", "j_pos", "gripper_width", "c_pos"),
+        objects=OBJECTS["stacking"],
+        folder="stacking/all_data",
+        convert=_stacking,
+    ),
+} | {
+    "sorting" if num_boxes == 4 else f"sorting_{num_boxes}": Converter(
+        robot=("des_c_pos", "c_pos"),
+        objects=boxes,
+        folder=f"sorting/{num_boxes}_boxes/state",
+        convert=partial(_sorting, boxes=boxes),
+    )
+    for num_boxes, boxes in _SORTING_OBJECTS.items()
 }
 
 
@@ -140,22 +208,25 @@ def get_converter(task: str) -> Converter:
     """Looks up how raw episodes of a task are converted.
 
     Raises:
-        ValueError: if the task is unknown, or its raw episodes cannot be read yet.
+        ValueError: if the task is unknown.
     """
-    get_task(task)
-    if task not in CONVERTERS:
-        raise ValueError(f"raw demonstrations of task {task!r} cannot be read yet; known: {', '.join(CONVERTERS)}")
-    return CONVERTERS[task]
+    facts = get_task(task)
+    return CONVERTERS[facts.data or facts.name]
 
 
 def _refuse_other_task(file: Path, episode: RawEpisode, converter: Converter) -> None:
-    if set(episode.objects) == set(converter.objects):
+    if _logs(episode, converter.objects):
         return
     logged = ", ".join(map(str, episode.objects)) or "no objects"
-    others = [task for task, objects in OBJECTS.items() if set(objects) == set(episode.objects)]
+    others = [task for task, objects in OBJECTS.items() if _logs(episode, objects)]
     origin = f"a demonstration of {others[0]!r}" if others else "of an unknown task"
     wanted = ", ".join(converter.objects) or "no objects"
     raise RawEpisodeError([f"{file}: {origin}: it logs {logged}, wanted {wanted}"])
+
+
+def _logs(episode: RawEpisode, objects: tuple[str, ...]) -> bool:
+    logged = set(episode.objects)
+    return set(objects) in (logged, logged - {*_UNREAD})
 
 
 def _pickles(folder: Path) -> list[Path]:

@@ -31,7 +31,7 @@ from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_t
 from torchrl_koap.data.trajectories import select_state
 from torchrl_koap.tasks import Task, get_task
 
-_CONVERSION = 1  # raise it when the same raw files convert to other data
+_CONVERSION = 2  # raise it when the same raw files convert to other data
 
 
 class D3ILExperienceReplay(BaseDatasetExperienceReplay):
@@ -156,7 +156,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
                 got = data.get(key).shape[-1]
                 raise ValueError(f"{key!r} of task {task.name!r} has {wanted} columns, the data have {got}")
         if keys.STATE not in data.keys():
-            data = select_state(data, task.state_columns)
+            data = select_state(data, task.state_of)
         if label_budget is not None:
             data, self.label_report = label_budget.apply(data, command=command)
         self.task = task
@@ -170,7 +170,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
             except (DamagedDataError, ValueError) as error:
                 torchrl_logger.warning("converting %s again: %s", self.root, error)
                 shutil.rmtree(self._data_path, ignore_errors=True)
-        data = select_state(convert_raw_files(converter, files, self.root, dtype=dtype), task.state_columns)
+        data = select_state(convert_raw_files(converter, files, self.root, dtype=dtype), task.state_of)
         save_ted(data, self._data_path, task=task.name, notes={"files": [file.name for file in files]})
         return load_ted(self._data_path, task=task.name)
 
@@ -211,7 +211,7 @@ def _fingerprint(task: Task, files: Sequence[Path], dtype: torch.dtype) -> str:
     facts = {
         "conversion": _CONVERSION,
         "task": task.name,
-        "state": task.state_columns,
+        "state": [task.state_columns, task.state],
         "dtype": str(dtype),
         "files": [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files],
     }

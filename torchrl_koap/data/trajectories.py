@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -89,12 +89,15 @@ def trajectory_lengths(data: TensorDictBase) -> torch.Tensor:
     return torch.unique_consecutive(data.get(keys.EPISODE), return_counts=True)[1]
 
 
-def select_state(data: TensorDictBase, columns: Iterable[int]) -> TensorDictBase:
+def select_state(
+    data: TensorDictBase, columns: Iterable[int] | Callable[[torch.Tensor], torch.Tensor]
+) -> TensorDictBase:
     """Adds ``state [N, d]``: the columns of the observation that planner and controller may see.
 
     Args:
         data (TensorDictBase): flat data ``[N]``; not changed.
-        columns (iterable of int): columns to keep, for example ``get_task("avoiding").state_columns``.
+        columns (iterable of int, or callable): columns to keep, or a function of observations ``[N, obs]`` such as
+            ``get_task("sorting").state_of``.
 
     Returns:
         TensorDictBase: a shallow copy of ``data`` with ``state``.
@@ -109,6 +112,8 @@ def select_state(data: TensorDictBase, columns: Iterable[int]) -> TensorDictBase
         >>> select_state(data, (2, 3))["state"]
         tensor([[2., 3.]])
     """
+    if callable(columns):
+        return data.copy().set(keys.STATE, columns(data.get(keys.OBSERVATION)))
     columns = list(columns)
     width = data.get(keys.OBSERVATION).shape[-1]
     if not columns or not all(0 <= column < width for column in columns):

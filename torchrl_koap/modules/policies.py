@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -63,7 +63,8 @@ class PlanThenControl(TensorDictModuleBase):
             dynamics.
 
     Keyword Args:
-        state_columns (sequence of int): columns of the observation that make up the state.
+        state_columns (sequence of int, or callable): columns of the observation that make up the state, or a function
+            of observations ``[*B, obs]`` that gives it, such as ``get_task("sorting").state_of``.
         history (int): observed frames handed to the controller (and, of these, the planner's own last ones).
         execution (str): ``"feedback"`` or ``"open_loop"``. Defaults to ``"feedback"``.
         replan_interval (int): steps per plan. Defaults to ``4``.
@@ -95,7 +96,7 @@ class PlanThenControl(TensorDictModuleBase):
         planner: StatePlanner,
         controller: TensorDictModuleBase,
         *,
-        state_columns: Sequence[int],
+        state_columns: Sequence[int] | Callable[[Tensor], Tensor],
         history: int,
         execution: str = "feedback",
         replan_interval: int = 4,
@@ -114,7 +115,11 @@ class PlanThenControl(TensorDictModuleBase):
         self.joining = joining
         self.in_keys = [history_key, "is_init"]
         self.execution, self.history, self.replan_interval = execution, history, replan_interval
-        self.register_buffer("state_columns", torch.as_tensor(state_columns), persistent=False)
+        if callable(state_columns):
+            self._state_of = state_columns
+        else:
+            self.register_buffer("state_columns", torch.as_tensor(state_columns), persistent=False)
+            self._state_of = self._select
         self.planner, self.controller = planner, controller
         # the chunk that the wrapper caches and hands out step by step: remaining plans, or actions
         cached = ["remaining_plan"] if execution == "feedback" else [action_key]
@@ -139,12 +144,15 @@ class PlanThenControl(TensorDictModuleBase):
             raise ValueError(
                 f"{self.in_keys[0]!r} must hold {self.history} frames on axis -2, got {list(observed.shape)}"
             )
-        tensordict.set("state_history", observed[..., self.state_columns])
+        tensordict.set("state_history", self._state_of(observed))
         tensordict = self.receding(tensordict)
         if self.execution == "feedback":
             actions = self._actions(tensordict.get("state_history"), tensordict.get("remaining_plan"))
             tensordict.set(self.out_keys[0], actions[..., self.history - 1, :])
         return tensordict
+
+    def _select(self, observed: Tensor) -> Tensor:
+        return observed[..., self.state_columns]
 
     def _actions(self, history: Tensor, plan: Tensor) -> Tensor:
         """Actions ``[*B, T, act]`` of the window made of history and plan."""
