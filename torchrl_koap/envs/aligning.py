@@ -125,6 +125,7 @@ class AligningEnv(ManipulationEnv):
         self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
         for row, pose in zip(rows, self.targets[rows], strict=True):
             self.sims.data[row].mocap_pos[0], self.sims.data[row].mocap_quat[0] = pose[:3], pose[3:]
+            self.sims.set_state(row, self.sims.get_state(row))  # the first picture shows the target in its new place
 
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
         self._commands[rows, :3] += action

@@ -170,7 +170,7 @@ def _arrays(nested) -> list[np.ndarray]:
     """The position and quaternion arrays of a context, in order, however deep D3IL nests them."""
     if isinstance(nested, np.ndarray) and nested.dtype == object:
         nested = nested.tolist()
-    if isinstance(nested, (list, tuple)) and any(np.ndim(item) or isinstance(item, (list, tuple)) for item in nested):
+    if isinstance(nested, (list, tuple)) and any(isinstance(item, (list, tuple)) or np.ndim(item) for item in nested):
         return [array for item in nested for array in _arrays(item)]
     return [np.asarray(nested, dtype=np.float64)]
 
