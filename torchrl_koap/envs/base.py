@@ -66,6 +66,7 @@ class ManipulationEnv(EnvBase):
         contexts (array, optional): table ``[C, objects, 3]``; the ``j``-th reset of environment ``i`` takes row
             ``(i + j num_envs) mod C``. Default: random ones.
         reset_width (float): finger target (m) during the reset's substep.
+        command_dim (int): numbers that make up a command.
 
     Raises:
         ValueError: for sizes below 1, a non-floating dtype, or contexts of a wrong shape or out of range.
@@ -89,6 +90,7 @@ class ManipulationEnv(EnvBase):
         dtype: torch.dtype = torch.float32,
         contexts=None,
         reset_width: float = tracking.FINGER_RESET,
+        command_dim: int = 7,
     ):
         for name, value in (("num_envs", num_envs), ("num_threads", num_threads), ("max_steps", max_steps)):
             if not isinstance(value, int) or value < 1:
@@ -103,7 +105,7 @@ class ManipulationEnv(EnvBase):
         self._start_joints = np.asarray(start_joints, dtype=np.float64)
         self._dtype = dtype
         self._observation = np.zeros((num_envs, task.observation_dim))
-        self._commands = np.zeros((num_envs, 7))
+        self._commands = np.zeros((num_envs, command_dim))
         self._mode_values = mode_values
         self._mode = np.zeros((num_envs, num_mode_flags), dtype=bool if mode_values is None else np.int64)
         self._contexts = np.zeros((num_envs, len(task.objects), 3))
@@ -278,7 +280,7 @@ class ManipulationEnv(EnvBase):
 
     @property
     def commands(self) -> np.ndarray:
-        """Present commands in float64 [n, 7]: TCP position (m) and quaternion."""
+        """Present commands in float64: TCP position (m) and quaternion [n, 7]; Stacking: joints and gripper [n, 8]."""
         return self._commands.copy()
 
     def get_state(self, index: int) -> dict:

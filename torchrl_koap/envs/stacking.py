@@ -1,0 +1,228 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Stacking: pile three boxes on a target zone with the gripper, in any order (spec section 6.4)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from torchrl_koap.envs import tracking
+from torchrl_koap.envs.base import ManipulationEnv
+from torchrl_koap.envs.contexts import poses_of
+from torchrl_koap.envs.scene import compile_scene, scene
+from torchrl_koap.tasks import get_task
+
+START_JOINTS = (
+    -1.1708457375867388e-08,
+    -0.043618586668494642,
+    1.3201479763146580e-08,
+    -2.1884211669990354,
+    -5.9465223596397744e-09,
+    2.1499041610538185,
+    0.78539816721171052,
+)
+TARGET = (0.5, 0.2)  # centre of the target zone (m)
+ZONE_RADIUS = 0.06  # m; a box nearer to the centre than this (horizontally) is in the zone
+HEIGHT_GAP = 0.03  # m; boxes lie on top of each other if all their heights differ by more
+OPEN_ABOVE = 0.075  # a greater gripper number opens the fingers, any other closes them
+# name, half sizes (m), colour
+BOXES = (
+    ("red", (0.03, 0.03, 0.03), (1, 0, 0, 1)),
+    ("green", (0.03, 0.03, 0.03), (0, 1, 0, 1)),
+    ("blue", (0.03, 0.05, 0.03), (0, 0, 1, 1)),
+)
+JOINT_BOUND = 0.03  # rad per control step
+GRIPPER_BOUND = 0.08  # m
+
+
+def mode_index(mode: torch.Tensor, num_boxes: int = 3) -> torch.Tensor:
+    """Number of the order in which the boxes arrived: rgb 0, rbg 1, grb 2, gbr 3, brg 4, bgr 5.
+
+    Args:
+        mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 [*B, 3]: 0 red, 1 green, 2 blue, -1 none.
+        num_boxes (int): how many letters count: 1 tells the first box (0 to 2), 2 and 3 the order (0 to 5).
+
+    Returns:
+        torch.Tensor: int64 [*B]; -1 while incomplete.
+
+    Raises:
+        ValueError: if the last axis has not 3 entries or the number is not 1, 2 or 3.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.envs.stacking import mode_index
+        >>> mode_index(torch.tensor([[0, 1, 2], [2, 1, 0], [1, 2, -1]])).tolist()
+        [0, 5, -1]
+        >>> mode_index(torch.tensor([[1, 2, -1]]), num_boxes=2).tolist()
+        [3]
+    """
+    _check_num_boxes(num_boxes)
+    if mode.shape[-1] != 3:
+        raise ValueError(f"mode must have 3 entries on the last axis, got shape {list(mode.shape)}")
+    mode = mode.to(torch.int64)
+    first, second = mode[..., 0], mode[..., 1]
+    index = first if num_boxes == 1 else 2 * first + (second > 3 - first - second)
+    return index.masked_fill((mode[..., :num_boxes] < 0).any(-1), -1)
+
+
+def _check_num_boxes(num_boxes: int) -> None:
+    if num_boxes not in (1, 2, 3):
+        raise ValueError(f"num_boxes must be 1, 2 or 3: how many boxes make a success; got {num_boxes!r}")
+
+
+class StackingEnv(ManipulationEnv):
+    """Stacking of D3IL as a native-batch TorchRL environment on MuJoCo.
+
+    ============== ========== ================= ===============================================================
+    key            shape      dtype             meaning
+    ============== ========== ================= ===============================================================
+    ``observation`` [n, 31]   ``dtype``         0-6 last commanded joints (rad), 7 last gripper number (m), 8-10 red
+                                                box position (m), 11 its tan(yaw), 12-15 green, 16-19 blue, 20-26
+                                                measured joints, 27 distance of the fingers (m), 28-30 TCP position;
+                                                after a reset the commands are the measured joints and distance
+    ``action``      [n, 8]    ``dtype``         0-6 change of the commanded joints (rad), 7 the gripper number itself
+                                                (m): above 0.075 the fingers open, else they close and press
+    ``success``     [n, 1]    bool              ``num_boxes`` boxes are in place, see below
+    ``mode``        [n, 3]    int64             boxes in the order of their arrival: 0 red, 1 green, 2 blue, -1 none
+    ``context``     [n, 3, 3] ``dtype``         start of red, green and blue: x, y (m), yaw (rad)
+    ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
+    ============== ========== ================= ===============================================================
+
+    The first 20 columns of the observation are those of D3IL's recordings. A box has *arrived* once its centre has
+    been within 6 cm (horizontally) of (0.5, 0.2), at most one box per control step. Success with ``num_boxes=3``: all
+    three are within 6 cm now and their heights differ by more than 3 cm, whether or not the gripper still holds one;
+    with 1 or 2: so many boxes have arrived. There is no failure. The order of events is that of
+    :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one control step back.
+
+    Args:
+        num_envs (int): number of environments, the batch size.
+        num_threads (int): threads that advance them; results do not depend on it.
+        max_steps (int): control steps (30 ms each) after which an episode is truncated.
+        seed (int, optional): seed of the random contexts.
+        device (torch.device, optional): device of the tensors handed out.
+        dtype (torch.dtype): floating type of observation, action and reward.
+
+    Keyword Args:
+        num_boxes (int): how many boxes make a success, 1 to 3; the scene always holds three.
+        contexts (array, optional): table of contexts [C, 3, 3] to take in turn, for example
+            ``evaluation_contexts("stacking")``; random ones by default.
+        arm_alpha (float): opacity of the arm in pictures.
+
+    Raises:
+        ValueError: for sizes below 1, another number of boxes, contexts out of range, actions of a wrong shape or that
+            are not finite.
+
+    Examples:
+        >>> from torchrl_koap.envs import StackingEnv
+        >>> env = StackingEnv(num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([2, 3, 31])
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        num_threads: int = 1,
+        max_steps: int = 1000,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype = torch.float32,
+        *,
+        num_boxes: int = 3,
+        contexts=None,
+        arm_alpha: float = 1.0,
+    ):
+        _check_num_boxes(num_boxes)
+        super().__init__(
+            get_task("stacking_1" if num_boxes == 1 else "stacking"),
+            compile_scene(stacking_scene(arm_alpha=arm_alpha)),
+            start_joints=START_JOINTS,
+            num_mode_flags=3,
+            mode_values=3,
+            action_bound=((-JOINT_BOUND,) * 7 + (0.0,), (JOINT_BOUND,) * 7 + (GRIPPER_BOUND,)),
+            num_envs=num_envs,
+            num_threads=num_threads,
+            max_steps=max_steps,
+            substeps=30,
+            seed=seed,
+            device=device,
+            dtype=dtype,
+            contexts=contexts,
+            reset_width=tracking.FINGER_OPEN,
+            command_dim=8,
+        )
+        self.num_boxes = num_boxes
+
+    def _place(self, rows: np.ndarray) -> np.ndarray:
+        return poses_of(self._contexts[rows], height=0.0)
+
+    def _begin(self, rows: np.ndarray) -> None:
+        self._commands[rows, :7] = self.sims.joint_positions[rows]
+        self._commands[rows, 7] = self.sims.gripper_width[rows]
+        self.sims.grasping[rows] = False
+
+    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
+        self._commands[rows, :7] += action[:, :7]
+        self._commands[rows, 7] = action[:, 7]
+        opens = action[:, 7] > OPEN_ABOVE
+        self.sims.widths[rows] = np.where(opens, tracking.FINGER_OPEN, 0.0)
+        self.sims.grasping[rows] = ~opens
+
+    def _advance(self, rows: np.ndarray) -> None:
+        self.sims.track_joints(rows, self._commands[:, :7], self.substeps)
+
+    def _observe(self, rows: np.ndarray) -> np.ndarray:
+        poses = self.sims.object_poses[rows]
+        w, x, y, z = np.moveaxis(poses[..., 3:], -1, 0)
+        # the original's formula, whose sign of xy matters for tilted boxes only
+        yaw = np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2))
+        boxes = np.concatenate([poses[..., :3], np.tan(yaw)[..., None]], axis=-1).reshape(len(rows), -1)
+        parts = (self.sims.joint_positions, self.sims.gripper_width[:, None], self.sims.tcp_position)
+        return np.concatenate([self._commands[rows], boxes, *(part[rows] for part in parts)], axis=1)
+
+    def _distances(self, rows: np.ndarray) -> np.ndarray:
+        """Horizontal distances of the boxes from the centre of the zone [len(rows), 3] (m)."""
+        return np.linalg.norm(self.sims.object_poses[rows, :, :2] - TARGET, axis=-1)
+
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self.num_boxes < 3:
+            success = self._mode[rows, self.num_boxes - 1] >= 0
+        else:
+            heights = np.sort(self.sims.object_poses[rows, :, 2], axis=1)
+            piled = (np.diff(heights, axis=1) > HEIGHT_GAP).all(1)
+            success = piled & (self._distances(rows) <= ZONE_RADIUS).all(1)
+        return success, np.zeros(len(rows), dtype=bool)
+
+    def _update_mode(self, rows: np.ndarray) -> None:
+        distance = self._distances(rows)
+        for letter in range(3):
+            distance[(self._mode[rows] == letter).any(1), letter] = np.inf
+        nearest = distance.argmin(1)
+        arrived = distance[np.arange(len(rows)), nearest] <= ZONE_RADIUS
+        place = (self._mode[rows] >= 0).sum(1)
+        self._mode[rows[arrived], place[arrived]] = nearest[arrived]
+
+    def _logged_command(self) -> dict[str, np.ndarray]:
+        return {}  # joints are commanded; the log holds them already
+
+
+def stacking_scene(*, arm_alpha: float = 1.0):
+    """Scene of Stacking: table, arm with gripper, three boxes, drawn target zone.
+
+    Args:
+        arm_alpha (float): opacity of the arm when drawn.
+
+    Returns:
+        mjcf.RootElement: the scene.
+    """
+    return scene(rod=False, arm_alpha=arm_alpha, link_collisions=True, add_objects=_add_boxes_and_target)
+
+
+def _add_boxes_and_target(root) -> None:
+    for name, size, colour in BOXES:
+        box = root.worldbody.add("body", name=name)
+        box.add("freejoint", name=name)
+        box.add("geom", name=name, type="box", size=size, mass=0.05, rgba=colour)
+    root.worldbody.add(
+        "site", name="target", type="box", pos=(*TARGET, 0), size=(0.05, 0.05, 0.04), rgba=(1, 0.5, 0, 0.3)
+    )
