@@ -7,20 +7,18 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDict
+from toy_episodes import episode_of, number
 from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength, PlannedStep, wandering_planner
 
 from torchrl_koap.envs import AvoidingEnv, mode_index
 from torchrl_koap.evaluation import (
     make_policy,
     measure_latency,
-    outcome_of,
     roll_out,
     rollouts_to_tensors,
-    score,
 )
-from torchrl_koap.metrics import wilson_interval
 from torchrl_koap.modules import NoiseSchedule, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+from torchrl_koap.scores import score
 
 SEEDS = [100, 101, 102, 103, 104, 105, 106, 107]
 
@@ -116,67 +114,6 @@ def test_history_is_that_of_the_longer_sighted():
     short = make_policy(CountingPlanner(), EchoController(history=0), state_columns=(1, 2))
     long = make_policy(CountingPlanner(), EchoController(history=4), state_columns=(1, 2))
     assert (short.history, long.history) == (2, 5)
-
-
-def episode_of(steps, *, success=False, collision=False, mode=3, start=0.0, plans=True):
-    """An episode whose position counts its steps; the mode flag is a plain number here."""
-    count = start + torch.arange(steps + 1.0)[:, None].expand(-1, 4).contiguous()
-    flags = {"success": success, "collision": collision}
-    nested = {key: torch.zeros(steps, 1, dtype=torch.bool) for key in flags}
-    for key, value in flags.items():
-        nested[key][-1] = value
-    chunk = {"remaining_plan_chunk": count[:-1, None, None, :2].expand(-1, 4, 14, 2)} if plans else {}
-    return TensorDict(
-        {
-            "observation": count[:-1],
-            "next": {"observation": count[1:], "mode": torch.full((steps, 1), mode), **nested},
-            **chunk,
-        },
-        [steps],
-    )
-
-
-def number(flags):
-    return flags.squeeze(-1)
-
-
-def test_outcomes():
-    assert outcome_of(episode_of(3, success=True)) == "success"
-    assert outcome_of(episode_of(3, collision=True)) == "collision"
-    assert outcome_of(episode_of(3)) == "timeout"
-    without = episode_of(3)
-    del without["next", "collision"]
-    assert outcome_of(without) == "timeout"
-
-
-def test_scores_by_hand():
-    episodes = [
-        episode_of(10, success=True, mode=0),
-        episode_of(20, success=True, mode=0),
-        episode_of(30, success=True, mode=1),
-        episode_of(40, success=True, mode=2),
-        episode_of(50, success=True, mode=-1),  # crossed the line without completing its mode
-        episode_of(7, collision=True, mode=3),
-        episode_of(90, mode=3),
-        episode_of(8, collision=True, mode=-1),
-    ]
-    result = score(episodes, range(8), num_modes=4, mode_index=number)
-    rows = result.pop("episode")
-    low, high = wilson_interval(5, 8)
-    assert result == {
-        "episodes": 8,
-        "success_rate": 0.625,
-        "success_low": low,
-        "success_high": high,
-        "mode_entropy": pytest.approx(0.75),
-        "distinct_modes": 3,
-        "collisions": 2,
-        "mean_steps": pytest.approx(255 / 8),
-    }
-    assert rows[2] == {"seed": 2, "outcome": "success", "mode": 1, "steps": 30}
-    assert rows[5]["outcome"] == "collision" and rows[6]["outcome"] == "timeout"
-    with pytest.raises(ValueError, match="longer"):
-        score(episodes, range(7), num_modes=4, mode_index=number)
 
 
 def test_pictures_get_padded_paths_and_the_plans_that_were_made():

@@ -18,6 +18,7 @@ from torchrl_koap.tasks import Task
 
 # frames of the evaluation windows: enough history and look-ahead for every controller compared
 BEFORE, AFTER = 4, 11
+UNITS = {"m": "mm", "rad": "mrad"}  # unit of the actions to the unit of their errors
 
 
 @torch.no_grad()
@@ -47,7 +48,7 @@ def hidden_action_errors(
 
 
 def rmse_mm(predicted: Tensor, true: Tensor) -> float:
-    """Root of the mean squared error over steps and axes, m to mm."""
+    """Root of the mean squared error over steps and axes, m to mm (rad to mrad)."""
     return (predicted - true).square().mean().sqrt().item() * 1e3
 
 
@@ -70,8 +71,10 @@ def write_analysis(
     save_tensors(run.path / "actions.safetensors", {"predicted": predicted, "true": true})
     ridge = LinearInverseDynamics(data["state"].shape[-1], task.action_dim).to(data["state"].dtype)
     fit_closed_form(ridge, labelled)
+    same = slice(task.same_unit)
+    by_ridge, _ = hidden_action_errors(ridge, data, labelled)
     return {
-        "controller": rmse_mm(predicted, true),
-        "ridge": rmse_mm(*hidden_action_errors(ridge, data, labelled)),
+        "controller": rmse_mm(predicted[:, same], true[:, same]),
+        "ridge": rmse_mm(by_ridge[:, same], true[:, same]),
         "analysis_labels_read": len(true),
     }

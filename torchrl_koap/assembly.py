@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +35,19 @@ NORMALIZATION = {
 
 
 def load_demonstrations(
-    dataset: str, task: Task, *, episodes: int = 96, seed: int = 0, progress: Callable[[int, int], None] | None = None
+    dataset: str,
+    task: Task,
+    *,
+    episodes: int | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
 ) -> TensorDictBase:
     """Fully labelled demonstrations, flat, with the columns that a policy may see as ``state``.
 
     Args:
         dataset (str): ``"scripted"``, or a folder: of D3IL's raw pickles, or written by ``koap demos``.
         task (Task): the task.
-        episodes (int): number of scripted demonstrations to record.
+        episodes (int, optional): number of scripted demonstrations to record. Default: that of the task.
         seed (int): seed of the scripted demonstrations.
         progress (callable, optional): called with recorded and wanted scripted demonstrations.
 
@@ -51,14 +55,16 @@ def load_demonstrations(
         FileNotFoundError: if there is no such folder, or it holds no demonstrations.
     """
     if dataset == "scripted":
-        data, _ = record_demonstrations(task.name, episodes=episodes, seed=seed, progress=progress)
+        data, _ = record_demonstrations(
+            task.name, task.demonstrations if episodes is None else episodes, seed, progress=progress
+        )
     elif not Path(dataset).is_dir():
         raise FileNotFoundError(f"dataset {dataset!r} is neither 'scripted' nor a folder")
     elif (Path(dataset) / "ted").is_dir():
-        data = load_ted(Path(dataset) / "ted", task=task.name, memmap=False)
+        data = load_ted(Path(dataset) / "ted", task=task.source, memmap=False)
     else:
         data = D3ILExperienceReplay(task.name, dataset).data.clone()
-    return select_state(data, task.state_columns)
+    return select_state(data, task.state_of)
 
 
 def _unet(state_dim: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
@@ -171,14 +177,22 @@ def set_up_torch(threads: int, device: str) -> None:
 
 def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
     """A function that makes an environment of the task with a given number of parallel episodes."""
-    from torchrl_koap.envs import AvoidingEnv  # the simulator is not needed to train from recorded data
+    from torchrl.envs import TransformedEnv
 
-    makers = {"avoiding": AvoidingEnv}
-    return partial(lookup(makers, task.name, "task with an environment"), num_threads=num_threads)
+    from torchrl_koap.envs.registry import ENVIRONMENTS  # the simulator is not needed to train from recorded data
+    from torchrl_koap.envs.transforms import EndEffectorNoise
+
+    make = lookup(ENVIRONMENTS, task.name, "task with an environment")
+
+    def make_env(num_envs: int):
+        env = make(num_envs, num_threads=num_threads, max_steps=task.max_steps)
+        return TransformedEnv(env, EndEffectorNoise(task, task.noise)) if task.noise else env
+
+    return make_env
 
 
 def mode_index_of(task: Task) -> Callable[[torch.Tensor], torch.Tensor]:
-    """The function that turns a task's mode flags into a number."""
-    from torchrl_koap.envs import mode_index
+    """The function that turns a task's leaf ``mode`` into a number."""
+    from torchrl_koap.envs.registry import MODE_INDEX
 
-    return lookup({"avoiding": mode_index}, task.name, "task with an environment")
+    return lookup(MODE_INDEX, task.name, "task with an environment")

@@ -123,8 +123,7 @@ def record_episodes(
     Returns:
         tuple: the episodes, for :func:`episodes_to_ted` and :func:`write_raw_episodes`, and the report.
     """
-    facts = get_task(task)
-    name = facts.data or facts.name
+    name = get_task(task).source
     for option, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_threads", num_threads, 1)):
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{option} must be an integer of at least {least}, got {value!r}")

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -14,20 +15,18 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_koap.keys import ACTION, COLLISION, MODE, OBSERVATION, SUCCESS
-from torchrl_koap.metrics import mode_entropy, wilson_interval
+from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion import SOLVERS
 from torchrl_koap.modules.planner import StatePlanner
 from torchrl_koap.modules.policies import NOISE, OBSERVATION_HISTORY, EpisodeNoise, PlanThenControl, policy_transforms
-
-OUTCOMES = ("timeout", "success", "collision")
+from torchrl_koap.scores import OUTCOMES, outcome_of
 
 
 def make_policy(
     planner: StatePlanner,
     controller: TensorDictModuleBase,
     *,
-    state_columns: Sequence[int],
+    state_columns: Sequence[int] | Callable[[Tensor], Tensor],
     execution: str = "feedback",
     replan_interval: int = 4,
     joining: float = 0.8,
@@ -52,6 +51,7 @@ def roll_out(
     *,
     max_steps: int,
     batch_size: int | None = None,
+    contexts: Any = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[TensorDict]:
     """Runs one episode per seed.
@@ -64,28 +64,36 @@ def roll_out(
     Keyword Args:
         max_steps (int): control steps at most.
         batch_size (int, optional): episodes at a time. Default: all. Outcomes do not depend on it.
+        contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
         progress (callable, optional): called with the number of episodes finished.
 
     Returns:
         list of TensorDict: one per episode, ``[steps]``, cut at its end.
 
     Raises:
-        ValueError: if there are no seeds, or the batch size is below 1.
+        ValueError: if there are no seeds, the batch size is below 1, or contexts and seeds differ in number.
     """
     if not len(seeds) or (batch_size is not None and batch_size < 1):
         raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
-    planner = policy.planner
+    if contexts is not None and len(contexts) != len(seeds):
+        raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
+    planner, device = policy.planner, _device_of(policy)
     draws = (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
     shape = (*draws, planner.horizon, planner.state_dim)
     size, episodes = batch_size or len(seeds), []
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
-        env = TransformedEnv(make_env(len(part)), policy_transforms(policy.history))
-        noise = EpisodeNoise(part, shape, num_steps=max_steps).to(policy.state_columns.device)
+        env = make_env(len(part))
+        _seed_noise(env, part)
+        env = TransformedEnv(env, policy_transforms(policy.history))
+        noise = EpisodeNoise(part, shape, num_steps=max_steps).to(device)
+        start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(
                 max_steps,
                 TensorDictSequential(noise, policy),
+                auto_reset=False,
+                tensordict=env.reset(**start),
                 break_when_any_done=False,
                 break_when_all_done=True,
             )
@@ -100,42 +108,22 @@ def roll_out(
     return episodes
 
 
-def outcome_of(episode: TensorDict) -> str:
-    """``"success"``, ``"collision"`` or ``"timeout"``, from the last frame of an episode."""
-    last = episode[-1]["next"]
-    if last[SUCCESS].item():
-        return "success"
-    return "collision" if COLLISION in last.keys() and last[COLLISION].item() else "timeout"
+def _device_of(policy: PlanThenControl) -> torch.device:
+    return next(itertools.chain(policy.parameters(), policy.buffers()), torch.empty(0)).device
 
 
-def score(
-    episodes: Sequence[TensorDict], seeds: Sequence[int], *, num_modes: int, mode_index: Callable[[Tensor], Tensor]
-) -> dict[str, Any]:
-    """Success with its 95 % Wilson interval, entropy of the modes of successful episodes, and a row per episode."""
-    rows = []
-    for seed, episode in zip(seeds, episodes, strict=True):
-        mode = int(mode_index(episode[-1]["next", MODE]))
-        rows.append({"seed": seed, "outcome": outcome_of(episode), "mode": mode, "steps": len(episode)})
-    won = [row for row in rows if row["outcome"] == "success"]
-    modes = [row["mode"] for row in won if row["mode"] >= 0]
-    low, high = wilson_interval(len(won), len(rows))
-    return {
-        "episodes": len(rows),
-        "success_rate": len(won) / len(rows),
-        "success_low": low,
-        "success_high": high,
-        "mode_entropy": mode_entropy(modes, num_modes),
-        "distinct_modes": len(set(modes)),
-        "collisions": sum(row["outcome"] == "collision" for row in rows),
-        "mean_steps": statistics.fmean(row["steps"] for row in rows),
-        "episode": rows,
-    }
+def _seed_noise(env: EnvBase, seeds: Sequence[int]) -> None:
+    """Observation noise that an episode meets depends on its own seed alone."""
+    transforms = env.transform if isinstance(env, TransformedEnv) else ()
+    for transform in transforms if isinstance(transforms, Iterable) else (transforms,):
+        if hasattr(transform, "seed_episodes"):
+            transform.seed_episodes(seeds)
 
 
 @torch.no_grad()
 def measure_latency(policy: PlanThenControl, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
     """Median time of a plan and of a control step between plans, at batch 1, in ms, and the control rate in Hz."""
-    device = policy.state_columns.device
+    device = _device_of(policy)
     observed = torch.zeros(1, policy.history, observation_dim, device=device)
     td = TensorDict({OBSERVATION_HISTORY: observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1], device=device)
     between, with_plan = [], []
@@ -161,35 +149,52 @@ def _wait(device: torch.device) -> None:
 
 
 def rollouts_to_tensors(
-    episodes: Sequence[TensorDict], *, position: slice, mode_index: Callable[[Tensor], Tensor], interval: int
+    episodes: Sequence[TensorDict],
+    *,
+    position: slice,
+    mode_index: Callable[[Tensor], Tensor],
+    interval: int,
+    objects: Sequence[slice] = (),
+    plans_position: bool = True,
 ) -> dict[str, Tensor]:
     """What the pictures need, padded to the longest episode.
 
     Args:
         episodes (sequence of TensorDict): from :func:`roll_out`.
-        position (slice): columns of the observation that are drawn.
-        mode_index (callable): mode flags to a number, -1 if incomplete.
+        position (slice): columns of the observation that are drawn; the first two count.
+        mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
         interval (int): steps per plan.
+        objects (sequence of slice): columns of the objects that are drawn, likewise.
+        plans_position (bool): the first two columns of a plan are that position; otherwise plans are left out.
 
     Returns:
-        dict: ``position`` ``[E, T, 2]`` (NaN behind the end), ``length``, ``mode``, ``outcome`` ``[E]``, ``plan``
-        ``[E, P, H, 2]`` and ``plan_step`` ``[E, P]`` (NaN and -1 padding; empty for open-loop execution, whose cache
-        holds actions).
+        dict: ``position`` ``[E, T, 2]`` (NaN behind the end), ``length``, ``mode``, ``outcome`` ``[E]``, ``action``
+        ``[E, T, act]``, ``plan`` ``[E, P, H, 2]`` and ``plan_step`` ``[E, P]`` (NaN and -1 padding; empty for open-loop
+        execution, whose cache holds actions); for a task with objects ``object_position`` ``[E, T, objects, 2]`` and
+        ``context`` ``[E, objects, 3]``.
     """
     longest, last = max(len(episode) for episode in episodes), [episode[-1]["next"] for episode in episodes]
-    paths = torch.full((len(episodes), longest + 1, 2), torch.nan)
-    plans, plan_steps = [], []
+    columns = [slice(part.start, part.start + 2) for part in (position, *objects)]
+    paths = torch.full((len(episodes), longest + 1, len(columns), 2), torch.nan)
+    plans, plan_steps, actions = [], [], []
     for index, episode in enumerate(episodes):
-        paths[index, : len(episode)] = episode[OBSERVATION][..., position]
-        paths[index, len(episode)] = last[index][OBSERVATION][..., position]
+        frames = torch.cat([episode[OBSERVATION], last[index][OBSERVATION][None]])
+        paths[index, : len(frames)] = torch.stack([frames[:, part] for part in columns], 1).float()
         chunks = episode.get("remaining_plan_chunk", None)
-        plans.append(torch.zeros(0, 1, 2) if chunks is None else chunks[::interval, 0])
+        plans.append(torch.zeros(0, 1, 2) if chunks is None or not plans_position else chunks[::interval, 0, :, :2])
         plan_steps.append(torch.arange(len(plans[-1])) * interval)
-    return {
-        "position": paths,
+        actions.append(episode[ACTION])
+    pad = torch.nn.utils.rnn.pad_sequence
+    tensors = {
+        "position": paths[:, :, 0].contiguous(),
         "length": torch.tensor([len(episode) for episode in episodes]),
         "mode": torch.stack([mode_index(end[MODE]).reshape(()) for end in last]).long(),
         "outcome": torch.tensor([OUTCOMES.index(outcome_of(episode)) for episode in episodes]),
-        "plan": torch.nn.utils.rnn.pad_sequence(plans, batch_first=True, padding_value=torch.nan),
-        "plan_step": torch.nn.utils.rnn.pad_sequence(plan_steps, batch_first=True, padding_value=-1),
+        "plan": pad(plans, batch_first=True, padding_value=torch.nan),
+        "plan_step": pad(plan_steps, batch_first=True, padding_value=-1),
+        "action": pad(actions, batch_first=True, padding_value=torch.nan),
     }
+    if objects:
+        tensors["object_position"] = paths[:, :, 1:].contiguous()
+        tensors["context"] = torch.stack([end[CONTEXT] for end in last])
+    return tensors

@@ -1,10 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Numbers that evaluations report: success with its interval, entropy of the modes."""
+"""Numbers that evaluations report: success, entropy of the modes over all episodes or per context, intervals."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import random
+from collections.abc import Callable, Sequence
 
 
 def wilson_interval(successes: int, trials: int, *, z: float = 1.959963984540054) -> tuple[float, float]:
@@ -50,3 +51,59 @@ def mode_entropy(modes: Sequence[int], num_modes: int) -> float:
         counts[mode] += 1
     total = sum(counts)
     return sum(-n / total * math.log(n / total, num_modes) for n in counts if n) + 0.0
+
+
+def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsolved: str = "skip") -> float | None:
+    """Mean over contexts of the entropy of the modes seen in each, logarithm base ``num_modes``.
+
+    A single rollout per context always gives 0: the figure says something from two on.
+
+    Args:
+        modes (sequence): for each context the modes of its successful rollouts.
+        num_modes (int): number of possible modes.
+        unsolved (str): ``"skip"`` leaves contexts without success out (Sorting, Stacking), ``"zero"`` counts them as 0
+            (Aligning).
+
+    Returns:
+        float or None: None if there is nothing to average.
+
+    Raises:
+        ValueError: for a mode out of range, or another ``unsolved``.
+
+    Examples:
+        >>> from torchrl_koap.metrics import conditional_entropy
+        >>> conditional_entropy([[0, 1], [1, 1], []], 2), conditional_entropy([[0, 1], []], 2, unsolved="zero")
+        (0.5, 0.5)
+    """
+    if unsolved not in ("skip", "zero"):
+        raise ValueError(f"unsolved must be 'skip' or 'zero', got {unsolved!r}")
+    values = [mode_entropy(seen, num_modes) for seen in modes if len(seen) or unsolved == "zero"]
+    return sum(values) / len(values) if values else None
+
+
+def bootstrap_interval(
+    units: Sequence, statistic: Callable[[Sequence], float | None], *, draws: int = 500, level: float = 0.95
+) -> tuple[float, float] | None:
+    """Percentile interval of a statistic under resampling of independent units.
+
+    Args:
+        units (sequence): what was sampled independently: episodes, or contexts with all their episodes.
+        statistic (callable): from a list of units to a number, or None where it is not defined.
+        draws (int): number of resamples; the same ones in every call.
+        level (float): probability that the interval holds.
+
+    Returns:
+        tuple or None: low and high end; None if the statistic is never defined.
+
+    Examples:
+        >>> from torchrl_koap.metrics import bootstrap_interval
+        >>> bootstrap_interval([1.0] * 9, lambda units: sum(units) / len(units))
+        (1.0, 1.0)
+    """
+    generator = random.Random(0)
+    values = [statistic(generator.choices(units, k=len(units))) for _ in range(draws)]
+    values = sorted(value for value in values if value is not None)
+    if not values:
+        return None
+    tail = (1 - level) / 2
+    return values[int(tail * (len(values) - 1))], values[round((1 - tail) * (len(values) - 1))]

@@ -36,7 +36,9 @@ class Task:
         max_steps (int): control steps after which an episode is truncated.
         control_hz (float): control steps per second.
         num_modes (int): base of the logarithm of the mode entropy.
-        actuated (tuple of int): for every action entry the state column that it moves; empty if there is none.
+        actuated (tuple of int): for every action entry the state column that it moves, by the same filter for all;
+            empty if there is none.
+        robot (tuple of int): state columns of the robot itself, which the recovery augmentation shifts.
         state (dict): part of the observation to name of its features (:mod:`torchrl_koap.state_features`), in the
             order of the state. Empty: every part but the command and the hidden ones, unchanged.
         hidden (tuple): further parts that planner and controller must not see.
@@ -49,7 +51,9 @@ class Task:
         label_levels (tuple of float): shares of labelled windows of the label levels 1, 2, ...
         recovery_sigma (float): typical shift of the recovery augmentation, in the units of the actuated columns.
         noise (float): standard deviation of the noise on the measured end effector (m).
-        data (str): name of the task whose demonstrations are used.
+        data (str): name of the task whose demonstrations are used, if another one.
+        demonstrations (int): number of scripted demonstrations to record by default.
+        planner_steps (int): planner updates by default.
     """
 
     name: str
@@ -61,6 +65,7 @@ class Task:
     control_hz: float
     num_modes: int
     actuated: tuple[int, ...] = field(default=())
+    robot: tuple[int, ...] = field(default=())
     state: dict[str, str] = field(default_factory=dict)
     hidden: tuple[str, ...] = field(default=())
     objects: tuple[str, ...] = field(default=())
@@ -72,6 +77,8 @@ class Task:
     recovery_sigma: float = 0.004
     noise: float = 0.0
     data: str = ""
+    demonstrations: int = 200
+    planner_steps: int = 12000
 
     @property
     def observation_dim(self) -> int:
@@ -96,6 +103,21 @@ class Task:
             return [(name, kind) for name, kind in self.state.items() if name not in self.hidden]
         dropped = {self.command, *self.hidden}
         return [(name, "plain") for name in self.observation if name not in dropped]
+
+    @property
+    def plans_position(self) -> bool:
+        """Whether the state begins with the position that pictures draw."""
+        return self._state_parts[0] == (self.position, "plain")
+
+    @property
+    def same_unit(self) -> int:
+        """Number of leading action columns that are in ``action_unit``; Stacking's last one is a width in m."""
+        return self.action_dim - (self.action_unit == "rad")
+
+    @property
+    def source(self) -> str:
+        """Name of the task whose demonstrations are used."""
+        return self.data or self.name
 
     def state_of(self, observation: Tensor) -> Tensor:
         """The state that planner and controller see.
@@ -145,6 +167,7 @@ def _sorting(num_boxes: int, num_modes: int) -> Task:
         control_hz=CONTROL_HZ,
         num_modes=num_modes,
         actuated=(0, 1),
+        robot=(0, 1),
         state={"measured_xy": "plain"} | {name: "tan_yaw" if size == 1 else "plain" for name, size in columns},
         objects=tuple(boxes),
         drawn={box: f"{box}_xy" for box in boxes},
@@ -168,7 +191,7 @@ _stacking = Task(
     max_steps=1000,
     control_hz=1 / 0.03,
     num_modes=6,
-    actuated=tuple(range(8)),
+    robot=tuple(range(7)),
     state={"measured_joints": "plain", "gripper_width": "plain"}
     | {
         name: kind
@@ -193,7 +216,10 @@ _tasks = (
         control_hz=CONTROL_HZ,
         num_modes=24,
         actuated=(0, 1),
+        robot=(0, 1),
         collides=True,
+        demonstrations=96,
+        planner_steps=5000,
     ),
     Task(
         name="aligning",
@@ -212,6 +238,7 @@ _tasks = (
         control_hz=CONTROL_HZ,
         num_modes=2,
         actuated=(0, 1, 2),
+        robot=(0, 1, 2),
         state={
             "measured_xyz": "plain",
             "box_position": "plane",

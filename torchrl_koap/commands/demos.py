@@ -20,14 +20,14 @@ class Demos:
     Attributes:
         out: folder to write: OUT/ted and OUT/raw. Must not hold demonstrations yet.
         task: name of the task.
-        episodes: number of demonstrations, spread evenly over the modes.
+        episodes: number of demonstrations, spread evenly over the modes (default: that of the task).
         seed: seed of the players' variation.
         threads: simulator threads.
     """
 
     out: Path
     task: str = "avoiding"
-    episodes: int = 96
+    episodes: int | None = None
     seed: int = 0
     threads: int = 2
 
@@ -42,15 +42,16 @@ def run_demos(options: Demos) -> RecordingReport:
     for name in ("ted", "raw"):
         if (options.out / name).exists():
             raise FileExistsError(f"{options.out / name} exists already; choose another --out")
-    with tqdm(total=options.episodes, desc="recording", unit="episode") as bar:
+    episodes = task.demonstrations if options.episodes is None else options.episodes
+    with tqdm(total=episodes, desc="recording", unit="episode") as bar:
         raw, report = record_episodes(
             task.name,
-            options.episodes,
+            episodes,
             options.seed,
             options.threads,
             lambda recorded, wanted: bar.update(recorded - bar.n),
         )
     data = episodes_to_ted(raw, task.name)
-    save_ted(data, options.out / "ted", task=task.name, notes={"seed": options.seed, "modes": list(report.modes)})
+    save_ted(data, options.out / "ted", task=task.source, notes={"seed": options.seed, "modes": list(report.modes)})
     write_raw_episodes(options.out / "raw", raw)
     return report

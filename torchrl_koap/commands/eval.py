@@ -7,18 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 from torch import nn
 from tqdm import tqdm
 
 from torchrl_koap.assembly import build_controller, build_planner, make_env_of, mode_index_of, set_up_torch
 from torchrl_koap.checkpoints import load_weights, save_tensors
-from torchrl_koap.evaluation import make_policy, measure_latency, roll_out, rollouts_to_tensors, score
+from torchrl_koap.evaluation import make_policy, measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.policies import EXECUTIONS
 from torchrl_koap.report import write_report
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.scores import d3il_score, score, stacking_scores
 from torchrl_koap.tasks import Task, get_task
 
 
@@ -28,7 +30,8 @@ class Eval:
 
     Attributes:
         run: run directory of `koap train`.
-        episodes: number of rollouts.
+        episodes: number of rollouts; tasks with contexts take the fixed ones of the evaluation table in turn.
+        rollouts_per_context: rollouts in each context; from 2 on the entropy of the modes per context is known.
         seed: seed of the first rollout; the others count on from it.
         execution: "feedback" (decode at every step) or "open_loop" (decode once per plan).
         solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
@@ -36,6 +39,7 @@ class Eval:
         replan_interval: control steps per plan.
         joining: how slowly plans are joined to the present state; 0 turns it off.
         batch_size: episodes at a time; results do not depend on it.
+        contexts_file: a context file of D3IL to take instead of the table.
         task: refuse a run of another task than this.
         threads: torch and simulator threads.
         device: "cpu" or "cuda".
@@ -44,6 +48,7 @@ class Eval:
 
     run: tyro.conf.Positional[Path]
     episodes: int = 60
+    rollouts_per_context: int = 1
     seed: int = 100
     execution: str = "feedback"
     solver: str | None = None
@@ -51,6 +56,7 @@ class Eval:
     replan_interval: int = 4
     joining: float = 0.8
     batch_size: int | None = None
+    contexts_file: Path | None = None
     task: str | None = None
     threads: int = 2
     device: str = "cpu"
@@ -68,12 +74,34 @@ def load_run(run: RunDirectory, task: str | None = None) -> tuple[Task, StatePla
     if task is not None and task != trained_on:
         raise RunDirectoryError(f"{run.path} was trained on task {trained_on!r}, not on {task!r}")
     facts = get_task(trained_on)
-    state_dim = len(facts.state_columns)
+    state_dim = facts.state_dim
     planner = build_planner(parts[0], state_dim)
     controller = build_controller(parts[1], state_dim, facts.action_dim)
     for name, module in (("planner", planner), ("controller", controller)):
         load_weights(run.path / f"{name}.safetensors", module, task=facts.name)
     return facts, planner.eval(), controller.eval()
+
+
+def choose_contexts(task: Task, options: Eval) -> tuple[list[int] | None, np.ndarray | None]:
+    """Number of the context of every rollout, and the contexts; None for a task in which all episodes start alike."""
+    if not task.objects:
+        for name in ("contexts_file", "rollouts_per_context"):
+            if getattr(options, name) not in (None, 1):
+                raise ValueError(f"{name} was given, but task {task.name!r} has no contexts")
+        return None, None
+    from torchrl_koap.envs.contexts import evaluation_contexts, load_contexts  # takes seconds
+
+    if options.contexts_file is None:
+        table = evaluation_contexts(task)
+    else:
+        table = load_contexts(options.contexts_file, task)
+    numbers = [episode // options.rollouts_per_context for episode in range(options.episodes)]
+    if numbers[-1] >= len(table):
+        raise ValueError(
+            f"{options.episodes} episodes with {options.rollouts_per_context} per context need {numbers[-1] + 1}"
+            f" contexts, there are {len(table)}"
+        )
+    return numbers, table[numbers]
 
 
 def run_eval(options: Eval) -> dict[str, Any]:
@@ -82,7 +110,8 @@ def run_eval(options: Eval) -> dict[str, Any]:
     Raises:
         ValueError: for unknown options or fewer than one episode.
     """
-    for name, value in {"episodes": options.episodes, "batch_size": options.batch_size}.items():
+    for name in ("episodes", "batch_size", "rollouts_per_context"):
+        value = getattr(options, name)
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
     lookup(EXECUTIONS, options.execution, "execution")
@@ -96,12 +125,13 @@ def run_eval(options: Eval) -> dict[str, Any]:
     policy = make_policy(
         planner,
         controller,
-        state_columns=task.state_columns,
+        state_columns=task.state_of,
         execution=options.execution,
         replan_interval=options.replan_interval,
         joining=options.joining,
     ).to(options.device)
     seeds = list(range(options.seed, options.seed + options.episodes))
+    numbers, contexts = choose_contexts(task, options)
     mode_index = mode_index_of(task)
     with tqdm(total=options.episodes, desc="rollouts", unit="episode") as bar:
         episodes = roll_out(
@@ -110,9 +140,16 @@ def run_eval(options: Eval) -> dict[str, Any]:
             seeds,
             max_steps=task.max_steps,
             batch_size=options.batch_size,
+            contexts=contexts,
             progress=lambda finished: bar.update(finished - bar.n),
         )
-    result = score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index)
+    unsolved = "zero" if task.entropy == "contexts" else "skip"
+    result = score(
+        episodes, seeds, num_modes=task.num_modes, mode_index=mode_index, contexts=numbers, unsolved=unsolved
+    )
+    if task.source == "stacking":
+        result |= stacking_scores(episodes, numbers, complete=task.name == "stacking")
+    result |= d3il_score(task, result)
     rows = result.pop("episode")
     result |= measure_latency(policy, task.observation_dim)
     result |= {
@@ -128,6 +165,8 @@ def run_eval(options: Eval) -> dict[str, Any]:
         position=task.observation[task.position],
         mode_index=mode_index,
         interval=options.replan_interval,
+        objects=[task.observation[part] for part in task.drawn.values()],
+        plans_position=task.plans_position,
     )
     save_tensors(run.path / "rollouts.safetensors", rollouts, {"task": task.name})
     run.write_json("eval.json", result)

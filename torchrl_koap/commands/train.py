@@ -16,11 +16,11 @@ from torch import nn
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from torchrl_koap.analysis import AFTER, BEFORE, write_analysis
+from torchrl_koap.analysis import AFTER, BEFORE, UNITS, write_analysis
 from torchrl_koap.assembly import METHODS, build_controller, build_planner, load_demonstrations, set_up_torch
 from torchrl_koap.checkpoints import load_weights, save_tensors, save_weights
 from torchrl_koap.closed_form import fit_closed_form
-from torchrl_koap.commands.train_options import HISTORY, HORIZON, WINDOW, Train, configure, started_with
+from torchrl_koap.commands.train_options import Train, configure, started_with, with_task_defaults
 from torchrl_koap.data import (
     LabelBudget,
     RecoveryAugmentation,
@@ -33,7 +33,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS, KoopmanInverseDynamics, StatePlanner
 from torchrl_koap.objectives import InverseDynamicsLoss, KOAPLoss, PlannerLoss
 from torchrl_koap.run_directory import RunDirectory
-from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task, get_task
 from torchrl_koap.training import phase_finished, train
 
 
@@ -47,6 +47,7 @@ def run_train(options: Train) -> dict[str, Any]:
     run = RunDirectory(options.out)
     options = started_with(run, options)
     task = get_task(options.task)
+    options = with_task_defaults(options, task)
     lookup(METHODS, options.method, "method")
     lookup(PRESETS, options.preset, "preset")
     lookup(("ridge", "sgd"), options.decoder, "decoder")
@@ -62,7 +63,7 @@ def run_train(options: Train) -> dict[str, Any]:
             raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
     set_up_torch(options.threads, options.device)
     config = configure(run, options)
-    planner = build_planner(config["planner"], len(task.state_columns))  # finds unknown names before any work is done
+    planner = build_planner(config["planner"], task.state_dim)  # finds unknown names before any work is done
     if options.planner_from is not None:
         load_weights(options.planner_from / "planner.safetensors", planner, task=task.name)
 
@@ -102,7 +103,7 @@ def run_train(options: Train) -> dict[str, Any]:
         "decoder_fit": fit,
     }
     if options.analysis:
-        summary["action_error_mm"] = write_analysis(run, task, data, labelled, controller)
+        summary[f"action_error_{UNITS[task.action_unit]}"] = write_analysis(run, task, data, labelled, controller)
     run.write_json("summary.json", summary)
     return summary
 
@@ -139,7 +140,7 @@ def _train_planner(
     planner.fit_normalizers(cut_windows(extended, WINDOW, select=["state"], pad_before=1)["state"])
     planner.to(options.device)
     buffer = make_window_buffer(extended, WINDOW, options.batch_size, select=["state"], pad_before=1)
-    augment = RecoveryAugmentation(options.recovery_sigma, history=HISTORY)
+    augment = RecoveryAugmentation(options.recovery_sigma, history=HISTORY, columns=task.robot)
     loss = PlannerLoss(planner)
     with _bar(options.steps, "planner") as bar:
         values = train(

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.tasks import HISTORY, HORIZON, Task
 
 
 @dataclass
@@ -28,7 +29,7 @@ class Train:
         method: "koap", "linear" (ridge on raw frames) or "supervised" (inverse dynamics network).
         preset: variant of KOAP: "default", "paper" or "released".
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest).
-        steps: planner updates; a smaller number than the default shortens the controller's training as well.
+        steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: controller updates.
         batch_size: windows per planner update.
         controller_batch_size: windows per controller update.
@@ -39,11 +40,11 @@ class Train:
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
         relative: plan displacements from the current state instead of states.
-        recovery_sigma: typical shift (m) of the recovery augmentation; 0 turns it off.
+        recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
         solver: solver used at evaluation unless told otherwise.
         solver_steps: its number of steps.
         planner_from: run directory whose planner is taken over instead of training one.
-        episodes: number of scripted demonstrations.
+        episodes: number of scripted demonstrations (default: that of the task).
         threads: torch threads.
         device: "cpu" or "cuda".
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
@@ -62,7 +63,7 @@ class Train:
     method: str = "koap"
     preset: str = "default"
     decoder: str = "ridge"
-    steps: int = 5000
+    steps: int | None = None
     controller_steps: int = 500
     batch_size: int = 128
     controller_batch_size: int = 256
@@ -73,11 +74,11 @@ class Train:
     schedule: str = "squared_cosine"
     prediction: str = "sample"
     relative: bool = False
-    recovery_sigma: float = 0.004
+    recovery_sigma: float | None = None
     solver: str = "dpm++2m"
     solver_steps: int = 10
     planner_from: Path | None = None
-    episodes: int = 96
+    episodes: int | None = None
     threads: int = 1
     device: str = "cpu"
     checkpoint_every: int = 500
@@ -86,8 +87,6 @@ class Train:
     analysis: bool = True
 
 
-HISTORY, HORIZON = 2, 14
-WINDOW = HISTORY + HORIZON
 # options with which a run may be resumed differently; with other threads sums are rounded differently
 FREE = ("out", "threads", "checkpoint_every", "resume")
 
@@ -104,6 +103,17 @@ def started_with(run: RunDirectory, options: Train) -> Train:
     if kept.get("planner_from") is not None:
         kept["planner_from"] = Path(kept["planner_from"])
     return replace(options, **kept)
+
+
+def with_task_defaults(options: Train, task: Task) -> Train:
+    """Fills in what was left to the task."""
+    defaults = {
+        "steps": task.planner_steps,
+        "recovery_sigma": task.recovery_sigma,
+        "episodes": task.demonstrations,
+    }
+    left = {name: value for name, value in defaults.items() if getattr(options, name) is None}
+    return replace(options, **left)
 
 
 def configure(run: RunDirectory, options: Train) -> dict[str, Any]:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -27,6 +29,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
     Keyword Args:
         history (int): observed frames of the window. Defaults to ``2``.
         decay (float): share ``rho`` of the shift that remains after each planned frame. Defaults to ``0.7``.
+        columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
 
     Examples:
@@ -38,18 +41,31 @@ class RecoveryAugmentation(TensorDictModuleBase):
         True
     """
 
-    def __init__(self, sigma: float, *, history: int = 2, decay: float = 0.7, key: NestedKey = STATE):
+    def __init__(
+        self,
+        sigma: float,
+        *,
+        history: int = 2,
+        decay: float = 0.7,
+        columns: Sequence[int] | None = None,
+        key: NestedKey = STATE,
+    ):
         super().__init__()
         if sigma < 0 or not 0 <= decay < 1:
             raise ValueError(f"sigma must be >= 0 and decay in [0, 1), got {sigma} and {decay}")
         self.in_keys, self.out_keys = [key], [key]
         self.sigma, self.history, self.decay = sigma, history, decay
+        self.columns = None if columns is None else list(columns)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by shifted ones."""
         state = tensordict.get(self.in_keys[0])
         size = torch.rand(*state.shape[:-2], 1, 1, dtype=state.dtype, device=state.device)
         shift = torch.randn(*state.shape[:-2], 1, state.shape[-1], dtype=state.dtype, device=state.device)
+        if self.columns is not None:
+            keep = torch.zeros_like(shift)
+            keep[..., self.columns] = 1
+            shift = shift * keep
         frames = torch.arange(state.shape[-2], device=state.device) - (self.history - 1)
         remaining = self.decay ** frames.clamp_min(0).to(state.dtype)
         return tensordict.set(self.in_keys[0], state + 2 * self.sigma * size * shift * remaining[:, None])

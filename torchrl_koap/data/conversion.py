@@ -210,8 +210,7 @@ def get_converter(task: str) -> Converter:
     Raises:
         ValueError: if the task is unknown.
     """
-    facts = get_task(task)
-    return CONVERTERS[facts.data or facts.name]
+    return CONVERTERS[get_task(task).source]
 
 
 def _refuse_other_task(file: Path, episode: RawEpisode, converter: Converter) -> None:

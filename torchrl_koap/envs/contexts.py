@@ -99,7 +99,7 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
     """
     task = get_task(task) if isinstance(task, str) else task
     _family(task)
-    rows = _table()["contexts"][task.data or task.name]
+    rows = _table()["contexts"][task.source]
     if not 1 <= num <= len(rows):
         raise ValueError(f"the table holds {len(rows)} contexts of task {task.name!r}, asked for {num}")
     return np.array(rows[:num])
