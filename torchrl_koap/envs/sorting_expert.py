@@ -29,8 +29,9 @@ ARRIVED_Y = 0.232  # m; beyond, a box has left the platform
 _LANE_HALF = 0.058  # m; a box is led to within this of the middle of its bin
 _HORIZON = 700  # control steps for which the hand's noise is drawn
 _LINGER = 4  # control steps after success
-_PUSH, _FREE = 0.0095, 0.0112  # m per control step
+_PUSH, _FREE = 0.0110, 0.0125  # m per control step
 _DIRECTIONS = 32
+_HOLD = 0.006  # a direction is given up for a very different one if that is better by this much (m of way)
 
 
 @njit(cache=True)
@@ -53,7 +54,7 @@ def _box_field(boxes, yaws, obstacle, lane):
             for k in range(len(boxes)):
                 if obstacle[k]:
                     gap = square_distance(x, y, boxes[k, 0], boxes[k, 1], yaws[k], BOX_HALF)
-                    s += 12.0 * min(max((0.052 - gap) / 0.02, 0.0), 1.0)
+                    s += 12.0 * min(max((0.048 - gap) / 0.02, 0.0), 1.0)
             slowness[i, j] = s
     return travel_cost(slowness, cost)
 
@@ -65,7 +66,7 @@ def _rod_slowness(boxes, yaws, solid, target):
         x = ORIGIN[0] + i * STEP
         for j in range(SHAPE[1]):
             y = ORIGIN[1] + j * STEP
-            border = max(0.24 - x, x - 0.76, y - 0.26)
+            border = max(0.18 - x, x - 0.82, y - 0.28)
             s = 1.0 + (10.0 * min(border / 0.02, 1.0) if border > 0 else 0.0)
             for k in range(len(boxes)):
                 if solid[k]:
@@ -113,18 +114,24 @@ def _carried(box, yaw, rod, commanded):
 
 
 @njit(cache=True)
+def _direction_cost(box, yaw, angle, to_go, way, slowness):
+    """What is left to go after pushing along ``angle``, plus the rod's way to the place behind the box."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    left = 0.5 * (
+        value_at(to_go, box[0] + 0.02 * cos, box[1] + 0.02 * sin)
+        + value_at(to_go, box[0] + 0.045 * cos, box[1] + 0.045 * sin)
+    )
+    x, y = _behind(box, yaw, angle, 0.007)
+    return left + 0.2 * max(value_at(way, x, y) - 0.03, 0.0) + 0.004 * (value_at(slowness, x, y) - 1)
+
+
+@njit(cache=True)
 def _choose_direction(box, yaw, to_go, way, slowness):
-    """Angle along which to push, and its cost: what is left to go afterwards plus the rod's way behind the box."""
+    """Angle along which to push, and its cost."""
     best, best_cost = 0.0, np.inf
     for k in range(_DIRECTIONS):
         angle = 2 * np.pi * k / _DIRECTIONS
-        cos, sin = np.cos(angle), np.sin(angle)
-        left = 0.5 * (
-            value_at(to_go, box[0] + 0.02 * cos, box[1] + 0.02 * sin)
-            + value_at(to_go, box[0] + 0.045 * cos, box[1] + 0.045 * sin)
-        )
-        x, y = _behind(box, yaw, angle, 0.007)
-        cost = left + 0.2 * max(value_at(way, x, y) - 0.03, 0.0) + 0.004 * (value_at(slowness, x, y) - 1)
+        cost = _direction_cost(box, yaw, angle, to_go, way, slowness)
         if cost < best_cost:
             best, best_cost = angle, cost
     return best, best_cost
@@ -136,8 +143,8 @@ def _wrapped(angle):
 
 
 @njit(cache=True)
-def _decide(boxes, yaws, present, target, lane, rod, commanded, pushing):
-    """Velocity of the rod [2] relative to full speed, and whether it pushes."""
+def _decide(boxes, yaws, present, target, lane, rod, commanded, pushing, held):
+    """Step of the rod [2] (m), whether it pushes, and the direction in which; ``held`` is the last one, or NaN."""
     boxes = boxes.copy()
     boxes[target] = _carried(boxes[target], yaws[target], rod, commanded)
     box, yaw = boxes[target], yaws[target]
@@ -146,7 +153,9 @@ def _decide(boxes, yaws, present, target, lane, rod, commanded, pushing):
     to_go = _box_field(boxes, yaws, others, lane)
     slowness = _rod_slowness(boxes, yaws, present, target)
     way = _cost_from(slowness, commanded[0], commanded[1])
-    angle, _ = _choose_direction(box, yaw, to_go, way, slowness)
+    angle, cost = _choose_direction(box, yaw, to_go, way, slowness)
+    if abs(_wrapped(angle - held)) > 0.45 and _direction_cost(box, yaw, held, to_go, way, slowness) < cost + _HOLD:
+        angle = held
 
     towards = box - commanded
     distance = np.sqrt(towards[0] ** 2 + towards[1] ** 2)
@@ -160,7 +169,7 @@ def _decide(boxes, yaws, present, target, lane, rod, commanded, pushing):
     if pushing:
         heading = angle + min(max(2.2 * off, -1.2), 1.2)
         speed = _PUSH * (1.0 - 0.5 * min(abs(off) / 0.6, 1.0))
-        return speed * np.cos(heading), speed * np.sin(heading), True
+        return speed * np.cos(heading), speed * np.sin(heading), True, angle
     x, y = _behind(box, yaw, angle, 0.008)
     gap = np.hypot(x - commanded[0], y - commanded[1])
     if gap < 0.02:
@@ -168,7 +177,7 @@ def _decide(boxes, yaws, present, target, lane, rod, commanded, pushing):
     else:
         direction = descent(_cost_from(slowness, x, y), commanded[0], commanded[1])
     speed = min(_FREE, max(0.35 * gap, 0.003))
-    return speed * direction[0], speed * direction[1], False
+    return speed * direction[0], speed * direction[1], False, angle
 
 
 class SortingExpert:
@@ -221,6 +230,7 @@ class SortingExpert:
         self._lost = np.zeros((count, num_boxes), dtype=bool)
         self._target = np.full(count, -1)
         self._pushing = np.zeros(count, dtype=bool)
+        self._direction = np.full(count, np.nan)  # of pushing (rad)
         self._rest = np.zeros(count, dtype=np.int64)  # control steps without anything to do
         self._velocity = np.zeros((count, 2))
 
@@ -272,11 +282,12 @@ class SortingExpert:
         commanded, rod = observation[:2].copy(), observation[2:4].copy()
         if self._target[row] < 0 or not present[self._target[row]]:
             self._target[row] = self._choose_box(row, places, yaws, present, commanded)
-            self._pushing[row] = False
+            self._pushing[row], self._direction[row] = False, np.nan
         target = int(self._target[row])
         lane = BIN_X[self._colours[target]] + self._aim[row, target]
-        x, y, pushing = _decide(places, yaws, present, target, lane, rod, commanded, bool(self._pushing[row]))
-        self._pushing[row] = pushing
+        mind = bool(self._pushing[row]), float(self._direction[row])
+        x, y, *mind = _decide(places, yaws, present, target, lane, rod, commanded, *mind)
+        self._pushing[row], self._direction[row] = mind
         return x, y
 
     def _choose_box(self, row: int, places, yaws, present, commanded) -> int:
@@ -298,7 +309,7 @@ class SortingExpert:
 def _draw(generator: np.random.Generator, num_boxes: int) -> dict[str, np.ndarray]:
     """What is random about an episode: ``taste`` for boxes (m of way), ``aim`` within the bin (m), pause, tempo."""
     return {
-        "taste": generator.normal(0, 0.06, num_boxes),
+        "taste": generator.normal(0, 0.03, num_boxes),
         "aim": generator.uniform(-0.015, 0.015, num_boxes),
         "pause": np.array(generator.integers(0, 6)),
         "tempo": generator.uniform(0.95, 1.05) * (1 + _drift(generator, 15, 0.04)),

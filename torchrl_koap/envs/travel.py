@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 
 STEP = 0.008  # m between neighbouring grid points
-ORIGIN = (0.2, -0.4)  # x, y of the first one (m)
-SHAPE = (76, 90)  # points along x and y
+ORIGIN = (0.14, -0.4)  # x, y of the first one (m)
+SHAPE = (91, 90)  # points along x and y
 FAR = 1e3  # cost of a place that is not reached
 
 
