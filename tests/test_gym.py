@@ -11,16 +11,79 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
-from torchrl_koap.envs import AvoidingEnv
+from torchrl_koap.envs import AvoidingEnv, ManipulationGymEnv
+from torchrl_koap.envs.contexts import evaluation_contexts
+from torchrl_koap.envs.registry import ENVIRONMENTS
+
+NAMES = ("Avoiding", "Aligning", "Sorting2", "Sorting4", "Sorting6", "Stacking")
 
 
-@pytest.mark.parametrize("name", ["torchrl_koap/Avoiding-v0", "torchrl_koap.envs:torchrl_koap/Avoiding-v0"])
+@pytest.mark.parametrize(
+    "name", [f"torchrl_koap/{name}-v0" for name in NAMES] + ["torchrl_koap.envs:torchrl_koap/Avoiding-v0"]
+)
 def test_make_and_check(name):
     env = gymnasium.make(name)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*Box observation space m.*imum value is")
         check_env(env.unwrapped, skip_render_check=True)
     env.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_layout_of_the_batched_environment(name):
+    env = gymnasium.make(f"torchrl_koap/{name}-v0").unwrapped
+    observation, info = env.reset(seed=0)
+    assert observation.shape == (env.task.observation_dim,) and observation.dtype == np.float32
+    assert env.action_space.shape == (env.task.action_dim,)
+    np.testing.assert_array_equal(env.action_space.low, env.batched.action_spec.low[0])
+    np.testing.assert_array_equal(env.action_space.high, env.batched.action_spec.high[0])
+    assert env.batched.max_steps == env.task.max_steps
+    assert env.metadata["render_fps"] == (33 if name == "Stacking" else 29)
+    assert set(info) == {"success", "mode", "mode_index"} | ({"collision"} if name == "Avoiding" else {"context"})
+    assert info["mode_index"] == -1 and not info["success"]
+
+
+@pytest.mark.parametrize("name", NAMES[1:])
+def test_seeds_make_contexts_repeatable(name):
+    env = gymnasium.make(f"torchrl_koap/{name}-v0")
+    found = [[env.reset(seed=seed)[1]["context"], env.reset()[1]["context"]] for seed in (3, 3, 4)]
+    np.testing.assert_array_equal(found[0], found[1])
+    apart = [found[0][0], found[0][1], found[2][0]]
+    assert all(np.abs(a - b).max() > 1e-3 for i, a in enumerate(apart) for b in apart[:i])
+
+
+@pytest.mark.parametrize("name", ["Aligning", "Sorting4", "Stacking"])
+def test_a_context_that_is_asked_for(name):
+    env = gymnasium.make(f"torchrl_koap/{name}-v0").unwrapped
+    context = evaluation_contexts(env.task)[7]
+    observation, info = env.reset(options={"context": context})
+    np.testing.assert_array_equal(info["context"], context)
+    wanted = ENVIRONMENTS[env.task.name](1).reset(contexts=context[None])
+    np.testing.assert_array_equal(observation, wanted["observation"][0])
+    info = env.step(env.action_space.sample() * 0)[4]
+    np.testing.assert_array_equal(info["context"], context)
+
+
+def test_bad_options():
+    env = gymnasium.make("torchrl_koap/Aligning-v0").unwrapped
+    with pytest.raises(ValueError, match=r"must be \[C, 2, 3\]"):
+        env.reset(options={"context": np.zeros((4, 3))})
+    with pytest.raises(ValueError, match="outside its region"):
+        env.reset(options={"context": np.zeros((2, 3))})
+    with pytest.raises(ValueError, match="only option of reset.* is 'context', got 'contexts'"):
+        env.reset(options={"contexts": np.zeros((2, 3))})
+    with pytest.raises(ValueError, match="'avoiding' has no contexts"):
+        gymnasium.make("torchrl_koap/Avoiding-v0").unwrapped.reset(options={"context": np.zeros((2, 3))})
+    with pytest.raises(ValueError, match="did you mean 'sorting'"):
+        ManipulationGymEnv("sortin")
+
+
+def test_mode_number_of_a_task_with_objects():
+    env = gymnasium.make("torchrl_koap/Aligning-v0").unwrapped
+    _, info = env.reset(seed=0)
+    assert info["mode_index"] == -1
+    info = env.step(np.zeros(3))[4]
+    assert info["mode_index"] == info["mode"][0] == 1  # the rod starts outside
 
 
 def test_same_episode_as_the_batched_environment():

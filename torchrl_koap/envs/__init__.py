@@ -4,10 +4,19 @@
 from torchrl_koap.envs.aligning import AligningEnv
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.gym import AvoidingGymEnv, register
+from torchrl_koap.envs.gym import AvoidingGymEnv, ManipulationGymEnv, register
 from torchrl_koap.envs.sorting import SortingEnv
 from torchrl_koap.envs.stacking import StackingEnv
 
-__all__ = ["AligningEnv", "AvoidingEnv", "AvoidingGymEnv", "ManipulationEnv", "SortingEnv", "StackingEnv", "mode_index"]
+__all__ = [
+    "AligningEnv",
+    "AvoidingEnv",
+    "AvoidingGymEnv",
+    "ManipulationEnv",
+    "ManipulationGymEnv",
+    "SortingEnv",
+    "StackingEnv",
+    "mode_index",
+]
 
 register()

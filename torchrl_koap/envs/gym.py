@@ -11,62 +11,109 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap import keys
-from torchrl_koap.envs.avoiding import ACTION_BOUND, AvoidingEnv, mode_index
+from torchrl_koap.envs.contexts import draw_contexts
+from torchrl_koap.envs.registry import ENVIRONMENTS, MODE_INDEX
+from torchrl_koap.tasks import get_task
+
+# id of Gymnasium to name of the task
+IDS = {
+    "torchrl_koap/Avoiding-v0": "avoiding",
+    "torchrl_koap/Aligning-v0": "aligning",
+    "torchrl_koap/Sorting2-v0": "sorting_2",
+    "torchrl_koap/Sorting4-v0": "sorting",
+    "torchrl_koap/Sorting6-v0": "sorting_6",
+    "torchrl_koap/Stacking-v0": "stacking",
+}
 
 
-class AvoidingGymEnv(gymnasium.Env):
-    """One :class:`~torchrl_koap.envs.avoiding.AvoidingEnv` behind Gymnasium's interface.
+class ManipulationGymEnv(gymnasium.Env):
+    """One environment of a task behind Gymnasium's interface.
 
-    Observation float32 [4]: commanded xy, measured TCP xy (m). Action float32 [2]: change of the commanded xy (m); the
-    action space is the range of human demonstrators, larger actions are executed unchanged. Reward 1 in the step that
-    reports success, else 0. ``info`` holds ``success``, ``collision`` (bool), ``mode`` (bool [9]) and ``mode_index``.
+    Observation and action are those of the batched environment (:class:`~torchrl_koap.envs.AvoidingEnv` and so on) in
+    float32; the action space is the range of human demonstrators, larger actions are executed unchanged. Reward 1 in
+    the step that reports success, else 0. ``info`` holds
+
+    ============== ============================ ====================================================================
+    key            type                         meaning
+    ============== ============================ ====================================================================
+    ``success``    bool                         the task is done
+    ``collision``  bool                         only where an episode can end by one (Avoiding)
+    ``mode``       bool or int64 array          leaf ``mode`` of the batched environment
+    ``mode_index`` int                          number of the mode, -1 while it is not decided
+    ``context``    float64 ``[objects, 3]``     only in tasks with objects: where they start, x, y (m) and yaw (rad)
+    ============== ============================ ====================================================================
 
     Args:
+        task (str): name of the task.
         render_mode (str, optional): ``"rgb_array"`` or None.
-        max_steps (int): control steps after which an episode is truncated.
+        max_steps (int, optional): control steps after which an episode is truncated. Default: that of the task.
         width (int): width of pictures in pixels.
         height (int): height of pictures in pixels.
         camera (str): camera of pictures, see :meth:`~torchrl_koap.envs.base.ManipulationEnv.render`.
 
     Raises:
-        ValueError: for another ``render_mode``, or actions of a wrong shape or that are not finite.
+        ValueError: for an unknown task, another ``render_mode``, or actions of a wrong shape or that are not finite.
 
     Examples:
         >>> import gymnasium
         >>> import torchrl_koap.envs  # registers
-        >>> env = gymnasium.make("torchrl_koap/Avoiding-v0")
+        >>> env = gymnasium.make("torchrl_koap/Sorting2-v0")
         >>> observation, info = env.reset(seed=0)
-        >>> observation.shape, info["mode_index"]
-        ((4,), -1)
+        >>> observation.shape, info["mode_index"], info["context"].shape
+        ((10,), -1, (2, 3))
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 29}
 
     def __init__(
         self,
+        task: str,
         render_mode: str | None = None,
         *,
-        max_steps: int = 250,
+        max_steps: int | None = None,
         width: int = 480,
         height: int = 480,
         camera: str = "front",
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        facts = get_task(task)
         self.render_mode = render_mode
-        self.batched = AvoidingEnv(1, max_steps=max_steps)
+        self.metadata = self.metadata | {"render_fps": round(facts.control_hz)}
+        self.task = facts
+        self.batched = ENVIRONMENTS[task](1, max_steps=facts.max_steps if max_steps is None else max_steps)
+        self._mode_index = MODE_INDEX[task]
         self._picture = {"width": width, "height": height, "camera": camera}
-        size = self.batched.task.observation_dim
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-ACTION_BOUND, ACTION_BOUND, (2,), np.float32)
+        self._context = None
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (facts.observation_dim,), np.float32)
+        low, high = (bound[0].numpy() for bound in (self.batched.action_spec.low, self.batched.action_spec.high))
+        self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode; every episode starts in the same state."""
+        """Starts an episode.
+
+        Args:
+            seed (int, optional): seed of the contexts drawn from now on.
+            options (dict, optional): ``"context"``: where the objects start, ``[objects, 3]``: x, y (m), yaw (rad).
+                Random by default; a task without objects starts every episode in the same state.
+
+        Raises:
+            ValueError: for another option, or a context of a wrong shape, out of range, or of a task without objects.
+        """
         super().reset(seed=seed)
-        return self._split(self.batched.reset())
+        options = dict(options or {})
+        context = options.pop("context", None)
+        if options:
+            raise ValueError(f"the only option of reset() is 'context', got {', '.join(map(repr, options))}")
+        if context is None and not self.task.objects:
+            return self._split(self.batched.reset())
+        contexts = draw_contexts(self.task, 1, self.np_random) if context is None else np.asarray(context)[None]
+        data = self.batched.reset(contexts=contexts)
+        self._context = contexts[0].astype(np.float64)
+        return self._split(data)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Moves the commanded xy by ``action`` (m) and runs one control step of 35 ms."""
+        """Executes an action and runs one control step (35 ms, Stacking 30 ms)."""
         action = torch.as_tensor(np.asarray(action, dtype=np.float32))[None]
         data = self.batched.step(TensorDict({keys.ACTION: action}, [1]))["next"]
         observation, info = self._split(data)
@@ -83,14 +130,32 @@ class AvoidingGymEnv(gymnasium.Env):
     def _split(self, data) -> tuple[np.ndarray, dict[str, Any]]:
         info = {
             keys.SUCCESS: data[keys.SUCCESS].item(),
-            keys.COLLISION: data[keys.COLLISION].item(),
             keys.MODE: data[keys.MODE][0].numpy(),
-            "mode_index": mode_index(data[keys.MODE]).item(),
+            "mode_index": self._mode_index(data[keys.MODE]).item(),
         }
+        if self.task.collides:
+            info[keys.COLLISION] = data[keys.COLLISION].item()
+        if self.task.objects:
+            info[keys.CONTEXT] = self._context.copy()
         return data[keys.OBSERVATION][0].numpy(), info
+
+
+class AvoidingGymEnv(ManipulationGymEnv):
+    """:class:`ManipulationGymEnv` of Avoiding.
+
+    Examples:
+        >>> from torchrl_koap.envs import AvoidingGymEnv
+        >>> observation, info = AvoidingGymEnv(max_steps=50).reset(seed=0)
+        >>> observation.shape, info["collision"]
+        ((4,), False)
+    """
+
+    def __init__(self, render_mode: str | None = None, **options: Any):
+        super().__init__("avoiding", render_mode, **options)
 
 
 def register() -> None:
     """Makes ``gymnasium.make("torchrl_koap/Avoiding-v0")`` work; importing ``torchrl_koap.envs`` calls it."""
-    if "torchrl_koap/Avoiding-v0" not in gymnasium.registry:
-        gymnasium.register("torchrl_koap/Avoiding-v0", entry_point="torchrl_koap.envs.gym:AvoidingGymEnv")
+    for name, task in IDS.items():
+        if name not in gymnasium.registry:
+            gymnasium.register(name, entry_point="torchrl_koap.envs.gym:ManipulationGymEnv", kwargs={"task": task})
