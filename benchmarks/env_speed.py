@@ -1,31 +1,43 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Control steps per second of AvoidingEnv, per core and over threads, against the original simulator.
+"""Control steps per second of the environments, per core and over threads, against the original simulator.
 
-    python benchmarks/env_speed.py --num-envs 60 --steps 40 --threads 1 2
+    python benchmarks/env_speed.py --task avoiding --num-envs 60 --steps 40 --threads 1 2
+    python benchmarks/env_speed.py --task aligning --num-envs 30 --steps 150 --recordings ../shared/d3il_reference
 
-The original (one environment, one core, Python controller) makes 26 control steps per second; ratios are against it.
+The original (one environment, one core, Python controller) makes 19 to 80 control steps per second, depending on the
+task; ratios are against that. With ``--recordings`` every environment plays the first recorded episode of the task,
+pushes and grasps included; otherwise it moves on at human speed.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import math
 import statistics
 import time
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import torch
 
-from torchrl_koap.envs import AvoidingEnv
+from torchrl_koap.envs import ManipulationEnv
+from torchrl_koap.envs.registry import ENVIRONMENTS
 
-ANCHOR = 26.0
+# control steps per second of the original (specification, section 12)
+ANCHORS = {"avoiding": 26.0, "aligning": 27.5, "sorting": 19.0, "stacking": 80.5}
 
 
-def straight_on(env: AvoidingEnv):
+def straight_on(env: ManipulationEnv):
     """A policy that moves at human speed through the scene, so that controller and contacts have work to do."""
     generator = torch.Generator().manual_seed(0)
-    aim = torch.rand(env.batch_size[0], 2, generator=generator) * torch.tensor([0.012, 0.006])
-    aim[:, 0] -= 0.006
+    spec = env.action_spec
+    aim = torch.rand(spec.shape, generator=generator) * (spec.high - spec.low) / 2 + spec.low / 2
+    if env.task.action_unit == "rad":
+        aim = aim * 0.1
+    else:
+        aim[:, 1] = aim[:, 1].abs()
 
     def policy(tensordict):
         return tensordict.set("action", aim)
@@ -33,22 +45,43 @@ def straight_on(env: AvoidingEnv):
     return policy
 
 
-def rollout_speed(env: AvoidingEnv, steps: int, repeats: int) -> list[float]:
+def recorded(env: ManipulationEnv, file: Path):
+    """A policy that plays the first recorded episode, and its context."""
+    data = np.load(file)
+    commands, context = torch.from_numpy(data["ep0_action"]), None
+    if env.task.objects:
+        rows = data["ep0_context"][: len(env.task.objects), :3] * (1, 1, math.pi / 180)
+        context = np.repeat(rows[None], env.batch_size[0], 0)
+    columns = 7 if env.task.action_unit == "rad" else env.task.action_dim
+    steps = itertools.count()
+
+    def policy(tensordict):
+        target = commands[min(next(steps), len(commands) - 1)]
+        delta = target[:columns] - torch.from_numpy(env.commands[:, :columns])
+        rest = target[columns : env.task.action_dim].expand(len(delta), -1)
+        return tensordict.set("action", torch.cat([delta, rest], -1).float())
+
+    return policy, context
+
+
+def rollout_speed(env: ManipulationEnv, steps: int, repeats: int, file: Path | None) -> list[float]:
     """Control steps per second of ``env.rollout`` (TorchRL included), once per repeat."""
-    policy = straight_on(env)
-    env.rollout(2, policy, break_when_any_done=False)
+    env.rollout(2, straight_on(env), break_when_any_done=False)
     speeds = []
     for _ in range(repeats):
-        tensordict = env.reset()
+        policy, context = (straight_on(env), None) if file is None else recorded(env, file)
+        tensordict = env.reset() if context is None else env.reset(contexts=context)
         start = time.perf_counter()
         env.rollout(steps, policy, break_when_any_done=False, auto_reset=False, tensordict=tensordict)
         speeds.append(env.batch_size[0] * steps / (time.perf_counter() - start))
     return speeds
 
 
-def shares(env: AvoidingEnv, steps: int) -> dict[str, float]:
+def shares(env: ManipulationEnv, steps: int) -> dict[str, float]:
     """Microseconds per substep spent in the physics alone and in physics with controller (one thread)."""
     env.reset()
+    if env.task.action_unit == "rad":
+        return {}
     rows = np.arange(env.batch_size[0])
     substeps = steps * env.substeps
     start = time.perf_counter()
@@ -64,6 +97,8 @@ def shares(env: AvoidingEnv, steps: int) -> dict[str, float]:
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="avoiding", choices=sorted(ANCHORS))
+    parser.add_argument("--recordings", type=Path, help="folder of d3il_reference")
     parser.add_argument("--num-envs", type=int, default=60)
     parser.add_argument("--steps", type=int, default=40, help="control steps per measurement")
     parser.add_argument("--repeats", type=int, default=5)
@@ -71,20 +106,23 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
 
-    base = None
-    print("| batch | threads | control steps/s (min / median / max) | per thread, over the original's 26 | scaling |")
+    base, anchor = None, ANCHORS[options.task]
+    file = None if options.recordings is None else options.recordings / f"{options.task}.npz"
+    make = ENVIRONMENTS[options.task]
+    head = "control steps/s (min / median / max) | per thread, over the original's"
+    print(f"| {options.task}, batch | threads | {head} {anchor} | scaling |")
     print("|---|---|---|---|---|")
     for num_envs in (1, options.num_envs):
         for threads in options.threads if num_envs > 1 else [1]:
-            env = AvoidingEnv(num_envs, num_threads=threads, max_steps=10**6)
-            speeds = rollout_speed(env, options.steps, options.repeats)
+            env = make(num_envs, num_threads=threads, max_steps=10**6)
+            speeds = rollout_speed(env, options.steps, options.repeats, file)
             median = statistics.median(speeds)
             base = median if threads == 1 else base
             print(
                 f"| {num_envs} | {threads} | {min(speeds):.0f} / {median:.0f} / {max(speeds):.0f}"
-                f" | {median / threads / ANCHOR:.0f}x | {median / base:.2f}x |"
+                f" | {median / threads / anchor:.0f}x | {median / base:.2f}x |"
             )
-    env = AvoidingEnv(options.num_envs, max_steps=10**6)
+    env = make(options.num_envs, max_steps=10**6)
     print()
     for name, value in shares(env, options.steps).items():
         print(f"{name}: {value:.1f} us per substep")

@@ -144,7 +144,8 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
 
     Args:
         rod (bool): the hand holds a rod (Avoiding, Aligning, Sorting) or nothing (Stacking).
-        link_collisions (bool): the convex hulls of links 0-7 collide too, as in the original.
+        link_collisions (bool): the convex hulls of links 0-7 collide with objects and table too. The original lets
+            them collide with each other as well, which joint limits and tasks keep them from; looking for it costs time.
         alpha (float): opacity of the arm when drawn.
 
     Raises:
@@ -162,7 +163,7 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
     for name in (*(f"link{i}" for i in range(8)), "hand", "finger"):
         root.asset.add("mesh", name=name, file=str(_mesh(folder, name)))
     colour, dark = (0.95, 0.95, 0.95, alpha), (0.25, 0.25, 0.28, alpha)
-    hull = {"contype": int(link_collisions), "conaffinity": int(link_collisions)}
+    hull = {"contype": int(link_collisions), "conaffinity": 0}  # a conaffinity would let links meet each other
 
     body = root.worldbody
     for index, (offset, quat, mass, com, inertia, frame) in enumerate(_LINKS):
