@@ -145,7 +145,7 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
     Args:
         rod (bool): the hand holds a rod (Avoiding, Aligning, Sorting) or nothing (Stacking).
         link_collisions (bool): the convex hulls of links 0-7 collide with objects and table too. The original lets
-            them collide with each other as well, which joint limits and tasks keep them from; looking for it costs time.
+            them collide with each other as well, which joint limits and tasks keep them from; testing takes time.
         alpha (float): opacity of the arm when drawn.
 
     Raises:
