@@ -31,7 +31,7 @@ HALF_SIZES = np.array([size[:2] for _, size, _ in BOXES])
 BOX_HEIGHT = 0.06
 ON_TABLE = 0.011  # height of the centre of a box that lies on the table (m)
 
-_SPEED, _PUSH = 0.0105, 0.0014  # m per control step, and its change per control step
+_SPEED, _PUSH = 0.0125, 0.0016  # m per control step, and its change per control step
 _TURN, _TURN_PUSH = 0.028, 0.004  # rad per control step, and its change
 _EAGERNESS = 0.2  # share of the remaining way that is wanted in the next control step
 _HOLD = 0.004  # the TCP grasps that much above the centre of a box (m)
@@ -132,8 +132,8 @@ class _Person:
         self._wobble = np.stack([_drift(generator, 12, 0.0012) for _ in range(3)], axis=1)
         self._hesitation = generator.integers(0, 4, 16)
         self._velocity, self._spin = np.zeros(3), 0.0
-        self._stage, self._since, self._time, self._placed = _REACH, 0, 0, 0
-        self._grasp, self._grip_width = None, 0.0
+        self._time, self._placed, self._grasp, self._grip_width = 0, 0, None, 0.0
+        self._enter(_REACH)
 
     def decide(self, tcp: np.ndarray, yaw: float, width: float, boxes: np.ndarray) -> float:
         """Moves the command by one control step, given what is seen; returns the gripper number."""
@@ -143,7 +143,7 @@ class _Person:
         return stage(tcp, yaw, width, boxes)
 
     def _enter(self, stage: int) -> None:
-        self._stage, self._since = stage, 0
+        self._stage, self._since, self._down = stage, 0, False
 
     def _reach(self, tcp, yaw, width, boxes) -> float:
         self._recount(tcp, boxes)
@@ -154,8 +154,12 @@ class _Person:
         turn, shift = self._grasp
         goal = box[:2] + shift * np.array([math.cos(turn), math.sin(turn)])
         error, tilt = np.linalg.norm(goal - tcp[:2]), abs(turn - yaw)
-        low, hover = box[2] + _HOLD, box[2] + 0.07
-        height = _funnel(error + 0.08 * max(tilt - 0.03, 0.0), low, hover, 0.007, 0.035)
+        low, off = box[2] + _HOLD, error + 0.08 * max(tilt - 0.03, 0.0)
+        if off < 0.006:
+            self._down = True
+        elif off > 0.012 and tcp[2] > box[2] + 0.025:  # the fingers would come down on the box
+            self._down = False
+        height = low if self._down else box[2] + 0.05 + _funnel(off, 0.0, 0.02, 0.009, 0.03)
         self._move(goal, max(height, self._above_stack(tcp)), turn, tcp)
         there = error < 0.004 and tilt < 0.04 and abs(tcp[2] - low) < 0.005
         if (there and width > 0.07 and self._since > 8) or (tcp[2] - low < 0.03 and self._since > 250):
@@ -239,7 +243,7 @@ class _Person:
         way = np.append(goal, height) + (wobble if far else 0.0) - self.position
         wanted = _EAGERNESS * way
         wanted[:2] = _limited(wanted[:2], speed * freedom)
-        wanted[2] = np.clip(wanted[2], -0.8 * speed, 0.9 * speed)
+        wanted[2] = np.clip(wanted[2], -0.65 * speed, 0.9 * speed)
         self._velocity += _limited(wanted - self._velocity, _PUSH)
         self.position += self._velocity
         spin = np.clip(_EAGERNESS * (turn - self.yaw), -_TURN, _TURN) * self._pace
