@@ -29,7 +29,13 @@ ARRIVED_Y = 0.232  # m; beyond, a box has left the platform
 _LANE_HALF = 0.058  # m; a box is led to within this of the middle of its bin
 _HORIZON = 700  # control steps for which the hand's noise is drawn
 _LINGER = 4  # control steps after success
-_PUSH, _FREE = 0.0110, 0.0125  # m per control step
+_PUSH, _FREE = 0.0105, 0.0125  # m per control step
+_STICK = 0.0118  # m per control step and axis, the most that humans used
+# The arm is soft: its rod swings around the command with a period of 26 control steps, by centimetres. These gains
+# damp it: on the difference of wanted and seen speed, and on the stretch between command and rod.
+_DAMPING = np.array([0.4, 0.7])
+_LEAK = 0.18
+_LATENCY = 2.0  # control steps from what is seen to when an action begins to show
 _DIRECTIONS = 32
 _HOLD = 0.006  # a direction is given up for a very different one if that is better by this much (m of way)
 
@@ -100,11 +106,11 @@ def _behind(box, yaw, angle, clearance):
 
 
 @njit(cache=True)
-def _carried(box, yaw, rod, commanded):
-    """Where a box will be once the rod has come from where it is to where it is commanded."""
+def _carried(box, yaw, rod, ahead):
+    """Where a box will be once the rod has come from where it is to the place ``ahead``."""
     box = box.copy()
     for k in range(1, 5):
-        x, y = rod + (commanded - rod) * k / 4
+        x, y = rod + (ahead - rod) * k / 4
         overlap = ROD_RADIUS - square_distance(x, y, box[0], box[1], yaw, BOX_HALF)
         away = box - np.array([x, y])
         size = np.sqrt(away[0] ** 2 + away[1] ** 2)
@@ -143,21 +149,21 @@ def _wrapped(angle):
 
 
 @njit(cache=True)
-def _decide(boxes, yaws, present, target, lane, rod, commanded, pushing, held):
+def _decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
     """Step of the rod [2] (m), whether it pushes, and the direction in which; ``held`` is the last one, or NaN."""
     boxes = boxes.copy()
-    boxes[target] = _carried(boxes[target], yaws[target], rod, commanded)
+    boxes[target] = _carried(boxes[target], yaws[target], rod, ahead)
     box, yaw = boxes[target], yaws[target]
     others = present.copy()
     others[target] = False
     to_go = _box_field(boxes, yaws, others, lane)
     slowness = _rod_slowness(boxes, yaws, present, target)
-    way = _cost_from(slowness, commanded[0], commanded[1])
+    way = _cost_from(slowness, ahead[0], ahead[1])
     angle, cost = _choose_direction(box, yaw, to_go, way, slowness)
     if abs(_wrapped(angle - held)) > 0.45 and _direction_cost(box, yaw, held, to_go, way, slowness) < cost + _HOLD:
         angle = held
 
-    towards = box - commanded
+    towards = box - ahead
     distance = np.sqrt(towards[0] ** 2 + towards[1] ** 2)
     off = _wrapped(np.arctan2(towards[1], towards[0]) - angle)
     near_x, near_y = _behind(box, yaw, angle, 0.0)
@@ -171,11 +177,11 @@ def _decide(boxes, yaws, present, target, lane, rod, commanded, pushing, held):
         speed = _PUSH * (1.0 - 0.5 * min(abs(off) / 0.6, 1.0))
         return speed * np.cos(heading), speed * np.sin(heading), True, angle
     x, y = _behind(box, yaw, angle, 0.008)
-    gap = np.hypot(x - commanded[0], y - commanded[1])
+    gap = np.hypot(x - ahead[0], y - ahead[1])
     if gap < 0.02:
-        direction = np.array([x - commanded[0], y - commanded[1]]) / max(gap, 1e-6)
+        direction = np.array([x - ahead[0], y - ahead[1]]) / max(gap, 1e-6)
     else:
-        direction = descent(_cost_from(slowness, x, y), commanded[0], commanded[1])
+        direction = descent(_cost_from(slowness, x, y), ahead[0], ahead[1])
     speed = min(_FREE, max(0.35 * gap, 0.003))
     return speed * direction[0], speed * direction[1], False, angle
 
@@ -232,7 +238,9 @@ class SortingExpert:
         self._pushing = np.zeros(count, dtype=bool)
         self._direction = np.full(count, np.nan)  # of pushing (rad)
         self._rest = np.zeros(count, dtype=np.int64)  # control steps without anything to do
-        self._velocity = np.zeros((count, 2))
+        self._wish = np.zeros((count, 2))  # speed the rod shall have (m per control step)
+        self._speed = np.zeros((count, 2))  # that it has
+        self._seen = None
 
     @property
     def finished(self) -> np.ndarray:
@@ -257,14 +265,17 @@ class SortingExpert:
             raise ValueError(f"observation must have shape {list(wanted)}, got {list(observation.shape)}")
         boxes = observation[:, 4:].reshape(len(observation), -1, 3)
         self._look(boxes[..., :2])
-        decision = np.zeros((len(observation), 2))
+        rod = observation[:, 2:4].copy()
+        self._speed = np.zeros_like(rod) if self._seen is None else rod - self._seen
+        self._seen = rod
+        decision = np.zeros_like(rod)
         for row in np.flatnonzero(self._rest == 0):
             decision[row] = self._play(row, observation[row], boxes[row])
         tempo = self._tempo[:, self._time % _HORIZON] * (self._time >= self._pause)
-        decision *= tempo[:, None]
-        self._velocity += 0.6 * (decision - self._velocity)
+        self._wish += 0.6 * (decision * tempo[:, None] - self._wish)
         self._time += 1
-        return self._velocity.copy()
+        stretch = observation[:, 2:4] - observation[:, :2]
+        return np.clip(self._wish + _DAMPING * (self._wish - self._speed) + _LEAK * stretch, -_STICK, _STICK)
 
     def _look(self, places: np.ndarray) -> None:
         """Notes which boxes have arrived in their bins, and which fell beside."""
@@ -279,18 +290,19 @@ class SortingExpert:
     def _play(self, row: int, observation: np.ndarray, boxes: np.ndarray) -> tuple[float, float]:
         present = ~self._arrived[row] & ~self._lost[row]
         places, yaws = np.ascontiguousarray(boxes[:, :2]), np.arctan(boxes[:, 2])
-        commanded, rod = observation[:2].copy(), observation[2:4].copy()
+        rod = observation[2:4].copy()
+        ahead = rod + _LATENCY * self._speed[row]
         if self._target[row] < 0 or not present[self._target[row]]:
-            self._target[row] = self._choose_box(row, places, yaws, present, commanded)
+            self._target[row] = self._choose_box(row, places, yaws, present, ahead)
             self._pushing[row], self._direction[row] = False, np.nan
         target = int(self._target[row])
         lane = BIN_X[self._colours[target]] + self._aim[row, target]
         mind = bool(self._pushing[row]), float(self._direction[row])
-        x, y, *mind = _decide(places, yaws, present, target, lane, rod, commanded, *mind)
+        x, y, *mind = _decide(places, yaws, present, target, lane, rod, ahead, *mind)
         self._pushing[row], self._direction[row] = mind
         return x, y
 
-    def _choose_box(self, row: int, places, yaws, present, commanded) -> int:
+    def _choose_box(self, row: int, places, yaws, present, rod) -> int:
         wanted = self._orders[row, min(int(self._arrived[row].sum()), len(self._colours) - 1)]
         candidates = np.flatnonzero(present & (self._colours == wanted))
         if not len(candidates):
@@ -301,7 +313,7 @@ class SortingExpert:
             others[target] = False
             to_go = _box_field(places, yaws, others, BIN_X[self._colours[target]])
             slowness = _rod_slowness(places, yaws, present, target)
-            way = _cost_from(slowness, commanded[0], commanded[1])
+            way = _cost_from(slowness, rod[0], rod[1])
             costs.append(_choose_direction(places[target], yaws[target], to_go, way, slowness)[1])
         return int(candidates[np.argmin(np.array(costs) + self._taste[row, candidates])])
 

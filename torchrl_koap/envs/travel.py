@@ -78,14 +78,21 @@ def value_at(field, x, y):
 
 
 @njit(cache=True)
-def descent(field, x, y, reach=0.012):
-    """Direction [2] of steepest descent of a field at a point, from values ``reach`` (m) around it; zero where flat."""
+def descent(field, x, y, reach=0.016, softness=0.002):
+    """Direction [2] in which a field is least at a distance ``reach`` (m) from a point.
+
+    Values within about ``softness`` of the least one count too, which smooths the direction; a mere gradient would
+    shiver between the walls of narrow passages.
+    """
+    values = np.empty(32)
+    for k in range(32):
+        angle = 2 * np.pi * k / 32
+        values[k] = value_at(field, x + reach * np.cos(angle), y + reach * np.sin(angle))
+    weights = np.exp((values.min() - values) / softness)
     direction = np.zeros(2)
-    for k in range(16):
-        angle = 2 * np.pi * k / 16
-        cos, sin = np.cos(angle), np.sin(angle)
-        value = value_at(field, x + reach * cos, y + reach * sin)
-        direction[0] -= value * cos
-        direction[1] -= value * sin
+    for k in range(32):
+        angle = 2 * np.pi * k / 32
+        direction[0] += weights[k] * np.cos(angle)
+        direction[1] += weights[k] * np.sin(angle)
     size = np.sqrt(direction[0] ** 2 + direction[1] ** 2)
     return direction / size if size > 1e-9 else direction
