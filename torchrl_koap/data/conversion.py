@@ -21,6 +21,7 @@ from torchrl_koap.data.trajectories import flatten_trajectories
 from torchrl_koap.data.unpickling import load_pickle
 from torchrl_koap.tasks import get_task
 
+SPLITS = ("train", "eval")
 _NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.pkl")
 
 _SORTING_OBJECTS = {
@@ -36,7 +37,6 @@ OBJECTS = {
     "sorting_6": _SORTING_OBJECTS[6],
     "stacking": ("red-box", "green-box", "blue-box"),
 }
-_UNREAD = ("target-box",)  # Stacking logs a target that never moves
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,14 @@ class Converter:
         folder (str): where D3IL keeps the files, seen from its data folder.
         convert (callable): from a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``,
             as float64 arrays.
+        unread (tuple of str): objects that may be logged as well and are not read.
     """
 
     robot: tuple[str, ...]
     objects: tuple[str, ...]
     folder: str
     convert: Callable[[RawEpisode], tuple[np.ndarray, np.ndarray]]
+    unread: tuple[str, ...] = ()
 
 
 def _robot(episode: RawEpisode, name: str) -> np.ndarray:
@@ -117,6 +119,7 @@ CONVERTERS = {
         objects=OBJECTS["stacking"],
         folder="stacking/all_data",
         convert=_stacking,
+        unread=("target-box",),  # it never moves
     ),
 } | {
     "sorting" if num_boxes == 4 else f"sorting_{num_boxes}": Converter(
@@ -143,7 +146,9 @@ def find_raw_files(task: str, root: str | Path, *, split_file: str | Path | None
     Args:
         task (str): name of the task.
         root (str or Path): the folder of the pickles or one above it.
-        split_file (str or Path, optional): a pickled list of file names.
+        split_file (str or Path, optional): a pickled list of file names, looked for in ``root``, in the folder of the
+            pickles and in the two above it, where D3IL keeps its lists. ``"train"`` and ``"eval"`` stand for D3IL's
+            own: ``train_files.pkl``, in Sorting ``4_boxes_train_files.pkl``.
 
     Returns:
         tuple: the folder, and its files in the order of their names.
@@ -152,8 +157,9 @@ def find_raw_files(task: str, root: str | Path, *, split_file: str | Path | None
         FileNotFoundError: if nothing is there; the message lists the places looked at.
         ValueError: if the split file is no list of plain file names.
     """
-    root, inside = Path(root).expanduser(), get_converter(task).folder
-    places = [root, root / PurePosixPath(inside).name, root / inside, root / "environments/dataset/data" / inside]
+    root, inside = Path(root).expanduser(), PurePosixPath(get_converter(task).folder).parts
+    ends = [Path(*inside[start:]) for start in range(len(inside) - 1, -1, -1)]
+    places = [root, *(root / end for end in ends), root / "environments/dataset/data" / ends[-1]]
     for folder in places:
         files = _pickles(folder)
         if files:
@@ -163,7 +169,12 @@ def find_raw_files(task: str, root: str | Path, *, split_file: str | Path | None
             raise FileNotFoundError(f"no folder {root}")
         raise FileNotFoundError("no demonstrations (*.pkl) in " + ", ".join(map(str, places)))
     if split_file is not None:
-        names = _read_split([Path(split_file), root / split_file, folder / split_file, folder.parent / split_file])
+        above = [root, folder, folder.parent, folder.parent.parent]
+        if split_file in SPLITS:
+            lists = [f"{part}_{split_file}_files.pkl" for part in inside] + [f"{split_file}_files.pkl"]
+            names = _read_split([place / name for place in above for name in lists])
+        else:
+            names = _read_split([Path(split_file), *(place / split_file for place in above)])
         files = [folder / name for name in names]
         absent = [file.name for file in files if not file.is_file()]
         if absent:
@@ -189,14 +200,16 @@ def convert_raw_files(
     for file in files:
         try:
             episode = read_raw_episode(file, robot=converter.robot, objects=converter.objects)
-            _refuse_other_task(file, episode, converter)
-            observation, action = converter.convert(episode)
         except RawEpisodeError as error:
-            problems += error.problems
+            problems += _other_task(file, converter) or error.problems
             continue
         except OSError as error:
             problems.append(f"{file}: cannot be read: {error}")
             continue
+        if not _logs(episode, converter):
+            problems.append(_origin(file, episode, converter))
+            continue
+        observation, action = converter.convert(episode)
         observations.append(torch.from_numpy(observation))
         actions.append(torch.from_numpy(action))
     if problems:
@@ -213,19 +226,26 @@ def get_converter(task: str) -> Converter:
     return CONVERTERS[get_task(task).source]
 
 
-def _refuse_other_task(file: Path, episode: RawEpisode, converter: Converter) -> None:
-    if _logs(episode, converter.objects):
-        return
+def _other_task(file: Path, converter: Converter) -> list[str]:
+    """Of a file that lacks something: the one problem that explains it all if it belongs to another task, else none."""
+    try:
+        episode = read_raw_episode(file)
+    except RawEpisodeError:
+        return []
+    known = not _logs(episode, converter) and any(_logs(episode, other) for other in CONVERTERS.values())
+    return [_origin(file, episode, converter)] if known else []
+
+
+def _origin(file: Path, episode: RawEpisode, converter: Converter) -> str:
     logged = ", ".join(map(str, episode.objects)) or "no objects"
-    others = [task for task, objects in OBJECTS.items() if _logs(episode, objects)]
+    others = [task for task, other in CONVERTERS.items() if _logs(episode, other)]
     origin = f"a demonstration of {others[0]!r}" if others else "of an unknown task"
-    wanted = ", ".join(converter.objects) or "no objects"
-    raise RawEpisodeError([f"{file}: {origin}: it logs {logged}, wanted {wanted}"])
+    return f"{file}: {origin}: it logs {logged}, wanted {', '.join(converter.objects) or 'no objects'}"
 
 
-def _logs(episode: RawEpisode, objects: tuple[str, ...]) -> bool:
+def _logs(episode: RawEpisode, converter: Converter) -> bool:
     logged = set(episode.objects)
-    return set(objects) in (logged, logged - {*_UNREAD})
+    return set(converter.objects) in (logged, logged - {*converter.unread})
 
 
 def _pickles(folder: Path) -> list[Path]:
