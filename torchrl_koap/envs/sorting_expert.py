@@ -29,7 +29,7 @@ ARRIVED_Y = 0.232  # m; beyond, a box has left the platform
 _LANE_HALF = 0.058  # m; a box is led to within this of the middle of its bin
 _HORIZON = 700  # control steps for which the hand's noise is drawn
 _LINGER = 4  # control steps after success
-_PUSH, _FREE = 0.0105, 0.0125  # m per control step
+_PUSH, _FREE = 0.0130, 0.0145  # m per control step
 _STICK = 0.0118  # m per control step and axis, the most that humans used
 # The arm is soft: its rod swings around the command with a period of 26 control steps, by centimetres. These gains
 # damp it: on the difference of wanted and seen speed, and on the stretch between command and rod.
@@ -173,7 +173,7 @@ def _decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
     else:
         pushing = abs(off) < 0.3 and distance < contact + 0.02
     if pushing:
-        heading = angle + min(max(2.2 * off, -1.2), 1.2)
+        heading = angle + min(max(1.7 * off, -1.2), 1.2)
         speed = _PUSH * (1.0 - 0.5 * min(abs(off) / 0.6, 1.0))
         return speed * np.cos(heading), speed * np.sin(heading), True, angle
     x, y = _behind(box, yaw, angle, 0.008)
