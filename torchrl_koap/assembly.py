@@ -45,7 +45,8 @@ def load_demonstrations(
     """Fully labelled demonstrations, flat, with the columns that a policy may see as ``state``.
 
     Args:
-        dataset (str): ``"scripted"``, or a folder: of D3IL's raw pickles, or written by ``koap demos``.
+        dataset (str): ``"scripted"``, or a folder: of D3IL's raw pickles, a LeRobot data set, or written by
+            ``koap demos``.
         task (Task): the task.
         episodes (int, optional): number of scripted demonstrations to record. Default: that of the task.
         seed (int): seed of the scripted demonstrations.

@@ -27,7 +27,7 @@ class Validate:
     """Check a folder of demonstrations and report every problem found.
 
     Attributes:
-        dataset: folder of D3IL raw pickles, or one written by `koap demos`.
+        dataset: folder of D3IL raw pickles, a LeRobot data set, or a folder written by `koap demos`.
         task: name of the task.
     """
 
@@ -56,7 +56,7 @@ def run_doctor(options: Doctor) -> dict[str, str]:
     facts["torch threads"] = str(torch.get_num_threads())
     facts["CUDA"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     facts["rendering (3-D pictures)"] = _rendering()
-    for extra, module in {"wandb": "wandb", "video": "imageio"}.items():
+    for extra, module in {"wandb": "wandb", "video": "imageio", "lerobot": "pyarrow"}.items():
         found = importlib.util.find_spec(module) is not None
         facts[f"extra {extra}"] = "installed" if found else f"not installed (pip install 'torchrl_koap[{extra}]')"
     return facts

@@ -21,7 +21,7 @@ class Train:
     Attributes:
         out: run directory to write.
         task: name of the task.
-        dataset: "scripted", or a folder of D3IL raw pickles, or one written by `koap demos`.
+        dataset: "scripted", or a folder: of D3IL raw pickles, a LeRobot data set, or written by `koap demos`.
         label_fraction: share of the trajectories, windows or transitions that keep their actions.
         label_count: number of them instead of a share.
         label_unit: "trajectory", "window" (the paper's levels) or "transition".

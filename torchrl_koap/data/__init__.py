@@ -5,6 +5,7 @@ from torchrl_koap.data.augmentation import RecoveryAugmentation, extrapolate_end
 from torchrl_koap.data.conversion import CONVERTERS, Converter, RawFolderError, convert_raw_files, find_raw_files
 from torchrl_koap.data.d3il import D3ILExperienceReplay
 from torchrl_koap.data.labels import LabelBudget, LabelReport, hide_commands
+from torchrl_koap.data.lerobot import read_lerobot
 from torchrl_koap.data.normalizers import Normalizer
 from torchrl_koap.data.raw import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
 from torchrl_koap.data.saving import replacing_file, replacing_folder
@@ -44,6 +45,7 @@ __all__ = [
     "loads_pickle",
     "make_window_buffer",
     "read_about",
+    "read_lerobot",
     "read_raw_episode",
     "replacing_file",
     "replacing_folder",

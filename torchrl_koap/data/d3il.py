@@ -1,7 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """D3IL's demonstrations as a TorchRL data set.
 
-A folder of raw pickles is read once, through the restricted unpickler, into a memory-mapped data set in a cache folder.
+A folder of raw pickles is read once, through the restricted unpickler, into a memory-mapped data set in a cache folder;
+so is a LeRobot data set.
 A folder whose files have other names, sizes or times is converted again; a damaged cache is rebuilt. The raw files
 are never written to.
 """
@@ -12,7 +13,8 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,8 @@ from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl_koap import keys
 from torchrl_koap.data.conversion import convert_raw_files, find_raw_files, get_converter
 from torchrl_koap.data.labels import LabelBudget, LabelReport
+from torchrl_koap.data.lerobot import read_lerobot
+from torchrl_koap.data.lerobot_files import find_lerobot_files, is_lerobot
 from torchrl_koap.data.saving import one_at_a_time
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
 from torchrl_koap.data.trajectories import select_state
@@ -42,11 +46,14 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
     ``torchrl.data.datasets.load_dataset("d3il:avoiding", root=...)``.
 
     Args:
-        task (str): name of the task.
+        task (str): name of the task. ``po_sorting`` and ``stacking_1`` use the demonstrations of ``sorting`` and
+            ``stacking``.
         root (str or Path): folder of raw pickles, or a folder above it as D3IL lays them out (``<task>/data``,
-            ``environments/dataset/data/<task>/data``).
-        split_file (str or Path, optional): a pickled list of the file names to use, looked for in ``root`` and in the
-            folder of the files, and above. Default: every pickle, in the order of the names.
+            ``environments/dataset/data/<task>/data``); or a LeRobot data set (:func:`~torchrl_koap.data.read_lerobot`).
+        split_file (str or Path, optional): a pickled list of the file names to use, or ``"train"`` or ``"eval"`` for
+            D3IL's own (:func:`~torchrl_koap.data.find_raw_files` says where they are looked for); of a LeRobot data set
+            the name of a split. Default: every demonstration, in the order of the names.
+        actions (str): of a LeRobot data set: what its actions are, ``"delta"`` or ``"absolute"``.
         cache (str or Path, optional): where converted data are kept. Default: ``$KOAP_CACHE``, else
             ``~/.cache/torchrl_koap``.
         dtype (torch.dtype): floating type of the entries; the differences are taken in float64.
@@ -57,7 +64,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
 
     Raises:
         RawFolderError: with the problems of *all* files.
-        ValueError: if the task is unknown.
+        ValueError: if the task is unknown, or a LeRobot data set has other columns than the task.
         FileNotFoundError: if the folder, its pickles or the split file are not there.
 
     Examples:
@@ -82,19 +89,26 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         root: str | Path,
         *,
         split_file: str | Path | None = None,
+        actions: str = "delta",
         cache: str | Path | None = None,
         dtype: torch.dtype = torch.float32,
         label_budget: LabelBudget | None = None,
         **kwargs: Any,
     ):
         facts, converter = get_task(task), get_converter(task)
-        folder, files = find_raw_files(task, root, split_file=split_file)
-        self.root = folder
+        if is_lerobot(root):
+            self.root, files, kind = Path(root).expanduser(), find_lerobot_files(root), [actions, split_file]
+            convert = partial(read_lerobot, self.root, task, actions=actions, split=split_file, dtype=dtype)
+        elif actions != "delta":
+            raise ValueError(f"actions={actions!r} is for LeRobot data sets; {root} is none")
+        else:
+            (self.root, files), kind = find_raw_files(task, root, split_file=split_file), []
+            convert = partial(convert_raw_files, converter, files, self.root, dtype=dtype)
         self._cache = _cache_folder(cache)
-        self._data_path = self._cache / "d3il" / f"{task}-{_fingerprint(facts, files, dtype)}"
+        self._data_path = self._cache / "d3il" / f"{task}-{_fingerprint(facts, files, dtype, kind)}"
         # several processes may open the same folder at the same time: one converts, the others wait for it
         with one_at_a_time(self._data_path.with_name(f".{self._data_path.name}.lock")):
-            data = self._open(facts, converter, files, dtype)
+            data = self._open(facts, files, convert)
         self._begin(facts, data, label_budget, kwargs)
 
     @classmethod
@@ -133,7 +147,8 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
 
         Args:
             folder (str or Path): the folder.
-            task (str, optional): the task the data must belong to.
+            task (str, optional): the task to use the data for: theirs, or one that takes its demonstrations, such as
+                ``po_sorting`` those of ``sorting``. Default: theirs.
             label_budget (LabelBudget, optional): see the class.
             **kwargs: as in :class:`~torchrl.data.TensorDictReplayBuffer`.
 
@@ -141,11 +156,15 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
             DamagedDataError: if files are missing or changed.
             ValueError: if the data belong to another task, or to none.
         """
-        data = load_ted(folder, task=task)
+        recorded = read_about(folder)["task"]
+        facts = get_task(task or recorded)
+        data = load_ted(folder, task=recorded if recorded == facts.name else facts.source)
+        if recorded != facts.name:
+            data = select_state(data, facts.state_of)
         self = cls.__new__(cls)
         self.root = self._cache = Path(folder)
         self._data_path = Path(folder)
-        self._begin(get_task(read_about(folder)["task"]), data, label_budget, kwargs)
+        self._begin(facts, data, label_budget, kwargs)
         return self
 
     def _begin(self, task: Task, data: TensorDictBase, label_budget: LabelBudget | None, kwargs: dict) -> None:
@@ -163,14 +182,14 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         kwargs = {"writer": ImmutableDatasetWriter(), **kwargs}
         super().__init__(storage=TensorStorage(data), **kwargs)
 
-    def _open(self, task, converter, files, dtype) -> TensorDictBase:
+    def _open(self, task: Task, files: Sequence[Path], convert: Callable[[], TensorDictBase]) -> TensorDictBase:
         if self._is_downloaded():
             try:
                 return load_ted(self._data_path, task=task.name)
             except (DamagedDataError, ValueError) as error:
                 torchrl_logger.warning("converting %s again: %s", self.root, error)
                 shutil.rmtree(self._data_path, ignore_errors=True)
-        data = select_state(convert_raw_files(converter, files, self.root, dtype=dtype), task.state_of)
+        data = select_state(convert(), task.state_of)
         save_ted(data, self._data_path, task=task.name, notes={"files": [file.name for file in files]})
         return load_ted(self._data_path, task=task.name)
 
@@ -207,12 +226,13 @@ def _cache_folder(cache: str | Path | None) -> Path:
     return Path(cache or os.environ.get("KOAP_CACHE") or "~/.cache/torchrl_koap").expanduser()
 
 
-def _fingerprint(task: Task, files: Sequence[Path], dtype: torch.dtype) -> str:
+def _fingerprint(task: Task, files: Sequence[Path], dtype: torch.dtype, kind: Sequence) -> str:
     facts = {
         "conversion": _CONVERSION,
         "task": task.name,
         "state": [task.state_columns, task.state],
         "dtype": str(dtype),
+        "kind": [str(part) for part in kind],
         "files": [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files],
     }
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
