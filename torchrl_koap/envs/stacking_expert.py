@@ -31,9 +31,10 @@ HALF_SIZES = np.array([size[:2] for _, size, _ in BOXES])
 BOX_HEIGHT = 0.06
 ON_TABLE = 0.011  # height of the centre of a box that lies on the table (m)
 
-_SPEED, _PUSH = 0.0125, 0.0016  # m per control step, and its change per control step
+_SPEED, _PUSH = 0.0125, 0.0012  # sideways: m per control step, and its change per control step
+_SINK, _RISE, _LIFT = 0.0075, 0.01, 0.001  # down, up: m per control step, and their change
 _TURN, _TURN_PUSH = 0.028, 0.004  # rad per control step, and its change
-_EAGERNESS = 0.2  # share of the remaining way that is wanted in the next control step
+_EAGERNESS = np.array([0.15, 0.15, 0.12])  # share of the remaining way that is wanted in the next control step
 _HOLD = 0.004  # the TCP grasps that much above the centre of a box (m)
 _FINGER_AT, _FINGER_HALF = 0.051, (0.015, 0.011)  # an open finger: distance from the TCP, half sizes (m)
 _CLEAR = 0.003  # room that a finger needs beside it (m)
@@ -237,16 +238,16 @@ class _Person:
     def _move(self, goal: np.ndarray, height: float, turn: float, tcp: np.ndarray) -> None:
         """Speeds up, slows down and steers towards a place; sideways only as far up as the height there asks for."""
         freedom = np.clip((0.02 - (height - tcp[2])) / 0.015, 0.0, 1.0)
-        speed = _SPEED * self._pace
         wobble = self._wobble[self._time % _HORIZON]
         far = np.linalg.norm(goal - tcp[:2]) > 0.03
         way = np.append(goal, height) + (wobble if far else 0.0) - self.position
         wanted = _EAGERNESS * way
-        wanted[:2] = _limited(wanted[:2], speed * freedom)
-        wanted[2] = np.clip(wanted[2], -0.65 * speed, 0.9 * speed)
-        self._velocity += _limited(wanted - self._velocity, _PUSH)
+        wanted[:2] = _limited(wanted[:2], _SPEED * self._pace * freedom)
+        wanted[2] = np.clip(wanted[2], -_SINK * self._pace, _RISE * self._pace)
+        change = wanted - self._velocity
+        self._velocity += np.append(_limited(change[:2], _PUSH), np.clip(change[2], -_LIFT, _LIFT))
         self.position += self._velocity
-        spin = np.clip(_EAGERNESS * (turn - self.yaw), -_TURN, _TURN) * self._pace
+        spin = np.clip(0.2 * (turn - self.yaw), -_TURN, _TURN) * self._pace
         self._spin += np.clip(spin - self._spin, -_TURN_PUSH, _TURN_PUSH)
         self.yaw += self._spin
 
