@@ -169,9 +169,9 @@ def _decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
     near_x, near_y = _behind(box, yaw, angle, 0.0)
     contact = np.hypot(box[0] - near_x, box[1] - near_y)
     if pushing:
-        pushing = abs(off) < 0.8 and distance < contact + 0.03
+        pushing = abs(off) < 0.8 and distance < contact + 0.04
     else:
-        pushing = abs(off) < 0.3 and distance < contact + 0.02
+        pushing = abs(off) < 0.35 and distance < contact + 0.04
     if pushing:
         heading = angle + min(max(1.7 * off, -1.2), 1.2)
         speed = _PUSH * (1.0 - 0.5 * min(abs(off) / 0.6, 1.0))
@@ -182,7 +182,7 @@ def _decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
         direction = np.array([x - ahead[0], y - ahead[1]]) / max(gap, 1e-6)
     else:
         direction = descent(_cost_from(slowness, x, y), ahead[0], ahead[1])
-    speed = min(_FREE, max(0.35 * gap, 0.003))
+    speed = min(_FREE, max(0.45 * gap, 0.005))
     return speed * direction[0], speed * direction[1], False, angle
 
 
