@@ -25,11 +25,11 @@ def play(modes, contexts, seeds, steps=LIMIT):
     for step in range(steps):
         action = expert.act(out["observation"].numpy())
         actions.append(action)
+        if expert.finished.all():
+            break
         mask = torch.as_tensor(~expert.finished)[:, None]
         out = env.step(TensorDict({"action": torch.as_tensor(action), "_step": mask}, [count]))["next"]
         length[(length < 0) & out["success"][:, 0].numpy()] = step + 1
-        if expert.finished.all():
-            break
     return out["success"][:, 0].numpy(), mode_index(out["mode"]).numpy(), length, np.stack(actions, 1), env, expert
 
 
