@@ -14,9 +14,17 @@ import tyro
 from torchrl_koap.commands.demos import Demos, run_demos
 from torchrl_koap.commands.doctor import Doctor, Validate, run_doctor, run_validate
 from torchrl_koap.commands.eval import Eval, run_eval
+from torchrl_koap.commands.inspect import Inspect, run_inspect
 from torchrl_koap.commands.train import Train, run_train
 
-RUNNERS = {Demos: run_demos, Train: run_train, Eval: run_eval, Doctor: run_doctor, Validate: run_validate}
+RUNNERS = {
+    Demos: run_demos,
+    Train: run_train,
+    Eval: run_eval,
+    Inspect: run_inspect,
+    Doctor: run_doctor,
+    Validate: run_validate,
+}
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, RuntimeError, KeyError, OSError)
 
@@ -24,6 +32,7 @@ Command = (
     Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]
 )

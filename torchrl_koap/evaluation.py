@@ -18,7 +18,14 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion import SOLVERS
 from torchrl_koap.modules.planner import StatePlanner
-from torchrl_koap.modules.policies import NOISE, OBSERVATION_HISTORY, EpisodeNoise, PlanThenControl, policy_transforms
+from torchrl_koap.modules.policies import (
+    NOISE,
+    OBSERVATION_HISTORY,
+    EpisodeNoise,
+    PlanThenControl,
+    RecordedFutures,
+    policy_transforms,
+)
 from torchrl_koap.scores import OUTCOMES, outcome_of
 
 
@@ -52,6 +59,7 @@ def roll_out(
     max_steps: int,
     batch_size: int | None = None,
     contexts: Any = None,
+    futures: Tensor | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[TensorDict]:
     """Runs one episode per seed.
@@ -65,6 +73,8 @@ def roll_out(
         max_steps (int): control steps at most.
         batch_size (int, optional): episodes at a time. Default: all. Outcomes do not depend on it.
         contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
+        futures (Tensor, optional): recorded futures ``[E, steps, H, d]`` for a policy whose planner is a
+            :class:`~torchrl_koap.modules.policies.RecordedPlanner`.
         progress (callable, optional): called with the number of episodes finished.
 
     Returns:
@@ -78,20 +88,22 @@ def roll_out(
     if contexts is not None and len(contexts) != len(seeds):
         raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
     planner, device = policy.planner, _device_of(policy)
-    draws = (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
-    shape = (*draws, planner.horizon, planner.state_dim)
     size, episodes = batch_size or len(seeds), []
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
         _seed_noise(env, part)
         env = TransformedEnv(env, policy_transforms(policy.history))
-        noise = EpisodeNoise(part, shape, num_steps=max_steps).to(device)
+        if futures is not None:
+            noise = RecordedFutures(futures[begin : begin + size])
+        else:
+            draws = (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
+            noise = EpisodeNoise(part, (*draws, planner.horizon, planner.state_dim), num_steps=max_steps)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(
                 max_steps,
-                TensorDictSequential(noise, policy),
+                TensorDictSequential(noise.to(device), policy),
                 auto_reset=False,
                 tensordict=env.reset(**start),
                 break_when_any_done=False,

@@ -98,6 +98,17 @@ class Task:
         return self.state_of(torch.zeros(1, self.observation_dim)).shape[-1]
 
     @property
+    def state_slices(self) -> dict[str, slice]:
+        """Columns of the state that every part of the observation ends up in."""
+        slices, start = {}, 0
+        for name, kind in self._state_parts:
+            part = self.observation[name]
+            width = FEATURES[kind](torch.zeros(1, part.stop - part.start)).shape[-1]
+            slices[name] = slice(start, start + width)
+            start += width
+        return slices
+
+    @property
     def _state_parts(self) -> list[tuple[str, str]]:
         if self.state:
             return [(name, kind) for name, kind in self.state.items() if name not in self.hidden]

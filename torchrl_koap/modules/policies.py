@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs.transforms import CatFrames, Compose, InitTracker, UnsqueezeTransform
 from torchrl.modules import MultiStepActorWrapper
 
@@ -215,6 +215,43 @@ class _Chunk(TensorDictModuleBase):
         plan = self.planner.plan(history[..., -self.planner.history :, :], tensordict.get(NOISE, None))
         tensordict.set(PLAN, plan)
         return tensordict.set(self.out_keys[1], self.make_chunk(history, plan))
+
+
+class RecordedFutures(TensorDictModuleBase):
+    """Hands recorded futures to a :class:`RecordedPlanner`, in place of noise.
+
+    Args:
+        futures (Tensor): for every environment and control step the states that follow ``[E, steps, H, d]``.
+    """
+
+    def __init__(self, futures: Tensor):
+        super().__init__()
+        self.in_keys, self.out_keys = [], [NOISE]
+        self.register_buffer("futures", futures, persistent=False)
+        self.step = 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the futures of the current step (the last ones when the record is over) and moves on."""
+        tensordict.set(NOISE, self.futures[:, min(self.step, self.futures.shape[1] - 1)])
+        self.step += 1
+        return tensordict
+
+
+class RecordedPlanner(nn.Module):
+    """A planner that knows the recorded future: what a controller does under it is its own doing.
+
+    Args:
+        planner (StatePlanner): the planner whose history, horizon and state it has.
+    """
+
+    def __init__(self, planner: StatePlanner):
+        super().__init__()
+        for name in ("history", "horizon", "state_dim"):
+            setattr(self, name, getattr(planner, name))
+
+    def plan(self, history: Tensor, noise: Tensor) -> Tensor:
+        """The futures that :class:`RecordedFutures` wrote, ``[*B, H, d]``."""
+        return noise.expand(*history.shape[:-2], -1, -1)
 
 
 class EpisodeNoise(TensorDictModuleBase):

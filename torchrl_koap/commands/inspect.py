@@ -1,0 +1,119 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap inspect``: which part of a trained run fails, planner, controller or data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from tqdm import tqdm
+
+from torchrl_koap.assembly import load_demonstrations, make_env_of, set_up_torch
+from torchrl_koap.commands.eval import Eval, choose_contexts, load_run
+from torchrl_koap.data import trajectory_lengths
+from torchrl_koap.diagnosis import (
+    coverage,
+    executed_success,
+    follow_recordings,
+    imagine,
+    imagined_success,
+    rate,
+    tracking_errors,
+)
+from torchrl_koap.evaluation import make_policy, roll_out
+from torchrl_koap.inspection_plot import plot_inspection
+from torchrl_koap.run_directory import RunDirectory
+
+
+@dataclass
+class Inspect:
+    """Find out which part of a trained run fails.
+
+    Attributes:
+        run: run directory of `koap train`.
+        episodes: episodes of each of the three experiments.
+        dataset: demonstrations to compare with (default: those the run was trained on).
+        seed: seed of the planner's noise.
+        replan_interval: control steps per plan.
+        joining: how slowly plans are joined to the present state.
+        threads: torch and simulator threads.
+        device: "cpu" or "cuda".
+    """
+
+    run: tyro.conf.Positional[Path]
+    episodes: int = 30
+    dataset: str | None = None
+    seed: int = 500
+    replan_interval: int = 4
+    joining: float = 0.8
+    threads: int = 2
+    device: str = "cpu"
+
+
+def run_inspect(options: Inspect) -> dict[str, Any]:
+    """Runs the three experiments; returns what is written to ``inspect.json``.
+
+    ``imagined`` is the planner alone, ``followed`` the controller alone on recorded states, ``closed_loop`` both.
+
+    Raises:
+        ValueError: for fewer than one episode.
+        RunDirectoryError: if the folder is no finished run.
+    """
+    if options.episodes < 1:
+        raise ValueError(f"episodes must be >= 1, got {options.episodes}")
+    set_up_torch(options.threads, options.device)
+    run = RunDirectory(options.run)
+    task, planner, controller = load_run(run)
+    planner, controller = planner.to(options.device), controller.to(options.device)
+    settings = {"replan_interval": options.replan_interval, "joining": options.joining}
+    seeds = list(range(options.seed, options.seed + options.episodes))
+    dataset = options.dataset or run.read_entry("config.json", "dataset")
+    data = load_demonstrations(dataset, task, episodes=run.read_entry("config.json", "episodes"))
+    make_env = make_env_of(task, num_threads=options.threads)
+    _, contexts = choose_contexts(task, Eval(run=options.run, episodes=options.episodes))
+    with tqdm(total=3, desc="experiments", unit="experiment") as bar:
+        policy = make_policy(planner, controller, state_columns=task.state_of, **settings)
+        closed = roll_out(policy, make_env, seeds, max_steps=task.max_steps, contexts=contexts)
+        bar.update()
+        followed = follow_recordings(planner, controller, task, data, make_env, episodes=options.episodes, **settings)
+        bar.update()
+        start = torch.stack([task.state_of(episode["observation"][0]) for episode in closed])
+        steps = max(int(trajectory_lengths(data).max() * 1.5), 50)
+        imagined = imagine(
+            planner, start.to(options.device), interval=options.replan_interval, max_steps=steps, seed=options.seed
+        ).cpu()
+        bar.update()
+    result = {
+        "imagined": rate(imagined_success(task, imagined)),
+        "followed": rate(executed_success(followed)),
+        "closed_loop": rate(executed_success(closed)),
+        "plan_to_execution": tracking_errors(task, closed, options.replan_interval),
+        "recording_to_execution": tracking_errors(task, followed, options.replan_interval),
+        "distance_to_demonstrations": coverage(task, closed, data),
+        "verdict": "",
+    }
+    result["verdict"] = verdict(result)
+    run.write_json("inspect.json", result)
+    plot_inspection(result, task, run.path / "pictures" / "inspect.png")
+    return result
+
+
+def verdict(result: dict[str, Any]) -> str:
+    """What the figures say, in a sentence."""
+    imagined, followed, closed = (result[name]["rate"] for name in ("imagined", "followed", "closed_loop"))
+    if closed >= 0.9:
+        return "nothing to find: the closed loop succeeds"
+    parts = []
+    if imagined < 0.9:
+        parts.append(f"the planner's own imagination reaches the goal in {imagined:.0%} of the episodes only")
+    if followed < 0.9:
+        parts.append(f"the controller follows recorded states to the goal in {followed:.0%} only")
+    distance = result["distance_to_demonstrations"]
+    if distance and distance["visited_95"] > 2 * distance["demonstrated_95"]:
+        parts.append("executed states lie far from every demonstration")
+    return (
+        "; ".join(parts) or "planner and controller work alone, not together: plans answer badly to what was executed"
+    )
