@@ -40,7 +40,7 @@ def plot_inspection(result: Mapping[str, Any], task: Task, path: str | Path) -> 
     """
     figure = Figure(figsize=(9.2, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
-    for index, (name, label) in enumerate(EXPERIMENTS.items()):
+    for index, name in enumerate(EXPERIMENTS):
         value = result[name]
         left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "closed_loop" else "#9cc3f5")
         left.vlines(index, 100 * value["low"], 100 * value["high"], color=INK, linewidth=1.4)

@@ -115,5 +115,5 @@ def verdict(result: dict[str, Any]) -> str:
     if distance and distance["visited_95"] > 2 * distance["demonstrated_95"]:
         parts.append("executed states lie far from every demonstration")
     return (
-        "; ".join(parts) or "planner and controller work alone, not together: plans answer badly to what was executed"
+        "; ".join(parts) or "each works alone, not together: plans answer badly to what was executed"
     )
