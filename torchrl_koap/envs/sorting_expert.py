@@ -41,9 +41,18 @@ _HOLD = 0.006  # a direction is given up for a very different one if that is bet
 
 
 @njit(cache=True)
+def _squares(boxes, yaws):
+    """Centres, cosines and sines of the yaw [n, 4]."""
+    squares = np.empty((len(boxes), 4))
+    squares[:, :2] = boxes
+    squares[:, 2], squares[:, 3] = np.cos(yaws), np.sin(yaws)
+    return squares
+
+
+@njit(cache=True)
 def _box_field(boxes, yaws, obstacle, lane):
     """Cost of the rest of a box's way into its bin, everywhere [X, Y]; ``lane`` is the middle of the bin (x)."""
-    slowness, cost = np.ones(SHAPE), np.full(SHAPE, FAR)
+    slowness, cost, squares = np.ones(SHAPE), np.full(SHAPE, FAR), _squares(boxes, yaws)
     for i in range(SHAPE[0]):
         x = ORIGIN[0] + i * STEP
         off = abs(x - lane)
@@ -59,7 +68,7 @@ def _box_field(boxes, yaws, obstacle, lane):
                 s += 10.0 * min(border / 0.02, 1.0)
             for k in range(len(boxes)):
                 if obstacle[k]:
-                    gap = square_distance(x, y, boxes[k, 0], boxes[k, 1], yaws[k], BOX_HALF)
+                    gap = square_distance(x, y, squares[k], BOX_HALF)
                     s += 12.0 * min(max((0.048 - gap) / 0.02, 0.0), 1.0)
             slowness[i, j] = s
     return travel_cost(slowness, cost)
@@ -67,7 +76,7 @@ def _box_field(boxes, yaws, obstacle, lane):
 
 @njit(cache=True)
 def _rod_slowness(boxes, yaws, solid, target):
-    slowness = np.ones(SHAPE)
+    slowness, squares = np.ones(SHAPE), _squares(boxes, yaws)
     for i in range(SHAPE[0]):
         x = ORIGIN[0] + i * STEP
         for j in range(SHAPE[1]):
@@ -76,7 +85,7 @@ def _rod_slowness(boxes, yaws, solid, target):
             s = 1.0 + (10.0 * min(border / 0.02, 1.0) if border > 0 else 0.0)
             for k in range(len(boxes)):
                 if solid[k]:
-                    gap = square_distance(x, y, boxes[k, 0], boxes[k, 1], yaws[k], BOX_HALF)
+                    gap = square_distance(x, y, squares[k], BOX_HALF)
                     margin = 0.016 if k == target else 0.022
                     s += 25.0 * min(max((margin - gap) / 0.012, 0.0), 1.0)
             slowness[i, j] = s
@@ -109,9 +118,11 @@ def _behind(box, yaw, angle, clearance):
 def _carried(box, yaw, rod, ahead):
     """Where a box will be once the rod has come from where it is to the place ``ahead``."""
     box = box.copy()
+    square = np.array([0.0, 0.0, np.cos(yaw), np.sin(yaw)])
     for k in range(1, 5):
         x, y = rod + (ahead - rod) * k / 4
-        overlap = ROD_RADIUS - square_distance(x, y, box[0], box[1], yaw, BOX_HALF)
+        square[:2] = box
+        overlap = ROD_RADIUS - square_distance(x, y, square, BOX_HALF)
         away = box - np.array([x, y])
         size = np.sqrt(away[0] ** 2 + away[1] ** 2)
         if overlap > 0 and size > 1e-6:

@@ -3,6 +3,8 @@
 
 The cost ``T(p)`` of the cheapest path from ``p`` to a source obeys the eikonal equation ``|grad T| = s`` with slowness
 ``s`` (cost per metre), solved on a grid by fast sweeping (Zhao 2005): Gauss-Seidel passes in alternating directions.
+
+Compiled callers in other files are cached by Numba without regard to this file: clear ``__pycache__`` after a change.
 """
 
 from __future__ import annotations
@@ -17,11 +19,21 @@ FAR = 1e3  # cost of a place that is not reached
 
 
 @njit(cache=True)
-def square_distance(x, y, centre_x, centre_y, yaw, half):
-    """Signed distance (m) of a point to a square of half width ``half`` that is turned by ``yaw``; negative inside."""
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    along = abs(cos * (x - centre_x) + sin * (y - centre_y)) - half
-    across = abs(-sin * (x - centre_x) + cos * (y - centre_y)) - half
+def square_distance(x, y, square, half):
+    """Signed distance (m) of a point to a square of half width ``half``; negative inside.
+
+    Args:
+        x (float): x of the point (m).
+        y (float): y of the point (m).
+        square (np.ndarray): centre x, y (m), cosine and sine of the yaw [4].
+        half (float): half the width (m).
+
+    Returns:
+        float: the distance.
+    """
+    x, y = x - square[0], y - square[1]
+    along = abs(square[2] * x + square[3] * y) - half
+    across = abs(square[2] * y - square[3] * x) - half
     if along > 0 and across > 0:
         return np.sqrt(along**2 + across**2)
     return max(along, across)
@@ -88,11 +100,12 @@ def descent(field, x, y, reach=0.016, softness=0.002):
     for k in range(32):
         angle = 2 * np.pi * k / 32
         values[k] = value_at(field, x + reach * np.cos(angle), y + reach * np.sin(angle))
-    weights = np.exp((values.min() - values) / softness)
+    best = np.argmin(values)
     direction = np.zeros(2)
-    for k in range(32):
-        angle = 2 * np.pi * k / 32
-        direction[0] += weights[k] * np.cos(angle)
-        direction[1] += weights[k] * np.sin(angle)
+    for turn in range(-7, 8):  # less than 80 deg to both sides, or two opposite ways would cancel
+        k = (best + turn) % 32
+        weight = np.exp((values[best] - values[k]) / softness)
+        direction[0] += weight * np.cos(2 * np.pi * k / 32)
+        direction[1] += weight * np.sin(2 * np.pi * k / 32)
     size = np.sqrt(direction[0] ** 2 + direction[1] ** 2)
     return direction / size if size > 1e-9 else direction
