@@ -65,6 +65,24 @@ def make_rollouts(episodes: int = 4, steps: int = 20) -> dict[str, torch.Tensor]
     }
 
 
+def make_object_rollouts(task: str, episodes: int = 4, steps: int = 20) -> dict[str, torch.Tensor]:
+    """:func:`make_rollouts` with bodies that are pushed 0.3 m away from the robot's side, and contexts."""
+    from torchrl_koap.tasks import get_task
+
+    facts = get_task(task)
+    rollouts = make_rollouts(max(episodes, 4), steps)
+    rollouts = {key: value[:episodes] for key, value in rollouts.items()}
+    number = len(facts.objects)
+    generator = torch.Generator().manual_seed(0)
+    start = torch.tensor([0.4, -0.2]) + 0.2 * torch.rand(episodes, number, 2, generator=generator)
+    moved = torch.linspace(0, 0.3, steps)[:, None, None] * torch.tensor([0.0, 1.0])
+    rollouts["object_position"] = start[:, None] + moved  # [E, T, objects, 2]
+    rollouts["object_position"][rollouts["position"].isnan().any(-1)] = torch.nan
+    rollouts["context"] = torch.cat([start, torch.rand(episodes, number, 1, generator=generator)], -1).double()
+    rollouts["action"] = torch.zeros(episodes, steps, facts.action_dim)
+    return rollouts
+
+
 def make_demonstrations() -> dict[str, torch.Tensor]:
     """Two straight demonstrations of 20 steps, the first one labelled."""
     y = torch.linspace(-0.28, 0.36, 20)

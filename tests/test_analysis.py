@@ -114,6 +114,18 @@ def test_a_linear_world_is_predicted_by_the_ridge_and_written_down(tmp_path):
     shown, _ = load_tensors(tmp_path / "demonstrations.safetensors")
     assert torch.equal(shown["labelled"], labelled["has_action"].squeeze(-1))
     assert torch.equal(shown["state"], data["state"]) and torch.equal(shown["episode"], data["episode"])
+    assert torch.equal(shown["position"], data["observation"][:, 2:]) and "objects" not in shown
+
+
+def test_tool_and_objects_of_demonstrations_are_kept_for_pictures(tmp_path):
+    task = get_task("stacking")
+    frames = torch.arange(40 * task.observation_dim).float().reshape(40, -1)
+    data = select_state(flatten_trajectories([frames[:20], frames[20:]], [torch.zeros(19, 8)] * 2), range(3))
+    labelled, _ = LabelBudget(1.0).apply(data)
+    write_analysis(RunDirectory(tmp_path), task, data, labelled, Copy(1))
+    shown, _ = load_tensors(tmp_path / "demonstrations.safetensors")
+    assert torch.equal(shown["position"], data["observation"][:, 28:30])
+    assert torch.equal(shown["objects"][:, 2], data["observation"][:, 16:18])  # the blue box
 
 
 def test_with_a_label_in_every_trajectory_there_is_nothing_to_measure(tmp_path):

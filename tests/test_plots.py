@@ -13,16 +13,14 @@ import matplotlib
 import numpy as np
 import pytest
 import torch
-from matplotlib import colors as matplotlib_colors
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parent))
-from run_files import make_demonstrations, make_rollouts
+from run_files import make_demonstrations, make_object_rollouts, make_rollouts
 
-from torchrl_koap import mode_plots, path_plots, plot_scenes, plots
-from torchrl_koap.animation import animate_rollouts, render_rollout
+from torchrl_koap import mode_names, mode_plots, path_plots, plot_objects, plots
 
 
 @pytest.fixture
@@ -94,55 +92,6 @@ def test_import_is_quick_and_brings_neither_torch_nor_pyplot():
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.strip() == "[]"
     assert time.perf_counter() - start < 10  # 0.7 s on a quiet machine
-
-
-def test_geometry_is_that_of_the_environment():
-    avoiding = pytest.importorskip("torchrl_koap.envs.avoiding")
-    assert [(x, y, radius) for _, x, y, radius, _ in avoiding.OBSTACLES] == list(plot_scenes.AVOIDING_CYLINDERS)
-    assert avoiding.FINISH_Y == plot_scenes.AVOIDING_FINISH
-
-
-def test_scene_has_true_radii():
-    axes = plot_scenes.draw_scene(Figure().add_subplot(), "avoiding")
-    sizes = sorted(round(patch.get_radius(), 3) for patch in axes.patches)
-    assert sizes == [0.025] * 5 + [0.03] + [0.035] * 5 + [0.04]
-    assert axes.get_aspect() == 1
-
-
-def test_unknown_scene_suggests_the_nearest():
-    with pytest.raises(ValueError, match="did you mean 'avoiding'"):
-        plot_scenes.draw_scene(Figure().add_subplot(), "avoidin")
-
-
-def test_mode_colors_are_distinct_with_hue_by_last_row_and_lightness_by_the_others():
-    colors = plot_scenes.mode_colors("avoiding")
-    apart = np.abs(colors[:, None] - colors[None]).sum(-1) + 10 * np.eye(24)
-    assert apart.min() > 0.08 and colors.min() >= 0 and colors.max() <= 1
-    hue = matplotlib_colors.rgb_to_hsv(colors)[:, 0].reshape(6, 4)
-    spread = np.abs(np.angle(np.exp(2j * np.pi * (hue - hue[2:3])))) / (2 * np.pi)
-    assert spread.max() < 0.06  # a column keeps its hue
-    between = np.abs(np.angle(np.exp(2j * np.pi * (hue[:, :, None] - hue[:, None])))) / (2 * np.pi)
-    assert between[:, ~np.eye(4, dtype=bool)].min() > 0.08
-    luminance = (colors @ [0.2126, 0.7152, 0.0722]).reshape(6, 4)
-    assert (np.diff(luminance, axis=0) > 0).all()
-
-
-@pytest.mark.parametrize("mode", range(24))
-def test_mode_names_follow_the_flags(mode):
-    envs = pytest.importorskip("torchrl_koap.envs.avoiding")
-    row1, row2, row3 = plot_scenes.mode_name(mode, "avoiding").split(", ")
-    flags = torch.zeros(9, dtype=torch.int64)
-    flags[("left", "right").index(row1)] = 1
-    flags[2 + ("left", "middle", "right").index(row2)] = 1
-    flags[5 + int(row3[-1]) - 1] = 1
-    assert envs.mode_index(flags) == mode
-
-
-def test_modes_of_a_task_without_choices():
-    assert plot_scenes.mode_colors(None, 6).shape == (6, 3)
-    assert plot_scenes.mode_name(3, None, 6) == "3"
-    with pytest.raises(ValueError, match="wanted num_modes"):
-        plot_scenes.mode_colors("sorting")
 
 
 def test_losses_get_a_panel_each_and_zero_is_said(figures, tmp_path):
@@ -217,6 +166,21 @@ def test_actions_tell_the_error_and_the_broken_budget(figures, tmp_path):
     )
 
 
+def test_actions_in_two_units(figures, tmp_path):
+    """Stacking: seven joints in mrad per step, and a width in mm that the error of all leaves out."""
+    true = torch.zeros(50, 8)
+    predicted = torch.tensor([0.002] * 7 + [0.08]).expand(50, 8)
+    names = [*(f"joint {index}" for index in range(1, 8)), "gripper"]
+    plots.plot_actions(predicted, true, tmp_path / "a.png", names=names, unit="mrad", absolute={"gripper": "mm"})
+    said = titles(figures[0])
+    assert said[0] == "joint 1: RMSE 2.00 mrad" and said[7] == "gripper: RMSE 80.00 mm"
+    assert said[8] == "all but gripper: RMSE 2.00 mrad, median 2.00"
+    panels = figures[0].axes
+    assert panels[6].get_xlabel() == "recorded joint 7 (mrad per step)"
+    assert panels[7].get_xlabel() == "recorded gripper (mm)"
+    assert [text.get_text() for text in panels[8].get_legend().get_texts()] == names[:7]
+
+
 @pytest.mark.parametrize(
     ("predicted", "message"),
     [(torch.zeros(3, 2), r"'predicted' must have shape \[4, 2\]"), (torch.full((4, 2), math.nan), "no row of 4")],
@@ -242,7 +206,7 @@ def test_modes_histogram(figures, tmp_path):
     assert titles(figures[0])[0].endswith("; 1 without a mode")
     levels = [line[0][1] for line in drawn_lines(axes)]
     assert levels[5] == pytest.approx(4 * 2 / 3) and sum(levels) == pytest.approx(4)
-    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], plot_scenes.mode_colors("avoiding"))
+    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], mode_names.mode_colors("avoiding"))
 
 
 def test_rollouts_are_cut_coloured_and_counted(figures, tmp_path):
@@ -251,12 +215,51 @@ def test_rollouts_are_cut_coloured_and_counted(figures, tmp_path):
     assert titles(figures[0])[0] == "2 of 4 rollouts succeed, out of time: 1, collision: 1"
     lines = axes.collections[0]
     np.testing.assert_allclose(lines.get_segments(), ROLLOUTS["position"][:2])
-    np.testing.assert_allclose(lines.get_colors()[:, :3], plot_scenes.mode_colors("avoiding")[:2])
+    np.testing.assert_allclose(lines.get_colors()[:, :3], mode_names.mode_colors("avoiding")[:2])
     late, hit = axes.lines[1:]  # the first line is the finish
     assert len(late.get_xdata()) == 20 and len(hit.get_xdata()) == 10
     np.testing.assert_allclose(axes.collections[-1].get_offsets()[0], ROLLOUTS["position"][3, 9])
     counts = [text.get_text() for text in side.texts[:24]]
     assert counts == ["1", "1"] + ["0"] * 22
+
+
+def test_a_list_of_modes_in_words(figures, tmp_path):
+    rollouts = make_object_rollouts("sorting")
+    path_plots.plot_rollouts(rollouts, tmp_path / "a.png", task="sorting")
+    side = figures[0].axes[2]
+    said = [text.get_text() for text in side.texts]
+    assert said[:4] == ["1", "red, red, blue, blue", "1", "red, blue, red, blue"] and said[-1] == "order of arrival"
+    mode_plots.plot_modes([0, 1, 1], tmp_path / "b.png", task="sorting_2")
+    bars = figures[1].axes[0]
+    assert [tick.get_text() for tick in bars.get_xticklabels()] == ["red\nblue", "blue\nred"]
+    assert [bar.get_height() for bar in bars.patches] == [1, 2]
+    mode_plots.plot_modes(range(20), tmp_path / "c.png", task="sorting_6")
+    assert len(figures[2].axes[0].patches) == 20
+
+
+@pytest.mark.parametrize("task", ["aligning", "sorting", "stacking", None])
+def test_objects_get_a_panel(task, figures, tmp_path):
+    rollouts = make_object_rollouts(task or "stacking")
+    looks = plot_objects.object_looks(task, rollouts["context"].shape[1])
+    path_plots.plot_rollouts(rollouts, tmp_path / "a.png", task=task, num_modes=6)
+    beside = figures[0].axes[1]
+    assert beside.get_title(loc="left").startswith("objects")
+    for index, look in enumerate(looks):
+        wanted = [rollouts["object_position"][e, : 21 if e < 3 else 11, index].numpy() for e in range(4)]
+        found = [line for line in drawn_lines(beside) if len(line) in (20, 11) and np.allclose(line[0], wanted[0][0])]
+        assert bool(found) is not look.still
+        if found:
+            np.testing.assert_allclose(found[0], wanted[0])
+    entries = [text.get_text() for text in figures[0].axes[2].get_legend().get_texts()]
+    assert entries[:2] == ["out of time", "collision"] and entries[-2:] == ["end", "end of a failure"]
+    assert entries[2:-2] == list(dict.fromkeys(look.name for look in looks))
+
+
+def test_plans_of_a_task_with_objects(figures, tmp_path):
+    path_plots.plot_plans(make_object_rollouts("aligning"), tmp_path / "a.png", task="aligning", episodes=[1, 3])
+    lines = drawn_lines(figures[0].axes[0])
+    outline = plot_objects.outlines(make_object_rollouts("aligning")["context"].numpy()[1, 0], (0.05, 0.05))
+    assert any(line.shape == (5, 2) and np.allclose(line, outline) for line in lines)
 
 
 def test_plans_lie_over_their_path(figures, tmp_path):
@@ -308,6 +311,23 @@ def test_demonstrations_emphasise_exactly_the_labelled_transitions(figures, tmp_
     assert titles(figures[0])[0] == ("2 demonstrations; labels on 3 of 40 transitions (7.5%)\nin 2 of 2 demonstrations")
 
 
+def test_demonstrations_with_objects(figures, tmp_path):
+    data = make_demonstrations() | {"state": torch.rand(40, 8), "position": make_demonstrations()["state"]}
+    data["objects"] = torch.rand(40, 3, 2)
+    path_plots.plot_demonstrations(data, tmp_path / "a.png", task="stacking")
+    axes, beside = figures[0].axes
+    np.testing.assert_allclose(axes.collections[0].get_segments()[1], data["position"][20:])
+    np.testing.assert_allclose(drawn_lines(beside)[3], data["objects"][20:, 1])  # green box of the second one
+    assert [text.get_text() for text in beside.get_legend().get_texts()] == ["red box", "green box", "blue box", "end"]
+
+
+def test_first_columns_of_older_demonstrations_are_the_position(figures, tmp_path):
+    data = make_demonstrations()
+    data["state"] = torch.cat([data["state"], torch.rand(40, 5)], 1)
+    path_plots.plot_demonstrations(data, tmp_path / "a.png", task="aligning")
+    np.testing.assert_allclose(figures[0].axes[0].collections[0].get_segments()[0], data["state"][:20, :2])
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -323,50 +343,3 @@ def test_bad_rollouts(change, message, tmp_path):
         path_plots.plot_plans(rollouts, tmp_path / "a.png")
     with pytest.raises(ValueError, match="must be 0 to 3, got 4"):
         path_plots.plot_plans(ROLLOUTS, tmp_path / "a.png", episodes=[4])
-
-
-def test_animation_shows_every_step_and_holds_the_end(tmp_path):
-    seen = []
-    path = animate_rollouts(ROLLOUTS, tmp_path / "a.gif", stride=3, progress=lambda *done: seen.append(done))
-    assert seen == [(number, 8) for number in range(1, 9)]  # steps 0, 3, ..., 18 and the last, 19
-    with Image.open(path) as film:
-        assert film.n_frames == 8 and film.info["duration"] == 100  # 3 x 35 ms, in hundredths of a second
-        first = np.asarray(film.convert("L")).astype(int)
-        film.seek(7)
-        assert film.info["duration"] == 1500
-        assert (np.abs(np.asarray(film.convert("L")).astype(int) - first) > 60).sum() > 500
-    assert path.stat().st_size < 2e6
-
-
-@pytest.mark.parametrize(
-    "call", [lambda path: animate_rollouts(ROLLOUTS, path), lambda path: render_rollout([[0, 0]], path)]
-)
-def test_animation_refuses_other_files(call, tmp_path):
-    with pytest.raises(ValueError, match="written as .gif"):
-        call(tmp_path / "a.avi")
-
-
-@pytest.mark.parametrize(("option", "value"), [("episodes", [9]), ("episodes", []), ("stride", 0)])
-def test_animation_options(option, value, tmp_path):
-    with pytest.raises(ValueError, match=option):
-        animate_rollouts(ROLLOUTS, tmp_path / "a.gif", **{option: value})
-
-
-def test_film_of_recorded_actions(tmp_path):
-    pytest.importorskip("torchrl_koap.envs")
-    actions = torch.full((6, 2), 0.008)
-    actions[5] = torch.nan
-    try:
-        path = render_rollout(actions, tmp_path / "a.gif", width=96, height=72)
-    except RuntimeError as error:
-        pytest.skip(f"no picture can be drawn on this machine: {error}")
-    with Image.open(path) as film:
-        assert film.size == (96, 72) and film.n_frames == 4  # the start, and after 2, 4, 5 steps
-
-
-def test_film_needs_its_packages_and_task(tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="'sorting'"):
-        render_rollout(torch.zeros(3, 2), tmp_path / "a.gif", task="sorting")
-    monkeypatch.setattr("torchrl_koap.animation.importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match="pip install imageio imageio-ffmpeg"):
-        render_rollout(torch.zeros(3, 2), tmp_path / "a.mp4")

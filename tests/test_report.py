@@ -9,15 +9,20 @@ import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from safetensors.torch import save_file
 
 sys.path.insert(0, str(Path(__file__).parent))
-from run_files import write_run
+from run_files import make_demonstrations, make_object_rollouts, make_rollouts, write_run
 
+from torchrl_koap import pictures
 from torchrl_koap.mode_plots import even_entropy
 from torchrl_koap.pictures import PICTURES, draw_pictures
 from torchrl_koap.report import CAPTIONS, write_report
 from torchrl_koap.report_html import definition, interval_bar
+from torchrl_koap.tasks import get_task
 
 _VOID = {"meta", "img", "rect", "br"}
 
@@ -80,10 +85,11 @@ def test_order_headline_labels_pictures_commands(run):
 
 def test_pictures_are_there_with_captions_and_no_outside_resource(run):
     page = Page(run / "index.html")
-    assert {f"plots/{picture.name}" for picture in PICTURES} <= set(page.links)
+    expected = [picture for picture in PICTURES if picture.name != "film.gif"]  # this run has kept no actions
+    assert {f"plots/{picture.name}" for picture in expected} <= set(page.links)
     for link in page.links:
         assert (run / link).is_file()
-    for picture in PICTURES:
+    for picture in expected:
         assert CAPTIONS[picture.name][0] in page.text
     assert "http" not in page.source and "script" not in page.tags
     assert "Not drawn" not in page.text and 'class="warning"' not in page.source
@@ -164,6 +170,97 @@ def test_camera_film_is_shown_if_there(tmp_path):
     (tmp_path / "plots" / "film.mp4").write_bytes(b"")
     page = Page(write_report(tmp_path))
     assert "video" in page.tags and "plots/film.mp4" in page.links
+
+
+def write_object_run(folder, task="stacking", **evaluation):
+    """A run of a task with objects, with what an evaluation in contexts leaves."""
+    write_run(folder)
+    rollouts = make_object_rollouts(task)
+    if not get_task(task).plans_position:
+        rollouts |= {"plan": torch.zeros(4, 0, 1, 2), "plan_step": torch.zeros(4, 0, dtype=torch.long)}
+    save_file(rollouts, folder / "rollouts.safetensors")
+    demonstrations = {"position": torch.rand(40, 2), "objects": torch.rand(40, len(get_task(task).objects), 2)}
+    data = make_demonstrations() | demonstrations
+    save_file(data, folder / "demonstrations.safetensors")
+    actions = torch.rand(20, get_task(task).action_dim)
+    save_file({"predicted": actions, "true": actions + 0.001}, folder / "actions.safetensors")
+    for name, change in (("config", {"task": task}), ("eval", {"contexts": 2} | evaluation)):
+        path = folder / f"{name}.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    return folder
+
+
+def test_tiles_of_a_task_with_contexts(tmp_path):
+    rates = {"stacked_1_rate": 0.75, "stacked_1_low": 0.3, "stacked_1_high": 0.954, "stacked_3_rate": 0.5}
+    pooled = {"mode_entropy": None, "pooled_mode_entropy": 0.387, "pooled_mode_entropy_low": 0.0}
+    write_object_run(tmp_path, **rates, **pooled, pooled_mode_entropy_high=0.5)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary["action_error_mrad"] = summary.pop("action_error_mm")
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    text = Page(write_report(tmp_path, draw=False)).text
+    even = f"an even choice averages {even_entropy(2, 6):.2f}, n = 2"
+    for wanted in (
+        "50.0 % interval 95 % interval 15.0 to 85.0 %, 2 of 4 rollouts in 2 contexts",
+        "one box stacked 75.0 % interval 95 % interval 30.0 to 95.4 %, 3 of 4 rollouts",
+        "three boxes stacked 50.0 % 2 of 4 rollouts",
+        f"mode entropy, all contexts together, base 6 0.39 95 % interval 0.00 to 0.50; 2 of 6 modes; {even}",
+        "action error, koap 0.91 mrad ridge 1.04 mrad, n = 20 unlabelled steps",
+        "Outside the budget, for analysis only: 20 labels",
+    ):
+        assert wanted in text
+    assert "two boxes" not in text
+
+
+def test_entropy_within_contexts(tmp_path):
+    write_object_run(tmp_path, "aligning", mode_entropy=0.5, pooled_mode_entropy=0.9)
+    text = Page(write_report(tmp_path, draw=False)).text
+    assert "mode entropy, base 2 0.50 2 of 2 modes; mean over contexts, 2 rollouts each" in text
+
+
+@pytest.mark.parametrize("task", ["aligning", "sorting", "stacking"])
+def test_report_of_a_task_with_objects(task, tmp_path, monkeypatch):
+    """Every picture that the task has, no word of Avoiding, and one line where no film can be made."""
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    (tmp_path / "plots").mkdir()
+    (tmp_path / "plots" / "plans.png").write_bytes(b"of an earlier evaluation")
+    page = Page(write_report(write_object_run(tmp_path, task)))
+    plans = get_task(task).plans_position
+    expected = {picture.name for picture in PICTURES} - {"film.gif"} - (set() if plans else {"plans.png"})
+    assert {link.removeprefix("plots/") for link in page.links} == expected
+    assert (tmp_path / "plots" / "plans.png").exists() is plans
+    assert ("the rollouts hold no plans of positions" in page.text) is not plans
+    assert page.source.count('class="warning"') == 1
+    assert "film.gif was not made: rendering is switched off by the environment variable MUJOCO_GL=off" in page.text
+    assert "cylinder" not in page.text and "gap taken" not in page.text
+    word = {"aligning": "thick far side", "sorting": "frames are the bins", "stacking": "still in the gripper"}[task]
+    assert word in page.text
+
+
+@pytest.mark.parametrize("task", ["avoiding", "stacking_1"])
+def test_film_of_the_first_success(task, tmp_path, monkeypatch):
+    made = []
+
+    def render(actions, path, **options):
+        made.append((actions, options))
+        path.write_bytes(b"GIF89a")
+        return path
+
+    monkeypatch.setattr(pictures, "render_rollout", render)
+    if task == "avoiding":
+        write_run(tmp_path)
+        rollouts = make_rollouts() | {"action": torch.rand(4, 20, 2)}
+    else:
+        write_object_run(tmp_path, task)
+        rollouts = make_object_rollouts(task)
+    rollouts["outcome"] = torch.tensor([0, 0, 1, 1])
+    save_file(rollouts, tmp_path / "rollouts.safetensors")
+    assert draw_pictures(tmp_path) == {}
+    ((actions, options),) = made
+    np.testing.assert_array_equal(actions, rollouts["action"][2])
+    assert options["task"] == task
+    assert (options["context"] is None) if task == "avoiding" else options["context"].dtype == np.float64
+    made.clear()
+    assert draw_pictures(tmp_path, animation=False) == {} and not made
 
 
 def test_no_such_directory(tmp_path):

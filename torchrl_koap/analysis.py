@@ -52,6 +52,13 @@ def rmse_mm(predicted: Tensor, true: Tensor) -> float:
     return (predicted - true).square().mean().sqrt().item() * 1e3
 
 
+def _drawn(task: Task, observation: Tensor) -> dict[str, Tensor]:
+    """Positions of the tool ``[N, 2]`` and, where there are any, of the objects ``[N, objects, 2]`` for pictures."""
+    starts = [task.observation[part].start for part in (task.position, *task.drawn.values())]
+    tool, *objects = (observation[:, start : start + 2] for start in starts)
+    return {"position": tool.contiguous()} | ({"objects": torch.stack(objects, 1)} if objects else {})
+
+
 def write_analysis(
     run: RunDirectory, task: Task, data: TensorDictBase, labelled: TensorDictBase, controller: nn.Module
 ) -> dict[str, Any]:
@@ -62,10 +69,8 @@ def write_analysis(
     labelled = labelled.cpu()
     predicted, true = hidden_action_errors(controller, data, labelled)
     has_action = labelled["has_action"].squeeze(-1)
-    save_tensors(
-        run.path / "demonstrations.safetensors",
-        {"state": data["state"], "episode": data["episode"], "labelled": has_action},
-    )
+    shown = {"state": data["state"], "episode": data["episode"], "labelled": has_action}
+    save_tensors(run.path / "demonstrations.safetensors", shown | _drawn(task, data["observation"]))
     if not len(true):
         return {"note": "every trajectory has a label in the budget: there is nothing to measure on"}
     save_tensors(run.path / "actions.safetensors", {"predicted": predicted, "true": true})

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which modes occurred: a picture, and what to compare their entropy with."""
+"""Which modes occurred: a chart, a table for other pictures, and what to compare their entropy with."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from torchrl_koap.metrics import mode_entropy
-from torchrl_koap.plot_scenes import INK, mode_choices, mode_colors, set_title, tidy
+from torchrl_koap.mode_names import initials, mode_choices, mode_colors
+from torchrl_koap.plot_scenes import FAINT, INK, MUTED, set_title, tidy
 from torchrl_koap.plots import as_array, save_figure
 
 
@@ -71,7 +74,8 @@ def plot_modes(
     last = len(choices[-1][1])
     places = np.arange(number) + 0.7 * (np.arange(number) // last) if len(choices) > 1 else np.arange(number) * 1.0
 
-    figure = Figure(figsize=(8.4, 3.3), layout="constrained")
+    few = len(choices) == 1 and number <= 10
+    figure = Figure(figsize=(max(5.6, 0.85 * number + 1.2) if few else 8.4, 3.3), layout="constrained")
     axes = figure.add_subplot()
     axes.bar(places, counts, width=0.86, color=colors, zorder=2)
     if reference is not None:
@@ -90,18 +94,79 @@ def plot_modes(
         axes.set_xticks(places, [name.split()[-1] for name in choices[-1][1]] * (number // last))
         for group in range(number // last):
             middle = places[group * last : (group + 1) * last].mean()
-            words, rest = [], group
-            for _, names in reversed(choices[:-1]):
-                rest, digit = divmod(rest, len(names))
-                words.append(names[digit])
-            text = " / ".join(reversed(words))
+            text = " / ".join(_words(group, choices[:-1]))
             axes.annotate(text, (middle, 0), (0, -22), textcoords="offset points", ha="center", size=8.5, color=INK)
         axes.set_xlabel(" / ".join(name for name, _ in choices[:-1]) + f", and above it {choices[-1][0]}", labelpad=19)
     else:
+        axes.set_xticks(places, [name.replace(", ", "\n") for name in choices[0][1]])
         axes.set_xlabel(choices[0][0])
     occurred = f"{int((counts > 0).sum())} of {number} modes, entropy {mode_entropy(mode.tolist(), number):.2f}"
-    even = f"; an even choice gives {even_entropy(len(mode), number):.2f} on average at n = {len(mode)}"
-    set_title(axes, occurred + (even if len(mode) else "") + (f"; {lost} without a mode" if lost else ""))
+    even = f"an even choice gives {even_entropy(len(mode), number):.2f} on average at n = {len(mode)}"
+    parts = [occurred] + [even] * bool(len(mode)) + [f"{lost} without a mode"] * bool(lost)
+    set_title(axes, ";\n".join((parts[0], "; ".join(parts[1:]))) if few and parts[1:] else "; ".join(parts))
     tidy(axes)
     axes.tick_params(axis="x", length=0)
     return save_figure(figure, path)
+
+
+def draw_mode_table(axes: Axes, mode: np.ndarray, choices: tuple, colors: np.ndarray) -> None:
+    """A cell per mode in its colour, with the number of rollouts.
+
+    Columns are the last of several choices. A single choice becomes a list with the names beside the cells (initials
+    from 11 on), or a compact grid if its names are numbers.
+
+    Args:
+        axes (Axes): panel to fill.
+        mode (np.ndarray): modes to count [n]; those out of range are left out.
+        choices (tuple): see :func:`~torchrl_koap.mode_names.mode_choices`.
+        colors (np.ndarray): a colour per mode [num_modes, 3].
+    """
+    names = choices[-1][1]
+    number = len(colors)
+    listed = len(choices) == 1 and not names[0].isdigit()
+    if listed:
+        down, step = (number, 4.0) if number <= 10 else (math.ceil(number / 2), 4.6)
+        places = [(step * (index // down), index % down) for index in range(number)]
+    else:
+        across = min(len(names), 6) if len(choices) == 1 else len(names)
+        down, step = math.ceil(number / across), 1.0
+        places = [(index % across, index // across) for index in range(number)]
+    counts = np.bincount(mode[(mode >= 0) & (mode < number)].astype(int), minlength=number)
+    top, label = 1.0, {"size": 8, "color": MUTED}
+    for index, (color, (column, row)) in enumerate(zip(colors, places, strict=True)):
+        used = counts[index] > 0
+        style = {"facecolor": color, "edgecolor": "white"} if used else {"facecolor": "none", "edgecolor": FAINT}
+        axes.add_patch(Rectangle((column, top - row - 1), 0.92, 0.9, linewidth=0.8, **style))
+        shade = "white" if used else FAINT
+        text = {"ha": "center", "va": "center", "size": 9, "color": shade}
+        axes.text(column + 0.46, top - row - 0.56, str(counts[index]), **text)
+        if listed:
+            name = names[index] if number <= 10 else initials(names[index])
+            axes.text(column + 1.1, top - row - 0.56, name, ha="left", va="center", **label)
+    if listed:
+        axes.text(0, top + 0.12, choices[0][0], ha="left", va="bottom", **label)
+    elif len(choices) > 1:
+        for column, name in enumerate(names):
+            axes.text(column + 0.46, top + 0.12, name.split()[-1], ha="center", va="bottom", **label)
+        axes.text(0, top + 0.62, f"{choices[-1][0]}: gap from left to right", ha="left", va="bottom", **label)
+        for row in range(down):
+            words = " / ".join(_words(row, choices[:-1]))
+            axes.text(-0.15, top - row - 0.56, words, ha="right", va="center", **label)
+        heads = " / ".join(name for name, _ in choices[:-1])
+        axes.text(-0.15, top + 0.12, heads, ha="right", va="bottom", **label)
+    width = 1 + max(column for column, _ in places) + (step if listed else 0)
+    axes.set_xlim(-2.1 if len(choices) > 1 else -0.1, width + 0.1)
+    axes.set_ylim(top - down - 4, top + 1.6)
+    axes.set_aspect("equal")
+    axes.set_anchor("NW")
+    axes.set_axis_off()
+    set_title(axes, "successes by mode")
+
+
+def _words(index: int, choices: tuple) -> list[str]:
+    """Names of the values of all choices, the slowest first."""
+    words = []
+    for _, names in reversed(choices):
+        index, digit = divmod(index, len(names))
+        words.append(names[digit])
+    return words[::-1]

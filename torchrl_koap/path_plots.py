@@ -13,10 +13,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 
-from torchrl_koap.plot_scenes import FAINT, INK, MUTED, draw_scene, mode_choices, mode_colors, mode_name, set_title
-from torchrl_koap.plots import BLUE, as_array, save_figure
+from torchrl_koap.mode_names import mode_choices, mode_colors, mode_name
+from torchrl_koap.mode_plots import draw_mode_table
+from torchrl_koap.plot_objects import draw_object_paths, draw_starts, legend_handles, object_looks, object_paths
+from torchrl_koap.plot_scenes import BLUE, INK, draw_scene, set_title
+from torchrl_koap.plots import as_array, save_figure
 
 TIMEOUT, SUCCESS, COLLISION = 0, 1, 2
 OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision"}
@@ -53,9 +55,12 @@ def plot_rollouts(
 ) -> Path:
     """Executed paths over the scene, coloured by mode; failures are black and marked where they end.
 
+    A second panel shows the bodies of tasks that have them: where they start, their paths, where they end.
+
     Args:
         rollouts (mapping): ``position`` [E, T, 2] (m, NaN after the end), ``length`` [E], ``mode`` [E] (-1 none),
-            ``outcome`` [E] (0 out of time, 1 success, 2 collision).
+            ``outcome`` [E] (0 out of time, 1 success, 2 collision); optionally ``object_position`` [E, T, objects, 2]
+            (m) and ``context`` [E, objects, 3] (x, y in m, yaw in rad).
         path (str or Path): png to write.
         task (str, optional): task whose scene and modes are drawn.
         num_modes (int, optional): number of modes, needed where the task names no choices.
@@ -71,10 +76,21 @@ def plot_rollouts(
     """
     paths, mode, outcome = _read(rollouts)
     choices, colors = mode_choices(task, num_modes), mode_colors(task, num_modes)
-    figure = Figure(figsize=(8.4, 5.9), layout="constrained")
-    axes, side = figure.subplots(1, 2, width_ratios=(2.15, 1))
-    draw_scene(axes, task)
+    bodies = object_paths(rollouts)
     good = outcome == SUCCESS
+    if bodies is None:
+        figure = Figure(figsize=(8.4, 5.9), layout="constrained")
+        axes, side = figure.subplots(1, 2, width_ratios=(2.15, 1))
+        draw_scene(axes, task)
+    else:
+        figure = Figure(layout="constrained")
+        axes, beside, side = figure.subplots(1, 3)
+        share = abs(np.ptp(draw_scene(axes, task).get_xlim()) / np.ptp(axes.get_ylim()))
+        figure.set_size_inches(10 * share + 4.4, 5.6)
+        axes.get_gridspec().set_width_ratios((5 * share, 5 * share, 3.2))
+        draw_scene(beside, task).label_outer()
+        draw_bodies(beside, bodies, rollouts.get("context"), task, good)
+        set_title(beside, "objects: starts (pale), paths, ends")
     axes.add_collection(
         LineCollection(
             [paths[index] for index in np.flatnonzero(good)],
@@ -91,12 +107,14 @@ def plot_rollouts(
     counts = [f"{int(good.sum())} of {len(good)} rollouts succeed"]
     counts += [f"{OUTCOMES[kind]}: {int((outcome == kind).sum())}" for kind in FAILURE_MARKS if (outcome == kind).any()]
     set_title(axes, ", ".join(counts))
-    _draw_mode_table(side, mode[good], choices, colors)
+    draw_mode_table(side, mode[good], choices, colors)
     marks = [
         Line2D([], [], color=INK, linewidth=1.2, marker=mark, markersize=7, label=OUTCOMES[kind])
         for kind, mark in FAILURE_MARKS.items()
         if (outcome == kind).any()
     ]
+    if bodies:
+        marks += legend_handles(object_looks(task, bodies[0].shape[1]), good)
     if marks:
         below = {"bbox_to_anchor": (side.get_xlim()[0], side.dataLim.y0 - 0.2), "bbox_transform": side.transData}
         side.legend(handles=marks, frameon=False, fontsize=8.5, loc="upper left", **below)
@@ -137,7 +155,7 @@ def plot_plans(
     paths, mode, outcome = _read(rollouts)
     plan = as_array("plan", _entry(rollouts, "plan"), [len(paths), None, None, 2])
     plan_step = as_array("plan_step", _entry(rollouts, "plan_step"), plan.shape[:2])
-    colors = mode_colors(task, num_modes)
+    colors, bodies = mode_colors(task, num_modes), object_paths(rollouts)
     if episodes is None:
         episodes = choose_episodes(mode, outcome, count)
     wrong = [index for index in episodes if not 0 <= index < len(paths)]
@@ -149,6 +167,9 @@ def plot_plans(
     for place, index in enumerate(episodes):
         axes = draw_scene(figure.add_subplot(down, across, place + 1), task)
         color = INK if outcome[index] != SUCCESS else _color(mode[index], colors)
+        if bodies is not None:
+            context = rollouts["context"][index : index + 1] if "context" in rollouts else None
+            draw_bodies(axes, bodies[index : index + 1], context, task, outcome[index : index + 1] == SUCCESS)
         axes.plot(*paths[index].T, color=color, linewidth=5, alpha=0.4, zorder=2, solid_capstyle="round")
         made = [(plan[index, row], int(plan_step[index, row])) for row in np.flatnonzero(plan_step[index] >= 0)]
         lines = [points[np.isfinite(points).all(1)] for points, _ in made]
@@ -227,7 +248,9 @@ def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, 
     """Paths of the demonstrations; transitions with an action label are emphasised, the others grey.
 
     Args:
-        demonstrations (mapping): ``state`` [N, 2] (m), ``episode`` [N], ``labelled`` [N].
+        demonstrations (mapping): ``episode`` [N], ``labelled`` [N] and ``position`` [N, 2] (m) or, in files that have
+            none, ``state`` [N, d], whose first two columns are the position; optionally ``objects`` [N, objects, 2]
+            (m), which get a panel of their own.
         path (str or Path): png to write.
         task (str, optional): task whose scene is drawn.
 
@@ -235,21 +258,35 @@ def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, 
         >>> import tempfile
         >>> import torch
         >>> from torchrl_koap.path_plots import plot_demonstrations
-        >>> data = {"state": torch.rand(6, 2), "episode": [0, 0, 0, 1, 1, 1], "labelled": [True] * 3 + [False] * 3}
+        >>> data = {"position": torch.rand(6, 2), "episode": [0, 0, 0, 1, 1, 1], "labelled": [True] * 3 + [False] * 3}
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     plot_demonstrations(data, f"{folder}/demonstrations.png").name
         'demonstrations.png'
     """
-    state = as_array("state", _entry(demonstrations, "state"), [None, 2])
-    episode = as_array("episode", _entry(demonstrations, "episode"), [len(state)])
-    labelled = as_array("labelled", _entry(demonstrations, "labelled"), [len(state)]).astype(bool)
-    figure = Figure(figsize=(5.9, 6.4), layout="constrained")
-    axes = draw_scene(figure.add_subplot(), task)
+    if "position" in demonstrations:
+        position = as_array("position", demonstrations["position"], [None, 2])
+    else:
+        position = as_array("state", _entry(demonstrations, "state"), [None, None])[:, :2]
+    episode = as_array("episode", _entry(demonstrations, "episode"), [len(position)])
+    labelled = as_array("labelled", _entry(demonstrations, "labelled"), [len(position)]).astype(bool)
     borders = np.flatnonzero(np.diff(episode) != 0) + 1
-    paths = np.split(state, borders)
+    paths = np.split(position, borders)
+    if "objects" in demonstrations:
+        bodies = as_array("objects", demonstrations["objects"], [len(position), None, 2])
+        figure = Figure(figsize=(10.9, 6.2), layout="constrained")
+        axes, beside = figure.subplots(1, 2)
+        draw_scene(beside, task).label_outer()
+        draw_bodies(beside, np.split(bodies, borders), None, task, [True] * len(paths))
+        entries = legend_handles([look for look in object_looks(task, bodies.shape[1]) if not look.still], [True])
+        beside.legend(handles=entries, frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(1, 1))
+        set_title(beside, "objects: paths and where they end\n")
+    else:
+        figure = Figure(figsize=(5.9, 6.4), layout="constrained")
+        axes = figure.add_subplot()
+    draw_scene(axes, task)
     axes.add_collection(LineCollection(paths, colors="#9aa1ab", linewidths=0.7, alpha=0.8, zorder=2))
     same = np.flatnonzero(labelled[:-1] & (episode[1:] == episode[:-1]))
-    segments = np.stack([state[same], state[same + 1]], axis=1)
+    segments = np.stack([position[same], position[same + 1]], axis=1)
     axes.add_collection(LineCollection(segments, colors=BLUE, linewidths=1.7, capstyle="round", zorder=3))
     if task is None:
         axes.autoscale()
@@ -265,49 +302,29 @@ def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, 
     return save_figure(figure, path)
 
 
+def draw_bodies(axes: Axes, paths: Sequence[np.ndarray], contexts: Any, task: str | None, good: Sequence[bool]) -> None:
+    """Start outlines (if there are contexts), paths and ends of a task's bodies.
+
+    Args:
+        axes (Axes): where to draw.
+        paths (sequence): positions [frames, objects, 2] (m) of each episode.
+        contexts (array, optional): ``[E, objects, 3]``.
+        task (str, optional): the task.
+        good (sequence of bool): whether each episode succeeded.
+    """
+    looks = object_looks(task, paths[0].shape[1] if len(paths) else 0)
+    if contexts is not None:
+        draw_starts(axes, contexts, looks)
+    draw_object_paths(axes, paths, looks, good)
+    if task is None:
+        axes.autoscale()
+
+
 def _draw_failure(axes: Axes, path: np.ndarray, outcome: int) -> None:
     axes.plot(*path.T, color=INK, linewidth=1.2, zorder=4)
     if len(path):
         mark = FAILURE_MARKS.get(int(outcome), "D")
         axes.scatter(*path[-1], s=75, marker=mark, color=INK, edgecolors="white", linewidths=0.9, zorder=5)
-
-
-def _draw_mode_table(axes: Axes, mode: np.ndarray, choices: tuple, colors: np.ndarray) -> None:
-    """A cell per mode in its colour, with the number of rollouts; columns are the last choice."""
-    across = len(choices[-1][1])
-    down = len(colors) // across
-    if len(choices) == 1:  # no structure: a compact grid
-        across = min(across, 6)
-        down = math.ceil(len(colors) / across)
-    counts = np.bincount(mode[(mode >= 0) & (mode < len(colors))].astype(int), minlength=len(colors))
-    top = 1.0
-    for index, color in enumerate(colors):
-        row, column = divmod(index, across)
-        used = counts[index] > 0
-        style = {"facecolor": color, "edgecolor": "white"} if used else {"facecolor": "none", "edgecolor": FAINT}
-        axes.add_patch(Rectangle((column, top - row - 1), 0.92, 0.9, linewidth=0.8, **style))
-        text = str(counts[index]) if used else "0"
-        shade = "white" if used else FAINT
-        axes.text(column + 0.46, top - row - 0.56, text, ha="center", va="center", size=9, color=shade)
-    label = {"size": 8, "color": MUTED}
-    if len(choices) > 1:
-        for column, name in enumerate(choices[-1][1]):
-            axes.text(column + 0.46, top + 0.12, name.split()[-1], ha="center", va="bottom", **label)
-        axes.text(0, top + 0.62, f"{choices[-1][0]}: gap from left to right", ha="left", va="bottom", **label)
-        for row in range(down):
-            words, rest = [], row
-            for _, names in reversed(choices[:-1]):
-                rest, digit = divmod(rest, len(names))
-                words.append(names[digit])
-            axes.text(-0.15, top - row - 0.56, " / ".join(reversed(words)), ha="right", va="center", **label)
-        heads = " / ".join(name for name, _ in choices[:-1])
-        axes.text(-0.15, top + 0.12, heads, ha="right", va="bottom", **label)
-    axes.set_xlim(-2.1 if len(choices) > 1 else -0.1, across + 0.1)
-    axes.set_ylim(top - down - 4, top + 1.6)
-    axes.set_aspect("equal")
-    axes.set_anchor("NW")
-    axes.set_axis_off()
-    set_title(axes, "successes by mode")
 
 
 def _read(rollouts: Mapping[str, Any]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:

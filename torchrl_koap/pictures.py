@@ -12,7 +12,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from torchrl_koap.animation import animate_rollouts
+from torchrl_koap.animation import animate_rollouts, render_rollout
 from torchrl_koap.mode_plots import plot_modes
 from torchrl_koap.path_plots import SUCCESS, plot_demonstrations, plot_plans, plot_rollouts
 from torchrl_koap.plot_scenes import SCENES
@@ -40,6 +40,10 @@ class Picture:
     draw: Callable[..., Path]
 
 
+class NotFilmed(RuntimeError):
+    """No OpenGL library can be used here; everything else can be drawn."""
+
+
 def draw_pictures(
     run_dir: str | Path, *, animation: bool = True, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, str]:
@@ -47,7 +51,7 @@ def draw_pictures(
 
     Args:
         run_dir (str or Path): the run directory.
-        animation (bool): draw the moving picture too (about a second).
+        animation (bool): draw the moving pictures too (a second from above, some more for the film).
         progress (callable, optional): called with (pictures looked at, pictures in all).
 
     Returns:
@@ -75,6 +79,8 @@ def draw_pictures(
         if (run_dir / picture.source).exists() and (animation or not picture.name.endswith(".gif")):
             try:
                 picture.draw(run_dir, run_dir / FOLDER / picture.name, **names)
+            except NotFilmed as error:
+                problems[picture.name] = f"{picture.name} was not made: {error}"
             except (ValueError, KeyError, OSError, SafetensorError) as error:
                 problems[picture.name] = f"{picture.source}: {error}"
         if progress is not None:
@@ -111,8 +117,25 @@ def _animation(run_dir: Path, path: Path, **names: Any) -> Path:
     return animate_rollouts(load_file(run_dir / "rollouts.safetensors"), path, **names)
 
 
+def _film(run_dir: Path, path: Path, *, task: str | None, **_: Any) -> Path:
+    rollouts = load_file(run_dir / "rollouts.safetensors")
+    if task is None or "action" not in rollouts:  # a file of before actions were kept
+        return path
+    won = np.flatnonzero(rollouts["outcome"] == SUCCESS)
+    index = int(won[0]) if len(won) else 0
+    context = rollouts["context"][index] if "context" in rollouts else None
+    try:
+        return render_rollout(rollouts["action"][index], path, task=task, context=context)
+    except RuntimeError as error:
+        raise NotFilmed(error) from error
+
+
 def _plans(run_dir: Path, path: Path, **names: Any) -> Path:
-    return plot_plans(load_file(run_dir / "rollouts.safetensors"), path, **names)
+    rollouts = load_file(run_dir / "rollouts.safetensors")
+    if rollouts["plan"].shape[1]:
+        return plot_plans(rollouts, path, **names)
+    path.unlink(missing_ok=True)  # plans of joints, or none kept: an earlier picture shows other rollouts
+    return path
 
 
 def _modes(run_dir: Path, path: Path, **names: Any) -> Path:
@@ -126,9 +149,13 @@ def _demonstrations(run_dir: Path, path: Path, *, task: str | None, **_: Any) ->
     return plot_demonstrations(load_file(run_dir / "demonstrations.safetensors"), path, task=task)
 
 
-def _actions(run_dir: Path, path: Path, **_: Any) -> Path:
+def _actions(run_dir: Path, path: Path, *, task: str | None, **_: Any) -> Path:
     data = load_file(run_dir / "actions.safetensors")
-    return plot_actions(data["predicted"], data["true"], path)
+    if task in TASKS and TASKS[task].action_unit == "rad":
+        joints = TASKS[task].same_unit
+        names = [*(f"joint {index + 1}" for index in range(joints)), "gripper"]
+        return plot_actions(data["predicted"], data["true"], path, names=names, unit="mrad", absolute={"gripper": "mm"})
+    return plot_actions(data["predicted"], data["true"], path, names=("x", "y", "z"))
 
 
 def _eigenvalues(run_dir: Path, path: Path, *, task: str | None, **_: Any) -> Path:
@@ -141,6 +168,7 @@ _TRAIN, _EVAL = "koap train --out {run}", "koap eval {run} --episodes 60 --seed 
 PICTURES = (
     Picture("rollouts.png", "rollouts.safetensors", _EVAL, _rollouts),
     Picture("rollouts.gif", "rollouts.safetensors", _EVAL, _animation),
+    Picture("film.gif", "rollouts.safetensors", _EVAL, _film),
     Picture("modes.png", "rollouts.safetensors", _EVAL, _modes),
     Picture("plans.png", "rollouts.safetensors", _EVAL, _plans),
     Picture("demonstrations.png", "demonstrations.safetensors", _TRAIN, _demonstrations),

@@ -1,21 +1,19 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How a task looks from above, and a colour and a name for each of its modes.
+"""How what stands still in a task looks from above, and the look that all pictures share.
 
-A new task adds one drawing function to :data:`SCENES` and, if its modes are made of several choices, one line to
-:data:`CHOICES`. The geometry is repeated here because the environments take seconds to import; a test compares them.
+A new task adds one drawing function to :data:`SCENES`; what moves is in ``plot_objects``, modes in ``mode_names``. The
+geometry is repeated here because the environments take seconds to import; a test compares them.
 """
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Rectangle
 
 from torchrl_koap.lookup import lookup
 
 INK, MUTED, FAINT = "#1f2328", "#6b7280", "#c9ced6"
+RED, GREEN, BLUE = "#cf222e", "#1a7f37", "#1f6feb"
 
 # x, y, radius in m (specification, section 6.1)
 AVOIDING_CYLINDERS = (
@@ -29,21 +27,22 @@ AVOIDING_CYLINDERS = (
 AVOIDING_FINISH = 0.35
 ROD_RADIUS = 0.01
 
-# the choices a mode is made of, slowest digit first, each with the names of its values
-CHOICES = {
-    "avoiding": (
-        ("row 1", ("left", "right")),
-        ("row 2", ("left", "middle", "right")),
-        ("row 3", ("gap 1", "gap 2", "gap 3", "gap 4")),
-    ),
-}
+# where a context puts the centres of tray and target: x and y range in m (section 6.2)
+ALIGNING_REGIONS = (((0.4, 0.6), (-0.25, -0.1)), ((0.4, 0.6), (0.2, 0.35)))
+
+# m (section 6.3); walls of a bin are given from the bin's centre: x, y, half width, half depth
+SORTING_PLATFORM = ((0.2, 0.8), (-0.4, 0.2))
+SORTING_BINS = ((RED, 0.4, 0.32), (BLUE, 0.625, 0.32))
+SORTING_WALLS = ((0, 0.09, 0.1, 0.01), (-0.1, 0, 0.005, 0.1), (0.1, 0, 0.005, 0.1), (0, -0.1, 0.1, 0.005))
+
+STACKING_TARGET, STACKING_RADIUS, STACKING_HALF = (0.5, 0.2), 0.06, 0.05  # m (section 6.4)
 
 
 def _draw_avoiding(axes: Axes) -> None:
     for x, y, radius in AVOIDING_CYLINDERS:
         axes.add_patch(Circle((x, y), radius + ROD_RADIUS, facecolor="#e9ebee", edgecolor="none", zorder=0.5))
         axes.add_patch(Circle((x, y), radius, facecolor="#7b828d", edgecolor="#565c66", linewidth=0.8, zorder=0.6))
-    axes.axhline(AVOIDING_FINISH, color="#1a7f37", linewidth=1.4, zorder=0.7)
+    axes.axhline(AVOIDING_FINISH, color=GREEN, linewidth=1.4, zorder=0.7)
     axes.annotate(
         "finish",
         (1, AVOIDING_FINISH),
@@ -52,14 +51,53 @@ def _draw_avoiding(axes: Axes) -> None:
         textcoords="offset points",
         ha="right",
         va="bottom",
-        color="#1a7f37",
+        color=GREEN,
         fontsize=7.5,
     )
     axes.set_xlim(0.215, 0.785)
     axes.set_ylim(-0.305, 0.405)
 
 
-SCENES = {"avoiding": _draw_avoiding}
+def _draw_aligning(axes: Axes) -> None:
+    for (left, right), (near, far) in ALIGNING_REGIONS:
+        style = {"facecolor": "#f4f5f7", "edgecolor": FAINT, "linewidth": 0.8, "linestyle": "--", "zorder": 0.5}
+        axes.add_patch(Rectangle((left, near), right - left, far - near, **style))
+    axes.set_xlim(0.21, 0.79)
+    axes.set_ylim(-0.39, 0.47)
+
+
+def _draw_sorting(axes: Axes) -> None:
+    (left, right), (near, far) = SORTING_PLATFORM
+    axes.add_patch(Rectangle((left, near), right - left, far - near, facecolor="#eef0f3", edgecolor=FAINT, zorder=0.4))
+    for color, x, y in SORTING_BINS:
+        for across, along, half_width, half_depth in SORTING_WALLS:
+            corner = x + across - half_width, y + along - half_depth
+            axes.add_patch(Rectangle(corner, 2 * half_width, 2 * half_depth, color=color, alpha=0.45, lw=0, zorder=0.6))
+    axes.set_xlim(0.17, 0.83)
+    axes.set_ylim(-0.43, 0.45)
+
+
+def _draw_stacking(axes: Axes) -> None:
+    (x, y), half = STACKING_TARGET, STACKING_HALF
+    axes.add_patch(Circle((x, y), STACKING_RADIUS, facecolor="#fff3e0", edgecolor="#d9730d", linewidth=0.8, zorder=0.5))
+    axes.add_patch(
+        Rectangle((x - half, y - half), 2 * half, 2 * half, facecolor="#ffe0b8", edgecolor="none", zorder=0.6)
+    )
+    axes.text(x, y + STACKING_RADIUS + 0.004, "zone", ha="center", va="bottom", color="#9a5b13", fontsize=7.5)
+    axes.set_xlim(0.28, 0.68)
+    axes.set_ylim(-0.3, 0.32)
+
+
+SCENES = {
+    "avoiding": _draw_avoiding,
+    "aligning": _draw_aligning,
+    "sorting": _draw_sorting,
+    "sorting_2": _draw_sorting,
+    "sorting_6": _draw_sorting,
+    "po_sorting": _draw_sorting,
+    "stacking": _draw_stacking,
+    "stacking_1": _draw_stacking,
+}
 
 
 def draw_scene(axes: Axes, task: str | None) -> Axes:
@@ -107,85 +145,3 @@ def tidy(axes: Axes) -> Axes:
 def set_title(axes: Axes, text: str) -> None:
     """Title of a panel, flush left."""
     axes.set_title(text, loc="left", fontsize=9.5, color=INK, linespacing=1.35)
-
-
-def mode_choices(task: str | None, num_modes: int | None = None) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    """Choices that make up a mode, the slowest digit first; a single one where the task names none.
-
-    Args:
-        task (str, optional): name of the task.
-        num_modes (int, optional): number of modes, needed for a task without an entry in ``CHOICES``.
-
-    Raises:
-        ValueError: if the task has no entry and ``num_modes`` is not given.
-    """
-    if task in CHOICES:
-        return CHOICES[task]
-    if num_modes is None:
-        raise ValueError(f"the modes of task {task!r} are not in CHOICES; wanted num_modes")
-    return (("mode", tuple(str(index) for index in range(num_modes))),)
-
-
-def mode_colors(task: str | None, num_modes: int | None = None) -> np.ndarray:
-    """A colour for each mode: hue tells the last choice apart, lightness all choices before it.
-
-    Hues and lightness are even steps of OKLCH, a space in which equal steps look equal.
-
-    Args:
-        task (str, optional): name of the task.
-        num_modes (int, optional): number of modes, needed for a task without an entry in ``CHOICES``.
-
-    Returns:
-        np.ndarray: sRGB colours in 0..1 [num_modes, 3].
-
-    Examples:
-        >>> from torchrl_koap.plot_scenes import mode_colors
-        >>> mode_colors("avoiding").shape
-        (24, 3)
-    """
-    counts = [len(names) for _, names in mode_choices(task, num_modes)]
-    hues, shades = counts[-1], math.prod(counts[:-1])
-    step = min(98.0, 360.0 / max(hues, 1))
-    colors = [
-        _oklch(0.40 + 0.36 * shade / max(shades - 1, 1) if shades > 1 else 0.58, 0.155, 255.0 - step * hue)
-        for shade in range(shades)
-        for hue in range(hues)
-    ]
-    return np.array(colors)
-
-
-def mode_name(mode: int, task: str | None, num_modes: int | None = None) -> str:
-    """A mode in words.
-
-    Examples:
-        >>> from torchrl_koap.plot_scenes import mode_name
-        >>> mode_name(23, "avoiding"), mode_name(-1, "avoiding")
-        ('right, right, gap 4', 'no mode')
-    """
-    choices = mode_choices(task, num_modes)
-    if not 0 <= mode < math.prod(len(names) for _, names in choices):
-        return "no mode"
-    words = []
-    for _, names in reversed(choices):
-        mode, digit = divmod(mode, len(names))
-        words.append(names[digit])
-    return ", ".join(reversed(words))
-
-
-def _oklch(lightness: float, chroma: float, hue: float) -> tuple[float, float, float]:
-    """Colour of OKLCH (hue in degrees) in sRGB; chroma is lowered until the colour exists there."""
-    while True:
-        a, b = chroma * math.cos(math.radians(hue)), chroma * math.sin(math.radians(hue))
-        long = (lightness + 0.3963377774 * a + 0.2158037573 * b) ** 3
-        medium = (lightness - 0.1055613458 * a - 0.0638541728 * b) ** 3
-        short = (lightness - 0.0894841775 * a - 1.2914855480 * b) ** 3
-        linear = (
-            4.0767416621 * long - 3.3077115913 * medium + 0.2309699292 * short,
-            -1.2684380046 * long + 2.6097574011 * medium - 0.3413193965 * short,
-            -0.0041960863 * long - 0.7034186147 * medium + 1.7076147010 * short,
-        )
-        if min(linear) >= -1e-6 and max(linear) <= 1 + 1e-6:
-            return tuple(
-                12.92 * max(v, 0) if v <= 0.0031308 else 1.055 * min(v, 1) ** (1 / 2.4) - 0.055 for v in linear
-            )
-        chroma *= 0.97

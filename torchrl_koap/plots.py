@@ -16,9 +16,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from torchrl_koap.plot_scenes import FAINT, INK, MUTED, set_title, tidy
+from torchrl_koap.plot_scenes import BLUE, FAINT, GREEN, INK, MUTED, set_title, tidy
 
-BLUE, ORANGE = "#1f6feb", "#d9730d"
+ORANGE = "#d9730d"
+_SERIES = (BLUE, ORANGE, GREEN, "#8250df", "#bf3989", "#0a7f7f", "#6b7280")
 _ROUND = (1, 2, 5, 10)
 TERMS = {
     "loss_planner": "planner",
@@ -226,7 +227,14 @@ def plot_eigenvalues(real: Any, imag: Any, path: str | Path, *, control_hz: floa
 
 
 def plot_actions(
-    predicted: Any, true: Any, path: str | Path, *, names: Sequence[str] = ("x", "y"), scale: float = 1e3, unit="mm"
+    predicted: Any,
+    true: Any,
+    path: str | Path,
+    *,
+    names: Sequence[str] = ("x", "y"),
+    scale: float = 1e3,
+    unit: str = "mm",
+    absolute: Mapping[str, str] | None = None,
 ) -> Path:
     """Predicted against recorded actions, a panel per dimension, and the distribution of the errors.
 
@@ -238,8 +246,10 @@ def plot_actions(
         true (torch.Tensor or array): recorded actions [N, d].
         path (str or Path): png to write.
         names (sequence of str): name of each dimension.
-        scale (float): factor from the unit of the data (m per step) to the unit shown.
+        scale (float): factor from the unit of the data (m or rad per step) to the unit shown.
         unit (str): the unit shown.
+        absolute (mapping, optional): dimensions that are no change per step, by name, with the unit shown. They are
+            left out of the distribution of the errors.
 
     Raises:
         ValueError: if shapes differ, or no row is finite in both.
@@ -261,9 +271,12 @@ def plot_actions(
     error = predicted - true
     width = true.shape[1]
     names = [names[index] if index < len(names) else str(index) for index in range(width)]
-    figure = Figure(figsize=(3.2 * (width + 1), 3.75), layout="constrained")
-    panels = figure.subplots(1, width + 1)
-    for index, (axes, name) in enumerate(zip(panels, names, strict=False)):
+    absolute = absolute or {}
+    across = width + 1 if width < 5 else -(-(width + 1) // 2)
+    down = -(-(width + 1) // across)
+    figure = Figure(figsize=(3.2 * across, 3.4 * down + 0.35), layout="constrained")
+    for index, name in enumerate(names):
+        axes = figure.add_subplot(down, across, index + 1)
         low, high = np.quantile(np.concatenate([true[:, index], predicted[:, index]]), [0.0005, 0.9995])
         margin = 0.06 * (high - low) + 1e-9
         span = (low - margin, high + margin)
@@ -271,22 +284,26 @@ def plot_actions(
         size = float(np.clip(3000 / len(true), 1.5, 14))
         opacity = float(np.clip(600 / len(true), 0.12, 0.7))
         axes.scatter(true[:, index], predicted[:, index], s=size, color=BLUE, alpha=opacity, linewidths=0, zorder=2)
-        axes.set(xlim=span, ylim=span, box_aspect=1, xlabel=f"recorded {name} ({unit} per step)")
-        axes.set_ylabel(f"predicted {name} ({unit} per step)")
-        set_title(axes, f"{name}: RMSE {_rms(error[:, index]):.2f} {unit}")
+        shown = absolute.get(name, f"{unit} per step")
+        axes.set(xlim=span, ylim=span, box_aspect=1, xlabel=f"recorded {name} ({shown})")
+        axes.set_ylabel(f"predicted {name} ({shown})")
+        set_title(axes, f"{name}: RMSE {_rms(error[:, index]):.2f} {absolute.get(name, unit)}")
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
         axes.yaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
         tidy(axes)
-    axes = panels[-1]
+    axes = figure.add_subplot(down, across, width + 1)
+    same = [index for index, name in enumerate(names) if name not in absolute] or list(range(width))
+    error = error[:, same]
     reach = max(float(np.quantile(abs(error), 0.995)), 1e-9)
-    for index, (name, color) in enumerate(zip(names, (BLUE, ORANGE, "#1a7f37", "#8250df") * width, strict=False)):
-        style = {"histtype": "step", "color": color, "linewidth": 1.4, "label": name}
-        axes.hist(np.clip(error[:, index], -reach, reach), bins=41, range=(-reach, reach), **style)
-    set_title(axes, f"all: RMSE {_rms(error):.2f} {unit}, median {np.median(abs(error)):.2f}")
+    for column, index in enumerate(same):
+        style = {"histtype": "step", "color": _SERIES[column % len(_SERIES)], "linewidth": 1.4, "label": names[index]}
+        axes.hist(np.clip(error[:, column], -reach, reach), bins=41, range=(-reach, reach), **style)
+    which = "all" if len(same) == width else f"all but {', '.join(absolute)}"
+    set_title(axes, f"{which}: RMSE {_rms(error):.2f} {unit}, median {np.median(abs(error)):.2f}")
     axes.set_box_aspect(1)
     axes.set_xlabel(f"predicted - recorded ({unit} per step)")
     axes.set_ylabel("steps")
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(frameon=False, fontsize=9 if len(same) < 5 else 7)
     tidy(axes)
     title = f"{len(true):,} steps of unlabelled demonstrations - for analysis only: reads labels outside the budget"
     figure.suptitle(title, fontsize=10, color="#9a3412", x=0.01, ha="left")

@@ -9,61 +9,14 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.captions import CAPTIONS, caption
 from torchrl_koap.data.saving import replacing_file
 from torchrl_koap.mode_plots import even_entropy
 from torchrl_koap.pictures import FOLDER, PICTURES, draw_pictures, task_names
 from torchrl_koap.report_html import STYLE, definition, duration, interval_bar, number, table, tile
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 
-CAPTIONS = {
-    "rollouts.png": (
-        "Executed rollouts",
-        "Path of the tool centre from above, to scale. Solid discs are the cylinders; the pale ring is where the rod"
-        " touches. Hue tells the gap taken in the last row, lightness the choices before it; the table counts successes"
-        " per mode. Failures are black and end in a cross (collision) or a square (out of time). Look for gaps nobody"
-        " takes, and for paths that brush the rings.",
-    ),
-    "rollouts.gif": (
-        "The same rollouts in real time",
-        "Every dot is one rollout, the thin grey line ahead of it is its present plan. Plans that swing from picture to"
-        " picture mean a planner that cannot make up its mind between modes.",
-    ),
-    "film.gif": ("One rollout as the camera sees it", "Recorded commands, played again in the simulator."),
-    "film.mp4": ("One rollout as the camera sees it", "Recorded commands, played again in the simulator."),
-    "modes.png": (
-        "Modes of the successful rollouts",
-        "One bar per mode. Black ticks: the share of each mode in the demonstrations. Entropy is 1 when all modes are"
-        " equally frequent; a handful of rollouts cannot reach 1 even with an even choice, the title says what to"
-        " expect.",
-    ),
-    "plans.png": (
-        "Plans against execution",
-        "Wide pale band: the executed path. Thin lines: every plan of that episode; dots: where each was made. A plan"
-        " that leaves the band at once was not followed (the controller errs); plans that fan out at their ends were"
-        " followed, then replaced (the planner revises). Distances are to the nearest point of the path, whatever the"
-        " time; what was planned beyond its end does not count. Failures come first.",
-    ),
-    "demonstrations.png": (
-        "Demonstrations and labels",
-        "Blue: transitions whose action the training may read. Grey: states only.",
-    ),
-    "actions.png": (
-        "Predicted against recorded actions",
-        "For analysis only: the recorded actions of unlabelled demonstrations lie outside the label budget and were not"
-        " used for training or selection. Points on the diagonal are exact; a slope below 1 means timid actions, an"
-        " offset in the error histogram means drift.",
-    ),
-    "losses.png": (
-        "Losses",
-        "Pale: logged values; line: running mean, its last value in the corner. Logarithmic. A planner's loss says"
-        " little about its rollouts: judge it by the pictures above.",
-    ),
-    "eigenvalues.png": (
-        "Koopman eigenvalues",
-        "Left: eigenvalues of the latent operator; outside the unit circle (orange) predictions blow up. Right: their"
-        " magnitudes in order, with the time in which such a part of the state fades.",
-    ),
-}
+ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
 _BESIDE_LABELS = "demonstrations.png"
 _SUMMARY_ELSEWHERE = ("labels",)
 _EVAL_ELSEWHERE = ("episode", "command")
@@ -110,13 +63,13 @@ def write_report(
         files[name], note = _read(run_dir, f"{name}.json")
         notes += note
     config, summary, evaluation = files["config"], files["summary"], files["eval"]
-    num_modes = task_names(run_dir)["num_modes"]
+    names = task_names(run_dir)
     sections = [
         _header(run_dir, config),
         "".join(f'<p class="warning">{escape(note)}</p>' for note in notes),
-        _headline(run_dir, config, summary, evaluation, num_modes),
+        _headline(run_dir, config, summary, evaluation, names["num_modes"]),
         _labels(run_dir, summary, problems),
-        _pictures(run_dir, problems),
+        _pictures(run_dir, problems, names["task"]),
         _numbers(summary, evaluation),
         _reproduce(run_dir, config, evaluation),
     ]
@@ -159,28 +112,32 @@ def _header(run_dir: Path, config: Mapping[str, Any]) -> str:
 def _headline(run_dir: Path, config: Mapping, summary: Mapping, evaluation: Mapping, num_modes: int) -> str:
     tiles = []
     rate, episodes = number(evaluation.get("success_rate")), number(evaluation.get("episodes"))
-    if rate is not None:
-        low, high = number(evaluation.get("success_low")), number(evaluation.get("success_high"))
-        count = f"{round(rate * episodes)} of {episodes:g} rollouts" if episodes else ""
-        between = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %" if low is not None and high is not None else ""
-        bar = interval_bar(rate, low, high) if between else ""
-        tiles.append(tile("success", f"{100 * rate:.1f} %", ", ".join(filter(None, (between, count))), bar))
-    entropy = number(evaluation.get("mode_entropy"))
-    if entropy is not None:
+    contexts = number(evaluation.get("contexts"))
+    among = f" in {contexts:g} contexts" if contexts else ""
+    tiles += _rate(evaluation, "success", "success", f" rollouts{among}")
+    for count, what in ((1, "one box"), (2, "two boxes"), (3, "three boxes")):
+        tiles += _rate(evaluation, f"stacked_{count}", f"{what} stacked", " rollouts")
+    given = next((key for key in ENTROPIES if number(evaluation.get(key)) is not None), None)
+    if given is not None:
         seen = f"{evaluation['distinct_modes']} of {num_modes} modes" if _given(evaluation, "distinct_modes") else ""
         successes = round(rate * episodes) if rate is not None and episodes else 0
-        even = f"an even choice averages {even_entropy(successes, num_modes):.2f}, n = {successes}" if successes else ""
-        tiles.append(tile(f"mode entropy, base {num_modes}", f"{entropy:.2f}", "; ".join(filter(None, (seen, even)))))
-    errors = summary.get("action_error_mm")
-    if isinstance(errors, Mapping):
+        if contexts and given == "mode_entropy":
+            even = f"mean over contexts, {episodes / contexts:g} rollouts each" if episodes else ""
+        else:
+            even = f"an even choice averages {even_entropy(successes, num_modes):.2f}, n = {successes}"
+        notes = (_between(evaluation, given, "{:.2f}"), seen, even if successes else "")
+        head = f"{ENTROPIES[given]}, base {num_modes}"
+        tiles.append(tile(head, f"{number(evaluation[given]):.2f}", "; ".join(filter(None, notes))))
+    errors, unit = _action_errors(summary)
+    if errors:
         values = {key: number(value) for key, value in errors.items() if key != "analysis_labels_read"}
         values = {key: value for key, value in values.items() if value is not None}
         own = config.get("method") if config.get("method") in values else next(iter(values), None)
         if own is not None:
-            others = [f"{key} {value:.2f} mm" for key, value in values.items() if key != own]
+            others = [f"{key} {value:.2f} {unit}" for key, value in values.items() if key != own]
             read = number(errors.get("analysis_labels_read"))
             others += [f"n = {read:,.0f} unlabelled steps"] if read else []
-            tiles.append(tile(f"action error, {own}", f"{values[own]:.2f} mm", ", ".join(others)))
+            tiles.append(tile(f"action error, {own}", f"{values[own]:.2f} {unit}", ", ".join(others)))
     labels = summary.get("labels")
     if isinstance(labels, Mapping) and number(labels.get("labelled_transitions")) is not None:
         tiles.append(tile("action labels", f"{labels['labelled_transitions']:,.0f}", _share(labels)))
@@ -202,6 +159,33 @@ def _headline(run_dir: Path, config: Mapping, summary: Mapping, evaluation: Mapp
     return f'<section><h2>Result</h2><div class="tiles">{"".join(tiles)}</div>{missing}</section>'
 
 
+def _between(evaluation: Mapping[str, Any], name: str, form: str) -> str:
+    """The interval of an entry in words, empty if it has none."""
+    low, high = (number(evaluation.get(f"{name}_{end}")) for end in ("low", "high"))
+    return "" if low is None or high is None else f"95 % interval {form.format(low)} to {form.format(high)}"
+
+
+def _rate(evaluation: Mapping[str, Any], name: str, head: str, what: str) -> list[str]:
+    """Tile of a share of the rollouts with its interval, if it was measured."""
+    rate, episodes = number(evaluation.get(f"{name}_rate")), number(evaluation.get("episodes"))
+    if rate is None:
+        return []
+    low, high = (number(evaluation.get(f"{name}_{end}")) for end in ("low", "high"))
+    between, bar = "", ""
+    if low is not None and high is not None:
+        between, bar = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %", interval_bar(rate, low, high)
+    count = f"{round(rate * episodes)} of {episodes:g}{what}" if episodes else ""
+    return [tile(head, f"{100 * rate:.1f} %", ", ".join(filter(None, (between, count))), bar)]
+
+
+def _action_errors(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
+    """Errors of the predicted actions, empty if there are none, and their unit."""
+    for unit in ("mm", "mrad"):
+        if isinstance(summary.get(f"action_error_{unit}"), Mapping):
+            return summary[f"action_error_{unit}"], unit
+    return {}, ""
+
+
 def _share(labels: Mapping[str, Any]) -> str:
     labelled, total = number(labels.get("labelled_transitions")), number(labels.get("total_transitions"))
     touched, trajectories = number(labels.get("trajectories_touched")), number(labels.get("total_trajectories"))
@@ -217,8 +201,7 @@ def _labels(run_dir: Path, summary: Mapping[str, Any], problems: Mapping[str, st
         text += table(labels)
     else:
         text = f"<p>No account of the labels. {_hint('koap train --out {run}', run_dir)}</p>"
-    errors = summary.get("action_error_mm")
-    read = number(errors.get("analysis_labels_read")) if isinstance(errors, Mapping) else None
+    read = number(_action_errors(summary)[0].get("analysis_labels_read"))
     if read:
         text += (
             f"<p><strong>Outside the budget, for analysis only:</strong> {read:,.0f} labels were read to measure the"
@@ -228,32 +211,34 @@ def _labels(run_dir: Path, summary: Mapping[str, Any], problems: Mapping[str, st
     return f'<section><h2>Labels</h2><div class="account"><div>{text}</div>{figure}</div></section>'
 
 
-def _pictures(run_dir: Path, problems: Mapping[str, str]) -> str:
+def _pictures(run_dir: Path, problems: Mapping[str, str], task: str | None) -> str:
     known = {picture.name: picture for picture in PICTURES}
     parts, missing = [], {}
     for name, (head, _) in CAPTIONS.items():
-        figure = _figure(run_dir, name, problems)
+        figure = _figure(run_dir, name, problems, task)
         if figure and name != _BESIDE_LABELS:
             parts.append(figure)
         elif not figure and name not in problems and name in known and not (run_dir / known[name].source).exists():
             missing.setdefault(known[name].command, []).append(head)
+        elif not figure and name == "plans.png" and name not in problems:
+            parts.append(f'<p class="absent">{head}: not drawn, the rollouts hold no plans of positions.</p>')
     hints = [f"<li>{escape(', '.join(heads))}. {_hint(command, run_dir)}</li>" for command, heads in missing.items()]
     absent = f'<div class="absent"><p>Not drawn because the data are absent:</p><ul>{"".join(hints)}</ul></div>'
     return f"<section><h2>Pictures</h2>{''.join(parts)}{absent if hints else ''}</section>"
 
 
-def _figure(run_dir: Path, name: str, problems: Mapping[str, str]) -> str:
+def _figure(run_dir: Path, name: str, problems: Mapping[str, str], task: str | None = None) -> str:
     source = f"{FOLDER}/{name}"
     if name in problems or not (run_dir / source).exists():
         return ""
-    head, caption = map(escape, CAPTIONS[name])
+    head, text = map(escape, caption(name, task))
     if name.endswith(".mp4"):
         media = f'<video src="{source}" controls loop muted playsinline aria-label="{head}"></video>'
     else:
         media = f'<a href="{source}"><img src="{source}" alt="{head}"></a>'
     if name.endswith((".gif", ".mp4")):
-        return f'<figure class="beside">{media}<figcaption><h3>{head}</h3>{caption}</figcaption></figure>'
-    return f"<figure><h3>{head}</h3>{media}<figcaption>{caption}</figcaption></figure>"
+        return f'<figure class="beside">{media}<figcaption><h3>{head}</h3>{text}</figcaption></figure>'
+    return f"<figure><h3>{head}</h3>{media}<figcaption>{text}</figcaption></figure>"
 
 
 def _numbers(summary: Mapping[str, Any], evaluation: Mapping[str, Any]) -> str:

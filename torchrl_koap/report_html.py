@@ -43,8 +43,9 @@ details { margin: .8rem 0; } summary { cursor: pointer; }
   .tiles { grid-template-columns: repeat(3, 1fr); } .beside > a { flex-basis: 45%; }
   figure img, figure:not(.beside) img { width: auto; max-height: 11cm; } .account > figure img { max-height: 9cm; } }
 """
-_UNITS = {"_ms": "ms", "_mm": "mm", "_hz": "Hz", "_seconds": "s"}
-_PERCENT = {"success_rate", "success_low", "success_high"}
+_UNITS = {"_ms": "ms", "_mm": "mm", "_mrad": "mrad", "_hz": "Hz", "_seconds": "s"}
+_SHARES = ("success", "stacked_1", "stacked_2", "stacked_3")
+_PERCENT = {f"{name}_{part}" for name in _SHARES for part in ("rate", "low", "high")}
 _PLAIN = {"seed", "mode"}
 _WORDS = {
     "success_low": "success, 95 % from",

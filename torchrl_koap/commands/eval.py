@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import tyro
 from torch import nn
 from tqdm import tqdm
@@ -168,6 +169,8 @@ def run_eval(options: Eval) -> dict[str, Any]:
         objects=[task.observation[part] for part in task.drawn.values()],
         plans_position=task.plans_position,
     )
+    if contexts is not None:  # in full precision: a film of the same episode starts from it
+        rollouts["context"] = torch.from_numpy(contexts)
     save_tensors(run.path / "rollouts.safetensors", rollouts, {"task": task.name})
     run.write_json("eval.json", result)
     write_report(run.path, animation=options.animate)
