@@ -77,7 +77,7 @@ def plot_rollouts(
     paths, mode, outcome = _read(rollouts)
     choices, colors = mode_choices(task, num_modes), mode_colors(task, num_modes)
     bodies = object_paths(rollouts)
-    good = outcome == SUCCESS
+    good, crowded = outcome == SUCCESS, sum(map(len, paths)) > 8000
     if bodies is None:
         figure = Figure(figsize=(8.4, 5.9), layout="constrained")
         axes, side = figure.subplots(1, 2, width_ratios=(2.15, 1))
@@ -95,8 +95,8 @@ def plot_rollouts(
         LineCollection(
             [paths[index] for index in np.flatnonzero(good)],
             colors=[_color(mode[index], colors) for index in np.flatnonzero(good)],
-            linewidths=1.1,
-            alpha=0.85,
+            linewidths=0.6 if crowded else 1.1,
+            alpha=0.55 if crowded else 0.85,
             zorder=2,
         )
     )
