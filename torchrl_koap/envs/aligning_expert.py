@@ -27,7 +27,7 @@ import numpy as np
 
 from torchrl_koap.envs.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 from torchrl_koap.envs.contexts import check_contexts
-from torchrl_koap.envs.pushing import LENGTH, PLAN_SIZE, improve, motion, search
+from torchrl_koap.envs.pushing import LENGTH, PLAN_SIZE, improve, motion, search, two_pushes
 from torchrl_koap.tasks import get_task
 
 SAFE_HEIGHT = 0.25  # TCP height (m) at which the rod passes over the walls
@@ -38,6 +38,9 @@ _INSIDE, _OUTSIDE = 0, 1
 _WALL_CONE, _CORNER_CONE = math.radians(26), math.radians(68)
 _CORNERS = 20  # contacts from this one on are corners
 _REACH = ((0.30, 0.75), (-0.42, 0.60))  # where the rod may come down (m)
+_BETWEEN = np.array([0.36, 0.66, -0.28, 0.40])  # where the tray may lie between two pushes: x, x, y, y (m)
+_SWITCH_COST = 5.0
+_ROUND = 0.115  # distance of the rod from the centre on its way around the tray (m)
 _HORIZON = 500  # control steps for which hand noise is drawn
 
 
@@ -193,7 +196,13 @@ class _Player:
             for value, (low, high) in zip(place, _REACH, strict=True):
                 cost += 2000 * max(low - value, value - high, 0.0)
             if cost < least:
-                self.contact, self.plan, least = contact, plan, cost
+                self.contact, self.plan, self.aim, least = contact, plan, target, cost
+        if self.mode == _OUTSIDE:
+            between = np.empty(3)
+            cost, first = two_pushes(pose, target, contacts, _BETWEEN, between)
+            if cost + _SWITCH_COST < least:
+                self.contact, self.aim = contacts[first], between
+                search(pose, between, self.contact, self.plan)
         self.choices += 1
 
     def _in_world(self, point: np.ndarray) -> np.ndarray:
@@ -226,16 +235,17 @@ class _Player:
         return goal, 0.009 if self.command[2] > self.height + 0.03 else 0.005
 
     def _restart_push(self) -> None:
-        self.stuck, self.progress, self.shortest = 0, 0.01, 2.0
+        self.stuck, self.progress, self.shortest, self.started = 0, 0.01, 2.0, False
 
     def _push(self) -> tuple[np.ndarray, float]:
         rod = _turned(self.tcp[:2] - self.pose[:2], -self.pose[2])
         contact, anchor = self._felt_contact(rod)
-        improve(self.pose, self.target, contact, self.plan, 4)
+        soon = self.pose + 1.5 * (self.pose - self.last_pose) if self.started else self.pose
+        improve(soon, self.aim, contact, self.plan, 4)
         share, length = math.tanh(self.plan[0]), math.exp(self.plan[LENGTH])
         ahead = _turned(motion(contact, share)[3:], self.pose[2])
         angle = contact[2] + contact[3] * share + self.pose[2]
-        speed = (0.008 if length > 0.06 else 0.005) * self.pace
+        speed = min(0.008, 0.002 + 0.1 * length) * self.pace
         # the arm follows 1.6 control steps late, and gives way by 8 mm under the force that moves the tray
         hold = self._in_world(anchor) + 1.6 * speed * ahead - self.command[:2]
         hold += 0.008 * np.array([math.cos(angle), math.sin(angle)])
@@ -261,8 +271,8 @@ class _Player:
     def _judge(self, rod: np.ndarray, length: float) -> None:
         """Ends a push that has done what it could: its way is over, the tray rests, or the way grows again."""
         self.progress = 0.9 * self.progress + 0.1 * float(np.abs(self.pose - self.last_pose).sum())
-        self.last_pose, self.shortest = self.pose, min(self.shortest, length)
-        self.stuck += length < 0.008 or self.progress < 2e-4
+        self.last_pose, self.shortest, self.started = self.pose, min(self.shortest, length), True
+        self.stuck += 3 * (length < 0.006) + (self.progress < 2e-4)
         if self.mode == _INSIDE and self.contact[3] == _CORNER_CONE and length < 0.03:
             self.stuck += 3
         if (np.abs(rod).max() > 0.06) == (self.mode == _INSIDE):  # on the wrong side of the walls
@@ -280,8 +290,23 @@ class _Player:
                 self._restart_push()
             return np.append(self.pose[:2], self.height), 0.006
         if distance > 0.09:
-            self.doing = self._lift
-        return np.append(self.pose[:2] + 0.12 / distance * away, self.height), 0.006
+            self.doing = self._around
+        return np.append(self.pose[:2] + 0.12 / distance * away, self.height), 0.007
+
+    def _around(self) -> tuple[np.ndarray, float]:
+        """Takes the lowered rod around the tray to the next contact."""
+        entry = self._entry()
+        from_centre, to_centre = self.command[:2] - self.pose[:2], entry - self.pose[:2]
+        angle = math.atan2(from_centre[1], from_centre[0])
+        rest = (math.atan2(to_centre[1], to_centre[0]) - angle + math.pi) % (2 * math.pi) - math.pi
+        if abs(rest) > 0.35:
+            angle += math.copysign(min(abs(rest), 0.4), rest)
+            goal = self.pose[:2] + _ROUND * np.array([math.cos(angle), math.sin(angle)])
+            return np.append(goal, self.height), 0.008
+        if _apart(entry, self.tcp) < 0.012 and _apart(entry, self.command) < 0.010:
+            self.doing = self._push
+            self._restart_push()
+        return np.append(entry, self.height), min(0.008, 0.002 + 0.2 * _apart(entry, self.command))
 
     def _lift(self) -> tuple[np.ndarray, float]:
         if self.tcp[2] > SAFE_HEIGHT - 0.03:

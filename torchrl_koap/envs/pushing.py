@@ -29,7 +29,7 @@ LENGTH = KNOTS  # column of a plan
 PLAN_SIZE = KNOTS + 1
 _PIECES = 16
 _POSITION_UNIT, _ANGLE_UNIT = 0.004, math.radians(3.0)  # errors at the end of a plan that cost 1
-_SLANT_COST = np.array([0.25, 0.36, 0.64])  # late slants cost more: they leave nothing to correct with
+_SLANT_COST = np.array([0.75, 1.0, 1.9])  # late slants cost more: they leave nothing to correct with
 _BEND_COST, _LENGTH_COST = 0.25, 16.0
 _RESIDUALS = 3 + KNOTS + (KNOTS - 1) + 1
 _STEEPEST = 2.5
@@ -171,3 +171,43 @@ def search(pose, target, contact, plan):
                     least = cost
                     plan[:] = guess
     return least
+
+
+@njit(cache=True)
+def two_pushes(pose, target, contacts, bounds, aim):
+    """Looks for a first push after which a second one, from another contact, leads straight to the target.
+
+    Args:
+        pose (np.ndarray): x, y (m), yaw (rad) of the tray now [3].
+        target (np.ndarray): where it should come to lie [3].
+        contacts (np.ndarray): contacts to choose from [C, 8].
+        bounds (np.ndarray): least and greatest x, least and greatest y of the tray in between [4] (m).
+        aim (np.ndarray): the pose between the pushes is written here [3].
+
+    Returns:
+        tuple: least cost of both pushes, and the index of the first contact.
+    """
+    least, best = 1e300, 0
+    plan = np.empty(PLAN_SIZE)
+    for first in range(len(contacts)):
+        for slant in (-0.8, 0.0, 0.8):
+            for length in (0.05, 0.10, 0.16, 0.24, 0.34):
+                plan[:KNOTS] = slant
+                plan[LENGTH] = math.log(length)
+                between = np.array(arrive(pose, contacts[first], plan))
+                if between[0] < bounds[0] or between[0] > bounds[1] or between[1] < bounds[2] or between[1] > bounds[3]:
+                    continue
+                effort = _LENGTH_COST * length * length
+                for k in range(KNOTS):
+                    effort += _SLANT_COST[k] * slant * slant
+                distance = max(math.hypot(target[0] - between[0], target[1] - between[1]), 0.01)
+                for second in range(len(contacts)):
+                    if second == first or effort > least:
+                        continue
+                    plan[:KNOTS] = 0.0
+                    plan[LENGTH] = math.log(distance)
+                    cost = effort + improve(between, target, contacts[second], plan, 5)
+                    if cost < least:
+                        least, best = cost, first
+                        aim[:] = between
+    return least, best
