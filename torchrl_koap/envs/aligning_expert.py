@@ -277,9 +277,15 @@ class _Player:
             self.stuck += 3
         if (np.abs(rod).max() > 0.06) == (self.mode == _INSIDE):  # on the wrong side of the walls
             self.doing = self._lift
+        elif self.mode == _OUTSIDE and self._behind(rod) < 0.05:  # slipped around the corner
+            self.doing = self._let_go
         elif self.stuck > 6 or length > self.shortest + 0.06:
             self._choose(self.pose, self.target, rod)
             self.doing = self._let_go
+
+    def _behind(self, rod: np.ndarray) -> float:
+        """How far the rod stands behind the tray's centre, along the push (m)."""
+        return -(rod[0] * math.cos(self.contact[2]) + rod[1] * math.sin(self.contact[2]))
 
     def _let_go(self) -> tuple[np.ndarray, float]:
         away = self.tcp[:2] - self.pose[:2]
@@ -303,7 +309,8 @@ class _Player:
             angle += math.copysign(min(abs(rest), 0.4), rest)
             goal = self.pose[:2] + _ROUND * np.array([math.cos(angle), math.sin(angle)])
             return np.append(goal, self.height), 0.008
-        if _apart(entry, self.tcp) < 0.012 and _apart(entry, self.command) < 0.010:
+        still = _apart(self.tcp, self.last_tcp) < 0.004
+        if _apart(entry, self.tcp) < 0.012 and _apart(entry, self.command) < 0.010 and still:
             self.doing = self._push
             self._restart_push()
         return np.append(entry, self.height), min(0.008, 0.002 + 0.2 * _apart(entry, self.command))
