@@ -1,0 +1,71 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Partial observability: dropped parts, noise of a stated size, the same in specs, rollouts and any batch."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_koap.envs import AvoidingEnv, SortingEnv
+from torchrl_koap.envs.transforms import EndEffectorNoise, PartialObservation
+from torchrl_koap.tasks import get_task
+
+
+def test_po_sorting_is_sorting_plus_transforms():
+    env = TransformedEnv(
+        SortingEnv(2, seed=0), Compose(EndEffectorNoise("sorting", sigma=0.002), PartialObservation("sorting"))
+    )
+    check_env_specs(env)
+    assert env.observation_spec["observation"].shape == (2, 10)
+    data = env.rollout(3)
+    assert data["observation"].shape == (2, 3, 10) and data["next", "observation"].shape == (2, 3, 10)
+
+
+def test_what_remains_is_what_the_task_shows_its_planner():
+    """KOAP's ten columns: measured xy and the boxes' xy."""
+    observation = torch.randn(7, 16)
+    partial = PartialObservation("sorting")(TensorDict({"observation": observation.clone()}, [7]))["observation"]
+    assert torch.equal(partial, observation[:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]])
+    assert torch.equal(partial, get_task("po_sorting").state_of(observation))
+
+
+def test_parts_may_be_chosen_on_any_task():
+    hide = PartialObservation("aligning", drop=["target_position"])
+    row = torch.arange(20.0)[None]
+    assert hide(TensorDict({"observation": row}, [1]))["observation"].shape == (1, 17)
+    with pytest.raises(ValueError, match="task 'aligning' has no part 'yaw'"):
+        PartialObservation("aligning", drop=["yaw"])
+    with pytest.raises(ValueError, match="nothing of task 'avoiding' remains"):
+        PartialObservation("avoiding", drop=["desired_xy", "measured_xy"])
+    with pytest.raises(ValueError, match="has 20 columns, got 16"):
+        hide(TensorDict({"observation": torch.zeros(1, 16)}, [1]))
+
+
+def test_noise_has_the_stated_size_and_touches_nothing_else():
+    noisy = EndEffectorNoise("aligning", sigma=0.003, seed=1)
+    clean = torch.zeros(4000, 20)
+    found = noisy(TensorDict({"observation": clean}, [4000]))["observation"]
+    measured = get_task("aligning").observation["measured_xyz"]
+    assert found[:, measured].std().item() == pytest.approx(0.003, rel=0.03)
+    assert found[:, measured].mean().abs() < 2e-4
+    rest = [column for column in range(20) if column not in range(3, 6)]
+    assert not found[:, rest].any() and not clean.any()
+
+
+def test_noise_of_an_episode_depends_on_its_seed_alone():
+    def observed(seeds, place):
+        env = TransformedEnv(AvoidingEnv(len(seeds)), EndEffectorNoise("avoiding", sigma=0.01))
+        env.transform.seed_episodes(seeds)
+        still = env.rollout(3, lambda td: td.set("action", torch.zeros(len(seeds), 2)))
+        return still["next", "observation"][place]
+
+    assert torch.equal(observed([7, 8, 9], 1), observed([8, 3], 0))
+    assert not torch.equal(observed([7, 8], 0), observed([7, 8], 1))
+
+
+def test_a_negative_sigma_is_refused():
+    with pytest.raises(ValueError, match="sigma must be >= 0, got -1"):
+        EndEffectorNoise("sorting", sigma=-1)
