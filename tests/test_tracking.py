@@ -31,7 +31,7 @@ def generator():
 
 def kinematics(q):
     axes, origins, tcp, quat = np.empty((8, 3, 3)), np.empty((8, 3)), np.empty(3), np.empty(4)
-    tracking._forward_kinematics(q, axes, origins, tcp, quat)
+    tracking.forward_kinematics(q, axes, origins, tcp, quat)
     return axes, origins, tcp, quat
 
 
@@ -58,7 +58,7 @@ def numpy_inverse_kinematics(target, q):
 def compiled_inverse_kinematics(target, q):
     q = q.copy()
     shapes = [(8, 3, 3), (8, 3), (3,), (4,), (6, 7), (6, 6), (6,), (7,), (6, 6), (6, 6)]
-    tracking._inverse_kinematics(target, q, *[np.empty(shape) for shape in shapes])
+    tracking.inverse_kinematics(target, q, *[np.empty(shape) for shape in shapes])
     return q
 
 

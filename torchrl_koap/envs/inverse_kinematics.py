@@ -10,14 +10,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from torchrl_koap.envs.tracking import _forward_kinematics, _inverse_kinematics
+from torchrl_koap.envs.tracking import forward_kinematics, inverse_kinematics
 
 
 @njit(cache=True)
 def _poses(joints, positions, quaternions):
     axes, origins = np.empty((8, 3, 3)), np.empty((8, 3))
     for row in range(len(joints)):
-        _forward_kinematics(joints[row], axes, origins, positions[row], quaternions[row])
+        forward_kinematics(joints[row], axes, origins, positions[row], quaternions[row])
 
 
 @njit(cache=True)
@@ -29,7 +29,7 @@ def _follow(joints, poses, iterations):
     for row in range(len(joints)):
         for _ in range(iterations):
             scratch = (axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors)
-            _inverse_kinematics(poses[row], joints[row], *scratch)
+            inverse_kinematics(poses[row], joints[row], *scratch)
 
 
 def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

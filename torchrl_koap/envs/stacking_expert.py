@@ -156,13 +156,13 @@ class _Person:
         goal = box[:2] + shift * np.array([math.cos(turn), math.sin(turn)])
         error, tilt = np.linalg.norm(goal - tcp[:2]), abs(turn - yaw)
         low, off = box[2] + _HOLD, error + 0.08 * max(tilt - 0.03, 0.0)
-        if off < 0.006:
+        if off < 0.008:
             self._down = True
         elif off > 0.012 and tcp[2] > box[2] + 0.025:  # the fingers would come down on the box
             self._down = False
         height = low if self._down else box[2] + 0.05 + _funnel(off, 0.0, 0.02, 0.009, 0.03)
         self._move(goal, max(height, self._above_stack(tcp)), turn, tcp)
-        there = error < 0.004 and tilt < 0.04 and abs(tcp[2] - low) < 0.005
+        there = error < 0.007 and tilt < 0.05 and abs(tcp[2] - low) < 0.008
         if (there and width > 0.07 and self._since > 8) or (tcp[2] - low < 0.03 and self._since > 250):
             self._enter(_GRASP)
         return GRIPPER_OPEN
@@ -190,10 +190,10 @@ class _Person:
         goal, height = self._place(boxes)
         error, tilt = np.linalg.norm(goal - box[:2]), abs(yaw)
         low = height + offset[2]
-        near = _funnel(error + 0.08 * max(tilt - 0.03, 0.0), low, low + 0.045, 0.006, 0.035)
+        near = _funnel(error + 0.08 * max(tilt - 0.03, 0.0), low, low + 0.045, 0.008, 0.035)
         far = min(max(near, _funnel(0.25 - error, 0.105, low + 0.045, 0.0, 0.12)), max(low + 0.045, 0.105))
         self._move(goal + offset[:2], near if error < 0.06 else far, 0.0, tcp)
-        if error < 0.007 and box[2] < height + 0.003 and tilt < 0.06 and abs(self.position[2] - low) < 0.004:
+        if error < 0.009 and box[2] < height + 0.003 and tilt < 0.06 and abs(self.position[2] - low) < 0.004:
             self._enter(_RELEASE)
         return GRIPPER_CLOSED
 

@@ -120,7 +120,7 @@ def _rotate(axes, index, angle):
 
 
 @njit(cache=True)
-def _forward_kinematics(q, axes, origins, tcp, quat):
+def forward_kinematics(q, axes, origins, tcp, quat):
     """Frames of the seven joints (rows 1-7), TCP position and quaternion for the joint angles ``q``."""
     for i in range(3):
         for k in range(3):
@@ -267,10 +267,10 @@ def _diagonalise(matrix, vectors):
 
 
 @njit(cache=True)
-def _inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors):
+def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors):
     """Moves ``q`` in place by three damped steps towards the pose ``target`` (position and unit quaternion)."""
     for _ in range(IK_ITERATIONS):
-        _forward_kinematics(q, axes, origins, tcp, quat)
+        forward_kinematics(q, axes, origins, tcp, quat)
         near = 0.0
         for k in range(4):
             near += quat[k] * target[3 + k]
@@ -384,7 +384,7 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
             for j in range(7):
                 targets[row, j] = q[j]
                 speeds[row, j] = v[j]
-            _inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors)
+            inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors)
             for j in range(7):
                 v[j] = (q[j] - targets[row, j]) / TIMESTEP
                 a[j] = 0.4 * (v[j] - speeds[row, j]) / TIMESTEP  # logged by the original, used for nothing
