@@ -35,6 +35,7 @@ _STICK = 0.0118  # m per control step and axis, the most that humans used
 # damp it: on the difference of wanted and seen speed, and on the stretch between command and rod.
 _DAMPING = np.array([0.4, 0.7])
 _LEAK = 0.18
+_REACH = 0.30  # m from the base; nearer, the arm may flip over
 _LATENCY = 2.0  # control steps from what is seen to when an action begins to show
 _DIRECTIONS = 32
 _HOLD = 0.006  # a direction is given up for a very different one if that is better by this much (m of way)
@@ -63,7 +64,7 @@ def _box_field(boxes, yaws, obstacle, lane):
             s = 1.0
             if y > 0.15 and off > _LANE_HALF:
                 s += 6.0 * min((y - 0.15) / 0.03, 1.0)
-            border = max(0.25 - x, x - 0.75, -0.34 - y)
+            border = max(_REACH + 0.05 - np.hypot(x, y), x - 0.75, -0.34 - y)
             if border > 0:
                 s += 10.0 * min(border / 0.02, 1.0)
             for k in range(len(boxes)):
@@ -81,7 +82,7 @@ def _rod_slowness(boxes, yaws, solid, target):
         x = ORIGIN[0] + i * STEP
         for j in range(SHAPE[1]):
             y = ORIGIN[1] + j * STEP
-            border = max(0.18 - x, x - 0.82, y - 0.28)
+            border = max(_REACH - np.hypot(x, y), x - 0.82, y - 0.28)
             s = 1.0 + (10.0 * min(border / 0.02, 1.0) if border > 0 else 0.0)
             for k in range(len(boxes)):
                 if solid[k]:
@@ -184,7 +185,7 @@ def _decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
     else:
         pushing = abs(off) < 0.35 and distance < contact + 0.04
     if pushing:
-        heading = angle + min(max(1.7 * off, -1.2), 1.2)
+        heading = angle + min(max(1.4 * off, -1.2), 1.2)
         speed = _PUSH * (1.0 - 0.5 * min(abs(off) / 0.6, 1.0))
         return speed * np.cos(heading), speed * np.sin(heading), True, angle
     x, y = _behind(box, yaw, angle, 0.008)
@@ -283,7 +284,7 @@ class SortingExpert:
         for row in np.flatnonzero(self._rest == 0):
             decision[row] = self._play(row, observation[row], boxes[row])
         tempo = self._tempo[:, self._time % _HORIZON] * (self._time >= self._pause)
-        self._wish += 0.6 * (decision * tempo[:, None] - self._wish)
+        self._wish += 0.45 * (decision * tempo[:, None] - self._wish)
         self._time += 1
         stretch = observation[:, 2:4] - observation[:, :2]
         return np.clip(self._wish + _DAMPING * (self._wish - self._speed) + _LEAK * stretch, -_STICK, _STICK)
