@@ -33,7 +33,7 @@ _PUSH, _FREE = 0.0130, 0.0145  # m per control step
 _STICK = 0.0118  # m per control step and axis, the most that humans used
 # The arm is soft: its rod swings around the command with a period of 26 control steps, by centimetres. These gains
 # damp it: on the difference of wanted and seen speed, and on the stretch between command and rod.
-_DAMPING = np.array([0.4, 0.7])
+_DAMPING = np.array([0.3, 0.5])
 _LEAK = 0.18
 _REACH = 0.30  # m from the base; nearer, the arm may flip over
 _LATENCY = 2.0  # control steps from what is seen to when an action begins to show
@@ -172,7 +172,10 @@ def _decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
     slowness = _rod_slowness(boxes, yaws, present, target)
     way = _cost_from(slowness, ahead[0], ahead[1])
     angle, cost = _choose_direction(box, yaw, to_go, way, slowness)
-    if abs(_wrapped(angle - held)) > 0.45 and _direction_cost(box, yaw, held, to_go, way, slowness) < cost + _HOLD:
+    change = _wrapped(angle - held)
+    if abs(change) <= 0.5:
+        angle = held + 0.4 * change
+    elif _direction_cost(box, yaw, held, to_go, way, slowness) < cost + _HOLD:
         angle = held
 
     towards = box - ahead
@@ -284,7 +287,7 @@ class SortingExpert:
         for row in np.flatnonzero(self._rest == 0):
             decision[row] = self._play(row, observation[row], boxes[row])
         tempo = self._tempo[:, self._time % _HORIZON] * (self._time >= self._pause)
-        self._wish += 0.45 * (decision * tempo[:, None] - self._wish)
+        self._wish += 0.4 * (decision * tempo[:, None] - self._wish)
         self._time += 1
         stretch = observation[:, 2:4] - observation[:, :2]
         return np.clip(self._wish + _DAMPING * (self._wish - self._speed) + _LEAK * stretch, -_STICK, _STICK)
