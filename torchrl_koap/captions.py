@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from torchrl_koap.plot_objects import OBJECTS
+
 _FILM = (
     "Recorded commands, played again in the simulator: the first success, or the first rollout if there is none. Long"
     " ones pass faster than they did."
@@ -81,6 +83,11 @@ _ROLLOUTS = {
     "stacking": _STACKING,
     "stacking_1": _STACKING,
 }
+_WITH_OBJECTS = {
+    "rollouts.gif": " Squares are the objects, pale lines their paths; black marks are tools that ran out of time.",
+    "plans.png": " Outlines and thin coloured lines are the objects of that episode: starts and paths.",
+    "demonstrations.png": " Beside it the objects that were moved.",
+}
 
 
 def caption(name: str, task: str | None = None) -> tuple[str, str]:
@@ -99,4 +106,6 @@ def caption(name: str, task: str | None = None) -> tuple[str, str]:
         (True, False)
     """
     head, text = CAPTIONS[name]
-    return head, text + (_ROLLOUTS.get(task, "") if name == "rollouts.png" else "")
+    if name == "rollouts.png":
+        return head, text + _ROLLOUTS.get(task, "")
+    return head, text + (_WITH_OBJECTS.get(name, "") if task in OBJECTS else "")

@@ -163,7 +163,7 @@ def plot_plans(
         raise ValueError(f"episodes must be 0 to {len(paths) - 1}, got {wrong[0]}")
     across = min(len(episodes), 3)
     down = math.ceil(len(episodes) / max(across, 1))
-    figure = Figure(figsize=(3.5 * across + 0.3, 4.25 * down + 0.3), layout="constrained")
+    figure = Figure(figsize=(3.8 * across + 0.3, 4.25 * down + 0.3), layout="constrained")
     for place, index in enumerate(episodes):
         axes = draw_scene(figure.add_subplot(down, across, place + 1), task)
         color = INK if outcome[index] != SUCCESS else _color(mode[index], colors)
