@@ -53,6 +53,8 @@ def test_every_order_is_stacked(played):
 
 def test_motion_is_smooth(played):
     actions = played[3]
+    opens = actions[..., 7] > 0.075
+    assert (np.diff(opens, axis=1).sum(1) == 6).all()  # closed on every box once, opened once
     assert set(np.unique(actions[..., 7])) == {0.06, 0.08}
     assert np.abs(actions[..., :7]).max() < 0.08
     assert np.quantile(np.abs(actions[..., :7]), 0.99) < 0.04

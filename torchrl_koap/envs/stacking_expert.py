@@ -204,7 +204,7 @@ class _Person:
             self._placed += 1
             self._grasp = None
             self._enter(_RETREAT if self._placed == 3 else _REACH)
-        return GRIPPER_OPEN if self._since > 1 else GRIPPER_CLOSED
+        return GRIPPER_OPEN
 
     def _retreat(self, tcp, yaw, width, boxes) -> float:
         self._move(tcp[:2], ON_TABLE + 3 * BOX_HEIGHT, 0.0, tcp)
