@@ -242,6 +242,7 @@ def test_film_of_the_first_success(task, tmp_path, monkeypatch):
 
     def render(actions, path, **options):
         made.append((actions, options))
+        path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"GIF89a")
         return path
 
