@@ -169,7 +169,7 @@ def aligning_scene(*, arm_alpha: float = 0.3):
     Returns:
         mjcf.RootElement: the scene; the target is the mocap body ``target``.
     """
-    return scene(rod=True, arm_alpha=arm_alpha, link_collisions=True, add_objects=_add_tray_and_target)
+    return scene(rod=True, arm_alpha=arm_alpha, add_objects=_add_tray_and_target)
 
 
 def _add_tray_and_target(root) -> None:

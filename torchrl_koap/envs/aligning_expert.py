@@ -27,7 +27,7 @@ import numpy as np
 
 from torchrl_koap.envs.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 from torchrl_koap.envs.contexts import check_contexts
-from torchrl_koap.envs.pushing import LENGTH, PLAN_SIZE, improve, motion, search, two_pushes
+from torchrl_koap.envs.pushing import LENGTH, PLAN_SIZE, arrive, improve, motion, search, two_pushes
 from torchrl_koap.tasks import get_task
 
 SAFE_HEIGHT = 0.25  # TCP height (m) at which the rod passes over the walls
@@ -37,8 +37,9 @@ SURGE = 0.0025  # m per control step by which the push changes from one step to 
 _INSIDE, _OUTSIDE = 0, 1
 _WALL_CONE, _CORNER_CONE = math.radians(26), math.radians(68)
 _CORNERS = 20  # contacts from this one on are corners
-_REACH = ((0.30, 0.75), (-0.42, 0.60))  # where the rod may come down (m)
-_BETWEEN = np.array([0.36, 0.66, -0.28, 0.40])  # where the tray may lie between two pushes: x, x, y, y (m)
+_REACH = (0.30, 0.75, -0.42, 0.60)  # where the rod may come down: x, x, y, y (m)
+_BETWEEN = np.array([0.36, 0.66, -0.28, 0.40])  # where the tray may lie on the way: x, x, y, y (m)
+_LEAST, _MOST = ((*_REACH[i::2], *_BETWEEN[i::2]) for i in (0, 1))
 _SWITCH_COST = 5.0
 _ROUND = 0.115  # distance of the rod from the centre on its way around the tray (m)
 _HORIZON = 500  # control steps for which hand noise is drawn
@@ -193,8 +194,12 @@ class _Player:
             if rod is not None:
                 cost += 10 * _apart(contact[4:6], rod)
             place = pose[:2] + _turned(1.3 * contact[4:6], pose[2])
-            for value, (low, high) in zip(place, _REACH, strict=True):
-                cost += 2000 * max(low - value, value - high, 0.0)
+            for share in (0.25, 0.5):  # of the way
+                bend = share * (plan[1] - plan[0])
+                part = np.array([plan[0], plan[0] + bend, plan[0] + 2 * bend, plan[LENGTH] + math.log(share)])
+                x, y, _ = arrive(pose, contact, part)
+                for value, low, high in zip((*place, x, y), _LEAST, _MOST, strict=True):
+                    cost += 1000 * max(low - value, value - high, 0.0)
             if cost < least:
                 self.contact, self.plan, self.aim, least = contact, plan, target, cost
         if self.mode == _OUTSIDE:
