@@ -134,12 +134,14 @@ class _Person:
         self._hesitation = generator.integers(0, 4, 16)
         self._velocity, self._spin = np.zeros(3), 0.0
         self._time, self._placed, self._grasp, self._grip_width = 0, 0, None, 0.0
+        self._speed, self._seen = 0.0, np.zeros(3)
         self._enter(_REACH)
 
     def decide(self, tcp: np.ndarray, yaw: float, width: float, boxes: np.ndarray) -> float:
         """Moves the command by one control step, given what is seen; returns the gripper number."""
         self._time += 1
         self._since += 1
+        self._speed, self._seen = np.linalg.norm(tcp - self._seen), tcp.copy()
         stage = (self._reach, self._close, self._carry, self._open, self._retreat)[self._stage]
         return stage(tcp, yaw, width, boxes)
 
@@ -193,7 +195,8 @@ class _Person:
         near = _funnel(error + 0.08 * max(tilt - 0.03, 0.0), low, low + 0.045, 0.008, 0.035)
         far = min(max(near, _funnel(0.25 - error, 0.105, low + 0.045, 0.0, 0.12)), max(low + 0.045, 0.105))
         self._move(goal + offset[:2], near if error < 0.06 else far, 0.0, tcp)
-        if error < 0.009 and box[2] < height + 0.003 and tilt < 0.06 and abs(self.position[2] - low) < 0.004:
+        down = box[2] < height + 0.003 and abs(self.position[2] - low) < 0.004
+        if down and error < 0.009 and tilt < 0.06 and self._speed < 0.001:
             self._enter(_RELEASE)
         return GRIPPER_CLOSED
 
