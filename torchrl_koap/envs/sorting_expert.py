@@ -172,10 +172,10 @@ def _decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
     slowness = _rod_slowness(boxes, yaws, present, target)
     way = _cost_from(slowness, ahead[0], ahead[1])
     angle, cost = _choose_direction(box, yaw, to_go, way, slowness)
-    change = _wrapped(angle - held)
-    if abs(change) <= 0.5:
+    change = 0.0 if np.isnan(held) else _wrapped(angle - held)
+    if 0.0 < abs(change) <= 0.5:
         angle = held + 0.4 * change
-    elif _direction_cost(box, yaw, held, to_go, way, slowness) < cost + _HOLD:
+    elif change != 0.0 and _direction_cost(box, yaw, held, to_go, way, slowness) < cost + _HOLD:
         angle = held
 
     towards = box - ahead

@@ -80,6 +80,8 @@ def travel_cost(slowness, cost, sweeps=2):
 @njit(cache=True)
 def value_at(field, x, y):
     """Bilinear interpolation of a field [X, Y] at a point (m), at the border outside the grid."""
+    if np.isnan(x + y):
+        return np.nan
     u = min(max((x - ORIGIN[0]) / STEP, 0.0), field.shape[0] - 1.001)
     v = min(max((y - ORIGIN[1]) / STEP, 0.0), field.shape[1] - 1.001)
     i, j = int(u), int(v)
