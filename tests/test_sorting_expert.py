@@ -121,6 +121,8 @@ def test_bad_input():
         SortingExpert([0, 6], contexts, [(0,), (1,)])
     with pytest.raises(ValueError, match=r"shape \[2, 16\], got \[2, 4\]"):
         SortingExpert([0, 1], contexts, [(0,), (1,)]).act(np.zeros((2, 4)))
+    with pytest.raises(ValueError, match="NaN, row 1"):
+        SortingExpert([0, 1], contexts, [(0,), (1,)]).act(np.array([[0.5] * 16, [np.nan] * 16]))
 
 
 @pytest.mark.slow

@@ -272,12 +272,14 @@ class SortingExpert:
             np.ndarray: change of the commanded xy [n, 2] (m), float64.
 
         Raises:
-            ValueError: if the shape is wrong.
+            ValueError: if the shape is wrong or something is NaN.
         """
         observation = np.asarray(observation, dtype=np.float64)
         wanted = (len(self._target), 4 + 3 * len(self._colours))
         if observation.shape != wanted:
             raise ValueError(f"observation must have shape {list(wanted)}, got {list(observation.shape)}")
+        if np.isnan(observation).any():
+            raise ValueError(f"observation must not hold NaN, row {int(np.isnan(observation).any(1).argmax())} does")
         boxes = observation[:, 4:].reshape(len(observation), -1, 3)
         self._look(boxes[..., :2])
         rod = observation[:, 2:4].copy()
