@@ -131,15 +131,32 @@ def test_the_boxes_of_other_sortings_follow_by_colour(num_boxes):
         same(frames[:, 6 + 3 * index], np.tan(yaw))
 
 
-def test_a_tilted_box_has_the_rotation_about_z():
-    """First about z by 50 deg, then about the box's own x by 20 deg: the tilt does not change the yaw."""
+def test_the_yaw_of_a_tilted_box_is_the_original_s():
+    """About z by 50 deg after about its own x by 20 deg: not 50 deg again, because the original turns ``x y`` over."""
     z, x = np.radians([50, 20]) / 2
     quat = np.array([[np.cos(z) * np.cos(x), np.cos(z) * np.sin(x), np.sin(z) * np.sin(x), np.sin(z) * np.cos(x)]] * 2)
     episode = made_up("sorting", rows=2)
     frames, _ = convert(
         "sorting", dataclasses.replace(episode, objects=episode.objects | {"red-box1": pose(quat[:, :3], quat)})
     )
-    same(frames[:, 6], np.tan(np.radians([50, 50])))
+    w, x, y, z = quat[0]
+    yaw = np.arctan2(2 * (w * z - x * y), 1 - 2 * (y * y + z * z))
+    same(frames[:, 6], np.tan([yaw, yaw]))
+    assert 2 < 50 - np.degrees(yaw) < 3
+
+
+def test_while_the_gripper_opens_its_action_means_open():
+    width = np.array([0.0007, 0.029, 0.056, 0.069, 0.0749, 0.078, 0.08, 0.08, 0.07, 0.062, 0.06, 0.0601, 0.0599])
+    robot = {
+        "des_j_pos": np.zeros((len(width), 7)),
+        "j_pos": np.zeros((len(width), 7)),
+        "gripper_width": width,
+        "c_pos": np.zeros((len(width), 3)),
+    }
+    box = pose(np.zeros((len(width), 3)), np.tile([1.0, 0, 0, 0], (len(width), 1)))
+    objects = {f"{colour}-box": box for colour in ("red", "green", "blue")}
+    _, actions = convert("stacking", RawEpisode(robot=robot, objects=objects))
+    same(actions[:, 7], [0.08] * 7 + [0.07, 0.062, 0.06, 0.0601, 0.0599])
 
 
 def test_boxes_turned_by_a_right_angle_give_finite_numbers(tmp_path):

@@ -39,6 +39,10 @@ OBJECTS = {
 }
 
 
+_OPEN_ABOVE = 0.075  # m; greater gripper numbers open
+_OPENING = 5  # control steps that the fingers need to open
+
+
 @dataclass(frozen=True)
 class Converter:
     """How the raw episodes of one task become observations and actions.
@@ -69,9 +73,9 @@ def _pose(episode: RawEpisode, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tan_yaw(quat: np.ndarray) -> np.ndarray:
-    """Tangent of the rotation about z, ``[T, 1]``."""
+    """Tangent of the yaw, ``[T, 1]``; with the original's sign of ``x y``, which matters for tilted boxes only."""
     w, x, y, z = quat.T
-    return np.tan(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))[:, None]
+    return np.tan(np.arctan2(2 * (w * z - x * y), 1 - 2 * (y * y + z * z)))[:, None]
 
 
 def _avoiding(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
@@ -100,8 +104,20 @@ def _stacking(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
         position, quat = _pose(episode, name)
         columns += [position, _tan_yaw(quat)]
     columns += [_robot(episode, "j_pos"), width, _robot(episode, "c_pos")]
-    # the gripper's action is the width it is about to have
-    return np.concatenate(columns, axis=1), np.concatenate([np.diff(desired, axis=0), width[1:]], axis=1)
+    actions = np.concatenate([np.diff(desired, axis=0), _gripper_number(width)], axis=1)
+    return np.concatenate(columns, axis=1), actions
+
+
+def _gripper_number(width: np.ndarray) -> np.ndarray:
+    """The gripper's action from widths ``[T, 1]``: the width it is about to have, and 0.08 m all the time it opens.
+
+    D3IL takes the next width throughout. While the fingers open it passes through numbers that mean "close" when sent
+    (up to 0.075 m), and a policy that sends them never opens.
+    """
+    later = np.concatenate([width[1:], np.repeat(width[-1:], _OPENING, axis=0)])
+    soon = np.max([later[shift : shift + len(width) - 1] for shift in range(_OPENING)], axis=0)
+    opening = (width[1:] > width[:-1] + 1e-4) & (soon > _OPEN_ABOVE)
+    return np.where(opening | (width[1:] > _OPEN_ABOVE), np.maximum(width[1:], 0.08), width[1:])
 
 
 CONVERTERS = {
