@@ -106,7 +106,7 @@ def test_a_linear_world_is_predicted_by_the_ridge_and_written_down(tmp_path):
     torch.manual_seed(0)
     controller = build_controller({"method": "koap", "preset": "paper"}, 2, 2, labelled)
     run = RunDirectory(tmp_path)
-    result = write_analysis(run, get_task("avoiding"), data, labelled, controller)
+    result = write_analysis(run, get_task("avoiding"), data, labelled, controller, (0, 1))
     assert result["ridge"] < 1e-2 < result["controller"]
     tensors, _ = load_tensors(tmp_path / "actions.safetensors")
     assert result["analysis_labels_read"] == len(tensors["true"]) == 150 - report.labelled_transitions - 3 * AFTER
@@ -122,7 +122,7 @@ def test_tool_and_objects_of_demonstrations_are_kept_for_pictures(tmp_path):
     frames = torch.arange(40 * task.observation_dim).float().reshape(40, -1)
     data = select_state(flatten_trajectories([frames[:20], frames[20:]], [torch.zeros(19, 8)] * 2), range(3))
     labelled, _ = LabelBudget(1.0).apply(data)
-    write_analysis(RunDirectory(tmp_path), task, data, labelled, Copy(1))
+    write_analysis(RunDirectory(tmp_path), task, data, labelled, Copy(1), (0, 1))
     shown, _ = load_tensors(tmp_path / "demonstrations.safetensors")
     assert torch.equal(shown["position"], data["observation"][:, 28:30])
     assert torch.equal(shown["objects"][:, 2], data["observation"][:, 16:18])  # the blue box
@@ -131,6 +131,6 @@ def test_tool_and_objects_of_demonstrations_are_kept_for_pictures(tmp_path):
 def test_with_a_label_in_every_trajectory_there_is_nothing_to_measure(tmp_path):
     data = counting()
     labelled, _ = LabelBudget(1.0).apply(data)
-    result = write_analysis(RunDirectory(tmp_path), get_task("avoiding"), data, labelled, Copy(1))
+    result = write_analysis(RunDirectory(tmp_path), get_task("avoiding"), data, labelled, Copy(1), (0, 1))
     assert set(result) == {"note"}
     assert not (tmp_path / "actions.safetensors").exists()

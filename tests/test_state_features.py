@@ -59,8 +59,8 @@ def test_plane_drops_the_height():
         ("sorting_2", 10, 10),
         ("sorting_6", 22, 26),
         ("po_sorting", 16, 10),
-        ("stacking", 31, 23),
-        ("stacking_1", 31, 23),
+        ("stacking", 31, 26),
+        ("stacking_1", 31, 26),
     ],
 )
 def test_sizes(name, observed, state):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_koap.checkpoints import save_tensors
 from torchrl_koap.closed_form import fit_closed_form
-from torchrl_koap.data import cut_windows
+from torchrl_koap.data import cut_windows, select_columns
 from torchrl_koap.modules import LinearInverseDynamics
 from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import Task
@@ -60,24 +61,31 @@ def _drawn(task: Task, observation: Tensor) -> dict[str, Tensor]:
 
 
 def write_analysis(
-    run: RunDirectory, task: Task, data: TensorDictBase, labelled: TensorDictBase, controller: nn.Module
+    run: RunDirectory,
+    task: Task,
+    data: TensorDictBase,
+    labelled: TensorDictBase,
+    controller: nn.Module,
+    columns: Sequence[int],
 ) -> dict[str, Any]:
-    """Action error of the controller, and of a ridge on raw frames with the same labels, on hidden trajectories.
+    """Action error of the controller, and of a ridge on the same raw columns and labels, on hidden trajectories.
 
-    Writes ``actions.safetensors`` and ``demonstrations.safetensors`` for the report.
+    ``columns`` are the state columns that the controller reads. Writes ``actions.safetensors`` and
+    ``demonstrations.safetensors`` for the report.
     """
-    labelled = labelled.cpu()
-    predicted, true = hidden_action_errors(controller, data, labelled)
+    labelled = select_columns(labelled.cpu(), columns)
+    viewed = select_columns(data, columns)
+    predicted, true = hidden_action_errors(controller, viewed, labelled)
     has_action = labelled["has_action"].squeeze(-1)
     shown = {"state": data["state"], "episode": data["episode"], "labelled": has_action}
     save_tensors(run.path / "demonstrations.safetensors", shown | _drawn(task, data["observation"]))
     if not len(true):
         return {"note": "every trajectory has a label in the budget: there is nothing to measure on"}
     save_tensors(run.path / "actions.safetensors", {"predicted": predicted, "true": true})
-    ridge = LinearInverseDynamics(data["state"].shape[-1], task.action_dim).to(data["state"].dtype)
+    ridge = LinearInverseDynamics(len(columns), task.action_dim).to(data["state"].dtype)
     fit_closed_form(ridge, labelled)
     same = slice(task.same_unit)
-    by_ridge, _ = hidden_action_errors(ridge, data, labelled)
+    by_ridge, _ = hidden_action_errors(ridge, viewed, labelled)
     return {
         "controller": rmse_mm(predicted[:, same], true[:, same]),
         "ridge": rmse_mm(by_ridge[:, same], true[:, same]),

@@ -87,25 +87,29 @@ def _released(state_dim: int, condition_dim: int, options: Mapping[str, Any]) ->
 DENOISERS = {"unet": _unet, "mlp": _mlp, "transformer": _transformer, "released": _released}
 
 
-def build_planner(options: Mapping[str, Any], state_dim: int) -> StatePlanner:
+def build_planner(options: Mapping[str, Any], state_dim: int, features: nn.Module | None = None) -> StatePlanner:
     """A planner without statistics (:meth:`StatePlanner.fit_normalizers`, or weights, bring them).
 
     Args:
         options (mapping): the ``planner`` entry of ``config.json``: denoiser, channels, schedule, prediction, history,
             horizon, relative, solver, solver_steps, clip.
         state_dim (int): number of state columns.
+        features (nn.Module, optional): what the condition holds besides the history, see :class:`StatePlanner`.
 
     Raises:
         ValueError: for an unknown denoiser, schedule, prediction or solver.
     """
     denoiser = lookup(DENOISERS, options["denoiser"], "denoiser")
+    features = features if options.get("relations") else None
+    condition_dim = options["history"] * state_dim + (0 if features is None else features.num_features)
     return StatePlanner(
-        denoiser(state_dim, options["history"] * state_dim, options),
+        denoiser(state_dim, condition_dim, options),
         NoiseSchedule(options["schedule"], options["prediction"]),
         state_dim=state_dim,
         history=options["history"],
         horizon=options["horizon"],
         relative=options["relative"],
+        features=features,
         solver=options["solver"],
         num_steps=options["solver_steps"],
         clip=options["clip"],

@@ -37,6 +37,7 @@ def make_policy(
     execution: str = "feedback",
     replan_interval: int = 4,
     joining: float = 0.8,
+    controller_columns: Sequence[int] | None = None,
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two."""
     return PlanThenControl(
@@ -47,6 +48,7 @@ def make_policy(
         execution=execution,
         replan_interval=replan_interval,
         joining=joining,
+        controller_columns=controller_columns,
     )
 
 

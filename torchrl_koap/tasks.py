@@ -8,11 +8,13 @@ to task on the learning side is in :data:`TASKS`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import torch
 from torch import Tensor
 
 from torchrl_koap.lookup import lookup
+from torchrl_koap.relations import Relation, Relations
 from torchrl_koap.state_features import FEATURES
 
 CONTROL_HZ = 1 / 0.035
@@ -38,7 +40,8 @@ class Task:
         num_modes (int): base of the logarithm of the mode entropy.
         actuated (tuple of int): for every action entry the state column that it moves, by the same filter for all;
             empty if there is none.
-        robot (tuple of int): state columns of the robot itself, which the recovery augmentation shifts.
+        robot (tuple of int): state columns of the robot itself: the recovery augmentation shifts them, and the
+            controller reads them (see :meth:`controller_columns`).
         state (dict): part of the observation to name of its features (:mod:`torchrl_koap.state_features`), in the
             order of the state. Empty: every part but the command and the hidden ones, unchanged.
         hidden (tuple): further parts that planner and controller must not see.
@@ -54,6 +57,9 @@ class Task:
         data (str): name of the task whose demonstrations are used, if another one.
         demonstrations (int): number of scripted demonstrations to record by default.
         planner_steps (int): planner updates by default.
+        relative (bool): plans are displacements from the present state by default.
+        relations (tuple): what the planner is told besides the state: ``(part, seen from part, in the frame of part,
+            yaw of part)``, the last two optional (:mod:`torchrl_koap.relations`).
     """
 
     name: str
@@ -79,6 +85,8 @@ class Task:
     data: str = ""
     demonstrations: int = 200
     planner_steps: int = 12000
+    relative: bool = True
+    relations: tuple[tuple[str, ...], ...] = ()
 
     @property
     def observation_dim(self) -> int:
@@ -125,10 +133,30 @@ class Task:
         """Number of leading action columns that are in ``action_unit``; Stacking's last one is a width in m."""
         return self.action_dim - (self.action_unit == "rad")
 
+    def controller_columns(self, part: str) -> tuple[int, ...]:
+        """State columns that a controller reads.
+
+        Args:
+            part (str): ``"robot"``: the robot's own, whose motion the actions command; ``"all"``: the whole state, as
+                KOAP's configurations have it (spec section 7).
+
+        Raises:
+            ValueError: for another part.
+        """
+        everything = tuple(range(self.state_dim))
+        return lookup({"robot": self.robot or everything, "all": everything}, part, "part of the state")
+
     @property
     def source(self) -> str:
         """Name of the task whose demonstrations are used."""
         return self.data or self.name
+
+    def planner_features(self) -> Relations | None:
+        """The task's relations as a module, None if it has none."""
+        if not self.relations:
+            return None
+        columns = self.state_slices
+        return Relations([Relation(*(columns[name] for name in names)) for names in self.relations])
 
     def state_of(self, observation: Tensor) -> Tensor:
         """The state that planner and controller see.
@@ -183,6 +211,7 @@ def _sorting(num_boxes: int, num_modes: int) -> Task:
         objects=tuple(boxes),
         drawn={box: f"{box}_xy" for box in boxes},
         entropy="solved_contexts",
+        relations=tuple(("measured_xy", f"{box}_xy") for box in boxes),
     )
 
 
@@ -202,8 +231,8 @@ _stacking = Task(
     max_steps=1000,
     control_hz=1 / 0.03,
     num_modes=6,
-    robot=tuple(range(7)),
-    state={"measured_joints": "plain", "gripper_width": "plain"}
+    robot=tuple(range(8)),
+    state={"measured_joints": "plain", "gripper_width": "plain", "tcp_position": "plain"}
     | {
         name: kind
         for box in _STACKING_BOXES
@@ -213,7 +242,14 @@ _stacking = Task(
     drawn={box: f"{box}_position" for box in _STACKING_BOXES},
     action_unit="rad",
     entropy="solved_contexts",
-    recovery_sigma=0.01,
+    relations=(
+        *(("tcp_position", f"{box}_position") for box in _STACKING_BOXES),
+        *(
+            (f"{box}_position", f"{other}_position")
+            for box, other in (("red", "green"), ("red", "blue"), ("green", "blue"))
+        ),
+    ),
+    recovery_sigma=0.0,  # joints and tool would have to move together
 )
 
 _tasks = (
@@ -231,6 +267,7 @@ _tasks = (
         collides=True,
         demonstrations=96,
         planner_steps=5000,
+        relative=False,
     ),
     Task(
         name="aligning",
@@ -260,6 +297,11 @@ _tasks = (
         objects=("box", "target"),
         drawn={"box": "box_position", "target": "target_position"},
         entropy="contexts",
+        relations=(
+            ("measured_xyz", "box_position", "box_quaternion"),
+            ("target_position", "box_position", "box_quaternion", "target_quaternion"),
+            ("measured_xyz", "target_position", "target_quaternion"),
+        ),
     ),
     _sorting(4, num_modes=6),
     _sorting(2, num_modes=2),

@@ -75,12 +75,17 @@ def load_run(run: RunDirectory, task: str | None = None) -> tuple[Task, StatePla
     if task is not None and task != trained_on:
         raise RunDirectoryError(f"{run.path} was trained on task {trained_on!r}, not on {task!r}")
     facts = get_task(trained_on)
-    state_dim = facts.state_dim
-    planner = build_planner(parts[0], state_dim)
-    controller = build_controller(parts[1], state_dim, facts.action_dim)
+    planner = build_planner(parts[0], facts.state_dim, facts.planner_features())
+    columns = columns_of(run, facts)
+    controller = build_controller(parts[1], len(columns), facts.action_dim)
     for name, module in (("planner", planner), ("controller", controller)):
         load_weights(run.path / f"{name}.safetensors", module, task=facts.name)
     return facts, planner.eval(), controller.eval()
+
+
+def columns_of(run: RunDirectory, task: Task) -> tuple[int, ...]:
+    """State columns that the controller of a run reads."""
+    return task.controller_columns(run.read_entry("config.json", "controller").get("state", "all"))
 
 
 def choose_contexts(task: Task, options: Eval) -> tuple[list[int] | None, np.ndarray | None]:
@@ -130,6 +135,7 @@ def run_eval(options: Eval) -> dict[str, Any]:
         execution=options.execution,
         replan_interval=options.replan_interval,
         joining=options.joining,
+        controller_columns=columns_of(run, task),
     ).to(options.device)
     seeds = list(range(options.seed, options.seed + options.episodes))
     numbers, contexts = choose_contexts(task, options)

@@ -12,7 +12,7 @@ import tyro
 from tqdm import tqdm
 
 from torchrl_koap.assembly import load_demonstrations, make_env_of, set_up_torch
-from torchrl_koap.commands.eval import Eval, choose_contexts, load_run
+from torchrl_koap.commands.eval import Eval, choose_contexts, columns_of, load_run
 from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.diagnosis import (
     coverage,
@@ -68,7 +68,11 @@ def run_inspect(options: Inspect) -> dict[str, Any]:
     run = RunDirectory(options.run)
     task, planner, controller = load_run(run)
     planner, controller = planner.to(options.device), controller.to(options.device)
-    settings = {"replan_interval": options.replan_interval, "joining": options.joining}
+    settings = {
+        "replan_interval": options.replan_interval,
+        "joining": options.joining,
+        "controller_columns": columns_of(run, task),
+    }
     seeds = list(range(options.seed, options.seed + options.episodes))
     dataset = options.dataset or run.read_entry("config.json", "dataset")
     data = load_demonstrations(dataset, task, episodes=run.read_entry("config.json", "episodes"))
@@ -114,6 +118,4 @@ def verdict(result: dict[str, Any]) -> str:
     distance = result["distance_to_demonstrations"]
     if distance and distance["visited_95"] > 2 * distance["demonstrated_95"]:
         parts.append("executed states lie far from every demonstration")
-    return (
-        "; ".join(parts) or "each works alone, not together: plans answer badly to what was executed"
-    )
+    return "; ".join(parts) or "each works alone, not together: plans answer badly to what was executed"

@@ -28,6 +28,7 @@ from torchrl_koap.data import (
     cut_windows,
     extrapolate_ends,
     make_window_buffer,
+    select_columns,
 )
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS, KoopmanInverseDynamics, StatePlanner
@@ -63,7 +64,8 @@ def run_train(options: Train) -> dict[str, Any]:
             raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
     set_up_torch(options.threads, options.device)
     config = configure(run, options)
-    planner = build_planner(config["planner"], task.state_dim)  # finds unknown names before any work is done
+    # finds unknown names before any work is done
+    planner = build_planner(config["planner"], task.state_dim, task.planner_features())
     if options.planner_from is not None:
         load_weights(options.planner_from / "planner.safetensors", planner, task=task.name)
 
@@ -79,7 +81,8 @@ def run_train(options: Train) -> dict[str, Any]:
     command = task.observation[task.command]
     labelled, report = budget.apply(data, command=command)
     labelled = labelled.to(options.device)
-    _check_lengths(options, config, task, labelled)
+    columns = task.controller_columns(options.controller_state)
+    _check_lengths(options, config, task, labelled, len(columns))
     run.write_json("config.json", config)  # not before the data are known to be good: a wrong call leaves nothing
 
     began = time.perf_counter()
@@ -89,7 +92,8 @@ def run_train(options: Train) -> dict[str, Any]:
         trained, planner_values = _train_planner(run, options, config, task, labelled, logger)
         planned = time.perf_counter()
         torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
-        controller, fit, controller_values = _train_controller(run, options, config, task, labelled, logger)
+        view = select_columns(labelled, columns)
+        controller, fit, controller_values = _train_controller(run, options, config, task, view, logger)
     finally:
         if logger is not None:
             logger.close()
@@ -103,14 +107,15 @@ def run_train(options: Train) -> dict[str, Any]:
         "decoder_fit": fit,
     }
     if options.analysis:
-        summary[f"action_error_{UNITS[task.action_unit]}"] = write_analysis(run, task, data, labelled, controller)
+        analysis = write_analysis(run, task, data, labelled, controller, columns)
+        summary[f"action_error_{UNITS[task.action_unit]}"] = analysis
     run.write_json("summary.json", summary)
     return summary
 
 
-def _check_lengths(options: Train, config: dict[str, Any], task: Task, data: TensorDictBase) -> None:
+def _check_lengths(options: Train, config: dict[str, Any], task: Task, data: TensorDictBase, width: int) -> None:
     """Finds trajectories that are too short now rather than after the planner was trained."""
-    controller = build_controller(config["controller"], data["state"].shape[-1], task.action_dim)
+    controller = build_controller(config["controller"], width, task.action_dim)
     WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.history)
     if options.analysis:
         WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
@@ -128,7 +133,7 @@ def _make_logger(options: Train):
 def _train_planner(
     run: RunDirectory, options: Train, config: dict[str, Any], task: Task, data: TensorDictBase, logger
 ) -> tuple[StatePlanner, dict[str, float]]:
-    planner = build_planner(config["planner"], data["state"].shape[-1]).to(options.device)
+    planner = build_planner(config["planner"], data["state"].shape[-1], task.planner_features()).to(options.device)
     source = run.path if options.planner_from is None else Path(options.planner_from)
     if options.planner_from is not None or (options.resume and phase_finished(run, "planner")):
         load_weights(source / "planner.safetensors", planner, task=task.name)

@@ -39,7 +39,9 @@ class Train:
         channels: widths of the U-Net's levels.
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
-        relative: plan displacements from the current state instead of states.
+        relative: plan displacements from the current state instead of states (default: the task's).
+        relations: tell the planner where the tool is as seen from the objects (tasks with objects).
+        controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
         solver: solver used at evaluation unless told otherwise.
         solver_steps: its number of steps.
@@ -73,7 +75,9 @@ class Train:
     channels: tuple[int, ...] = (32, 64)
     schedule: str = "squared_cosine"
     prediction: str = "sample"
-    relative: bool = False
+    relative: bool | None = None
+    relations: bool = True
+    controller_state: str = "robot"
     recovery_sigma: float | None = None
     solver: str = "dpm++2m"
     solver_steps: int = 10
@@ -111,6 +115,7 @@ def with_task_defaults(options: Train, task: Task) -> Train:
         "steps": task.planner_steps,
         "recovery_sigma": task.recovery_sigma,
         "episodes": task.demonstrations,
+        "relative": task.relative,
     }
     left = {name: value for name, value in defaults.items() if getattr(options, name) is None}
     return replace(options, **left)
@@ -128,13 +133,14 @@ def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
         "history": HISTORY,
         "horizon": HORIZON,
         "relative": options.relative,
+        "relations": options.relations,
         "solver": options.solver,
         "solver_steps": options.solver_steps,
         "clip": 1.2 if options.prediction == "sample" else 1.0,
     }
     if options.planner_from is not None:
         config["planner"] = RunDirectory(options.planner_from).read_entry("config.json", "planner")
-    config["controller"] = {"method": options.method, "preset": options.preset}
+    config["controller"] = {"method": options.method, "preset": options.preset, "state": options.controller_state}
     config["channels"] = list(options.channels)
     config["command"] = "koap " + " ".join(sys.argv[1:])
     config["versions"] = {"python": platform.python_version()} | {

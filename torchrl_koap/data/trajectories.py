@@ -119,3 +119,21 @@ def select_state(
     if not columns or not all(0 <= column < width for column in columns):
         raise ValueError(f"state columns must be one or more of 0..{width - 1}, got {columns}")
     return data.copy().set(keys.STATE, data.get(keys.OBSERVATION)[..., columns])
+
+
+def select_columns(data: TensorDictBase, columns: Sequence[int]) -> TensorDictBase:
+    """The same data with fewer columns of ``state``: what a controller with a mask sees.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` with ``state``; not changed.
+        columns (sequence of int): columns of the state to keep.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import select_columns
+        >>> select_columns(TensorDict({"state": torch.arange(6.0).reshape(2, 3)}, [2]), (0, 2))["state"]
+        tensor([[0., 2.],
+                [3., 5.]])
+    """
+    return data.copy().set(keys.STATE, data.get(keys.STATE)[..., list(columns)])

@@ -37,7 +37,7 @@ class StatePlanner(TensorDictModuleBase):
     ``noise_key``.
 
     Args:
-        denoiser (nn.Module): ``denoiser(sequence [*B, H, d], time [*B], condition [*B, h * d]) -> [*B, H, d]``.
+        denoiser (nn.Module): ``denoiser(sequence [*B, H, d], time [*B], condition [*B, h * d + f]) -> [*B, H, d]``.
         schedule (NoiseSchedule, optional): noise schedule and prediction type. Defaults to ``NoiseSchedule()``, the
             50 steps, squared cosine and noise prediction of KOAP's first public code.
 
@@ -46,6 +46,8 @@ class StatePlanner(TensorDictModuleBase):
         history (int): number ``h`` of observed frames, the current one included. Defaults to 2.
         horizon (int): number ``H`` of planned frames. Defaults to 14.
         relative (bool): model displacements from the current state. Defaults to True.
+        features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
+            further numbers that the condition holds, such as :class:`~torchrl_koap.relations.Relations`.
         solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
             flow path.
         num_steps (int): solver steps. Defaults to 10.
@@ -81,6 +83,7 @@ class StatePlanner(TensorDictModuleBase):
         history: int = 2,
         horizon: int = 14,
         relative: bool = True,
+        features: nn.Module | None = None,
         solver: str | None = None,
         num_steps: int = 10,
         clip: float | None = None,
@@ -100,7 +103,8 @@ class StatePlanner(TensorDictModuleBase):
         self.schedule = NoiseSchedule() if schedule is None else schedule
         self.state_dim, self.history, self.horizon, self.relative = state_dim, history, horizon, relative
         self.clip, self.noise_key = clip, noise_key
-        self.condition_normalizer = _identity(history * state_dim)
+        self.features = features
+        self.condition_normalizer = _identity(history * state_dim + (0 if features is None else features.num_features))
         self.plan_normalizer = _identity(horizon * state_dim)
         default = "heun" if self.schedule.path == "flow" else "dpm++2m"
         self.solver = default if solver is None else solver
@@ -150,7 +154,7 @@ class StatePlanner(TensorDictModuleBase):
             plan = plan.flatten(-2)
         else:
             plan = plan.reshape(-1, self.state_dim).repeat(1, self.horizon)
-        condition = self._displace(history).flatten(-2)
+        condition = self._condition(history)
         example = self.plan_normalizer.scale
         self.condition_normalizer = Normalizer.fit(condition, mode=mode).to(example)
         self.plan_normalizer = Normalizer.fit(plan, mode=mode).to(example)
@@ -166,13 +170,13 @@ class StatePlanner(TensorDictModuleBase):
         return window[..., : self.history, :], window[..., self.history :, :]
 
     def encode_history(self, history: Tensor) -> Tensor:
-        """Raw history ``[*B, h, d]`` to the denoiser's condition ``[*B, h * d]``."""
+        """Raw history ``[*B, h, d]`` to the denoiser's condition ``[*B, h * d + f]``."""
         if history.ndim < 2 or history.shape[-2:] != (self.history, self.state_dim):
             raise ValueError(
                 f"{self.in_keys[0]!r} must be [*B, {self.history}, {self.state_dim}] (history, state_dim),"
                 f" got {list(history.shape)}"
             )
-        return self.condition_normalizer(self._displace(history).flatten(-2))
+        return self.condition_normalizer(self._condition(history))
 
     def encode_plan(self, history: Tensor, plan: Tensor) -> Tensor:
         """Raw plan ``[*B, H, d]`` to the normalised sequence that noise is added to."""
@@ -226,6 +230,10 @@ class StatePlanner(TensorDictModuleBase):
         """Writes the plan into the tensordict."""
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
         return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
+
+    def _condition(self, history: Tensor) -> Tensor:
+        condition = self._displace(history).flatten(-2)
+        return condition if self.features is None else torch.cat([condition, self.features(history)], -1)
 
     def _displace(self, history: Tensor) -> Tensor:
         if not self.relative:

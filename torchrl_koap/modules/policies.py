@@ -70,6 +70,8 @@ class PlanThenControl(TensorDictModuleBase):
         replan_interval (int): steps per plan. Defaults to ``4``.
         joining (float): share of the distance to the plan that remains after each frame. Defaults to ``0.8``; ``0``
             leaves plans as they are.
+        controller_columns (sequence of int, optional): columns of the state that the controller reads: its mask.
+            Default: all.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -101,6 +103,7 @@ class PlanThenControl(TensorDictModuleBase):
         execution: str = "feedback",
         replan_interval: int = 4,
         joining: float = 0.8,
+        controller_columns: Sequence[int] | None = None,
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -113,6 +116,8 @@ class PlanThenControl(TensorDictModuleBase):
         if not 0 <= joining < 1:
             raise ValueError(f"joining must be in [0, 1), got {joining}")
         self.joining = joining
+        columns = None if controller_columns is None else torch.as_tensor(controller_columns)
+        self.register_buffer("controller_columns", columns, persistent=False)
         self.in_keys = [history_key, "is_init"]
         self.execution, self.history, self.replan_interval = execution, history, replan_interval
         if callable(state_columns):
@@ -156,6 +161,8 @@ class PlanThenControl(TensorDictModuleBase):
 
     def _actions(self, history: Tensor, plan: Tensor) -> Tensor:
         """Actions ``[*B, T, act]`` of the window made of history and plan."""
+        if self.controller_columns is not None:
+            history, plan = history[..., self.controller_columns], plan[..., self.controller_columns]
         window = torch.cat([history, join_plan(history, plan, self.joining)], -2)
         name = self.controller.in_keys[0]
         out = self.controller(TensorDict({name: window}, batch_size=window.shape[:-2]))
