@@ -23,7 +23,7 @@ class Relation:
 
     Args:
         place (slice): state columns of the position, 2 or 3 of them.
-        origin (slice): state columns of the position it is seen from.
+        origin (slice): state columns of the position it is seen from; where it has 2, the height is taken as it is.
         yaw (slice, optional): state columns ``cos, sin`` of the yaw of the frame it is seen in.
         other_yaw (slice, optional): ``cos, sin`` of a yaw to be told relative to that frame, too.
     """
@@ -72,8 +72,9 @@ class Relations(nn.Module):
         state = history[..., -1, :]
         parts = []
         for relation in self.relations:
-            size = _size(relation.place)
-            gap = state[..., relation.place] - state[..., relation.origin][..., :size]
+            place, origin = state[..., relation.place], state[..., relation.origin]
+            shared = min(place.shape[-1], origin.shape[-1])
+            gap = torch.cat([place[..., :shared] - origin[..., :shared], place[..., shared:]], -1)
             if relation.yaw is not None:
                 frame = state[..., relation.yaw]
                 gap = torch.cat([_turn_back(gap[..., :2], frame), gap[..., 2:]], -1)

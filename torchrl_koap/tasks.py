@@ -244,10 +244,7 @@ _stacking = Task(
     entropy="solved_contexts",
     relations=(
         *(("tcp_position", f"{box}_position") for box in _STACKING_BOXES),
-        *(
-            (f"{box}_position", f"{other}_position")
-            for box, other in (("red", "green"), ("red", "blue"), ("green", "blue"))
-        ),
+        *((f"{box}_position", f"{other}_position") for box, other in combinations(_STACKING_BOXES, 2)),
     ),
     recovery_sigma=0.0,  # joints and tool would have to move together
 )
