@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_koap.checkpoints import save_tensors
 from torchrl_koap.closed_form import fit_closed_form
-from torchrl_koap.data import cut_windows, select_columns
+from torchrl_koap.data import controller_view, cut_windows
 from torchrl_koap.modules import LinearInverseDynamics
 from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import Task
@@ -73,8 +73,8 @@ def write_analysis(
     ``columns`` are the state columns that the controller reads. Writes ``actions.safetensors`` and
     ``demonstrations.safetensors`` for the report.
     """
-    labelled = select_columns(labelled.cpu(), columns)
-    viewed = select_columns(data, columns)
+    labelled = controller_view(labelled.cpu(), columns, task.levels)
+    viewed = controller_view(data, columns, task.levels)
     predicted, true = hidden_action_errors(controller, viewed, labelled)
     has_action = labelled["has_action"].squeeze(-1)
     shown = {"state": data["state"], "episode": data["episode"], "labelled": has_action}

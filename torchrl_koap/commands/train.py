@@ -25,10 +25,10 @@ from torchrl_koap.data import (
     LabelBudget,
     RecoveryAugmentation,
     WindowTable,
+    controller_view,
     cut_windows,
     extrapolate_ends,
     make_window_buffer,
-    select_columns,
 )
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS, KoopmanInverseDynamics, StatePlanner
@@ -92,7 +92,7 @@ def run_train(options: Train) -> dict[str, Any]:
         trained, planner_values = _train_planner(run, options, config, task, labelled, logger)
         planned = time.perf_counter()
         torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
-        view = select_columns(labelled, columns)
+        view = controller_view(labelled, columns, task.levels)
         controller, fit, controller_values = _train_controller(run, options, config, task, view, logger)
     finally:
         if logger is not None:

@@ -10,7 +10,7 @@ from torchrl_koap.data.normalizers import Normalizer
 from torchrl_koap.data.raw import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
 from torchrl_koap.data.saving import replacing_file, replacing_folder
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
-from torchrl_koap.data.trajectories import flatten_trajectories, select_columns, select_state, trajectory_lengths
+from torchrl_koap.data.trajectories import controller_view, flatten_trajectories, select_state, trajectory_lengths
 from torchrl_koap.data.unpickling import DamagedPickleError, UnsafePickleError, load_pickle, loads_pickle
 from torchrl_koap.data.window_buffer import cut_windows, make_window_buffer
 from torchrl_koap.data.window_table import WindowTable
@@ -34,6 +34,7 @@ __all__ = [
     "WindowSamplerWithoutReplacement",
     "WindowTable",
     "WindowUnit",
+    "controller_view",
     "convert_raw_files",
     "cut_windows",
     "extrapolate_ends",
@@ -50,7 +51,6 @@ __all__ = [
     "replacing_file",
     "replacing_folder",
     "save_ted",
-    "select_columns",
     "select_state",
     "trajectory_lengths",
     "write_raw_episode",

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -72,6 +72,8 @@ class PlanThenControl(TensorDictModuleBase):
             leaves plans as they are.
         controller_columns (sequence of int, optional): columns of the state that the controller reads: its mask.
             Default: all.
+        levels (mapping, optional): action entries that command the level of a state column, entry to column: the
+            controller's change is added to the present level (:func:`~torchrl_koap.data.controller_view`).
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -104,6 +106,7 @@ class PlanThenControl(TensorDictModuleBase):
         replan_interval: int = 4,
         joining: float = 0.8,
         controller_columns: Sequence[int] | None = None,
+        levels: Mapping[int, int] | None = None,
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -118,6 +121,7 @@ class PlanThenControl(TensorDictModuleBase):
         self.joining = joining
         columns = None if controller_columns is None else torch.as_tensor(controller_columns)
         self.register_buffer("controller_columns", columns, persistent=False)
+        self.levels = dict(levels or {})
         self.in_keys = [history_key, "is_init"]
         self.execution, self.history, self.replan_interval = execution, history, replan_interval
         if callable(state_columns):
@@ -161,12 +165,16 @@ class PlanThenControl(TensorDictModuleBase):
 
     def _actions(self, history: Tensor, plan: Tensor) -> Tensor:
         """Actions ``[*B, T, act]`` of the window made of history and plan."""
+        present = torch.cat([history, plan], -2)
         if self.controller_columns is not None:
             history, plan = history[..., self.controller_columns], plan[..., self.controller_columns]
         window = torch.cat([history, join_plan(history, plan, self.joining)], -2)
         name = self.controller.in_keys[0]
         out = self.controller(TensorDict({name: window}, batch_size=window.shape[:-2]))
-        return out.get(self.controller.out_keys[-1])
+        action = out.get(self.controller.out_keys[-1])
+        for entry, column in self.levels.items():
+            action[..., entry] = action[..., entry] + present[..., column]
+        return action
 
     def _remaining_plans(self, history: Tensor, plan: Tensor) -> Tensor:
         """What is left of the plan after 0, 1, ... steps, its last state repeated: ``[*B, interval, H, d]``."""
