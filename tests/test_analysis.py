@@ -120,7 +120,7 @@ def test_a_linear_world_is_predicted_by_the_ridge_and_written_down(tmp_path):
 def test_tool_and_objects_of_demonstrations_are_kept_for_pictures(tmp_path):
     task = get_task("stacking")
     frames = torch.arange(40 * task.observation_dim).float().reshape(40, -1)
-    data = select_state(flatten_trajectories([frames[:20], frames[20:]], [torch.zeros(19, 8)] * 2), range(3))
+    data = select_state(flatten_trajectories([frames[:20], frames[20:]], [torch.zeros(19, 8)] * 2), task.state_of)
     labelled, _ = LabelBudget(1.0).apply(data)
     write_analysis(RunDirectory(tmp_path), task, data, labelled, Copy(1), (0, 1))
     shown, _ = load_tensors(tmp_path / "demonstrations.safetensors")
