@@ -73,8 +73,8 @@ def write_analysis(
     ``columns`` are the state columns that the controller reads. Writes ``actions.safetensors`` and
     ``demonstrations.safetensors`` for the report.
     """
-    labelled = controller_view(labelled.cpu(), columns, task.levels)
-    viewed = controller_view(data, columns, task.levels)
+    labelled = controller_view(labelled.cpu(), columns)
+    viewed = controller_view(data, columns)
     predicted, true = hidden_action_errors(controller, viewed, labelled)
     has_action = labelled["has_action"].squeeze(-1)
     shown = {"state": data["state"], "episode": data["episode"], "labelled": has_action}

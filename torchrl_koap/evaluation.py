@@ -6,7 +6,7 @@ from __future__ import annotations
 import itertools
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -38,7 +38,7 @@ def make_policy(
     replan_interval: int = 4,
     joining: float = 0.8,
     controller_columns: Sequence[int] | None = None,
-    levels: Mapping[int, int] | None = None,
+    gripper: tuple[int, int] | None = None,
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two."""
     return PlanThenControl(
@@ -50,7 +50,7 @@ def make_policy(
         replan_interval=replan_interval,
         joining=joining,
         controller_columns=controller_columns,
-        levels=levels,
+        gripper=gripper,
     )
 
 

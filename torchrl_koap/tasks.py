@@ -58,8 +58,8 @@ class Task:
         demonstrations (int): number of scripted demonstrations to record by default.
         planner_steps (int): planner updates by default.
         relative (bool): plans are displacements from the present state by default.
-        levels (dict): for action entries that command the *level* of a state column (not its change): entry to state
-            column. A controller decodes them as change from the present level.
+        gripper (tuple of int, optional): action entry of the gripper and state column of its width: its number is read
+            off the planned widths (:mod:`torchrl_koap.gripper`), not decoded.
         relations (tuple): what the planner is told besides the state: ``(part, seen from part, in the frame of part,
             yaw of part)``, the last two optional (:mod:`torchrl_koap.relations`).
     """
@@ -88,7 +88,7 @@ class Task:
     demonstrations: int = 200
     planner_steps: int = 12000
     relative: bool = True
-    levels: dict[int, int] = field(default_factory=dict)
+    gripper: tuple[int, int] | None = None
     relations: tuple[tuple[str, ...], ...] = ()
 
     @property
@@ -235,7 +235,7 @@ _stacking = Task(
     control_hz=1 / 0.03,
     num_modes=6,
     robot=tuple(range(8)),
-    levels={7: 7},
+    gripper=(7, 7),
     state={"measured_joints": "plain", "gripper_width": "plain", "tcp_position": "plain"}
     | {
         name: kind

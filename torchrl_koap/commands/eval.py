@@ -136,7 +136,7 @@ def run_eval(options: Eval) -> dict[str, Any]:
         replan_interval=options.replan_interval,
         joining=options.joining,
         controller_columns=columns_of(run, task),
-        levels=task.levels,
+        gripper=task.gripper,
     ).to(options.device)
     seeds = list(range(options.seed, options.seed + options.episodes))
     numbers, contexts = choose_contexts(task, options)

@@ -72,7 +72,7 @@ def run_inspect(options: Inspect) -> dict[str, Any]:
         "replan_interval": options.replan_interval,
         "joining": options.joining,
         "controller_columns": columns_of(run, task),
-        "levels": task.levels,
+        "gripper": task.gripper,
     }
     seeds = list(range(options.seed, options.seed + options.episodes))
     dataset = options.dataset or run.read_entry("config.json", "dataset")

@@ -92,7 +92,7 @@ def run_train(options: Train) -> dict[str, Any]:
         trained, planner_values = _train_planner(run, options, config, task, labelled, logger)
         planned = time.perf_counter()
         torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
-        view = controller_view(labelled, columns, task.levels)
+        view = controller_view(labelled, columns)
         controller, fit, controller_values = _train_controller(run, options, config, task, view, logger)
     finally:
         if logger is not None:

@@ -19,6 +19,7 @@ from tensordict import TensorDictBase
 from torchrl_koap.data.raw import RawEpisode, RawEpisodeError, read_raw_episode
 from torchrl_koap.data.trajectories import flatten_trajectories
 from torchrl_koap.data.unpickling import load_pickle
+from torchrl_koap.gripper import gripper_number
 from torchrl_koap.tasks import get_task
 
 SPLITS = ("train", "eval")
@@ -37,10 +38,6 @@ OBJECTS = {
     "sorting_6": _SORTING_OBJECTS[6],
     "stacking": ("red-box", "green-box", "blue-box"),
 }
-
-
-_OPEN_ABOVE = 0.075  # m; greater gripper numbers open
-_OPENING = 5  # control steps that the fingers need to open
 
 
 @dataclass(frozen=True)
@@ -104,20 +101,9 @@ def _stacking(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
         position, quat = _pose(episode, name)
         columns += [position, _tan_yaw(quat)]
     columns += [_robot(episode, "j_pos"), width, _robot(episode, "c_pos")]
-    actions = np.concatenate([np.diff(desired, axis=0), _gripper_number(width)], axis=1)
+    number = gripper_number(torch.from_numpy(width[:, 0])).numpy()[:, None]
+    actions = np.concatenate([np.diff(desired, axis=0), number], axis=1)
     return np.concatenate(columns, axis=1), actions
-
-
-def _gripper_number(width: np.ndarray) -> np.ndarray:
-    """The gripper's action from widths ``[T, 1]``: the width it is about to have, and 0.08 m all the time it opens.
-
-    D3IL takes the next width throughout. While the fingers open it passes through numbers that mean "close" when sent
-    (up to 0.075 m), and a policy that sends them never opens.
-    """
-    later = np.concatenate([width[1:], np.repeat(width[-1:], _OPENING, axis=0)])
-    soon = np.max([later[shift : shift + len(width) - 1] for shift in range(_OPENING)], axis=0)
-    opening = (width[1:] > width[:-1] + 1e-4) & (soon > _OPEN_ABOVE)
-    return np.where(opening | (width[1:] > _OPEN_ABOVE), np.maximum(width[1:], 0.08), width[1:])
 
 
 CONVERTERS = {

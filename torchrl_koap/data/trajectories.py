@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -121,26 +121,18 @@ def select_state(
     return data.copy().set(keys.STATE, data.get(keys.OBSERVATION)[..., columns])
 
 
-def controller_view(data: TensorDictBase, columns: Sequence[int], levels: Mapping[int, int] | None = None):
+def controller_view(data: TensorDictBase, columns: Sequence[int]) -> TensorDictBase:
     """The same data as a controller with a mask sees them.
 
     Args:
-        data (TensorDictBase): flat data ``[N]`` with ``state`` and ``action``; not changed.
+        data (TensorDictBase): flat data ``[N]`` with ``state``; not changed.
         columns (sequence of int): columns of the state to keep.
-        levels (mapping, optional): action entries that command the level of a state column: entry to column (of the
-            whole state). They become changes from the present level, as all others are.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.data import controller_view
-        >>> data = TensorDict({"state": torch.tensor([[1.0, 2.0, 3.0]]), "action": torch.tensor([[0.5, 3.5]])}, [1])
-        >>> view = controller_view(data, (0, 2), levels={1: 2})
-        >>> view["state"], view["action"]
-        (tensor([[1., 3.]]), tensor([[0.5000, 0.5000]]))
+        >>> controller_view(TensorDict({"state": torch.tensor([[1.0, 2.0, 3.0]])}, [1]), (0, 2))["state"]
+        tensor([[1., 3.]])
     """
-    state = data.get(keys.STATE)
-    action = data.get(keys.ACTION).clone()
-    for entry, column in (levels or {}).items():
-        action[..., entry] -= state[..., column]
-    return data.copy().set(keys.STATE, state[..., list(columns)]).set(keys.ACTION, action)
+    return data.copy().set(keys.STATE, data.get(keys.STATE)[..., list(columns)])

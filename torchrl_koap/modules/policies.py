@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs.transforms import CatFrames, Compose, InitTracker, UnsqueezeTransform
 from torchrl.modules import MultiStepActorWrapper
 
+from torchrl_koap.gripper import gripper_number
 from torchrl_koap.keys import ACTION, OBSERVATION, PLAN
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.planner import StatePlanner
@@ -72,8 +73,8 @@ class PlanThenControl(TensorDictModuleBase):
             leaves plans as they are.
         controller_columns (sequence of int, optional): columns of the state that the controller reads: its mask.
             Default: all.
-        levels (mapping, optional): action entries that command the level of a state column, entry to column: the
-            controller's change is added to the present level (:func:`~torchrl_koap.data.controller_view`).
+        gripper (tuple of int, optional): action entry and state column of a gripper whose number is read off the planned
+            widths (:mod:`torchrl_koap.gripper`).
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -106,7 +107,7 @@ class PlanThenControl(TensorDictModuleBase):
         replan_interval: int = 4,
         joining: float = 0.8,
         controller_columns: Sequence[int] | None = None,
-        levels: Mapping[int, int] | None = None,
+        gripper: tuple[int, int] | None = None,
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -121,7 +122,7 @@ class PlanThenControl(TensorDictModuleBase):
         self.joining = joining
         columns = None if controller_columns is None else torch.as_tensor(controller_columns)
         self.register_buffer("controller_columns", columns, persistent=False)
-        self.levels = dict(levels or {})
+        self.gripper = gripper
         self.in_keys = [history_key, "is_init"]
         self.execution, self.history, self.replan_interval = execution, history, replan_interval
         if callable(state_columns):
@@ -165,15 +166,15 @@ class PlanThenControl(TensorDictModuleBase):
 
     def _actions(self, history: Tensor, plan: Tensor) -> Tensor:
         """Actions ``[*B, T, act]`` of the window made of history and plan."""
-        present = torch.cat([history, plan], -2)
+        widths = None if self.gripper is None else torch.cat([history, plan], -2)[..., self.gripper[1]]
         if self.controller_columns is not None:
             history, plan = history[..., self.controller_columns], plan[..., self.controller_columns]
         window = torch.cat([history, join_plan(history, plan, self.joining)], -2)
         name = self.controller.in_keys[0]
         out = self.controller(TensorDict({name: window}, batch_size=window.shape[:-2]))
         action = out.get(self.controller.out_keys[-1])
-        for entry, column in self.levels.items():
-            action[..., entry] = action[..., entry] + present[..., column]
+        if widths is not None:
+            action[..., :-1, self.gripper[0]] = gripper_number(widths)
         return action
 
     def _remaining_plans(self, history: Tensor, plan: Tensor) -> Tensor:
