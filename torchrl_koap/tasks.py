@@ -60,6 +60,9 @@ class Task:
         relative (bool): plans are displacements from the present state by default.
         gripper (tuple of int, optional): action entry of the gripper and state column of its width: its number is read
             off the planned widths (:mod:`torchrl_koap.gripper`), not decoded.
+        scene (tuple): parts whose positions and yaws may be moved and turned together for training, empty if the place
+            on the table matters.
+        alike (tuple): groups of objects that may be exchanged for training.
         relations (tuple): what the planner is told besides the state: ``(part, seen from part, in the frame of part,
             yaw of part)``, the last two optional (:mod:`torchrl_koap.relations`).
     """
@@ -90,6 +93,8 @@ class Task:
     relative: bool = True
     gripper: tuple[int, int] | None = None
     relations: tuple[tuple[str, ...], ...] = ()
+    scene: tuple[str, ...] = ()
+    alike: tuple[tuple[str, ...], ...] = ()
 
     @property
     def observation_dim(self) -> int:
@@ -154,6 +159,30 @@ class Task:
         """Name of the task whose demonstrations are used."""
         return self.data or self.name
 
+    def alike_columns(self) -> list[list[list[int]]]:
+        """State columns of the objects that may be exchanged, by group and object."""
+        columns = self.state_slices
+        return [
+            [
+                [
+                    column
+                    for part, place in columns.items()
+                    if part.startswith(f"{name}_")
+                    for column in range(place.start, place.stop)
+                ]
+                for name in group
+            ]
+            for group in self.alike
+            if len(group) > 1
+        ]
+
+    def scene_columns(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """State columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` that move together."""
+        columns = self.state_slices
+        pairs = {name: (columns[name].start, columns[name].start + 1) for name in self.scene}
+        yaws = [name for name in self.scene if name.endswith(("_quaternion", "_yaw"))]
+        return [pair for name, pair in pairs.items() if name not in yaws], [pairs[name] for name in yaws]
+
     def planner_features(self) -> Relations | None:
         """The task's relations as a module, None if it has none."""
         if not self.relations:
@@ -215,6 +244,7 @@ def _sorting(num_boxes: int, num_modes: int) -> Task:
         drawn={box: f"{box}_xy" for box in boxes},
         entropy="solved_contexts",
         relations=tuple(("measured_xy", f"{box}_xy") for box in boxes),
+        alike=(tuple(boxes[: num_boxes // 2]), tuple(boxes[num_boxes // 2 :])),
     )
 
 
@@ -246,6 +276,7 @@ _stacking = Task(
     drawn={box: f"{box}_position" for box in _STACKING_BOXES},
     action_unit="rad",
     entropy="solved_contexts",
+    alike=(("red", "green"),),
     relations=(
         *(("tcp_position", f"{box}_position") for box in _STACKING_BOXES),
         *((f"{box}_position", f"{other}_position") for box, other in combinations(_STACKING_BOXES, 2)),
@@ -298,6 +329,7 @@ _tasks = (
         objects=("box", "target"),
         drawn={"box": "box_position", "target": "target_position"},
         entropy="contexts",
+        scene=("measured_xyz", "box_position", "box_quaternion", "target_position", "target_quaternion"),
         relations=(
             ("measured_xyz", "box_position", "box_quaternion"),
             ("target_position", "box_position", "box_quaternion", "target_quaternion"),

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
@@ -22,8 +23,10 @@ from torchrl_koap.checkpoints import load_weights, save_tensors, save_weights
 from torchrl_koap.closed_form import fit_closed_form
 from torchrl_koap.commands.train_options import Train, configure, started_with, with_task_defaults
 from torchrl_koap.data import (
+    ExchangeAugmentation,
     LabelBudget,
     RecoveryAugmentation,
+    SceneAugmentation,
     WindowTable,
     controller_view,
     cut_windows,
@@ -145,7 +148,7 @@ def _train_planner(
     planner.fit_normalizers(cut_windows(extended, WINDOW, select=["state"], pad_before=1)["state"])
     planner.to(options.device)
     buffer = make_window_buffer(extended, WINDOW, options.batch_size, select=["state"], pad_before=1)
-    augment = RecoveryAugmentation(options.recovery_sigma, history=HISTORY, columns=task.robot)
+    augment = _augmentation(options, task)
     loss = PlannerLoss(planner)
     with _bar(options.steps, "planner") as bar:
         values = train(
@@ -165,6 +168,18 @@ def _train_planner(
     loss.target_planner_params.to_module(planner)
     save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
     return planner, values
+
+
+def _augmentation(options: Train, task: Task) -> TensorDictSequential:
+    """What windows undergo before the planner learns from them."""
+    steps = []
+    if options.exchange and task.alike_columns():
+        steps.append(ExchangeAugmentation(task.alike_columns()))
+    if task.scene and (options.scene_shift or options.scene_turn):
+        shift, turn = options.scene_shift, options.scene_turn
+        steps.append(SceneAugmentation(*task.scene_columns(), shift=shift, turn=turn, history=HISTORY))
+    steps.append(RecoveryAugmentation(options.recovery_sigma, history=HISTORY, columns=task.robot))
+    return TensorDictSequential(*steps)
 
 
 def _train_controller(

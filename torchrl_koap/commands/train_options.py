@@ -43,6 +43,9 @@ class Train:
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
+        scene_shift: typical displacement (m) of whole scenes, for tasks whose place on the table does not matter.
+        scene_turn: typical angle (rad) by which such scenes are turned.
+        exchange: exchange objects that are alike.
         solver: solver used at evaluation unless told otherwise.
         solver_steps: its number of steps.
         planner_from: run directory whose planner is taken over instead of training one.
@@ -79,6 +82,9 @@ class Train:
     relations: bool = True
     controller_state: str = "robot"
     recovery_sigma: float | None = None
+    scene_shift: float = 0.05
+    scene_turn: float = 0.3
+    exchange: bool = True
     solver: str = "dpm++2m"
     solver_steps: int = 10
     planner_from: Path | None = None

@@ -1,7 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Demonstrations: reading, storing, hiding labels, normalising, cutting into windows."""
 
-from torchrl_koap.data.augmentation import RecoveryAugmentation, extrapolate_ends
+from torchrl_koap.data.augmentation import (
+    ExchangeAugmentation,
+    RecoveryAugmentation,
+    SceneAugmentation,
+    extrapolate_ends,
+)
 from torchrl_koap.data.conversion import CONVERTERS, Converter, RawFolderError, convert_raw_files, find_raw_files
 from torchrl_koap.data.d3il import D3ILExperienceReplay
 from torchrl_koap.data.labels import LabelBudget, LabelReport, hide_commands
@@ -22,6 +27,7 @@ __all__ = [
     "D3ILExperienceReplay",
     "DamagedDataError",
     "DamagedPickleError",
+    "ExchangeAugmentation",
     "LabelBudget",
     "LabelReport",
     "Normalizer",
@@ -29,6 +35,7 @@ __all__ = [
     "RawEpisodeError",
     "RawFolderError",
     "RecoveryAugmentation",
+    "SceneAugmentation",
     "UnsafePickleError",
     "WindowSampler",
     "WindowSamplerWithoutReplacement",

@@ -73,8 +73,8 @@ class PlanThenControl(TensorDictModuleBase):
             leaves plans as they are.
         controller_columns (sequence of int, optional): columns of the state that the controller reads: its mask.
             Default: all.
-        gripper (tuple of int, optional): action entry and state column of a gripper whose number is read off the planned
-            widths (:mod:`torchrl_koap.gripper`).
+        gripper (tuple of int, optional): action entry and state column of a gripper whose number is read off the
+            planned widths (:mod:`torchrl_koap.gripper`).
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
