@@ -147,7 +147,8 @@ class ExchangeAugmentation(TensorDictModuleBase):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.data import ExchangeAugmentation
-        >>> td = ExchangeAugmentation([[(0, 1), (2, 3)]])(TensorDict({"state": torch.arange(4.0).expand(99, 5, 4)}, [99]))
+        >>> windows = TensorDict({"state": torch.arange(4.0).expand(99, 5, 4)}, [99])
+        >>> td = ExchangeAugmentation([[(0, 1), (2, 3)]])(windows)
         >>> sorted(set(td["state"][:, 0, 0].tolist()))
         [0.0, 2.0]
     """
