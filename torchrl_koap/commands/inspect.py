@@ -25,6 +25,7 @@ from torchrl_koap.diagnosis import (
 )
 from torchrl_koap.evaluation import make_policy, roll_out
 from torchrl_koap.inspection_plot import plot_inspection
+from torchrl_koap.pictures import FOLDER
 from torchrl_koap.run_directory import RunDirectory
 
 
@@ -102,7 +103,7 @@ def run_inspect(options: Inspect) -> dict[str, Any]:
     }
     result["verdict"] = verdict(result)
     run.write_json("inspect.json", result)
-    plot_inspection(result, task, run.path / "pictures" / "inspect.png")
+    plot_inspection(result, task, run.path / FOLDER / "inspect.png")
     return result
 
 
