@@ -98,9 +98,8 @@ def main() -> None:
             print(f"| {task} | {level} | {method} | {row(runs)} | {mean:.2f} | {paper or ''} | {seconds} |", flush=True)
             for count in (1, 2) if task == "stacking" else ():
                 known = PAPER["stacking_1"][LEVELS.index(level)] if count == 1 else ""
-                print(
-                    f"| {task}, {count} of 3 boxes | {level} | {method} | {row(runs, f'stacked_{count}')} | | {known} | |"
-                )
+                boxes = row(runs, f"stacked_{count}")
+                print(f"| {task}, {count} of 3 boxes | {level} | {method} | {boxes} | | {known} | |")
 
 
 if __name__ == "__main__":

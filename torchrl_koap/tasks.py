@@ -57,6 +57,7 @@ class Task:
         data (str): name of the task whose demonstrations are used, if another one.
         demonstrations (int): number of scripted demonstrations to record by default.
         planner_steps (int): planner updates by default.
+        channels (tuple of int): widths of the planner's U-Net by default.
         relative (bool): plans are displacements from the present state by default.
         gripper (tuple of int, optional): action entry of the gripper and state column of its width: its number is read
             off the planned widths (:mod:`torchrl_koap.gripper`), not decoded.
@@ -90,6 +91,7 @@ class Task:
     data: str = ""
     demonstrations: int = 200
     planner_steps: int = 12000
+    channels: tuple[int, ...] = (64, 128)
     relative: bool = True
     gripper: tuple[int, int] | None = None
     relations: tuple[tuple[str, ...], ...] = ()
@@ -299,6 +301,7 @@ _tasks = (
         collides=True,
         demonstrations=96,
         planner_steps=5000,
+        channels=(32, 64),
         relative=False,
     ),
     Task(

@@ -36,7 +36,7 @@ class Train:
         planner_learning_rate: peak learning rate of the planner.
         controller_learning_rate: peak learning rate of the controller.
         denoiser: "unet", "mlp", "transformer" or "released" (11.9 M parameters).
-        channels: widths of the U-Net's levels.
+        channels: widths of the U-Net's levels (default: the task's).
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
         relative: plan displacements from the current state instead of states (default: the task's).
@@ -75,7 +75,7 @@ class Train:
     planner_learning_rate: float = 3e-3
     controller_learning_rate: float = 1e-3
     denoiser: str = "unet"
-    channels: tuple[int, ...] = (32, 64)
+    channels: tuple[int, ...] | None = None
     schedule: str = "squared_cosine"
     prediction: str = "sample"
     relative: bool | None = None
@@ -108,7 +108,7 @@ def started_with(run: RunDirectory, options: Train) -> Train:
     earlier = run.read_json("config.json")
     left = [field.name for field in fields(options) if getattr(options, field.name) == field.default]
     kept = {name: earlier[name] for name in left if name in earlier}
-    if "channels" in kept:
+    if kept.get("channels") is not None:
         kept["channels"] = tuple(kept["channels"])
     if kept.get("planner_from") is not None:
         kept["planner_from"] = Path(kept["planner_from"])
@@ -122,6 +122,7 @@ def with_task_defaults(options: Train, task: Task) -> Train:
         "recovery_sigma": task.recovery_sigma,
         "episodes": task.demonstrations,
         "relative": task.relative,
+        "channels": task.channels,
     }
     left = {name: value for name, value in defaults.items() if getattr(options, name) is None}
     return replace(options, **left)
