@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_koap.gripper import OPEN_ABOVE, gripper_number
+from torchrl_koap.gripper import OPEN_ABOVE, PLANNED_OPEN_ABOVE, gripper_number
 
 OPENS = torch.tensor([0.0007, 0.029, 0.056, 0.069, 0.0749, 0.078, 0.08, 0.08])
 
@@ -37,3 +37,11 @@ def test_any_number_of_batch_dimensions_and_dtypes():
     found = gripper_number(batch)
     assert found.shape == (2, 3, 7) and found.dtype == torch.float64
     assert torch.equal(found[1, 2], gripper_number(OPENS.double()))
+
+
+def test_a_planned_opening_that_falls_short_by_millimetres_still_opens():
+    planned = torch.tensor([0.0685, 0.072, 0.0745, 0.0745, 0.0745, 0.0745])
+    assert (gripper_number(planned)[1:] <= OPEN_ABOVE).all()
+    assert (gripper_number(planned, open_above=PLANNED_OPEN_ABOVE) > OPEN_ABOVE).all()
+    held = torch.full((6,), 0.062)
+    assert (gripper_number(held, open_above=PLANNED_OPEN_ABOVE) <= OPEN_ABOVE).all()

@@ -12,16 +12,20 @@ import torch
 from torch import Tensor
 
 OPEN_ABOVE = 0.075  # m; greater numbers open
+PLANNED_OPEN_ABOVE = 0.07  # m; half way from a box held to fingers open: plans err by some millimetres
 OPEN = 0.08
 OPENING = 5  # control steps that the fingers need to open
 _MOVES = 1e-4
 
 
-def gripper_number(width: Tensor) -> Tensor:
+def gripper_number(width: Tensor, *, open_above: float = OPEN_ABOVE) -> Tensor:
     """Numbers for all steps but the last of a sequence of widths.
 
     Args:
         width (Tensor): ``[*B, T]`` (m).
+
+    Keyword Args:
+        open_above (float): widths above it count as open (m).
 
     Returns:
         Tensor: ``[*B, T - 1]`` (m): above 0.075 opens, anything else closes.
@@ -35,5 +39,5 @@ def gripper_number(width: Tensor) -> Tensor:
     now, following = width[..., :-1], width[..., 1:]
     padded = torch.cat([following, width[..., -1:].expand(*width.shape[:-1], OPENING - 1)], -1)
     soon = padded.unfold(-1, OPENING, 1).amax(-1)
-    opening = (following > now + _MOVES) & (soon > OPEN_ABOVE)
-    return torch.where(opening | (following > OPEN_ABOVE), following.clamp_min(OPEN), following)
+    opening = (following > now + _MOVES) & (soon > open_above)
+    return torch.where(opening | (following > open_above), following.clamp_min(OPEN), following)

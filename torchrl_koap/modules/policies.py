@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs.transforms import CatFrames, Compose, InitTracker, UnsqueezeTransform
 from torchrl.modules import MultiStepActorWrapper
 
-from torchrl_koap.gripper import gripper_number
+from torchrl_koap.gripper import PLANNED_OPEN_ABOVE, gripper_number
 from torchrl_koap.keys import ACTION, OBSERVATION, PLAN
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.planner import StatePlanner
@@ -174,7 +174,7 @@ class PlanThenControl(TensorDictModuleBase):
         out = self.controller(TensorDict({name: window}, batch_size=window.shape[:-2]))
         action = out.get(self.controller.out_keys[-1])
         if widths is not None:
-            action[..., :-1, self.gripper[0]] = gripper_number(widths)
+            action[..., :-1, self.gripper[0]] = gripper_number(widths, open_above=PLANNED_OPEN_ABOVE)
         return action
 
     def _remaining_plans(self, history: Tensor, plan: Tensor) -> Tensor:
