@@ -157,6 +157,14 @@ class Task:
         return lookup({"robot": self.robot or everything, "all": everything}, part, "part of the state")
 
     @property
+    def tool_columns(self) -> tuple[int, ...] | None:
+        """State columns of a tool position that follows the arm's joints, None where the tool itself is commanded."""
+        if self.action_unit != "rad":
+            return None
+        part = self.state_slices[self.position]
+        return tuple(range(part.start, part.stop))
+
+    @property
     def source(self) -> str:
         """Name of the task whose demonstrations are used."""
         return self.data or self.name
@@ -283,7 +291,7 @@ _stacking = Task(
         *(("tcp_position", f"{box}_position") for box in _STACKING_BOXES),
         *((f"{box}_position", f"{other}_position") for box, other in combinations(_STACKING_BOXES, 2)),
     ),
-    recovery_sigma=0.0,  # joints and tool would have to move together
+    recovery_sigma=0.02,
 )
 
 _tasks = (

@@ -178,7 +178,9 @@ def _augmentation(options: Train, task: Task) -> TensorDictSequential:
     if task.scene and (options.scene_shift or options.scene_turn):
         shift, turn = options.scene_shift, options.scene_turn
         steps.append(SceneAugmentation(*task.scene_columns(), shift=shift, turn=turn, history=HISTORY))
-    steps.append(RecoveryAugmentation(options.recovery_sigma, history=HISTORY, columns=task.robot))
+    arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
+    sigma = options.recovery_sigma
+    steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, tool=task.tool_columns))
     return TensorDictSequential(*steps)
 
 

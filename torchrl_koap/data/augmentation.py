@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.keys import EPISODE, STATE
+from torchrl_koap.panda_kinematics import tool_position
 
 
 class RecoveryAugmentation(TensorDictModuleBase):
@@ -30,6 +31,8 @@ class RecoveryAugmentation(TensorDictModuleBase):
         history (int): observed frames of the window. Defaults to ``2``.
         decay (float): share ``rho`` of the shift that remains after each planned frame. Defaults to ``0.7``.
         columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
+        tool (sequence of int, optional): state columns of the tool's position; they follow the arm's seven joints, which
+            are then ``columns`` (:func:`~torchrl_koap.panda_kinematics.tool_position`).
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
 
     Examples:
@@ -48,14 +51,18 @@ class RecoveryAugmentation(TensorDictModuleBase):
         history: int = 2,
         decay: float = 0.7,
         columns: Sequence[int] | None = None,
+        tool: Sequence[int] | None = None,
         key: NestedKey = STATE,
     ):
         super().__init__()
+        if tool is not None and (columns is None or len(columns) != 7):
+            raise ValueError(f"a tool follows the arm's seven joints, got columns {columns}")
         if sigma < 0 or not 0 <= decay < 1:
             raise ValueError(f"sigma must be >= 0 and decay in [0, 1), got {sigma} and {decay}")
         self.in_keys, self.out_keys = [key], [key]
         self.sigma, self.history, self.decay = sigma, history, decay
         self.columns = None if columns is None else list(columns)
+        self.tool = None if tool is None else list(tool)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by shifted ones."""
@@ -68,7 +75,11 @@ class RecoveryAugmentation(TensorDictModuleBase):
             shift = shift * keep
         frames = torch.arange(state.shape[-2], device=state.device) - (self.history - 1)
         remaining = self.decay ** frames.clamp_min(0).to(state.dtype)
-        return tensordict.set(self.in_keys[0], state + 2 * self.sigma * size * shift * remaining[:, None])
+        shifted = state + 2 * self.sigma * size * shift * remaining[:, None]
+        if self.tool is not None and self.sigma:
+            moved = tool_position(shifted[..., self.columns]) - tool_position(state[..., self.columns])
+            shifted[..., self.tool] = shifted[..., self.tool] + moved
+        return tensordict.set(self.in_keys[0], shifted)
 
 
 class SceneAugmentation(TensorDictModuleBase):
