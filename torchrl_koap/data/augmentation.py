@@ -31,8 +31,8 @@ class RecoveryAugmentation(TensorDictModuleBase):
         history (int): observed frames of the window. Defaults to ``2``.
         decay (float): share ``rho`` of the shift that remains after each planned frame. Defaults to ``0.7``.
         columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
-        tool (sequence of int, optional): state columns of the tool's position; they follow the arm's seven joints, which
-            are then ``columns`` (:func:`~torchrl_koap.panda_kinematics.tool_position`).
+        tool (sequence of int, optional): state columns of the tool's position; they follow the arm's seven joints,
+            which are then ``columns`` (:func:`~torchrl_koap.panda_kinematics.tool_position`).
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
 
     Examples:
