@@ -1,0 +1,54 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""First attempts of the scripted experts on the 60 evaluation contexts: how many end as the mode asked for.
+
+    python benchmarks/expert_success.py --tasks aligning sorting sorting_2 sorting_6 stacking
+
+Modes are taken in turn. An attempt counts only if the task's environment reports success, in the mode asked for, within
+the step limit; nothing is repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+
+import numpy as np
+import torch
+
+from torchrl_koap.envs.contexts import evaluation_contexts
+from torchrl_koap.metrics import wilson_interval
+from torchrl_koap.recording import RECIPES, play
+
+
+def main() -> None:
+    """Prints a row per task."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--tasks", nargs="+", default=["aligning", "sorting", "sorting_2", "sorting_6", "stacking"])
+    parser.add_argument("--contexts", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    print("| task | first attempts that succeed | % (95 %) | per mode | control steps, median (range) | seconds |")
+    print("|---|---|---|---|---|---|")
+    for task in options.tasks:
+        recipe, contexts = RECIPES[task](), evaluation_contexts(task, options.contexts)
+        rows = np.arange(len(contexts))
+        modes = [int(row) % recipe.num_modes for row in rows]
+        env = recipe.make_env(len(rows), num_threads=options.threads, dtype=torch.float64)
+        start = time.perf_counter()
+        seeds = [(options.seed, int(row)) for row in rows]
+        results = play(env, recipe, task, rows, modes, contexts, seeds, lambda over: None)
+        env.close()
+        good = [episode is not None for episode, _ in results]
+        low, high = wilson_interval(sum(good), len(good))
+        share = [sum(g for g, m in zip(good, modes, strict=True) if m == mode) for mode in range(recipe.num_modes)]
+        lengths = [len(episode) for episode, _ in results if episode is not None]
+        steps = f"{statistics.median(lengths):.0f} ({min(lengths)}-{max(lengths)})"
+        rate = f"{100 * sum(good) / len(good):.1f} ({100 * low:.1f}-{100 * high:.1f})"
+        seconds = time.perf_counter() - start
+        print(f"| {task} | {sum(good)}/{len(good)} | {rate} | {share} | {steps} | {seconds:.0f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
