@@ -34,10 +34,11 @@ from torchrl_koap.data import (
 )
 from torchrl_koap.demonstrations import record_demonstrations
 from torchrl_koap.envs import AvoidingEnv, mode_index
-from torchrl_koap.evaluation import make_policy, roll_out, rollouts_to_tensors, score
+from torchrl_koap.evaluation import make_policy, roll_out, rollouts_to_tensors
 from torchrl_koap.modules import NoiseSchedule, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.path_plots import plot_rollouts
+from torchrl_koap.scores import score
 from torchrl_koap.tasks import get_task
 
 torch.manual_seed(0)
