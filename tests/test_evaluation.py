@@ -7,10 +7,12 @@ import math
 
 import pytest
 import torch
+from torchrl.envs import TransformedEnv
 from toy_episodes import episode_of, number
 from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength, PlannedStep, wandering_planner
 
 from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs.transforms import EndEffectorNoise
 from torchrl_koap.evaluation import (
     make_policy,
     measure_latency,
@@ -72,6 +74,19 @@ def test_real_networks_and_a_stochastic_solver_do_not_depend_on_it_either(solver
         assert (one["next", "observation"] - other["next", "observation"]).abs().max() < 1e-4
         assert (one["action"] - other["action"]).abs().max() < 1e-4
     assert not torch.allclose(together[0]["action"], together[1]["action"])
+
+
+def test_observation_noise_of_an_episode_depends_on_its_seed_alone():
+    def noisy(num_envs):
+        return TransformedEnv(AvoidingEnv(num_envs), EndEffectorNoise("avoiding", sigma=0.003))
+
+    policy = make_policy(wandering_planner(), PlannedStep(), state_columns=(2, 3))
+    paths = [
+        roll_out(policy, noisy, SEEDS[:3], max_steps=12, batch_size=size)[2]["observation"] for size in (None, 2, 1)
+    ]
+    assert torch.equal(paths[0], paths[1]) and torch.equal(paths[0], paths[2])
+    clean = roll_out(policy, AvoidingEnv, SEEDS[2:3], max_steps=12)[0]["observation"]
+    assert 1e-4 < (paths[0][0] - clean[0])[2:].abs().max() < 0.02
 
 
 def test_the_seed_decides_not_the_place_and_not_the_global_generator(together):

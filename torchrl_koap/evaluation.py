@@ -97,7 +97,8 @@ def roll_out(
         part = seeds[begin : begin + size]
         env = make_env(len(part))
         _seed_noise(env, part)
-        env = TransformedEnv(env, policy_transforms(policy.history))
+        transforms = policy_transforms(policy.history)
+        env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
         if futures is not None:
             noise = RecordedFutures(futures[begin : begin + size])
         else:
