@@ -7,7 +7,7 @@ import pytest
 import torch
 from toy_episodes import episode_of, number
 
-from torchrl_koap.metrics import bootstrap_interval, conditional_entropy, wilson_interval
+from torchrl_koap.metrics import bootstrap_interval, conditional_entropy, mode_entropy, wilson_interval
 from torchrl_koap.scores import STACKING_PRIOR, d3il_score, divergence, outcome_of, score, stacking_scores
 from torchrl_koap.tasks import get_task
 
@@ -35,14 +35,13 @@ def test_scores_by_hand():
     result = score(episodes, range(8), num_modes=4, mode_index=number)
     rows = result.pop("episode")
     low, high = wilson_interval(5, 8)
+    assert 0 <= result.pop("mode_entropy_low") < 0.75 < result.pop("mode_entropy_high") <= 1
     assert result == {
         "episodes": 8,
         "success_rate": 0.625,
         "success_low": low,
         "success_high": high,
         "mode_entropy": pytest.approx(0.75),
-        "mode_entropy_low": pytest.approx(0.0),
-        "mode_entropy_high": pytest.approx(0.75),  # a resample of four holds three modes at most
         "distinct_modes": 3,
         "collisions": 2,
         "mean_steps": pytest.approx(255 / 8),
@@ -134,3 +133,9 @@ def test_bootstrap_interval_covers_the_mean():
     low, high = bootstrap_interval(values, lambda units: sum(units) / len(units))
     assert 40 < low < 49.5 < high < 59  # 49.5 +- 1.96 * 28.9 / 10
     assert bootstrap_interval([1, 2], lambda units: None) is None
+
+
+def test_interval_of_an_entropy_holds_the_entropy():
+    modes = [mode % 20 for mode in range(58)]
+    low, high = bootstrap_interval(modes, lambda units: mode_entropy(units, 24))
+    assert low < mode_entropy(modes, 24) < high and 0.01 < high - low < 0.2

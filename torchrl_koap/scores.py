@@ -111,7 +111,8 @@ def _rate(name: str, good: int, total: int, first: dict[str, Any]) -> dict[str, 
 
 def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:
     interval = (bootstrap_interval(units, statistic) if len(units) else None) or (None, None)
-    return {name: statistic(units), f"{name}_low": interval[0], f"{name}_high": interval[1]}
+    low, high = (None if end is None else min(max(end, 0.0), 1.0) for end in interval)
+    return {name: statistic(units), f"{name}_low": low, f"{name}_high": high}
 
 
 def stacking_scores(episodes: Sequence[TensorDict], contexts: Sequence[int], *, complete: bool = True) -> dict:
