@@ -86,8 +86,8 @@ def bootstrap_interval(
 ) -> tuple[float, float] | None:
     """Percentile interval of a statistic under resampling of independent units, shifted by the bias.
 
-    Resamples hold fewer distinct units than the sample; an entropy is lower on them. The interval is moved by as much as
-    their mean lies beside the statistic of the sample.
+    Resamples hold fewer distinct units than the sample; an entropy is lower on them. The interval is moved by as much
+    as their mean lies beside the statistic of the sample.
 
     Args:
         units (sequence): what was sampled independently: episodes, or contexts with all their episodes.
