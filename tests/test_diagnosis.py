@@ -108,12 +108,22 @@ def test_states_beside_the_demonstrations_are_far():
         ((0.5, 1.0, 1.0), "nothing to find"),
         ((0.5, 1.0, 0.4), "the planner's own imagination reaches the goal in 50%"),
         ((1.0, 0.3, 0.4), "the controller follows recorded states to the goal in 30%"),
-        ((1.0, 1.0, 0.4), "each works alone, not together"),
+        ((1.0, 1.0, 0.4), "planner and controller work alone, not together"),
     ],
 )
 def test_verdicts(rates, words):
     result = {name: {"rate": value} for name, value in zip(("imagined", "followed", "closed_loop"), rates, strict=True)}
-    assert verdict(result | {"distance_to_demonstrations": {}}).startswith(words)
+    assert verdict(result | {"distance_to_demonstrations": {}}, AVOIDING).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("off", "words"), [(0.007, "planner and controller work alone"), (0.04, "the controller leaves")]
+)
+def test_a_blind_push_is_not_held_against_the_controller(off, words):
+    rates = {"imagined": 1.0, "followed": 0.0, "closed_loop": 0.4}
+    result = {name: {"rate": value} for name, value in rates.items()}
+    result |= {"distance_to_demonstrations": {}, "recording_to_execution": {"measured_xy": [0.001, off]}}
+    assert verdict(result, get_task("sorting")).startswith(words)
 
 
 def test_inspect_from_the_shell(trained_run, tmp_path, capsys):
