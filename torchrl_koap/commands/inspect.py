@@ -60,8 +60,8 @@ class Inspect:
 def run_inspect(options: Inspect) -> dict[str, Any]:
     """Runs the three experiments; returns what is written to ``inspect.json``.
 
-    ``imagined`` is the planner alone, ``followed`` the controller alone on recorded states (blind to where objects went),
-    ``closed_loop`` both.
+    ``imagined`` is the planner alone, ``followed`` the controller alone on recorded states (blind to where objects
+    went), ``closed_loop`` both.
 
     Raises:
         ValueError: for fewer than one episode.
@@ -114,8 +114,8 @@ def run_inspect(options: Inspect) -> dict[str, Any]:
 def verdict(result: dict[str, Any], task: Task) -> str:
     """What the figures say, in a sentence.
 
-    Where things are pushed or grasped, recorded tool paths do not answer to where the objects went: there the controller
-    is judged by how near the tool stays to them.
+    Where things are pushed or grasped, recorded tool paths do not answer to where the objects went: there the
+    controller is judged by how near the tool stays to them.
     """
     imagined, followed, closed = (result[name]["rate"] for name in ("imagined", "followed", "closed_loop"))
     if closed >= 0.9:
