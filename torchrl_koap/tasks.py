@@ -18,9 +18,9 @@ from torchrl_koap.relations import Relation, Relations
 from torchrl_koap.state_features import FEATURES
 
 CONTROL_HZ = 1 / 0.035
-# planner and controller see the same window in every task: 2 observed frames, 14 planned ones, look-ahead at most 8,
-# 4 actions of each plan executed
-HISTORY, HORIZON, LOOK_AHEAD, REPLAN_INTERVAL = 2, 14, 8, 4
+# planner and controller see the same window in every task: 2 observed frames, 14 planned ones; 4 actions of each plan
+# are executed
+HISTORY, HORIZON, REPLAN_INTERVAL = 2, 14, 4
 WINDOW = HISTORY + HORIZON
 
 

@@ -22,7 +22,7 @@ from torchrl_koap.modules.policies import EXECUTIONS
 from torchrl_koap.report import write_report
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.scores import d3il_score, score, stacking_scores
-from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks import REPLAN_INTERVAL, Task, get_task
 
 
 @dataclass
@@ -54,7 +54,7 @@ class Eval:
     execution: str = "feedback"
     solver: str | None = None
     solver_steps: int | None = None
-    replan_interval: int = 4
+    replan_interval: int = REPLAN_INTERVAL
     joining: float = 0.8
     batch_size: int | None = None
     contexts_file: Path | None = None
@@ -88,23 +88,26 @@ def columns_of(run: RunDirectory, task: Task) -> tuple[int, ...]:
     return task.controller_columns(run.read_entry("config.json", "controller").get("state", "all"))
 
 
-def choose_contexts(task: Task, options: Eval) -> tuple[list[int] | None, np.ndarray | None]:
+def choose_contexts(
+    task: Task, episodes: int, rollouts_per_context: int = 1, contexts_file: Path | None = None
+) -> tuple[list[int] | None, np.ndarray | None]:
     """Number of the context of every rollout, and the contexts; None for a task in which all episodes start alike."""
     if not task.objects:
-        for name in ("contexts_file", "rollouts_per_context"):
-            if getattr(options, name) not in (None, 1):
+        given = {"contexts_file": contexts_file is not None, "rollouts_per_context": rollouts_per_context != 1}
+        for name, unfit in given.items():
+            if unfit:
                 raise ValueError(f"{name} was given, but task {task.name!r} has no contexts")
         return None, None
     from torchrl_koap.envs.contexts import evaluation_contexts, load_contexts  # takes seconds
 
-    if options.contexts_file is None:
+    if contexts_file is None:
         table = evaluation_contexts(task)
     else:
-        table = load_contexts(options.contexts_file, task)
-    numbers = [episode // options.rollouts_per_context for episode in range(options.episodes)]
+        table = load_contexts(contexts_file, task)
+    numbers = [episode // rollouts_per_context for episode in range(episodes)]
     if numbers[-1] >= len(table):
         raise ValueError(
-            f"{options.episodes} episodes with {options.rollouts_per_context} per context need {numbers[-1] + 1}"
+            f"{episodes} episodes with {rollouts_per_context} per context need {numbers[-1] + 1}"
             f" contexts, there are {len(table)}"
         )
     return numbers, table[numbers]
@@ -139,7 +142,7 @@ def run_eval(options: Eval) -> dict[str, Any]:
         gripper=task.gripper,
     ).to(options.device)
     seeds = list(range(options.seed, options.seed + options.episodes))
-    numbers, contexts = choose_contexts(task, options)
+    numbers, contexts = choose_contexts(task, options.episodes, options.rollouts_per_context, options.contexts_file)
     mode_index = mode_index_of(task)
     with tqdm(total=options.episodes, desc="rollouts", unit="episode") as bar:
         episodes = roll_out(

@@ -12,7 +12,7 @@ import tyro
 from tqdm import tqdm
 
 from torchrl_koap.assembly import load_demonstrations, make_env_of, set_up_torch
-from torchrl_koap.commands.eval import Eval, choose_contexts, columns_of, load_run
+from torchrl_koap.commands.eval import choose_contexts, columns_of, load_run
 from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.diagnosis import (
     coverage,
@@ -27,7 +27,7 @@ from torchrl_koap.evaluation import make_policy, roll_out
 from torchrl_koap.inspection_plot import plot_inspection
 from torchrl_koap.pictures import FOLDER
 from torchrl_koap.run_directory import RunDirectory
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import REPLAN_INTERVAL, Task
 
 _NEAR = 0.015  # m; recorded tool paths followed within this are followed well
 
@@ -51,7 +51,7 @@ class Inspect:
     episodes: int = 30
     dataset: str | None = None
     seed: int = 500
-    replan_interval: int = 4
+    replan_interval: int = REPLAN_INTERVAL
     joining: float = 0.8
     threads: int = 2
     device: str = "cpu"
@@ -83,7 +83,7 @@ def run_inspect(options: Inspect) -> dict[str, Any]:
     dataset = options.dataset or run.read_entry("config.json", "dataset")
     data = load_demonstrations(dataset, task, episodes=run.read_entry("config.json", "episodes"))
     make_env = make_env_of(task, num_threads=options.threads)
-    _, contexts = choose_contexts(task, Eval(run=options.run, episodes=options.episodes))
+    _, contexts = choose_contexts(task, options.episodes)
     with tqdm(total=3, desc="experiments", unit="experiment") as bar:
         policy = make_policy(planner, controller, state_columns=task.state_of, **settings)
         closed = roll_out(policy, make_env, seeds, max_steps=task.max_steps, contexts=contexts)

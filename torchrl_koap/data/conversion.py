@@ -20,6 +20,7 @@ from torchrl_koap.data.raw import RawEpisode, RawEpisodeError, read_raw_episode
 from torchrl_koap.data.trajectories import flatten_trajectories
 from torchrl_koap.data.unpickling import load_pickle
 from torchrl_koap.gripper import gripper_number
+from torchrl_koap.rotations import tan_yaw
 from torchrl_koap.tasks import get_task
 
 SPLITS = ("train", "eval")
@@ -69,12 +70,6 @@ def _pose(episode: RawEpisode, name: str) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(logged["pos"], dtype=np.float64), np.asarray(logged["quat"], dtype=np.float64)
 
 
-def _tan_yaw(quat: np.ndarray) -> np.ndarray:
-    """Tangent of the yaw, ``[T, 1]``; with the original's sign of ``x y``, which matters for tilted boxes only."""
-    w, x, y, z = quat.T
-    return np.tan(np.arctan2(2 * (w * z - x * y), 1 - 2 * (y * y + z * z)))[:, None]
-
-
 def _avoiding(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
     desired, measured = _robot(episode, "des_c_pos")[:, :2], _robot(episode, "c_pos")[:, :2]
     return np.concatenate([desired, measured], axis=1), np.diff(desired, axis=0)
@@ -90,7 +85,7 @@ def _sorting(episode: RawEpisode, boxes: tuple[str, ...]) -> tuple[np.ndarray, n
     frames, actions = _avoiding(episode)
     for name in boxes:
         position, quat = _pose(episode, name)
-        frames = np.concatenate([frames, position[:, :2], _tan_yaw(quat)], axis=1)
+        frames = np.concatenate([frames, position[:, :2], tan_yaw(quat)[:, None]], axis=1)
     return frames, actions
 
 
@@ -99,7 +94,7 @@ def _stacking(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
     columns = [desired, width]
     for name in OBJECTS["stacking"]:
         position, quat = _pose(episode, name)
-        columns += [position, _tan_yaw(quat)]
+        columns += [position, tan_yaw(quat)[:, None]]
     columns += [_robot(episode, "j_pos"), width, _robot(episode, "c_pos")]
     number = gripper_number(torch.from_numpy(width[:, 0])).numpy()[:, None]
     actions = np.concatenate([np.diff(desired, axis=0), number], axis=1)

@@ -121,8 +121,7 @@ class AligningEnv(ManipulationEnv):
         return poses_of(self._contexts[rows, :1], height=0.0)
 
     def _begin(self, rows: np.ndarray) -> None:
-        self._commands[rows, :3] = self.sims.tcp_position[rows]
-        self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
+        super()._begin(rows)
         for row, pose in zip(rows, self.targets[rows], strict=True):
             self.sims.data[row].mocap_pos[0], self.sims.data[row].mocap_quat[0] = pose[:3], pose[3:]
             self.sims.set_state(row, self.sims.get_state(row))  # the first picture shows the target in its new place

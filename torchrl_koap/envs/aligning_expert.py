@@ -27,6 +27,7 @@ import numpy as np
 
 from torchrl_koap.envs.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 from torchrl_koap.envs.contexts import check_contexts
+from torchrl_koap.envs.hand import drift
 from torchrl_koap.envs.pushing import LENGTH, PLAN_SIZE, arrive, improve, motion, search, two_pushes
 from torchrl_koap.tasks import get_task
 
@@ -154,7 +155,7 @@ class _Player:
         self.linger = generator.integers(3, 7)
         self.height = PUSH_HEIGHT[mode] + generator.uniform(-0.004, 0.004)
         self.slip = generator.normal(0.0, 0.002, 2)  # by which the rod comes down beside the intended place
-        self.wobble = _drift(generator, 6, 0.00025)
+        self.wobble = drift(generator, 6, 0.00025, (_HORIZON, 2))
         self._choose(context[0], context[1], None)
 
     @property
@@ -324,12 +325,3 @@ class _Player:
         if self.tcp[2] > SAFE_HEIGHT - 0.03:
             self.doing = self._travel
         return np.append(self.command[:2], SAFE_HEIGHT), FULL_PUSH
-
-
-def _drift(generator: np.random.Generator, memory: float, deviation: float) -> np.ndarray:
-    """Noise [horizon, 2] of a given standard deviation that forgets itself over ``memory`` steps."""
-    keep = math.exp(-1 / memory)
-    drift = generator.normal(0.0, deviation, (_HORIZON, 2))
-    for step in range(1, _HORIZON):
-        drift[step] = keep * drift[step - 1] + math.sqrt(1 - keep**2) * drift[step]
-    return drift

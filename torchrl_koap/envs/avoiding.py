@@ -142,10 +142,6 @@ class AvoidingEnv(ManipulationEnv):
         self._rod = model.geom(f"{PANDA}rod").id
         self._obstacles = np.array([model.geom(name).id for name, *_ in OBSTACLES])
 
-    def _begin(self, rows: np.ndarray) -> None:
-        self._commands[rows, :3] = self.sims.tcp_position[rows]
-        self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
-
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
         self._commands[rows, :2] += action
 

@@ -22,6 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES, ROW_Y
+from torchrl_koap.envs.hand import drift
 
 FULL_PUSH = 0.0124  # m per control step at full deflection
 LEAST_PUSH = 0.0053  # smaller deflections fall into the dead zone
@@ -240,7 +241,7 @@ def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
     brisk = generator.random() < 0.6
     start = uniform(0.88, 1.02) if brisk else uniform(0.66, 0.88)
     warm_up = np.clip(np.arange(_HORIZON) / uniform(10, 45), 0, 1)
-    cruise = (start + (uniform(0.98, 1.06) - start) * warm_up) + _drift(generator, 15, 0.05)
+    cruise = (start + (uniform(0.98, 1.06) - start) * warm_up) + drift(generator, 15, 0.05, _HORIZON)
     lets_go = generator.random() < 0.35
     turns = generator.random() < 0.5
     return {
@@ -263,19 +264,9 @@ def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
         "last_side": np.array(uniform(-0.008, 0.008) if turns else 0.0),
         "last_forward": np.array(uniform(-0.1, 0.2) if lets_go else 1.0),
         "cruise": np.clip(cruise, 0.4, uniform(1.0, 1.05)) * FULL_PUSH,
-        "grip": 1 + _drift(generator, 8, 0.06),
-        "misjudgement": np.stack([_drift(generator, 12, 0.003), _drift(generator, 12, 0.003)], axis=1),
-        "tremor": np.stack([_drift(generator, 2, 0.0002), _drift(generator, 2, 0.0002)], axis=1),
+        "grip": 1 + drift(generator, 8, 0.06, _HORIZON),
+        "misjudgement": np.stack(
+            [drift(generator, 12, 0.003, _HORIZON), drift(generator, 12, 0.003, _HORIZON)], axis=1
+        ),
+        "tremor": np.stack([drift(generator, 2, 0.0002, _HORIZON), drift(generator, 2, 0.0002, _HORIZON)], axis=1),
     }
-
-
-def _drift(generator: np.random.Generator, memory: float, deviation: float) -> np.ndarray:
-    """Noise [horizon] of a given standard deviation that forgets itself over ``memory`` steps."""
-    keep = np.exp(-1 / memory)
-    kicks = generator.normal(0, deviation, _HORIZON)
-    kicks[1:] *= np.sqrt(1 - keep**2)
-    drift = np.empty(_HORIZON)
-    drift[0] = kicks[0]
-    for step in range(1, _HORIZON):
-        drift[step] = keep * drift[step - 1] + kicks[step]
-    return drift

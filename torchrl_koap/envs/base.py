@@ -36,9 +36,9 @@ _EPISODE = ("_observation", "_commands", "_mode", "_success", "_collision", "_se
 class ManipulationEnv(EnvBase):
     """Base of the D3IL tasks: a batch of simulations, outcome bookkeeping, partial resets and partial steps.
 
-    A task implements five hooks; each receives ``rows``, the indices of the environments concerned:
-    :meth:`_begin`, :meth:`_command`, :meth:`_observe`, :meth:`_check`, :meth:`_update_mode`. Where objects are placed
-    is one more, :meth:`_place`; :meth:`_advance` and :meth:`_begin` differ where joints are commanded.
+    A task implements four hooks; each receives ``rows``, the indices of the environments concerned:
+    :meth:`_command`, :meth:`_observe`, :meth:`_check`, :meth:`_update_mode`. Where objects are placed is one more,
+    :meth:`_place`; :meth:`_advance` and :meth:`_begin` differ where joints are commanded.
 
     A task with objects has *contexts*, the poses in which an episode starts
     (:mod:`torchrl_koap.envs.contexts`): drawn at random at every reset, or taken from a table in turn, or handed over
@@ -150,9 +150,10 @@ class ManipulationEnv(EnvBase):
             {"done": done.clone(), "terminated": done.clone(), "truncated": done.clone()}, shape=shape
         )
 
-    @abc.abstractmethod
     def _begin(self, rows: np.ndarray) -> None:
-        """Writes the first command into ``self._commands[rows]`` after a reset."""
+        """Writes the first command into ``self._commands[rows]`` after a reset: stay, hand straight down."""
+        self._commands[rows, :3] = self.sims.tcp_position[rows]
+        self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
 
     @abc.abstractmethod
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:

@@ -12,6 +12,7 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.scene import compile_scene, scene
+from torchrl_koap.rotations import tan_yaw
 from torchrl_koap.tasks import get_task
 
 START_JOINTS = (
@@ -196,8 +197,7 @@ class SortingEnv(ManipulationEnv):
         return poses_of(self._contexts[rows], height=START_HEIGHT)
 
     def _begin(self, rows: np.ndarray) -> None:
-        self._commands[rows, :3] = self.sims.tcp_position[rows]
-        self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
+        super()._begin(rows)
         self._noted[rows] = -1
 
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
@@ -205,10 +205,7 @@ class SortingEnv(ManipulationEnv):
 
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         poses = self.sims.object_poses[rows]
-        w, x, y, z = np.moveaxis(poses[..., 3:], -1, 0)
-        # the original's formula, whose sign of xy matters for tilted boxes only
-        yaw = np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2))
-        boxes = np.concatenate([poses[..., :2], np.tan(yaw)[..., None]], axis=-1)
+        boxes = np.concatenate([poses[..., :2], tan_yaw(poses[..., 3:])[..., None]], axis=-1)
         return np.concatenate(
             [self._commands[rows, :2], self.sims.tcp_position[rows, :2], boxes.reshape(len(rows), -1)], axis=1
         )

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
+from torchrl_koap.envs.hand import drift
 from torchrl_koap.envs.sorting import BIN_HALF, BIN_X, BOX_HALF, box_colours, mode_colours
 from torchrl_koap.envs.travel import FAR, ORIGIN, SHAPE, STEP, descent, square_distance, travel_cost, value_at
 
@@ -341,17 +342,5 @@ def _draw(generator: np.random.Generator, num_boxes: int) -> dict[str, np.ndarra
         "taste": generator.normal(0, 0.03, num_boxes),
         "aim": generator.uniform(-0.015, 0.015, num_boxes),
         "pause": np.array(generator.integers(0, 6)),
-        "tempo": generator.uniform(0.95, 1.05) * (1 + _drift(generator, 15, 0.04)),
+        "tempo": generator.uniform(0.95, 1.05) * (1 + drift(generator, 15, 0.04, _HORIZON)),
     }
-
-
-def _drift(generator: np.random.Generator, memory: float, deviation: float) -> np.ndarray:
-    """Noise [horizon] of a given standard deviation that forgets itself over ``memory`` steps."""
-    keep = np.exp(-1 / memory)
-    kicks = generator.normal(0, deviation, _HORIZON)
-    kicks[1:] *= np.sqrt(1 - keep**2)
-    drift = np.empty(_HORIZON)
-    drift[0] = kicks[0]
-    for time in range(1, _HORIZON):
-        drift[time] = keep * drift[time - 1] + kicks[time]
-    return drift

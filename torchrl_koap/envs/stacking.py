@@ -10,6 +10,7 @@ from torchrl_koap.envs import tracking
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.scene import compile_scene, scene
+from torchrl_koap.rotations import tan_yaw
 from torchrl_koap.tasks import get_task
 
 START_JOINTS = (
@@ -173,10 +174,7 @@ class StackingEnv(ManipulationEnv):
 
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         poses = self.sims.object_poses[rows]
-        w, x, y, z = np.moveaxis(poses[..., 3:], -1, 0)
-        # the original's formula, whose sign of xy matters for tilted boxes only
-        yaw = np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2))
-        boxes = np.concatenate([poses[..., :3], np.tan(yaw)[..., None]], axis=-1).reshape(len(rows), -1)
+        boxes = np.concatenate([poses[..., :3], tan_yaw(poses[..., 3:])[..., None]], axis=-1).reshape(len(rows), -1)
         parts = (self.sims.joint_positions, self.sims.gripper_width[:, None], self.sims.tcp_position)
         return np.concatenate([self._commands[rows], boxes, *(part[rows] for part in parts)], axis=1)
 

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torchrl_koap.envs.hand import drift
 from torchrl_koap.envs.inverse_kinematics import follow_pose, tcp_pose
 from torchrl_koap.envs.stacking import BOXES, TARGET
 from torchrl_koap.tasks import get_task
@@ -130,7 +131,7 @@ class _Person:
         self.finished = False
         self._pace = generator.uniform(0.85, 1.05)
         self._centre = np.array(TARGET) + generator.uniform(-0.004, 0.004, 2)
-        self._wobble = np.stack([_drift(generator, 12, 0.0012) for _ in range(3)], axis=1)
+        self._wobble = np.stack([drift(generator, 12, 0.0012, _HORIZON) for _ in range(3)], axis=1)
         self._hesitation = generator.integers(0, 4, 16)
         self._velocity, self._spin = np.zeros(3), 0.0
         self._time, self._placed, self._grasp, self._grip_width = 0, 0, None, 0.0
@@ -299,14 +300,3 @@ def _funnel(error: float, low: float, high: float, tight: float, wide: float) ->
 def _limited(vector: np.ndarray, length: float) -> np.ndarray:
     """The vector, shortened to ``length`` if it is longer."""
     return vector * min(1.0, length / max(np.linalg.norm(vector), 1e-12))
-
-
-def _drift(generator: np.random.Generator, memory: float, deviation: float) -> np.ndarray:
-    """Noise [horizon] of a given standard deviation that forgets itself over ``memory`` steps."""
-    keep = np.exp(-1 / memory)
-    kicks = generator.normal(0, deviation, _HORIZON)
-    drift = np.empty(_HORIZON)
-    drift[0] = kicks[0]
-    for step in range(1, _HORIZON):
-        drift[step] = keep * drift[step - 1] + np.sqrt(1 - keep**2) * kicks[step]
-    return drift
