@@ -18,8 +18,8 @@ def tan_yaw(quaternion: np.ndarray) -> np.ndarray:
     Examples:
         >>> import numpy as np
         >>> from torchrl_koap.rotations import tan_yaw
-        >>> tan_yaw(np.array([np.cos(0.25), 0.0, 0.0, np.sin(0.25)])).round(6) == np.tan(0.5).round(6)
-        True
+        >>> print(f"{tan_yaw(np.array([np.cos(0.25), 0.0, 0.0, np.sin(0.25)])):.4f} = tan(0.5) = {np.tan(0.5):.4f}")
+        0.5463 = tan(0.5) = 0.5463
     """
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
     return np.tan(np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2)))

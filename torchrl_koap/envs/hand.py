@@ -22,8 +22,8 @@ def drift(generator: np.random.Generator, memory: float, deviation: float, size:
         >>> import numpy as np
         >>> from torchrl_koap.envs.hand import drift
         >>> noise = drift(np.random.default_rng(0), 5, 2.0, 20000)
-        >>> round(noise.std()), round(np.corrcoef(noise[5:], noise[:-5])[0, 1], 1)
-        (2, 0.4)
+        >>> print(f"{noise.std():.1f} {np.corrcoef(noise[5:], noise[:-5])[0, 1]:.1f}")
+        2.0 0.4
     """
     keep = np.exp(-1 / memory)
     values = generator.normal(0, deviation, size)
