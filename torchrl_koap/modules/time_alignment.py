@@ -20,17 +20,19 @@ import torch
 from torch import Tensor
 
 
-def check_offsets(history: int, look_ahead: int | Sequence[int]) -> tuple[int, ...]:
+def check_offsets(history: int, look_ahead: int | Sequence[int], *, least: int = 2) -> tuple[int, ...]:
     """Validates and returns the look-ahead offsets, ascending.
 
     Raises:
-        ValueError: if ``history < 0``, or an offset is below 2 (``x_{t+1}`` is what the latent action must explain).
+        ValueError: if ``history < 0``, or an offset is below ``least``, by default 2 (``x_{t+1}`` is what the latent
+            action must explain).
     """
     offsets = (look_ahead,) if isinstance(look_ahead, int) else tuple(sorted(look_ahead))
     if history < 0:
         raise ValueError(f"history must be >= 0 frames, got {history}")
-    if not offsets or min(offsets) < 2:
-        raise ValueError(f"look_ahead offsets must be >= 2 (x_(t+1) is never an input), got {offsets}")
+    if not offsets or min(offsets) < least:
+        why = " (x_(t+1) is never an input)" if least == 2 else ""
+        raise ValueError(f"look_ahead offsets must be >= {least}{why}, got {offsets}")
     return offsets
 
 
@@ -66,6 +68,6 @@ def frame_index(frames: range, num_frames: int, history: int, look_ahead: int | 
         >>> frame_index(range(16), 16, 1, 8)[[1, 7, 14]].tolist()
         [[0, 1, 9], [6, 7, 15], [13, 14, 15]]
     """
-    offsets = [*range(-history, 1), *check_offsets(history, look_ahead)]
+    offsets = [*range(-history, 1), *check_offsets(history, look_ahead, least=1)]
     rows = torch.arange(frames.start, frames.stop, device=device)[:, None]
     return (rows + torch.tensor(offsets, device=device)).clamp(0, num_frames - 1)
