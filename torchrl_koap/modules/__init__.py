@@ -5,6 +5,7 @@ from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.controllers import LinearInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.denoisers import MLPDenoiser, TransformerDenoiser
 from torchrl_koap.modules.diffusion import NoiseSchedule
+from torchrl_koap.modules.diffusion_policy import DiffusionPolicy
 from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.latent_action import (
@@ -20,6 +21,7 @@ from torchrl_koap.modules.unet import TemporalUnet
 
 __all__ = [
     "PRESETS",
+    "DiffusionPolicy",
     "EpisodeNoise",
     "KoopmanInverseDynamics",
     "KoopmanLifting",

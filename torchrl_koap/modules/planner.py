@@ -5,19 +5,19 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
-from tensordict.nn.probabilistic import InteractionType, interaction_type
+from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import nn
 
 from torchrl_koap import keys
 from torchrl_koap.data.normalizers import Normalizer
-from torchrl_koap.modules.diffusion import SOLVERS, NoiseSchedule
+from torchrl_koap.modules.conditioned_diffusion import ConditionedDiffusion, identity_normalizer
+from torchrl_koap.modules.diffusion import NoiseSchedule
 
 Tensor = torch.Tensor
 
 
-class StatePlanner(TensorDictModuleBase):
+class StatePlanner(ConditionedDiffusion):
     """Samples the next ``horizon`` states given the last ``history`` ones: KOAP's pi_PL(x_{t+1:t+H} | x_{t-h+1:t}).
 
     With ``relative=True`` a plan is modelled as displacements from the current state, and the condition is the
@@ -91,44 +91,23 @@ class StatePlanner(TensorDictModuleBase):
         out_keys: list[NestedKey] | None = None,
         noise_key: NestedKey | None = "noise",
     ):
-        super().__init__()
-        for name, value in {"state_dim": state_dim, "history": history, "horizon": horizon}.items():
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
-        self.in_keys = [keys.HISTORY] if in_keys is None else list(in_keys)
-        self.out_keys = [keys.PLAN] if out_keys is None else list(out_keys)
-        if len(self.in_keys) != 1 or len(self.out_keys) != 1:
-            raise ValueError(f"one in_key and one out_key are needed, got {self.in_keys} and {self.out_keys}")
-        self.denoiser = denoiser
-        self.schedule = NoiseSchedule() if schedule is None else schedule
-        self.state_dim, self.history, self.horizon, self.relative = state_dim, history, horizon, relative
-        self.clip, self.noise_key = clip, noise_key
-        self.features = features
-        self.condition_normalizer = _identity(history * state_dim + (0 if features is None else features.num_features))
-        self.plan_normalizer = _identity(horizon * state_dim)
-        default = "heun" if self.schedule.path == "flow" else "dpm++2m"
-        self.solver = default if solver is None else solver
-        self.num_steps = num_steps
-
-    @property
-    def solver(self) -> str:
-        """Name of the solver; may be set at any time."""
-        return self._solver
-
-    @solver.setter
-    def solver(self, name: str) -> None:
-        self.schedule.check_solver(name)
-        self._solver = name
-
-    @property
-    def num_steps(self) -> int:
-        """Number of solver steps; may be set at any time."""
-        return self._num_steps
-
-    @num_steps.setter
-    def num_steps(self, number: int) -> None:
-        self.schedule.nodes(number)
-        self._num_steps = number
+        super().__init__(
+            denoiser,
+            schedule,
+            state_dim=state_dim,
+            width=state_dim,
+            history=history,
+            horizon=horizon,
+            relative=relative,
+            features=features,
+            solver=solver,
+            num_steps=num_steps,
+            clip=clip,
+            in_keys=[keys.HISTORY] if in_keys is None else in_keys,
+            out_keys=[keys.PLAN] if out_keys is None else out_keys,
+            noise_key=noise_key,
+        )
+        self.plan_normalizer = identity_normalizer(horizon * state_dim)
 
     def set_keys(self, *, history: NestedKey | None = None, plan: NestedKey | None = None) -> None:
         """Renames the entries read and written."""
@@ -154,29 +133,10 @@ class StatePlanner(TensorDictModuleBase):
             plan = plan.flatten(-2)
         else:
             plan = plan.reshape(-1, self.state_dim).repeat(1, self.horizon)
-        condition = self._condition(history)
+        condition = self.condition(history)
         example = self.plan_normalizer.scale
         self.condition_normalizer = Normalizer.fit(condition, mode=mode).to(example)
         self.plan_normalizer = Normalizer.fit(plan, mode=mode).to(example)
-
-    def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
-        """Cuts windows ``[*B, history + horizon, d]`` into history and plan."""
-        length = self.history + self.horizon
-        if window.ndim < 2 or window.shape[-2] != length or window.shape[-1] != self.state_dim:
-            raise ValueError(
-                f"windows must be [*B, {length}, {self.state_dim}] (history + horizon, state_dim),"
-                f" got {list(window.shape)}"
-            )
-        return window[..., : self.history, :], window[..., self.history :, :]
-
-    def encode_history(self, history: Tensor) -> Tensor:
-        """Raw history ``[*B, h, d]`` to the denoiser's condition ``[*B, h * d + f]``."""
-        if history.ndim < 2 or history.shape[-2:] != (self.history, self.state_dim):
-            raise ValueError(
-                f"{self.in_keys[0]!r} must be [*B, {self.history}, {self.state_dim}] (history, state_dim),"
-                f" got {list(history.shape)}"
-            )
-        return self.condition_normalizer(self._condition(history))
 
     def encode_plan(self, history: Tensor, plan: Tensor) -> Tensor:
         """Raw plan ``[*B, H, d]`` to the normalised sequence that noise is added to."""
@@ -193,60 +153,12 @@ class StatePlanner(TensorDictModuleBase):
         plan = self.plan_normalizer.inverse(sequence.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
         return plan + history[..., -1:, :] if self.relative else plan
 
-    def draw_noise(self, history: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Start noise ``[*B, H, d]`` for histories ``[*B, h, d]``."""
-        shape = (*history.shape[:-2], self.horizon, self.state_dim)
-        return torch.randn(shape, dtype=history.dtype, device=history.device, generator=generator)
-
     def plan(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
         """Samples plans ``[*B, H, d]`` for histories ``[*B, h, d]``, both in raw units; see the class for ``noise``."""
-        condition = self.encode_history(history)
-        step_noise = None
-        if noise is None:
-            noise = self.draw_noise(history, generator)
-        elif noise.ndim == history.ndim + 1:
-            step_noise = noise[..., 1:, :, :].movedim(-3, 0)
-            noise = noise[..., 0, :, :]
-        expected = (*history.shape[:-2], self.horizon, self.state_dim)
-        if noise.shape != expected or (step_noise is not None and step_noise.shape[0] < self.num_steps):
-            raise ValueError(
-                f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, state_dim]), or hold at least"
-                f" {1 + self.num_steps} (1 + num_steps) of these on axis -3, got start noise {list(noise.shape)}"
-                + ("" if step_noise is None else f" and {step_noise.shape[0]} further draws")
-            )
-        sequence = self.schedule.solve(
-            lambda x, time: self.denoiser(x, time, condition),
-            noise,
-            self.num_steps,
-            self._solver_now(explicit=step_noise is not None),
-            clip=self.clip,
-            step_noise=step_noise,
-            generator=generator,
-        )
-        return self.decode_plan(history, sequence)
+        return self.decode_plan(history, self.solve(history, noise, generator))
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the plan into the tensordict."""
         noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
         return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
-
-    def _condition(self, history: Tensor) -> Tensor:
-        condition = self._displace(history).flatten(-2)
-        return condition if self.features is None else torch.cat([condition, self.features(history)], -1)
-
-    def _displace(self, history: Tensor) -> Tensor:
-        if not self.relative:
-            return history
-        now = history[..., -1:, :]
-        return torch.cat([history[..., :-1, :] - now, now], -2)
-
-    def _solver_now(self, explicit: bool) -> str:
-        """A stochastic solver stays if the exploration type asks for samples, or if its draws are given."""
-        if explicit or not SOLVERS[self.solver].stochastic or interaction_type() in (None, InteractionType.RANDOM):
-            return self.solver
-        return "ddim"
-
-
-def _identity(width: int) -> Normalizer:
-    return Normalizer.fit(torch.zeros(1, width), mode="identity")

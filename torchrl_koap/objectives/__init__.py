@@ -2,6 +2,7 @@
 """Loss modules."""
 
 from torchrl_koap.objectives.controllers import InverseDynamicsLoss
+from torchrl_koap.objectives.diffusion_policy import DiffusionPolicyLoss
 from torchrl_koap.objectives.koopman import (
     KOAPLoss,
     KoopmanDynamicsLoss,
@@ -11,6 +12,7 @@ from torchrl_koap.objectives.koopman import (
 from torchrl_koap.objectives.planner import PlannerLoss
 
 __all__ = [
+    "DiffusionPolicyLoss",
     "InverseDynamicsLoss",
     "KOAPLoss",
     "KoopmanDynamicsLoss",

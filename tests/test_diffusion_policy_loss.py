@@ -1,0 +1,238 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The Diffusion Policy's loss: closed forms, alignment in time, labels and padding, and what it learns."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from loss_test_base import LossTestBase
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+
+from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
+from torchrl_koap.modules import DiffusionPolicy, MLPDenoiser, NoiseSchedule
+from torchrl_koap.objectives import DiffusionPolicyLoss
+
+HORIZON, ACT = 6, 3
+KINDS = [("squared_cosine", "epsilon"), ("squared_cosine", "sample"), ("flow", "velocity")]
+
+
+def make_policy(schedule="squared_cosine", prediction=None, history=2, **options):
+    denoiser = MLPDenoiser(ACT, 2 * history, horizon=HORIZON, width=32, depth=1)
+    policy = DiffusionPolicy(
+        denoiser,
+        NoiseSchedule(schedule, prediction),
+        state_dim=2,
+        action_dim=ACT,
+        history=history,
+        horizon=HORIZON,
+        **options,
+    )
+    data = batch_of(64, history=history)
+    policy.fit_normalizers(data["state"], data["action"][data["has_action"].squeeze(-1)])
+    return policy
+
+
+def make_loss(schedule="squared_cosine", prediction=None, seed=0, policy_options=None, **options):
+    torch.manual_seed(seed)
+    return DiffusionPolicyLoss(make_policy(schedule, prediction, **(policy_options or {})), **options)
+
+
+def batch_of(*batch, history=2):
+    generator = torch.Generator().manual_seed(3)
+    length = history + HORIZON
+    has_action = torch.rand(*batch, length, 1, generator=generator) < 0.7
+    action = 2 + 5 * torch.randn(*batch, length, ACT, generator=generator)
+    return TensorDict(
+        {
+            "state": torch.randn(*batch, length, 2, generator=generator).cumsum(-2),
+            "action": torch.where(has_action, action, torch.nan),
+            "has_action": has_action,
+            "policy_noise": torch.randn(*batch, HORIZON, ACT, generator=generator),
+            "policy_time": torch.randint(1, 50, batch, generator=generator),
+        },
+        batch,
+    )
+
+
+class TestDiffusionPolicyLoss(LossTestBase):
+    default_keys = {
+        "state": "state",
+        "action": "action",
+        "has_action": "has_action",
+        "padded": "padded",
+        "noise": "policy_noise",
+        "time": "policy_time",
+    }
+    in_names, out_keys = ("state", "action", "has_action"), ("loss_policy",)
+
+    def make_loss(self, seed=0, **options):
+        return make_loss(seed=seed, **options)
+
+    def make_batch(self, *batch):
+        return batch_of(*batch)
+
+    def counted(self, batch, key, elements):
+        return int(batch["has_action"][..., 1:-1, :].sum()) * ACT
+
+
+@pytest.mark.parametrize(("schedule", "prediction"), KINDS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("history", [1, 3])
+def test_value_in_closed_form(schedule, prediction, dtype, history):
+    loss = make_loss(schedule, prediction, policy_options={"history": history}, reduction="none").to(dtype)
+    data = batch_of(5, history=history).apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
+    value = loss(data)["loss_policy"]
+
+    policy, noise, time = loss.policy, data["policy_noise"], data["policy_time"].to(dtype)
+    frames = slice(history - 1, history - 1 + HORIZON)
+    counts = data["has_action"][:, frames]
+    clean = (data["action"][:, frames] - policy.action_normalizer.offset) / policy.action_normalizer.scale
+    clean = clean.nan_to_num(0.0)
+    condition = data["state"][:, :history].flatten(1)
+    condition = (condition - policy.condition_normalizer.offset) / policy.condition_normalizer.scale
+    if schedule == "flow":
+        noise_level = (time / 50)[:, None, None]
+        signal = 1 - noise_level
+    else:
+        signal = policy.schedule.signal.to(dtype)[time.long()][:, None, None]
+        noise_level = (1 - signal**2).sqrt()
+    target = {"epsilon": noise, "sample": clean, "velocity": noise - clean}[prediction]
+    with loss.policy_params.to_module(policy):
+        output = policy.denoiser(signal * clean + noise_level * noise, time, condition)
+    torch.testing.assert_close(value, torch.where(counts, (output - target) ** 2, 0.0), atol=1e-4, rtol=1e-4)
+    assert value.dtype == dtype and 0 < counts.sum() < counts.numel()
+
+
+def test_what_counts_are_labelled_recorded_transitions_from_now_on():
+    data = batch_of(1)
+    data["has_action"] = torch.ones(1, 8, 1, dtype=torch.bool)
+    data["action"] = torch.randn(1, 8, ACT)
+    loss = make_loss(reduction="none")
+
+    def counted(**entries):
+        return (loss(data.clone().update(entries))["loss_policy"] > 0).all(-1)[0].nonzero().flatten().tolist()
+
+    frames = torch.arange(8)
+    assert counted() == [0, 1, 2, 3, 4, 5]
+    assert counted(has_action=((frames == 1) | (frames == 6))[None, :, None]) == [0, 5]
+    assert counted(has_action=((frames == 0) | (frames == 7))[None, :, None]) == []
+    assert counted(padded=(frames >= 5)[None]) == [0, 1, 2]  # frame 4 -> 5 leads into padding
+    assert counted(padded=(frames < 1)[None, :, None]) == [0, 1, 2, 3, 4, 5]  # a repeated past takes no action away
+    assert counted(padded=(frames < 2)[None]) == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("poison", [float("nan"), 1e30])
+def test_what_is_stored_at_unlabelled_and_padded_steps_reaches_neither_value_nor_gradient(poison):
+    data = batch_of(6)
+    data["padded"] = torch.zeros(6, 8, dtype=torch.bool)
+    data["padded"][:3, 5:] = True
+    hidden = ~data["has_action"].squeeze(-1) | data["padded"]
+    outcomes = []
+    for stored in (0.0, poison):
+        poisoned = data.clone()
+        poisoned["action"][hidden] = stored
+        loss = make_loss()
+        value = loss(poisoned)["loss_policy"]
+        value.backward()
+        gradients = {name: p.grad.clone() for name, p in loss.named_parameters() if p.requires_grad}
+        outcomes.append((value.detach(), gradients))
+    (clean, gradients), (value, poisoned) = outcomes
+    assert value.isfinite() and torch.equal(value, clean)
+    for name, gradient in gradients.items():
+        assert torch.equal(gradient, poisoned[name]), name
+        assert gradient.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum"])
+def test_a_batch_without_labels_gives_exactly_zero(reduction):
+    data = batch_of(4)
+    data["has_action"] = torch.zeros_like(data["has_action"])
+    data["action"] = torch.full_like(data["action"], torch.nan)
+    loss = make_loss(reduction=reduction)
+    value = loss(data)["loss_policy"]
+    assert value == 0 and value.requires_grad
+    value.backward()
+    assert all((p.grad == 0).all() for p in loss.parameters() if p.requires_grad)
+
+
+def test_the_future_states_are_not_read():
+    data, loss = batch_of(4), make_loss()
+    other = data.clone()
+    other["state"][:, 2:] = torch.nan
+    assert torch.equal(loss(data)["loss_policy"], loss(other)["loss_policy"])
+    other["state"][:, 1] += 1
+    assert not torch.equal(loss(data)["loss_policy"], loss(other)["loss_policy"])
+
+
+def test_average_of_the_weights_follows_the_formula():
+    loss = make_loss()
+    average = SoftUpdate(loss, eps=0.9)
+    optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
+    expected = {name: value.clone() for name, value in loss.policy_params.flatten_keys(".").items()}
+    loss(batch_of(8))["loss_policy"].backward()
+    optimizer.step()
+    average.step()
+    target = loss.target_policy_params.flatten_keys(".")
+    for name, value in loss.policy_params.flatten_keys(".").items():
+        wanted = 0.9 * expected[name] + 0.1 * value.detach() if value.requires_grad else expected[name]
+        torch.testing.assert_close(target[name], wanted)
+    history, noise = batch_of(3)["state"][:, :2], torch.randn(3, HORIZON, ACT)
+    trained = loss.policy.sample(history, noise)
+    with loss.target_policy_params.to_module(loss.policy):
+        assert not torch.allclose(trained, loss.policy.sample(history, noise))
+    assert any("target" in name for name in loss.state_dict())
+    assert not any("target" in name for name in make_loss(create_target_params=False).state_dict())
+
+
+def test_training_recovers_a_linear_law_from_few_labels():
+    """Actions are ``A x``; with 10 of 60 trajectories labelled, each entry of a chunk belongs to its own step."""
+    torch.manual_seed(0)
+    law, turn = torch.tensor([[1.0, -2.0], [0.5, 1.0]]), torch.tensor([[0.98, 0.2], [-0.2, 0.98]])
+    states = [torch.rand(2) * 2 - 1 for _ in range(60)]
+    states = [torch.stack([torch.linalg.matrix_power(turn, t) @ start for t in range(31)]) for start in states]
+    data = flatten_trajectories(states, [frames[:-1] @ law.T for frames in states])
+    data, _ = LabelBudget(10, seed=1).apply(select_state(data, (0, 1)))
+    policy = DiffusionPolicy(
+        MLPDenoiser(2, 4, horizon=4, width=64, depth=1, frequencies=0),
+        NoiseSchedule("flow"),
+        state_dim=2,
+        action_dim=2,
+        horizon=4,
+        num_steps=5,
+    )
+    buffer = make_window_buffer(
+        data, 6, 256, select=["state", "action", "has_action"], labelled_share=1.0, pad_before=1
+    )
+    policy.fit_normalizers(buffer.sample()["state"], data["action"][data["has_action"].squeeze(-1)])
+    loss = DiffusionPolicyLoss(policy)
+    average = SoftUpdate(loss, eps=0.98)
+    optimizer = torch.optim.Adam(loss.parameters())
+    for step in range(800):
+        optimizer.param_groups[0]["lr"] = 4e-3 * (1 - step / 800)
+        loss(buffer.sample())["loss_policy"].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        average.step()
+    hidden = [frames for index, frames in enumerate(states) if not data["has_action"][data["episode"] == index].all()]
+    assert len(hidden) == 50
+    windows = torch.cat([frames[:30].unfold(0, 6, 1).transpose(1, 2) for frames in hidden])
+    with torch.no_grad(), loss.target_policy_params.to_module(policy):
+        chunk = policy.sample(windows[:, :2])
+    expected = windows[:, 1:5] @ law.T
+    error = (chunk - expected).square().mean((0, 2)).sqrt()
+    off_by_one = (windows[:, 2:6] @ law.T - expected).square().mean().sqrt()
+    assert (error < 0.25 * off_by_one).all() and (error < 0.06 * expected.std()).all(), (error, off_by_one)
+
+
+def test_bad_input_is_explained():
+    loss = make_loss()
+    data = batch_of(4)
+    with pytest.raises(ValueError, match=r"windows must be \[\*B, 8, 2\]"):
+        loss(data.clone().set("state", data["state"][:, 1:]))
+    with pytest.raises(ValueError, match=r"'action' must be \[4, 8, 3\] \(\[\*B, T, act\]\), got \[4, 6, 3\]"):
+        loss(data.clone().set("action", data["action"][:, 1:-1]))
+    with pytest.raises(ValueError, match=r"'has_action' must be bool \[4, 8, 1\], got torch.float32"):
+        loss(data.clone().set("has_action", data["has_action"].float()))
+    with pytest.raises(RuntimeError, match="use set_keys"):
+        loss.in_keys = ["x"]
