@@ -8,9 +8,9 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import Normalizer
-from torchrl_koap.modules import LinearInverseDynamics, SupervisedInverseDynamics
+from torchrl_koap.modules import LinearInverseDynamics, RecurrentInverseDynamics, SupervisedInverseDynamics
 
-MAKERS = (LinearInverseDynamics, SupervisedInverseDynamics)
+MAKERS = (LinearInverseDynamics, RecurrentInverseDynamics, SupervisedInverseDynamics)
 
 
 def linear_windows(*batch, frames=12, look_ahead=5, history=2, dtype=torch.float64, seed=0):
@@ -97,9 +97,9 @@ def test_batch_dimensions_types_keys_and_state_dict(make, dtype):
     assert model.num_window_frames == model.history + (9 if make is LinearInverseDynamics else 2)
 
 
-def test_supervised_action_depends_on_everything_up_to_the_next_state_and_nothing_later():
+def test_recurrent_action_depends_on_everything_up_to_the_next_state_and_nothing_later():
     torch.manual_seed(0)
-    model = SupervisedInverseDynamics(3, 2, hidden_dim=8)
+    model = RecurrentInverseDynamics(3, 2, hidden_dim=8)
     state = torch.randn(1, 6, 3, requires_grad=True)
     for frame in range(5):
         action = model(TensorDict({"state": state}, [1]))["action"]
@@ -109,12 +109,12 @@ def test_supervised_action_depends_on_everything_up_to_the_next_state_and_nothin
     assert torch.equal(action[0, 5], action[0, 4])  # there is no x_6: the last one is repeated
 
 
-def test_supervised_normalisers_are_applied_on_both_sides():
+def test_recurrent_normalisers_are_applied_on_both_sides():
     torch.manual_seed(0)
-    plain = SupervisedInverseDynamics(3, 2, hidden_dim=8)
+    plain = RecurrentInverseDynamics(3, 2, hidden_dim=8)
     shift, scale = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 4.0, 8.0])
     out_shift, out_scale = torch.tensor([5.0, 6.0]), torch.tensor([0.5, 0.25])
-    model = SupervisedInverseDynamics(
+    model = RecurrentInverseDynamics(
         3,
         2,
         hidden_dim=8,
@@ -129,5 +129,41 @@ def test_supervised_normalisers_are_applied_on_both_sides():
 
 
 def test_look_ahead_of_the_next_state_is_refused():
+    """A ridge may not be told the next state, as KOAP may not; the supervised network may."""
+    assert SupervisedInverseDynamics(2, 2, look_ahead=1).num_window_frames == 6
     with pytest.raises(ValueError, match="must be >= 2"):
         LinearInverseDynamics(2, 2, look_ahead=1)
+
+
+@pytest.mark.parametrize("look_ahead", [(1,), (1, 3)])
+def test_supervised_action_depends_on_its_frames_and_no_others(look_ahead):
+    torch.manual_seed(0)
+    model = SupervisedInverseDynamics(3, 2, hidden_dims=(8,), history=2, look_ahead=look_ahead)
+    state = torch.randn(1, 9, 3, requires_grad=True)
+    assert model.span(9) == range(2, 9 - look_ahead[-1])
+    for frame in model.span(9):
+        action = model(TensorDict({"state": state}, [1]))["action"]
+        (gradient,) = torch.autograd.grad(action[0, frame].sum(), state)
+        reached = (gradient[0].abs().sum(-1) > 0).nonzero().flatten().tolist()
+        assert reached == [frame - 2, frame - 1, frame, *(frame + offset for offset in look_ahead)]
+
+
+def test_supervised_network_normalises_both_sides_and_scales_steps():
+    torch.manual_seed(0)
+    plain = SupervisedInverseDynamics(3, 2, hidden_dims=(8,))
+    shift, scale = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 4.0, 8.0])
+    model = SupervisedInverseDynamics(
+        3,
+        2,
+        hidden_dims=(8,),
+        state_normalizer=Normalizer(shift, scale),
+        action_normalizer=Normalizer(torch.tensor([5.0, 6.0]), torch.tensor([0.5, 0.25])),
+    )
+    model.load_state_dict(plain.state_dict(), strict=False)
+    state = torch.randn(4, 12, 3).cumsum(1)
+    plain.fit_scales(state)
+    model.fit_scales(state * scale + shift)
+    torch.testing.assert_close(model.frames.scales, plain.frames.scales)
+    expected = plain(TensorDict({"state": state}, [4]))["action"] * torch.tensor([0.5, 0.25]) + torch.tensor([5.0, 6.0])
+    actual = model(TensorDict({"state": state * scale + shift}, [4]))["action"]
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4)

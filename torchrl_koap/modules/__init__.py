@@ -2,7 +2,6 @@
 """Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
 
 from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
-from torchrl_koap.modules.controllers import LinearInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.denoisers import MLPDenoiser, TransformerDenoiser
 from torchrl_koap.modules.diffusion import NoiseSchedule
 from torchrl_koap.modules.diffusion_policy import DiffusionPolicy
@@ -14,10 +13,13 @@ from torchrl_koap.modules.latent_action import (
     LatentActionMLP,
     LatentActionModule,
 )
+from torchrl_koap.modules.linear import LinearInverseDynamics
 from torchrl_koap.modules.planner import StatePlanner
 from torchrl_koap.modules.policies import EpisodeNoise, PlanThenControl, join_plan, policy_transforms
 from torchrl_koap.modules.presets import PRESETS, make_koopman_inverse_dynamics
+from torchrl_koap.modules.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.unet import TemporalUnet
+from torchrl_koap.modules.variational import LatentInverseDynamics, VariationalInverseDynamics
 
 __all__ = [
     "PRESETS",
@@ -30,16 +32,19 @@ __all__ = [
     "LatentActionLSTM",
     "LatentActionMLP",
     "LatentActionModule",
+    "LatentInverseDynamics",
     "LinearActionDecoder",
     "LinearInverseDynamics",
     "MLPDenoiser",
     "NoiseSchedule",
     "PlanThenControl",
+    "RecurrentInverseDynamics",
     "RidgeFit",
     "StatePlanner",
     "SupervisedInverseDynamics",
     "TemporalUnet",
     "TransformerDenoiser",
+    "VariationalInverseDynamics",
     "join_plan",
     "make_koopman_inverse_dynamics",
     "policy_transforms",

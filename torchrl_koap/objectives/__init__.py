@@ -1,7 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Loss modules."""
 
-from torchrl_koap.objectives.controllers import InverseDynamicsLoss
 from torchrl_koap.objectives.diffusion_policy import DiffusionPolicyLoss
 from torchrl_koap.objectives.koopman import (
     KOAPLoss,
@@ -9,7 +8,10 @@ from torchrl_koap.objectives.koopman import (
     KoopmanReconstructionLoss,
     LatentActionLoss,
 )
+from torchrl_koap.objectives.latent_decoder import LatentDecoderLoss
 from torchrl_koap.objectives.planner import PlannerLoss
+from torchrl_koap.objectives.supervised import InverseDynamicsLoss
+from torchrl_koap.objectives.variational import VariationalLoss
 
 __all__ = [
     "DiffusionPolicyLoss",
@@ -18,5 +20,7 @@ __all__ = [
     "KoopmanDynamicsLoss",
     "KoopmanReconstructionLoss",
     "LatentActionLoss",
+    "LatentDecoderLoss",
     "PlannerLoss",
+    "VariationalLoss",
 ]

@@ -9,7 +9,7 @@ from loss_test_base import LossTestBase
 from tensordict import TensorDict
 
 from torchrl_koap.data import Normalizer
-from torchrl_koap.modules import SupervisedInverseDynamics
+from torchrl_koap.modules import RecurrentInverseDynamics
 from torchrl_koap.objectives import InverseDynamicsLoss
 
 T = 7
@@ -17,7 +17,7 @@ T = 7
 
 def make_loss(seed=0, **options):
     torch.manual_seed(seed)
-    network = SupervisedInverseDynamics(
+    network = RecurrentInverseDynamics(
         3,
         2,
         hidden_dim=16,

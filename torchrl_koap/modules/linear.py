@@ -1,16 +1,15 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Controllers that KOAP is measured against. Same interface: a window of states in, an action per frame out."""
+"""Ridge regression on raw frames: the control that any latent method must beat."""
 
 from __future__ import annotations
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchrl_koap.keys import ACTION, STATE
 from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
-from torchrl_koap.modules.recurrent import SequenceLSTM
 from torchrl_koap.modules.time_alignment import check_offsets, frame_index
 
 
@@ -95,75 +94,3 @@ class LinearInverseDynamics(TensorDictModuleBase):
         return self.decoder.fit_ridge(
             self._frames(windows.get(self.in_keys[0])), windows.get(self.out_keys[0]), mask, groups=groups
         )
-
-
-class SupervisedInverseDynamics(TensorDictModuleBase):
-    """The inverse dynamics of Decision Diffuser: an LSTM reads ``a_t`` off ``x_0, ..., x_{t+1}``, trained on labels.
-
-    ``koap_release_notes`` section 3.4: outputs at frames ``1 .. T-1`` are the actions of frames ``0 .. T-2``.
-
-    Args:
-        state_dim (int): size ``d`` of a state.
-        action_dim (int): size of an action.
-
-    Keyword Args:
-        hidden_dim (int): width of the LSTM. Defaults to ``256``.
-        history (int): frames before the current one that a policy hands over. Defaults to ``1``.
-        state_normalizer (nn.Module, optional): maps raw states to the network's units.
-        action_normalizer (nn.Module, optional): its ``inverse`` maps network outputs to raw actions.
-        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
-        out_key (NestedKey): raw actions ``[*B, T, act]``; that of the last frame repeats the one before.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules import SupervisedInverseDynamics
-        >>> model = SupervisedInverseDynamics(2, 2, hidden_dim=16)
-        >>> model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))["action"].shape
-        torch.Size([3, 16, 2])
-    """
-
-    def __init__(
-        self,
-        state_dim: int,
-        action_dim: int,
-        *,
-        hidden_dim: int = 256,
-        history: int = 1,
-        state_normalizer: nn.Module | None = None,
-        action_normalizer: nn.Module | None = None,
-        in_key: NestedKey = STATE,
-        out_key: NestedKey = ACTION,
-    ):
-        super().__init__()
-        self.in_keys, self.out_keys = [in_key], [out_key]
-        self.history = history
-        self.network = SequenceLSTM(state_dim, hidden_dim, action_dim)
-        self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
-
-    def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
-        """Renames the entries read and written."""
-        if state is not None:
-            self.in_keys = [state]
-        if action is not None:
-            self.out_keys = [action]
-
-    @property
-    def num_window_frames(self) -> int:
-        """Frames of the shortest complete window."""
-        return self.history + 2
-
-    def normalize_action(self, action: Tensor) -> Tensor:
-        """Raw actions to the network's units."""
-        return action if self.action_normalizer is None else self.action_normalizer(action)
-
-    def predict(self, state: Tensor) -> Tensor:
-        """Normalised actions ``[*B, T - 1, act]`` of frames ``0 .. T-2``."""
-        state = state if self.state_normalizer is None else self.state_normalizer(state)
-        return self.network(state)[..., 1:, :]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action of every frame."""
-        action = self.predict(tensordict.get(self.in_keys[0]))
-        action = action if self.action_normalizer is None else self.action_normalizer.inverse(action)
-        return tensordict.set(self.out_keys[0], torch.cat([action, action[..., -1:, :]], -2))

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Losses of the controllers that KOAP is measured against."""
+"""The loss of inverse dynamics networks that labels alone teach."""
 
 from __future__ import annotations
 
@@ -7,50 +7,52 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
 
-from torchrl_koap.modules.controllers import SupervisedInverseDynamics
+from torchrl_koap.modules.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.objectives.windows import WindowLoss
 
 
 class InverseDynamicsLoss(WindowLoss):
-    """Mean square error of supervised inverse dynamics on the labelled frames but the first and last, ``loss_action``.
+    """Mean square error of supervised inverse dynamics on the labelled frames of its span, ``loss_action``.
 
     A batch without labels gives exactly 0; an unlabelled (NaN) action reaches neither value nor gradient.
 
     Args:
-        network (SupervisedInverseDynamics): the model.
+        network (SupervisedInverseDynamics or RecurrentInverseDynamics): the model.
 
     Keyword Args:
-        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, T - 2]``, 0 where masked).
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import SupervisedInverseDynamics
         >>> from torchrl_koap.objectives import InverseDynamicsLoss
-        >>> loss = InverseDynamicsLoss(SupervisedInverseDynamics(2, 2, hidden_dim=8))
+        >>> loss = InverseDynamicsLoss(SupervisedInverseDynamics(2, 2))
         >>> batch = TensorDict({"state": torch.randn(4, 16, 2), "action": torch.full((4, 16, 2), torch.nan),
         ...                     "has_action": torch.zeros(4, 16, 1, dtype=torch.bool)}, [4])
         >>> loss(batch)["loss_action"].item()
         0.0
     """
 
-    network: SupervisedInverseDynamics
+    network: SupervisedInverseDynamics | RecurrentInverseDynamics
     network_params: TensorDictParams
     target_network_params: TensorDictParams
     out_keys = ["loss_action"]
     uses_labels = True
 
-    def __init__(self, network: SupervisedInverseDynamics, *, reduction: str = "mean"):
+    def __init__(self, network: SupervisedInverseDynamics | RecurrentInverseDynamics, *, reduction: str = "mean"):
         super().__init__(network, state_key=network.in_keys[0], action_key=network.out_keys[0], reduction=reduction)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Computes the loss."""
         state, recorded = self._inputs(tensordict)
-        action = self._read(tensordict, self.tensor_keys.action)[..., 1:-1, :]
-        counts = self._read_mask(tensordict, self.tensor_keys.has_action, state)[..., 1:-1] & recorded[..., 1:]
+        span = self.network.span(state.shape[-2])
+        frames = slice(span.start, span.stop)
+        action = self._read(tensordict, self.tensor_keys.action)[..., frames, :]
+        counts = self._read_mask(tensordict, self.tensor_keys.has_action, state)[..., frames] & recorded[..., frames]
         # zeroed before the residual: masking afterwards would leave NaN in the gradient
         target = self.network.normalize_action(torch.where(counts.unsqueeze(-1), action, 0.0))
         with self.network_params.to_module(self.network, preserve_module_state=False):
-            error = (self.network.predict(state)[..., 1:, :] - target).square().mean(-1)
+            error = (self.network.predict(state)[..., frames, :] - target).square().mean(-1)
         return TensorDict({"loss_action": self._reduce(error, counts)})

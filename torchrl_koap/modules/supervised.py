@@ -1,0 +1,191 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Inverse dynamics networks that labels alone teach. A window of states in, an action per frame out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from torchrl_koap.keys import ACTION, STATE
+from torchrl_koap.modules.recurrent import SequenceLSTM, mlp
+from torchrl_koap.modules.transition_frames import TransitionFrames
+
+
+class _Supervised(TensorDictModuleBase):
+    """Keys and normalisers; what is predicted is the subclass's."""
+
+    history: int
+
+    def __init__(
+        self,
+        *,
+        state_normalizer: nn.Module | None,
+        action_normalizer: nn.Module | None,
+        in_key: NestedKey,
+        out_key: NestedKey,
+    ):
+        super().__init__()
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
+
+    def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
+        """Renames the entries read and written."""
+        if state is not None:
+            self.in_keys = [state]
+        if action is not None:
+            self.out_keys = [action]
+
+    def normalize_state(self, state: Tensor) -> Tensor:
+        """Raw states to the network's units."""
+        return state if self.state_normalizer is None else self.state_normalizer(state)
+
+    def normalize_action(self, action: Tensor) -> Tensor:
+        """Raw actions to the network's units."""
+        return action if self.action_normalizer is None else self.action_normalizer(action)
+
+    def predict(self, state: Tensor) -> Tensor:
+        """Normalised actions ``[*B, T, act]`` of raw states ``[*B, T, d]``."""
+        raise NotImplementedError
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action of every frame."""
+        action = self.predict(tensordict.get(self.in_keys[0]))
+        action = action if self.action_normalizer is None else self.action_normalizer.inverse(action)
+        return tensordict.set(self.out_keys[0], action)
+
+
+class SupervisedInverseDynamics(_Supervised):
+    r"""A perceptron from the frames around a step to its action, trained on labels.
+
+    .. math::
+        a_t = f(x_{t-n}, \dots, x_t, x_{t+k_1}, x_{t+k_2}, \dots)
+
+    With ``look_ahead=1`` this is the inverse dynamics of Decision Diffuser, which is told the next state and nothing
+    further ahead. KOAP's first public code trains an LSTM instead (:class:`RecurrentInverseDynamics`), whose first
+    outputs, those that are executed, are its worst (``koap_release_notes`` section 8).
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        action_dim (int): size of an action.
+
+    Keyword Args:
+        hidden_dims (sequence of int): widths. Defaults to ``(128, 128)``.
+        history (int): frames ``n`` before the current one. Defaults to ``4``.
+        look_ahead (int or sequence of int): offsets ``k >= 1``. Defaults to ``1``.
+        state_normalizer (nn.Module, optional): maps raw states to the network's units.
+        action_normalizer (nn.Module, optional): its ``inverse`` maps network outputs to raw actions.
+        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
+        out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
+
+    Raises:
+        ValueError: for a negative history or an offset below 1.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import SupervisedInverseDynamics
+        >>> model = SupervisedInverseDynamics(2, 2, look_ahead=(1, 4))
+        >>> model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))["action"].shape
+        torch.Size([3, 16, 2])
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        hidden_dims: Sequence[int] = (128, 128),
+        history: int = 4,
+        look_ahead: int | Sequence[int] = 1,
+        state_normalizer: nn.Module | None = None,
+        action_normalizer: nn.Module | None = None,
+        in_key: NestedKey = STATE,
+        out_key: NestedKey = ACTION,
+    ):
+        super().__init__(
+            state_normalizer=state_normalizer, action_normalizer=action_normalizer, in_key=in_key, out_key=out_key
+        )
+        self.frames = TransitionFrames(state_dim, history=history, look_ahead=look_ahead)
+        self.history = history
+        self.network = mlp(self.frames.num_features, hidden_dims, action_dim)
+
+    @property
+    def num_window_frames(self) -> int:
+        """Frames of the shortest complete window."""
+        return self.frames.num_window_frames
+
+    def span(self, num_frames: int) -> range:
+        """Frames of a window that count in the loss: those that have all they read inside it."""
+        return self.frames.span(num_frames)
+
+    def fit_scales(self, windows: Tensor) -> None:
+        """Sets input scales from windows of raw states ``[*B, T, d]``; no label is read."""
+        self.frames.fit_scales(self.normalize_state(windows))
+
+    def predict(self, state: Tensor) -> Tensor:
+        """Normalised actions ``[*B, T, act]``; frames near the ends read a clamped window."""
+        return self.network(self.frames(self.normalize_state(state)))
+
+
+class RecurrentInverseDynamics(_Supervised):
+    """An LSTM that reads ``a_t`` off ``x_0, ..., x_{t+1}``: the supervised controller of KOAP's first public code.
+
+    ``koap_release_notes`` section 3.4: outputs at frames ``1 .. T-1`` are the actions of frames ``0 .. T-2``; that of
+    the last frame repeats the one before.
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        action_dim (int): size of an action.
+
+    Keyword Args:
+        hidden_dim (int): width of the LSTM. Defaults to ``256``.
+        history (int): frames before the current one that a policy hands over. Defaults to ``1``.
+        state_normalizer (nn.Module, optional): maps raw states to the network's units.
+        action_normalizer (nn.Module, optional): its ``inverse`` maps network outputs to raw actions.
+        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
+        out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import RecurrentInverseDynamics
+        >>> model = RecurrentInverseDynamics(2, 2, hidden_dim=16)
+        >>> model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))["action"].shape
+        torch.Size([3, 16, 2])
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        hidden_dim: int = 256,
+        history: int = 1,
+        state_normalizer: nn.Module | None = None,
+        action_normalizer: nn.Module | None = None,
+        in_key: NestedKey = STATE,
+        out_key: NestedKey = ACTION,
+    ):
+        super().__init__(
+            state_normalizer=state_normalizer, action_normalizer=action_normalizer, in_key=in_key, out_key=out_key
+        )
+        self.history = history
+        self.network = SequenceLSTM(state_dim, hidden_dim, action_dim)
+
+    @property
+    def num_window_frames(self) -> int:
+        """Frames of the shortest complete window."""
+        return self.history + 2
+
+    def span(self, num_frames: int) -> range:
+        """Frames of a window that count in the loss: all but the first and the last."""
+        return range(1, num_frames - 1)
+
+    def predict(self, state: Tensor) -> Tensor:
+        """Normalised actions ``[*B, T, act]``."""
+        action = self.network(self.normalize_state(state))[..., 1:, :]
+        return torch.cat([action, action[..., -1:, :]], -2)
