@@ -15,6 +15,7 @@ from torchrl_koap.commands.demos import Demos, run_demos
 from torchrl_koap.commands.doctor import Doctor, Validate, run_doctor, run_validate
 from torchrl_koap.commands.eval import Eval, run_eval
 from torchrl_koap.commands.inspect import Inspect, run_inspect
+from torchrl_koap.commands.suggest import Suggest, run_suggest
 from torchrl_koap.commands.train import Train, run_train
 
 RUNNERS = {
@@ -22,6 +23,7 @@ RUNNERS = {
     Train: run_train,
     Eval: run_eval,
     Inspect: run_inspect,
+    Suggest: run_suggest,
     Doctor: run_doctor,
     Validate: run_validate,
 }
@@ -33,6 +35,7 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
+    | Annotated[Suggest, tyro.conf.subcommand("suggest")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]
 )
