@@ -1,0 +1,97 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+r"""The loss of the variational auto-encoder of short trajectories.
+
+.. math::
+    L = \overline{|g_\psi(u_t, x_t) - s_t|^2} + \beta \, \overline{D_{KL}(q(u_t \mid s_t, x_t) \,\|\, N(0, 1))},
+    \qquad u_t = \mu_t + \sigma_t \epsilon
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams, dispatch
+from torch import Tensor
+
+from torchrl_koap.modules.variational import VariationalInverseDynamics
+from torchrl_koap.objectives.windows import WindowLoss
+
+
+class VariationalLoss(WindowLoss):
+    """Reconstruction of the steps around a frame from a sampled latent, and the divergence of the latent.
+
+    The squared error is averaged over the entries of a reconstruction, at unit scale; the divergence is summed over
+    those of a latent. No label is read: actions are decoded by :class:`~torchrl_koap.objectives.LatentDecoderLoss`,
+    afterwards (the paper) or, with ``train_encoder=True``, in the same update (the first public code).
+
+    Args:
+        network (VariationalInverseDynamics): the model.
+
+    Keyword Args:
+        kl_coeff (float): ``beta``, already applied to ``loss_kl``. Defaults to ``0.01``. Assigning to it later is an
+            in-place buffer write.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+
+    Raises:
+        ValueError: if the noise handed in has another shape than the latents.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import VariationalInverseDynamics
+        >>> from torchrl_koap.objectives import VariationalLoss
+        >>> loss = VariationalLoss(VariationalInverseDynamics(2, 2))
+        >>> sorted(loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4])).keys())
+        ['loss_kl', 'loss_reconstruction']
+    """
+
+    @dataclass
+    class _AcceptedKeys(WindowLoss._AcceptedKeys):
+        """Keys read from the input, as in :class:`WindowLoss`.
+
+        Attributes:
+            noise (NestedKey): optional; noise ``[*B, frames, m]`` of the frames that count instead of random.
+        """
+
+        noise: NestedKey = "latent_noise"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    network: VariationalInverseDynamics
+    network_params: TensorDictParams
+    target_network_params: TensorDictParams
+    out_keys = ["loss_reconstruction", "loss_kl"]
+    _schedulable_buffers = frozenset({"kl_coeff"})
+
+    def __init__(self, network: VariationalInverseDynamics, *, kl_coeff: float = 0.01, reduction: str = "mean"):
+        super().__init__(network, state_key=network.in_keys[0], action_key=network.out_keys[-1], reduction=reduction)
+        self.register_coeff_buffer("kl_coeff", kl_coeff)
+
+    def _noise(self, tensordict: TensorDictBase, mean: Tensor) -> Tensor:
+        noise = tensordict.get(self.tensor_keys.noise, None)
+        if noise is None:
+            return torch.randn_like(mean)
+        if noise.shape != mean.shape:
+            raise ValueError(f"{self.tensor_keys.noise!r} must be {list(mean.shape)}, got {list(noise.shape)}")
+        return noise
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Computes both terms from ``state``."""
+        state, recorded = self._inputs(tensordict)
+        span = self.network.span(state.shape[-2])
+        counts = recorded[..., span.start : span.stop]
+        with self.network_params.to_module(self.network, preserve_module_state=False):
+            read = self.network.read(state, span)
+            present, steps = self.network.split(read)
+            mean, log_variance = self.network.posterior(read)
+            sample = mean + (0.5 * log_variance).exp() * self._noise(tensordict, mean)
+            error = (self.network.reconstruct(sample, present) - steps).square().mean(-1)
+        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1)
+        losses = {
+            "loss_reconstruction": self._reduce(error, counts),
+            "loss_kl": self.kl_coeff * self._reduce(divergence, counts),
+        }
+        return TensorDict(losses)
