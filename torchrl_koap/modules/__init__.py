@@ -5,6 +5,7 @@ from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.denoisers import MLPDenoiser, TransformerDenoiser
 from torchrl_koap.modules.diffusion import NoiseSchedule
 from torchrl_koap.modules.diffusion_policy import DiffusionPolicy
+from torchrl_koap.modules.finite_scalar_quantization import FiniteScalarQuantizer
 from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.latent_action import (
@@ -17,6 +18,7 @@ from torchrl_koap.modules.linear import LinearInverseDynamics
 from torchrl_koap.modules.planner import StatePlanner
 from torchrl_koap.modules.policies import EpisodeNoise, PlanThenControl, join_plan, policy_transforms
 from torchrl_koap.modules.presets import PRESETS, make_koopman_inverse_dynamics
+from torchrl_koap.modules.quantized import QuantizedInverseDynamics
 from torchrl_koap.modules.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.unet import TemporalUnet
 from torchrl_koap.modules.variational import LatentInverseDynamics, VariationalInverseDynamics
@@ -25,6 +27,7 @@ __all__ = [
     "PRESETS",
     "DiffusionPolicy",
     "EpisodeNoise",
+    "FiniteScalarQuantizer",
     "KoopmanInverseDynamics",
     "KoopmanLifting",
     "KoopmanOperator",
@@ -38,6 +41,7 @@ __all__ = [
     "MLPDenoiser",
     "NoiseSchedule",
     "PlanThenControl",
+    "QuantizedInverseDynamics",
     "RecurrentInverseDynamics",
     "RidgeFit",
     "StatePlanner",

@@ -10,6 +10,7 @@ from torchrl_koap.objectives.koopman import (
 )
 from torchrl_koap.objectives.latent_decoder import LatentDecoderLoss
 from torchrl_koap.objectives.planner import PlannerLoss
+from torchrl_koap.objectives.quantized import QuantizedDynamicsLoss
 from torchrl_koap.objectives.supervised import InverseDynamicsLoss
 from torchrl_koap.objectives.variational import VariationalLoss
 
@@ -22,5 +23,6 @@ __all__ = [
     "LatentActionLoss",
     "LatentDecoderLoss",
     "PlannerLoss",
+    "QuantizedDynamicsLoss",
     "VariationalLoss",
 ]

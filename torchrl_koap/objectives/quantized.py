@@ -1,0 +1,56 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+r"""The loss of latent action policies (LAPO) with a quantised latent.
+
+.. math::
+    L = \overline{|h_\psi(x_{t-n}, \dots, x_t, u_t) - (x_{t+1} - x_t)|^2}
+"""
+
+from __future__ import annotations
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams, dispatch
+
+from torchrl_koap.modules.quantized import QuantizedInverseDynamics
+from torchrl_koap.objectives.windows import WindowLoss
+
+
+class QuantizedDynamicsLoss(WindowLoss):
+    """Error of the next step, at unit scale, predicted from the past and the code of the transition, ``loss_dynamics``.
+
+    No label is read: actions are decoded by :class:`~torchrl_koap.objectives.LatentDecoderLoss`, afterwards (LAPO) or,
+    with ``train_encoder=True``, in the same update (the first public code).
+
+    Args:
+        network (QuantizedInverseDynamics): the model.
+
+    Keyword Args:
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import QuantizedInverseDynamics
+        >>> from torchrl_koap.objectives import QuantizedDynamicsLoss
+        >>> loss = QuantizedDynamicsLoss(QuantizedInverseDynamics(2, 2))
+        >>> loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4]))["loss_dynamics"].shape
+        torch.Size([])
+    """
+
+    network: QuantizedInverseDynamics
+    network_params: TensorDictParams
+    target_network_params: TensorDictParams
+    out_keys = ["loss_dynamics"]
+
+    def __init__(self, network: QuantizedInverseDynamics, *, reduction: str = "mean"):
+        super().__init__(network, state_key=network.in_keys[0], action_key=network.out_keys[-1], reduction=reduction)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Computes the loss from ``state``."""
+        state, recorded = self._inputs(tensordict)
+        span = self.network.span(state.shape[-2])
+        with self.network_params.to_module(self.network, preserve_module_state=False):
+            read = self.network.read(state, span)
+            past, step = self.network.split(read)
+            error = (self.network.predict_step(past, self.network.quantized(read)) - step).square().mean(-1)
+        return TensorDict({"loss_dynamics": self._reduce(error, recorded[..., span.start : span.stop])})
