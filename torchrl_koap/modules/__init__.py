@@ -2,6 +2,7 @@
 """Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
 
 from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.chunked_policy import ChunkedPolicy
 from torchrl_koap.modules.denoisers import MLPDenoiser, TransformerDenoiser
 from torchrl_koap.modules.diffusion import NoiseSchedule
 from torchrl_koap.modules.diffusion_policy import DiffusionPolicy
@@ -25,6 +26,7 @@ from torchrl_koap.modules.variational import LatentInverseDynamics, VariationalI
 
 __all__ = [
     "PRESETS",
+    "ChunkedPolicy",
     "DiffusionPolicy",
     "EpisodeNoise",
     "FiniteScalarQuantizer",
