@@ -71,7 +71,7 @@ def main() -> None:
     parser.add_argument("--dataset", default="scripted")
     parser.add_argument("--planner", type=Path, required=True, help="run directory whose planner all cells share")
     parser.add_argument("--counts", type=int, nargs="+", default=[1, 2, 48], help="labelled trajectories")
-    parser.add_argument("--methods", nargs="+", default=["koap", "linear", "supervised"], help="koap:paper is a preset")
+    parser.add_argument("--methods", nargs="+", default=["koap", "linear", "dd"], help="koap:paper is a preset")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--episodes", type=int, default=60, help="0: action errors only")
     parser.add_argument("--threads", type=int, default=2)

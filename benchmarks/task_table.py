@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Success on the D3IL tasks at two label levels, KOAP against supervised inverse dynamics, one planner per seed.
+"""Success on the D3IL tasks at two label levels, KOAP against supervised inverse dynamics (dd), one planner per seed.
 
     python benchmarks/task_table.py --out runs/table --tasks aligning sorting po_sorting stacking --seeds 0 1 2
 
@@ -22,7 +22,7 @@ from torchrl_koap.tasks import get_task
 # success rates of KOAP in its paper at label levels 1 and 5, in per cent
 PAPER = {"aligning": (80, 92), "sorting": (62, 66), "po_sorting": (46, 58), "stacking_1": (27, 46)}
 LEVELS = (1, 5)
-METHODS = ("koap", "supervised")
+METHODS = ("koap", "dd")
 
 
 def koap(*arguments: object) -> None:

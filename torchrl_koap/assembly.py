@@ -14,15 +14,14 @@ from torch import nn
 from torchrl_koap.data import D3ILExperienceReplay, Normalizer, load_ted, select_state
 from torchrl_koap.demonstrations import record_demonstrations
 from torchrl_koap.lookup import lookup
+from torchrl_koap.methods import get_method, normalizers_of
 from torchrl_koap.modules import (
-    LinearInverseDynamics,
+    DiffusionPolicy,
     MLPDenoiser,
     NoiseSchedule,
     StatePlanner,
-    SupervisedInverseDynamics,
     TemporalUnet,
     TransformerDenoiser,
-    make_koopman_inverse_dynamics,
 )
 from torchrl_koap.tasks import Task
 
@@ -68,20 +67,20 @@ def load_demonstrations(
     return select_state(data, task.state_of)
 
 
-def _unet(state_dim: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    return TemporalUnet(state_dim, condition_dim, channels=tuple(options["channels"]))
+def _unet(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    return TemporalUnet(width, condition_dim, channels=tuple(options["channels"]))
 
 
-def _mlp(state_dim: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    return MLPDenoiser(state_dim, condition_dim, horizon=options["horizon"])
+def _mlp(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    return MLPDenoiser(width, condition_dim, horizon=options["horizon"])
 
 
-def _transformer(state_dim: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    return TransformerDenoiser(state_dim, condition_dim)
+def _transformer(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    return TransformerDenoiser(width, condition_dim)
 
 
-def _released(state_dim: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    return TemporalUnet.released(state_dim, condition_dim)
+def _released(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    return TemporalUnet.released(width, condition_dim)
 
 
 DENOISERS = {"unet": _unet, "mlp": _mlp, "transformer": _transformer, "released": _released}
@@ -99,44 +98,43 @@ def build_planner(options: Mapping[str, Any], state_dim: int, features: nn.Modul
     Raises:
         ValueError: for an unknown denoiser, schedule, prediction or solver.
     """
-    denoiser = lookup(DENOISERS, options["denoiser"], "denoiser")
+    return StatePlanner(**_diffusion(options, state_dim, state_dim, features))
+
+
+def build_diffusion_policy(
+    options: Mapping[str, Any], state_dim: int, action_dim: int, features: nn.Module | None = None
+) -> DiffusionPolicy:
+    """A diffusion policy with the denoiser of :func:`build_planner`, without statistics.
+
+    Args:
+        options (mapping): as for :func:`build_planner`.
+        state_dim (int): number of state columns.
+        action_dim (int): number of action columns.
+        features (nn.Module, optional): what the condition holds besides the history.
+
+    Raises:
+        ValueError: for an unknown denoiser, schedule, prediction or solver.
+    """
+    return DiffusionPolicy(action_dim=action_dim, **_diffusion(options, state_dim, action_dim, features))
+
+
+def _diffusion(options: Mapping[str, Any], state_dim: int, width: int, features: nn.Module | None) -> dict[str, Any]:
+    """What planner and diffusion policy take alike, with a denoiser for sequences of that width."""
+    make = lookup(DENOISERS, options["denoiser"], "denoiser")
     features = features if options.get("relations") else None
     condition_dim = options["history"] * state_dim + (0 if features is None else features.num_features)
-    return StatePlanner(
-        denoiser(state_dim, condition_dim, options),
-        NoiseSchedule(options["schedule"], options["prediction"]),
-        state_dim=state_dim,
-        history=options["history"],
-        horizon=options["horizon"],
-        relative=options["relative"],
-        features=features,
-        solver=options["solver"],
-        num_steps=options["solver_steps"],
-        clip=options["clip"],
-    )
-
-
-def _koap(state_dim, action_dim, state_normalizer, action_normalizer, options):
-    return make_koopman_inverse_dynamics(
-        state_dim,
-        action_dim,
-        preset=options["preset"],
-        state_normalizer=state_normalizer,
-        action_normalizer=action_normalizer,
-    )
-
-
-def _linear(state_dim, action_dim, state_normalizer, action_normalizer, options):
-    return LinearInverseDynamics(state_dim, action_dim)
-
-
-def _supervised(state_dim, action_dim, state_normalizer, action_normalizer, options):
-    return SupervisedInverseDynamics(
-        state_dim, action_dim, state_normalizer=state_normalizer, action_normalizer=action_normalizer
-    )
-
-
-METHODS = {"koap": _koap, "linear": _linear, "supervised": _supervised}
+    return {
+        "denoiser": make(width, condition_dim, options),
+        "schedule": NoiseSchedule(options["schedule"], options["prediction"]),
+        "state_dim": state_dim,
+        "history": options["history"],
+        "horizon": options["horizon"],
+        "relative": options["relative"],
+        "features": features,
+        "solver": options["solver"],
+        "num_steps": options["solver_steps"],
+        "clip": options["clip"],
+    }
 
 
 def build_controller(
@@ -145,23 +143,27 @@ def build_controller(
     """A controller, with statistics of the data if these are given, else without (weights bring them).
 
     Args:
-        options (mapping): the ``controller`` entry of ``config.json``: method and preset.
+        options (mapping): the ``controller`` entry of ``config.json``: method, decoder and preset.
         state_dim (int): number of state columns.
         action_dim (int): number of action columns.
         labelled (TensorDictBase, optional): flat data after the label budget was applied. State statistics come from
-            all of it, action statistics from the labelled steps alone.
+            all of it (of the labelled steps for a method that sees no others), action statistics from the labelled
+            steps alone.
 
     Raises:
-        ValueError: for an unknown method or preset.
+        ValueError: for an unknown method, decoder or preset.
     """
-    make = lookup(METHODS, options["method"], "method")
+    method = get_method(options["method"], options.get("decoder"))
     modes = lookup(NORMALIZATION, options["preset"], "preset")
     if labelled is None:
-        state_normalizer, action_normalizer = Normalizer(), Normalizer()
+        normalizers = normalizers_of(Normalizer(), Normalizer())
     else:
-        state_normalizer = Normalizer.fit(labelled["state"], mode=modes["state"])
-        action_normalizer = Normalizer.fit(labelled["action"], mode=modes["action"], mask=labelled["has_action"])
-    return make(state_dim, action_dim, state_normalizer, action_normalizer, options)
+        seen = labelled["has_action"] if method.labelled_only else None
+        normalizers = normalizers_of(
+            Normalizer.fit(labelled["state"], mode=modes["state"], mask=seen),
+            Normalizer.fit(labelled["action"], mode=modes["action"], mask=labelled["has_action"]),
+        )
+    return method.build(state_dim, action_dim, normalizers, options)
 
 
 def set_up_torch(threads: int, device: str) -> None:

@@ -43,7 +43,10 @@ class RunDirectory:
         "loss_planner",
         "loss_reconstruction",
         "loss_koopman",
+        "loss_kl",
+        "loss_dynamics",
         "loss_action",
+        "loss_policy",
         "learning_rate",
         "iterations_per_second",
     )

@@ -13,11 +13,19 @@ import tyro
 from torch import nn
 from tqdm import tqdm
 
-from torchrl_koap.assembly import build_controller, build_planner, make_env_of, mode_index_of, set_up_torch
+from torchrl_koap.assembly import (
+    build_controller,
+    build_diffusion_policy,
+    build_planner,
+    make_env_of,
+    mode_index_of,
+    set_up_torch,
+)
 from torchrl_koap.checkpoints import load_weights, save_tensors
 from torchrl_koap.evaluation import make_policy, measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import StatePlanner
+from torchrl_koap.methods import get_method
+from torchrl_koap.modules import ChunkedPolicy, StatePlanner
 from torchrl_koap.modules.policies import EXECUTIONS
 from torchrl_koap.report import write_report
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
@@ -64,8 +72,8 @@ class Eval:
     animate: bool = True
 
 
-def load_run(run: RunDirectory, task: str | None = None) -> tuple[Task, StatePlanner, nn.Module]:
-    """Planner and controller of a finished run, in evaluation mode.
+def load_run(run: RunDirectory, task: str | None = None) -> tuple[Task, StatePlanner | None, nn.Module]:
+    """Planner and controller of a finished run, in evaluation mode; a diffusion policy has no planner beside it.
 
     Raises:
         RunDirectoryError: if the folder is no finished run, or one of another task than asked for.
@@ -75,12 +83,17 @@ def load_run(run: RunDirectory, task: str | None = None) -> tuple[Task, StatePla
     if task is not None and task != trained_on:
         raise RunDirectoryError(f"{run.path} was trained on task {trained_on!r}, not on {task!r}")
     facts = get_task(trained_on)
-    planner = build_planner(parts[0], facts.state_dim, facts.planner_features())
-    columns = columns_of(run, facts)
-    controller = build_controller(parts[1], len(columns), facts.action_dim)
-    for name, module in (("planner", planner), ("controller", controller)):
-        load_weights(run.path / f"{name}.safetensors", module, task=facts.name)
-    return facts, planner.eval(), controller.eval()
+    modules: dict[str, nn.Module] = {}
+    if get_method(parts[1]["method"], parts[1].get("decoder")).acts:
+        modules["controller"] = build_diffusion_policy(
+            parts[0], facts.state_dim, facts.action_dim, facts.planner_features()
+        )
+    else:
+        modules["planner"] = build_planner(parts[0], facts.state_dim, facts.planner_features())
+        modules["controller"] = build_controller(parts[1], len(columns_of(run, facts)), facts.action_dim)
+    for name, module in modules.items():
+        load_weights(run.path / f"{name}.safetensors", module.eval(), task=facts.name)
+    return facts, modules.get("planner"), modules["controller"]
 
 
 def columns_of(run: RunDirectory, task: Task) -> tuple[int, ...]:
@@ -127,20 +140,30 @@ def run_eval(options: Eval) -> dict[str, Any]:
     set_up_torch(options.threads, options.device)
     run = RunDirectory(options.run)
     task, planner, controller = load_run(run, options.task)
+    sampler = controller if planner is None else planner
     if options.solver is not None:
-        planner.solver = options.solver
+        sampler.solver = options.solver
     if options.solver_steps is not None:
-        planner.num_steps = options.solver_steps
-    policy = make_policy(
-        planner,
-        controller,
-        state_columns=task.state_of,
-        execution=options.execution,
-        replan_interval=options.replan_interval,
-        joining=options.joining,
-        controller_columns=columns_of(run, task),
-        gripper=task.gripper,
-    ).to(options.device)
+        sampler.num_steps = options.solver_steps
+    if planner is None:
+        policy = ChunkedPolicy(
+            controller,
+            state_columns=task.state_of,
+            history=controller.history,
+            replan_interval=options.replan_interval,
+        )
+    else:
+        policy = make_policy(
+            planner,
+            controller,
+            state_columns=task.state_of,
+            execution=options.execution,
+            replan_interval=options.replan_interval,
+            joining=options.joining,
+            controller_columns=columns_of(run, task),
+            gripper=task.gripper,
+        )
+    policy = policy.to(options.device)
     seeds = list(range(options.seed, options.seed + options.episodes))
     numbers, contexts = choose_contexts(task, options.episodes, options.rollouts_per_context, options.contexts_file)
     mode_index = mode_index_of(task)
@@ -164,9 +187,9 @@ def run_eval(options: Eval) -> dict[str, Any]:
     rows = result.pop("episode")
     result |= measure_latency(policy, task.observation_dim)
     result |= {
-        "execution": options.execution,
-        "solver": planner.solver,
-        "solver_steps": planner.num_steps,
+        "execution": "chunks" if planner is None else options.execution,
+        "solver": sampler.solver,
+        "solver_steps": sampler.num_steps,
         "replan_interval": options.replan_interval,
         "joining": options.joining,
         "episode": rows,

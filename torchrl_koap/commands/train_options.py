@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.methods import get_method
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks import HISTORY, HORIZON, Task
 
@@ -26,9 +27,11 @@ class Train:
         label_count: number of them instead of a share.
         label_unit: "trajectory", "window" (the paper's levels) or "transition".
         seed: seed of label choice, initialisation and batches.
-        method: "koap", "linear" (ridge on raw frames) or "supervised" (inverse dynamics network).
+        observation_fraction: share of the trajectories that are used at all; those with labels come first.
+        method: "koap", "linear" (ridge on raw frames), "dd" (supervised inverse dynamics), "dp" (Diffusion Policy), or
+            another name in torchrl_koap.methods.METHODS.
         preset: variant of KOAP: "default", "paper" or "released".
-        decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest).
+        decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: controller updates.
         batch_size: windows per planner update.
@@ -64,10 +67,11 @@ class Train:
     label_fraction: float = 0.02
     label_count: int | None = None
     label_unit: str = "trajectory"
+    observation_fraction: float = 1.0
     seed: int = 0
     method: str = "koap"
     preset: str = "default"
-    decoder: str = "ridge"
+    decoder: str | None = None
     steps: int | None = None
     controller_steps: int = 500
     batch_size: int = 128
@@ -147,7 +151,13 @@ def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
     }
     if options.planner_from is not None:
         config["planner"] = RunDirectory(options.planner_from).read_entry("config.json", "planner")
-    config["controller"] = {"method": options.method, "preset": options.preset, "state": options.controller_state}
+    method = get_method(options.method, options.decoder)
+    config["controller"] = {
+        "method": options.method,
+        "decoder": options.decoder,
+        "preset": options.preset,
+        "state": "all" if method.acts else options.controller_state,
+    }
     config["channels"] = list(options.channels)
     config["command"] = "koap " + " ".join(sys.argv[1:])
     config["versions"] = {"python": platform.python_version()} | {

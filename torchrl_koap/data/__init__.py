@@ -12,6 +12,7 @@ from torchrl_koap.data.d3il import D3ILExperienceReplay
 from torchrl_koap.data.labels import LabelBudget, LabelReport, hide_commands
 from torchrl_koap.data.lerobot import read_lerobot
 from torchrl_koap.data.normalizers import Normalizer
+from torchrl_koap.data.observation_budget import limit_observations
 from torchrl_koap.data.raw import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
 from torchrl_koap.data.saving import replacing_file, replacing_folder
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
@@ -48,6 +49,7 @@ __all__ = [
     "find_raw_files",
     "flatten_trajectories",
     "hide_commands",
+    "limit_observations",
     "load_pickle",
     "load_ted",
     "loads_pickle",
