@@ -16,6 +16,7 @@ from torchrl_koap.modules.latent_action import (
     LatentActionModule,
 )
 from torchrl_koap.modules.linear import LinearInverseDynamics
+from torchrl_koap.modules.nonlinear import NonlinearInverseDynamics
 from torchrl_koap.modules.planner import StatePlanner
 from torchrl_koap.modules.policies import EpisodeNoise, PlanThenControl, join_plan, policy_transforms
 from torchrl_koap.modules.presets import PRESETS, make_koopman_inverse_dynamics
@@ -42,6 +43,7 @@ __all__ = [
     "LinearInverseDynamics",
     "MLPDenoiser",
     "NoiseSchedule",
+    "NonlinearInverseDynamics",
     "PlanThenControl",
     "QuantizedInverseDynamics",
     "RecurrentInverseDynamics",

@@ -9,6 +9,7 @@ from torchrl_koap.objectives.koopman import (
     LatentActionLoss,
 )
 from torchrl_koap.objectives.latent_decoder import LatentDecoderLoss
+from torchrl_koap.objectives.nonlinear import NonlinearLoss
 from torchrl_koap.objectives.planner import PlannerLoss
 from torchrl_koap.objectives.quantized import QuantizedDynamicsLoss
 from torchrl_koap.objectives.supervised import InverseDynamicsLoss
@@ -22,6 +23,7 @@ __all__ = [
     "KoopmanReconstructionLoss",
     "LatentActionLoss",
     "LatentDecoderLoss",
+    "NonlinearLoss",
     "PlannerLoss",
     "QuantizedDynamicsLoss",
     "VariationalLoss",
