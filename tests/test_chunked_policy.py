@@ -129,25 +129,25 @@ def test_wrong_arguments_and_missing_transforms_are_named():
         make_policy()(step_input(torch.zeros(2, 4, 3)))
 
 
-def diffusion_policy(solver="ddim", action_dim=2):
+def diffusion_policy(solver="ddim"):
     """Untrained; its actions point ahead on the whole, at about half a centimetre per step."""
     torch.manual_seed(0)
     policy = DiffusionPolicy(
-        TemporalUnet(action_dim, 4, channels=(8, 16)),
+        TemporalUnet(2, 6, channels=(8, 16)),
         NoiseSchedule(prediction="velocity"),
-        state_dim=2,
-        action_dim=action_dim,
+        state_dim=3,
+        action_dim=2,
         solver=solver,
         num_steps=3,
     )
     actions = torch.stack([0.004 * torch.randn(200), 0.01 * torch.rand(200)], -1)
-    policy.fit_normalizers(0.01 * torch.randn(50, 16, 2).cumsum(1), actions)
+    policy.fit_normalizers(0.01 * torch.randn(50, 16, 3).cumsum(1), actions)
     return policy.eval()
 
 
 @pytest.mark.parametrize("solver", ["ddim", "ddpm"])
 def test_evaluations_do_not_depend_on_the_batch_size(solver):
-    policy = ChunkedPolicy(diffusion_policy(solver), state_columns=(2, 3), history=2)
+    policy = ChunkedPolicy(diffusion_policy(solver), state_columns=(1, 2, 3), history=2)
     seeds = [100, 101, 102, 103]
     together, apart = (roll_out(policy, AvoidingEnv, seeds, max_steps=10, batch_size=size) for size in (None, 1))
     for one, other in zip(apart, together, strict=True):
@@ -164,7 +164,7 @@ def test_evaluations_do_not_depend_on_the_batch_size(solver):
 
 
 def test_pictures_and_latency_need_no_plans():
-    policy = ChunkedPolicy(diffusion_policy(), state_columns=(2, 3), history=2)
+    policy = ChunkedPolicy(diffusion_policy(), state_columns=(1, 2, 3), history=2)
     episodes = roll_out(policy, AvoidingEnv, [1, 2], max_steps=6)
     tensors = rollouts_to_tensors(episodes, position=slice(2, 4), mode_index=mode_index, interval=4)
     assert tensors["plan"].shape == (2, 0, 1, 2) and tensors["plan_step"].shape == (2, 0)
@@ -176,7 +176,7 @@ def test_pictures_and_latency_need_no_plans():
 
 def test_a_stochastic_start_stays_stochastic_under_deterministic_exploration():
     env = TransformedEnv(AvoidingEnv(20), policy_transforms(2))
-    policy = ChunkedPolicy(diffusion_policy(), state_columns=(2, 3), history=2)
+    policy = ChunkedPolicy(diffusion_policy(), state_columns=(1, 2, 3), history=2)
     collector = Collector(
         env, policy, frames_per_batch=20 * 5, total_frames=20 * 5, exploration_type=ExplorationType.DETERMINISTIC
     )
