@@ -19,7 +19,7 @@ from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics, LinearActionDecoder
 
 OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"
-MODELS = ("koopman", "linear", "copy_last")
+MODELS = ("koopman", "reconstruction", "linear", "copy_last")
 _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
 
 
@@ -115,9 +115,12 @@ def prediction_errors(
       the same inputs, no lifting;
     * ``copy_last``: :math:`x_{t+h} = x_t`.
 
+    Beside them ``reconstruction``: :math:`g_\psi(g_\theta(x_{t+h}))`, what the first one cannot do better than.
+
     Both ``u`` and ``v`` read recorded states around and *ahead* of every step (``x_{t+k}``), so this tests the models;
     it is no forecast. The linear model is fitted on the trajectories ``fit_on``, and all three are judged on the
-    others. The Koopman model has seen the states of all of them in training, but no label.
+    others. The Koopman model was trained on the states of all of them (that takes no label). Where ``v_t`` holds
+    ``x_{t+2}``, as by default, the linear model interpolates and owes little to what it predicted before.
 
     Args:
         controller (KoopmanInverseDynamics): the model, in evaluation mode.
@@ -148,12 +151,13 @@ def prediction_errors(
     frames = range(now, now + horizon)
     for states in new.split(1024):
         true = states[:, now + 1 : now + 1 + horizon]
-        lifted = controller.lift(states[:, : now + 1])
-        rolled = controller.rollout_latent(lifted[:, -1], controller.infer(states, frames))
-        # a recurrent decoder needs the frames before as well
-        decoded = controller.lifting.decode(torch.cat([lifted, rolled], -2))[:, now + 1 :]
+        lifted = controller.lift(states[:, : now + 1 + horizon])
+        past = lifted[:, : now + 1]  # a recurrent decoder needs it as well
+        rolled = controller.rollout_latent(past[:, -1], controller.infer(states, frames))
+        decoded = [controller.lifting.decode(path)[:, now + 1 :] for path in (torch.cat([past, rolled], 1), lifted)]
         predicted = {
-            "koopman": _raw(controller, decoded),
+            "koopman": _raw(controller, decoded[0]),
+            "reconstruction": _raw(controller, decoded[1]),
             "linear": _raw(controller, _roll_linear(controller, linear, states, frames)),
             "copy_last": states[:, now : now + 1].expand_as(true),
         }

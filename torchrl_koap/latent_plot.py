@@ -18,8 +18,10 @@ from torchrl_koap.plots import BLUE, ORANGE, as_array, save_figure
 from torchrl_koap.tasks import Task
 
 _WARNING = "#9a3412"
+_BLOWN_UP = 1e6  # mm; a prediction further off is left out of the picture
 _LABELS = {
     "koopman": ("latent dynamics", BLUE),
+    "reconstruction": ("lifted and mapped back", "#9cc3f5"),
     "linear": ("linear model on raw states", ORANGE),
     "copy_last": ("standing still", MUTED),
 }
@@ -38,10 +40,10 @@ def plot_latent(latent: Mapping[str, Any], path: str | Path, *, task: Task, eige
 
     Examples:
         >>> import tempfile
-        >>> from torchrl_koap.latent_analysis import OUTSIDE_THE_BUDGET
+        >>> from torchrl_koap.latent_analysis import MODELS, OUTSIDE_THE_BUDGET
         >>> from torchrl_koap.latent_plot import plot_latent
         >>> from torchrl_koap.tasks import get_task
-        >>> errors = {name: {"measured_xy": [0.001, 0.002]} for name in ("koopman", "linear", "copy_last")}
+        >>> errors = {name: {"measured_xy": [0.001, 0.002]} for name in MODELS}
         >>> outside = {"probe_r2": [0.9, 0.8], "decoder_r2": [0.7, 0.6], "labels_read": 50}
         >>> latent = {"multi_step": errors | {"steps": 2, "judged_trajectories": 3}, OUTSIDE_THE_BUDGET: outside}
         >>> with tempfile.TemporaryDirectory() as folder:
@@ -80,31 +82,55 @@ def action_names(task: Task) -> list[str]:
     return list("xyz"[: task.action_dim])
 
 
+def error_unit(part: str) -> str:
+    """Unit in which errors of a part of the state are shown, a thousandth of that in the data.
+
+    Examples:
+        >>> from torchrl_koap.latent_plot import error_unit
+        >>> error_unit("measured_xy"), error_unit("measured_joints")
+        ('mm', 'mrad')
+    """
+    return "mrad" if "joints" in part else "mm"
+
+
 def _draw_spectrum(axes: Axes, values: np.ndarray, facts: Mapping[str, Any]) -> None:
     angle = np.linspace(0, 2 * np.pi, 400)
     axes.fill(np.cos(angle), np.sin(angle), color="#f4f5f7", zorder=0)
     axes.plot(np.cos(angle), np.sin(angle), color=MUTED, linewidth=1)
     axes.axhline(0, color=FAINT, linewidth=0.6, zorder=0.5)
     axes.axvline(0, color=FAINT, linewidth=0.6, zorder=0.5)
-    axes.scatter(values.real, values.imag, s=20, color=BLUE, alpha=0.6, linewidths=0, zorder=2)
-    reach = 1.1 * max(1.0, float(np.abs(values).max()))
+    panels = [axes]
+    centre = np.array([values.real.min() + values.real.max(), values.imag.min() + values.imag.max()]) / 2
+    spread = max(np.ptp(values.real), np.ptp(values.imag), 0.02)
+    if spread < 0.4 and values.real.min() > 0.25:  # the empty half has room for a closer look
+        inset = axes.inset_axes((0.2, 0.55, 0.33, 0.33))
+        inset.set(xlim=centre[0] + 0.6 * spread * np.array([-1, 1]), ylim=centre[1] + 0.6 * spread * np.array([-1, 1]))
+        inset.plot(np.cos(angle), np.sin(angle), color=MUTED, linewidth=1)
+        inset.tick_params(labelsize=6.5, color=FAINT, labelcolor=MUTED)
+        inset.locator_params(nbins=3)
+        axes.indicate_inset_zoom(inset, edgecolor=MUTED)
+        panels.append(inset)
+    for panel in panels:
+        panel.scatter(values.real, values.imag, s=20, color=BLUE, alpha=0.6, linewidths=0, zorder=2)
+    reach = 1.1 * min(max(1.0, float(np.abs(values).max())), 4.0)  # the title counts those beyond
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1, xlabel="real part", ylabel="imaginary part")
     counts = f"{facts['inside']} inside, {facts['on']} on, {facts['outside']} outside the circle"
-    set_title(axes, f"Eigenvalues, radius {facts['spectral_radius']:.4f}\n{counts}")
+    set_title(axes, f"Eigenvalues, radius {facts['spectral_radius']:.5g}\n{counts}")
     tidy(axes)
 
 
 def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
     part = next(iter(errors["koopman"]))
-    unit = "mrad" if "joints" in part else "mm"
     steps = np.arange(1, errors["steps"] + 1)
     for model in MODELS:
         values = 1e3 * np.asarray(errors[model][part], dtype=float)
         label, color = _LABELS[model]
-        axes.plot(steps, np.where(np.isfinite(values) & (values > 0), values, np.nan), ".-", color=color, label=label)
+        axes.plot(steps, np.where((values > 0) & (values < _BLOWN_UP), values, np.nan), ".-", color=color, label=label)
     axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high * (high / low) ** 0.45)  # room for the legend
     axes.set_xlabel(f"control steps ahead (latent actions given; {1e3 / task.control_hz:.0f} ms each)")
-    axes.set_ylabel(f"root mean square distance ({unit})")
+    axes.set_ylabel(f"root mean square distance ({error_unit(part)})")
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
     judged = f"on {errors['judged_trajectories']} demonstrations"

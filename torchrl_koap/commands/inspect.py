@@ -29,9 +29,10 @@ from torchrl_koap.diagnosis import (
 from torchrl_koap.evaluation import make_policy, roll_out
 from torchrl_koap.inspection_plot import plot_inspection
 from torchrl_koap.latent_analysis import MODELS, OUTSIDE_THE_BUDGET, analyse_latent
-from torchrl_koap.latent_plot import plot_latent
+from torchrl_koap.latent_plot import error_unit, plot_latent
 from torchrl_koap.modules import KoopmanInverseDynamics, StatePlanner
 from torchrl_koap.pictures import FOLDER
+from torchrl_koap.report import write_report
 from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task
 
@@ -75,7 +76,7 @@ def run_inspect(options: Inspect) -> dict[str, Any]:
     the budget, for analysis only.
 
     Raises:
-        ValueError: for fewer than one episode or step.
+        ValueError: for fewer than one episode or step, or a run without a planner.
         RunDirectoryError: if the folder is no finished run.
     """
     for name in ("episodes", "latent_steps"):
@@ -89,6 +90,9 @@ def run_inspect(options: Inspect) -> dict[str, Any]:
     if options.latent_only:  # what earlier experiments found stays
         earlier = run.read_json("inspect.json") if (run.path / "inspect.json").exists() else {}
         result = {name: value for name, value in earlier.items() if name != "verdict"}
+    elif planner is None:
+        method = run.read_entry("config.json", "method")
+        raise ValueError(f"method {method!r} is a policy of its own: there are no planner and controller to tell apart")
     else:
         result = _experiments(options, run, task, planner, controller, data)
     result["latent"] = _look_into(options, run, task, controller.cpu(), data)
@@ -96,6 +100,8 @@ def run_inspect(options: Inspect) -> dict[str, Any]:
     run.write_json("inspect.json", result)
     if not options.latent_only:
         plot_inspection(result, task, run.path / FOLDER / "inspect.png")
+    if (run.path / "index.html").exists():
+        write_report(run.path, draw=False)
     return result
 
 
@@ -168,12 +174,13 @@ def verdict(result: dict[str, Any], task: Task) -> str:
 def _latent_says(latent: dict[str, Any]) -> str:
     errors = latent["multi_step"]
     part = next(iter(errors["koopman"]))
-    ahead = {model: f"{errors[model][part][-1]:.3g}" for model in MODELS}
+    ahead = {model: f"{1e3 * errors[model][part][-1]:.3g} {error_unit(part)}" for model in MODELS}
     outside = latent[OUTSIDE_THE_BUDGET]
     probe, own = (min(outside[name]) for name in ("probe_r2", "decoder_r2"))
     return (
-        f"{errors['steps']} steps ahead the latent dynamics miss the {part.replace('_', ' ')} by {ahead['koopman']}, a"
-        f" linear model on raw states by {ahead['linear']}, standing still by {ahead['copy_last']}. Outside the budget,"
+        f"{errors['steps']} steps ahead the latent dynamics miss the {part.replace('_', ' ')} by {ahead['koopman']}"
+        f" ({ahead['reconstruction']} of mapping back alone), a linear model on raw states by {ahead['linear']},"
+        f" standing still by {ahead['copy_last']}. Outside the budget,"
         f" for analysis only: a linear probe on all labels explains {probe:.1%} of the hardest action dimension on"
         f" held-out trajectories, the run's own decoder {own:.1%}"
     )
