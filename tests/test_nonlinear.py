@@ -23,6 +23,7 @@ def make_network(seed=0, **options):
         2,
         latent_dim=6,
         hidden_dims=(16,),
+        lifting_dims=(12,),
         history=HISTORY,
         look_ahead=LOOK_AHEAD,
         state_normalizer=Normalizer(torch.tensor([0.1, -0.2, 0.0]), torch.tensor([2.0, 1.0, 3.0])),

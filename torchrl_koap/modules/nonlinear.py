@@ -31,8 +31,9 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         action_dim (int): size of an action.
 
     Keyword Args:
-        latent_dim (int): size ``m`` of a lifted state and of a latent action. Defaults to ``64``.
-        hidden_dims (sequence of int): widths of all networks. Defaults to ``(128, 128)``.
+        latent_dim (int): size ``m`` of a lifted state and of a latent action. Defaults to ``32``.
+        hidden_dims (sequence of int): widths of ``f``, ``h`` and ``d``. Defaults to ``(128, 128)``.
+        lifting_dims (sequence of int): widths of ``g`` and its inverse. Defaults to ``(64, 64)``, as KOAP's default.
         history (int): number ``n`` of frames before the current one. Defaults to ``4``.
         look_ahead (int or sequence of int): offsets ``k >= 2``. Defaults to ``(2, 3, 4, 5)``.
         state_normalizer (nn.Module, optional): maps raw states to the networks' units.
@@ -50,7 +51,7 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         >>> model = NonlinearInverseDynamics(2, 2)
         >>> td = model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))
         >>> td["action"].shape, td["latent_action"].shape
-        (torch.Size([3, 16, 2]), torch.Size([3, 16, 64]))
+        (torch.Size([3, 16, 2]), torch.Size([3, 16, 32]))
     """
 
     reader: LatentActionMLP
@@ -60,8 +61,9 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         state_dim: int,
         action_dim: int,
         *,
-        latent_dim: int = 64,
+        latent_dim: int = 32,
         hidden_dims: Sequence[int] = (128, 128),
+        lifting_dims: Sequence[int] = (64, 64),
         history: int = 4,
         look_ahead: int | Sequence[int] = (2, 3, 4, 5),
         **kwargs,
@@ -71,7 +73,7 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         )
         super().__init__(reader, mlp(latent_dim, hidden_dims, action_dim), **kwargs)
         self.latent_dim = latent_dim
-        self.lifting = KoopmanLifting(state_dim, latent_dim, hidden_dims=hidden_dims)
+        self.lifting = KoopmanLifting(state_dim, latent_dim, hidden_dims=lifting_dims)
         self.dynamics = mlp(2 * latent_dim, hidden_dims, latent_dim)
 
     def lift(self, state: Tensor) -> Tensor:
