@@ -163,6 +163,9 @@ def test_a_probe_finds_what_lies_linearly_in_the_latent_and_nothing_else():
     linear = latent @ torch.tensor([[1.0, 2.0], [0.0, -1.0], [3.0, 0.5]]) + 4
     found = probe(latent, torch.cat([linear, noise[:, :1]], -1), groups, groups < 20)
     assert found[:2] == pytest.approx([1, 1], abs=1e-5) and abs(found[2]) < 0.05
+    # what holds in one half and is the other way round in the other explains -3: 1 - (2 a)^2 / a^2
+    sign = torch.where(groups < 20, 1.0, -1.0)[:, None]
+    assert probe(latent, sign * (linear - 4), groups, groups < 20) == pytest.approx([-3, -3], abs=0.02)
     with pytest.raises(ValueError, match="judged on others, got 1200 of 1200"):
         probe(latent, linear, groups, groups < 40)
 

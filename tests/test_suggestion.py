@@ -159,6 +159,19 @@ def test_no_hidden_label_has_a_say(run, monkeypatch):
     assert seen[0]["action"].isnan().all(-1).equal(~seen[0]["has_action"].squeeze(-1))
 
 
+@pytest.mark.parametrize(("preset", "bias"), [("default", False), ("paper", True)])
+def test_the_choice_is_made_for_the_decoder_of_the_run(demonstrations, tmp_path, monkeypatch, preset, bias):
+    out = tmp_path / "run"
+    assert koap("train", "--out", out, "--dataset", demonstrations, *TINY, "--preset", preset) == 0
+    seen, rank = {}, suggest.rank_trajectories
+    monkeypatch.setattr(
+        suggest, "rank_trajectories", lambda *args, **options: seen.update(options) or rank(*args, **options)
+    )
+    run_suggest(Suggest(out, count=1))
+    fit = json.loads((out / "summary.json").read_text())["decoder_fit"]
+    assert seen["bias"] is bias and seen["penalty"] == fit["penalty"]
+
+
 def test_other_demonstrations_than_those_of_the_training_are_refused(run, monkeypatch):
     def without_last(data):
         return data[data["episode"] < 7]

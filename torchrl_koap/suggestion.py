@@ -135,7 +135,7 @@ def rank_trajectories(
     chosen = []
     for _ in range(count):
         scores = {name: score(part, covariance, moment) for name, part in left.items()}
-        best = max(scores, key=scores.get)
+        best = max(scores, key=scores.__getitem__)
         part = _explained_part(left.pop(best), covariance)
         covariance = covariance - part.mT @ part
         chosen.append(Suggestion(best, scores[best]))
