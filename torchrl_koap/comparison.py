@@ -78,6 +78,11 @@ def compare(first: Outcomes, second: Outcomes, *, level: float = 0.95) -> Compar
     The p-value flips signs of :math:`\bar d_c`: for these trained networks, could the advantage be chance of the
     contexts? It says nothing about other training seeds, so it may be small while the interval holds 0.
 
+    Simulated with 60 contexts: where training seeds shift a method's logit of success by a standard deviation of 0.5,
+    95 % intervals hold the truth in 94 to 97 % of cases for 2, 3 or 5 seeds (63 % for a single one), and where seeds do
+    not matter in more than 99 %. The p-value is below 0.05 in 3 to 6 % of cases without a difference where seeds do not
+    matter, but in 27 to 32 % where they do: then the interval is what to go by.
+
     Args:
         first (mapping): training seed to ``{(context, evaluation seed): success}``, see :func:`read_outcomes`.
         second (mapping): the same of the other method.

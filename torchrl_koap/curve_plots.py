@@ -83,7 +83,7 @@ def plot_success(
 
     Keyword Args:
         by (sequence of str): what the horizontal axes show, of :data:`AXES`. Along ``"observations"`` there is a line
-            per method and label budget.
+            per method and label budget that was run with several shares.
         paper (sequence of mapping): the paper's figures, with ``method``, ``fraction`` and ``success`` in 0..1: hollow
             and dashed, in the colour of the method. Drawn only along ``"fraction"``.
         methods (sequence of str, optional): all methods in the order that gives the colours; without it those of the
@@ -188,8 +188,14 @@ def _lines(
     several = by == "observations" and len(fractions) > 1
     keys = [(method, fraction) for method in methods for fraction in (fractions if several else [None])]
     names = [f"{method}, {percent(fraction)}" if several else method for method, fraction in keys]
-    styles = method_styles(names if several else methods)
-    lines = {key: _Line(name, **styles[name]) for key, name in zip(keys, names, strict=True)}
+    styles = method_styles(methods)
+    if several:  # colour tells the method, marker and dashes the budget
+        places = {
+            fraction: {"marker": _MARKERS[n % 13], "dash": _DASHES[n % 3]} for n, fraction in enumerate(fractions)
+        }
+        lines = {key: _Line(name, **styles[key[0]] | places[key[1]]) for key, name in zip(keys, names, strict=True)}
+    else:
+        lines = {key: _Line(name, **styles[name]) for key, name in zip(keys, names, strict=True)}
     for item in sorted(summaries, key=lambda item: getattr(item, by) or 0):
         values = [getattr(item, name) for name in (by, *wanted)]
         if item.method not in methods or any(value is None for value in values):
@@ -197,6 +203,8 @@ def _lines(
         line = lines[item.method, item.fraction if several else None]
         for part, value in zip((line.x, line.y, line.low, line.high), values, strict=True):
             part.append(value)
+    if by == "observations" and any(len(set(line.x)) > 1 for line in lines.values()):
+        return {key: line for key, line in lines.items() if len(set(line.x)) > 1}  # the others do not scale anything
     return lines
 
 

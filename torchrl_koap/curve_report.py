@@ -12,7 +12,7 @@ from typing import Any
 
 from torchrl_koap.comparison import COMPARISON_COLUMNS, compare_cells, p_text
 from torchrl_koap.curve_plots import plot_action_error, plot_success
-from torchrl_koap.curve_summary import Summary, cell_name, percent, summarise
+from torchrl_koap.curve_summary import Summary, cell_name, percent, plural, summarise
 from torchrl_koap.curve_table import markdown_table, table_rows, why_not_done
 from torchrl_koap.data.saving import replacing_file
 from torchrl_koap.report_html import STYLE, definition, duration, table
@@ -20,7 +20,7 @@ from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks import get_task
 
 FOLDER = "plots"
-_UNITS = {"trajectory": "trajectories", "window": "windows", "transition": "transitions"}
+_STYLE = ".scroll td { white-space: nowrap; }\n"  # an interval on two lines cannot be read down the column
 _CAPTIONS = {
     "success": (
         "Success against the labels",
@@ -53,8 +53,8 @@ difference is averaged over training seeds within each context, then over contex
 training seeds both: a few seeds say little about the next training, and the interval is as wide as that. With a single
 seed it holds for that one training only.</li>
 <li><strong>p</strong> flips signs per context: could the advantage of these trained networks be chance of the contexts?
-It does not cover other training seeds, so it can be small where the interval still holds 0; trust the more careful of
-the two. <strong>p (Holm)</strong> is corrected for the number of comparisons on this page.</li>
+It does not cover other training seeds: where those matter it is below 0.05 far too often, and the interval is what to
+go by. <strong>p (Holm)</strong> is corrected for the number of comparisons on this page.</li>
 <li><strong>One planner</strong> is shared by all cells of a task and a share of the trajectories. The seeds vary the
 controller and which labels it sees; how much another planner would change is not in any interval here.</li>
 <li>Cells that <strong>failed or are missing</strong> are in no average. They are counted and named; if hard cells fail
@@ -95,7 +95,7 @@ def write_curve_report(
         >>> from torchrl_koap.curve_report import write_curve_report
         >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.02, "seed": 0, "status": "missing"}
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     "1 are missing" in write_curve_report(folder, [cell], title="a curve").read_text()
+        ...     "failed: 0, missing: 1" in write_curve_report(folder, [cell], title="a curve").read_text()
         True
     """
     folder = Path(folder)
@@ -123,7 +123,7 @@ def write_curve_report(
     ]
     page = (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}</style></head>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}{_STYLE}</style></head>\n'
         f"<body><main>\n{chr(10).join(section for section in sections if section)}\n</main></body></html>\n"
     )
     path = folder / "index.html"
@@ -153,7 +153,7 @@ def _wide(rows: Sequence[Mapping[str, str]]) -> str:
 def _what_was_run(rows: Sequence[Mapping[str, Any]], options: Mapping[str, Any]) -> str:
     count = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
     names = {name: list(dict.fromkeys(row.get(name) for row in rows)) for name in ("task", "method", "seed")}
-    unit = list(dict.fromkeys(_UNITS.get(row.get("label_unit"), row.get("label_unit") or "labels") for row in rows))
+    unit = list(dict.fromkeys(plural(row.get("label_unit") or "") for row in rows))
     text = ", ".join(
         (
             f"{', '.join(map(str, names['task']))}: methods {', '.join(map(str, names['method']))}",
@@ -162,7 +162,7 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]], options: Mapping[str, Any])
             f"training seeds {', '.join(map(str, sorted(names['seed'])))}",
         )
     )
-    done = f"{count['done']} of {len(rows)} cells are done, {count['failed']} failed, {count['missing']} are missing."
+    done = f"Of {len(rows)} cells {count['done']} are done; failed: {count['failed']}, missing: {count['missing']}."
     every = f"<details><summary>Every option</summary>{table(options)}</details>" if options else ""
     return _section("What was run", f"<p>{escape(text)}.</p><p>{escape(done)}</p>{every}")
 
@@ -178,7 +178,7 @@ def _draw(
         shares = sorted({item.observations for item in items})
         main = [item for item in items if item.observations == shares[-1]]
         name = task if sum(task == other for other, _ in groups) == 1 else f"{task}_{unit}"
-        base, common = folder / FOLDER, {"methods": methods, "label": _UNITS.get(unit, unit)}
+        base, common = folder / FOLDER, {"methods": methods, "label": plural(unit) if unit else ""}
         points = [row for row in paper if row.get("task", task) == task]
         if any(item.success is not None for item in main):
             plot_success(main, base / f"{name}_success.png", paper=points, **common)
@@ -208,10 +208,11 @@ def _figure(name: str, kind: str, task: str, more: str) -> str:
     head, caption = _CAPTIONS[kind]
     source = escape(f"{FOLDER}/{name}_{kind}.png")
     head = escape(f"{head}, {task}")
-    return (
-        f'<figure><h3>{head}</h3><a href="{source}"><img src="{source}" alt="{head}"></a>'
-        f"<figcaption>{escape(caption + more)}</figcaption></figure>"
-    )
+    image = f'<a href="{source}"><img src="{source}" alt="{head}"></a>'
+    text = escape(caption + more)
+    if kind == "success":  # two panels need the width of the page
+        return f"<figure><h3>{head}</h3>{image}<figcaption>{text}</figcaption></figure>"
+    return f'<figure class="beside">{image}<figcaption><h3>{head}</h3>{text}</figcaption></figure>'
 
 
 def _paper_table(summaries: Sequence[Summary], paper: Sequence[Mapping[str, Any]]) -> str:
@@ -245,8 +246,8 @@ def _comparisons(compared: Sequence[Mapping[str, Any]], reference: str) -> str:
             | {
                 "labels": percent(row["fraction"]),
                 f"{reference} against": row["method"],
-                "difference (points)": f"{100 * row['difference']:+.1f}" if known else "nothing in common",
-                "95 % interval": f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}" if known else "–",
+                "difference (points)": _points(row["difference"]) if known else "nothing in common",
+                "95 % interval": f"{_points(row['low'])} to {_points(row['high'])}" if known else "–",
                 "p": p_text(row["p"]),
                 "p (Holm)": p_text(row["p_holm"]),
                 "contexts": str(row["contexts"] or 0),
@@ -256,6 +257,10 @@ def _comparisons(compared: Sequence[Mapping[str, Any]], reference: str) -> str:
         )
     text = f"<p>Above 0: {escape(reference)} succeeds more often. Also in <code>comparisons.csv</code>.</p>"
     return text + _wide(rows)
+
+
+def _points(difference: float) -> str:
+    return f"{round(100 * difference, 1) + 0.0:+.1f}"  # the sum turns -0.0 into 0.0
 
 
 def _not_done(rows: Sequence[Mapping[str, Any]]) -> str:

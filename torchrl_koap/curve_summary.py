@@ -174,3 +174,14 @@ def percent(share: float | None, digits: int | None = None) -> str:
     if share is None:
         return "–"
     return f"{100 * share:.6g} %" if digits is None else f"{100 * share:.{digits}f} %"
+
+
+def plural(unit: str) -> str:
+    """What a budget of labels counts, in words.
+
+    Examples:
+        >>> from torchrl_koap.curve_summary import plural
+        >>> plural("trajectory"), plural("window"), plural("")
+        ('trajectories', 'windows', 'labels')
+    """
+    return {"trajectory": "trajectories", "": "labels"}.get(unit, f"{unit}s")

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.curve_summary import STATUSES, Summary, cell_name, percent, summarise
+from torchrl_koap.curve_summary import STATUSES, Summary, cell_name, percent, plural, summarise
 from torchrl_koap.lookup import lookup
 
 _KINDS = {
@@ -145,23 +145,25 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
     Args:
         summaries (sequence of Summary): of :func:`summarise`.
     """
+    units = {item.label_unit for item in summaries}
+    labels = f"labels ({plural(*units)})" if len(units) == 1 and "" not in units else "labels"
     rows = []
     for item in summaries:
         rows.append(
             {
                 "task": item.task,
-                "labels": f"{percent(item.fraction)} {item.label_unit}".strip(),
+                labels: percent(item.fraction) + (f" of {plural(item.label_unit)}" if len(units) > 1 else ""),
                 "trajectories used": percent(item.observations),
                 "method": item.method,
                 "success (95 %)": _interval(item),
                 "n": str(item.episodes),
                 "seeds": f"{len(item.done)} of {len(item.done) + len(item.failed) + len(item.missing)}",
-                "range of seeds": _range(item.lowest, item.highest),
+                "not done": _not_done(item),
+                "range of seeds": _range(item.lowest, item.highest, len(item.done)),
                 "mode entropy": _number(item.entropy, ".2f"),
                 "action error": _number(item.action_error, ".3g"),
                 "labelled transitions": _number(item.labelled_transitions, ",.0f"),
                 "in trajectories": _number(item.trajectories_touched, ".4g"),
-                "not done": _not_done(item),
             }
         )
     empty = {name for name in (rows[0] if rows else ()) if all(row[name] in ("", "–") for row in rows)}
@@ -178,8 +180,8 @@ def _interval(item: Summary) -> str:
     return f"{percent(item.success, 1)} ({100 * item.low:.1f}-{100 * item.high:.1f})"
 
 
-def _range(low: float | None, high: float | None) -> str:
-    return "–" if low is None else f"{100 * low:.0f}-{100 * high:.0f} %"
+def _range(low: float | None, high: float | None, seeds: int) -> str:
+    return "–" if low is None or seeds < 2 else f"{100 * low:.0f}-{100 * high:.0f} %"
 
 
 def _number(value: float | None, form: str) -> str:
