@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from torchrl_koap.commands.curve import Curve, run_curve
 from torchrl_koap.commands.demos import Demos, run_demos
 from torchrl_koap.commands.doctor import Doctor, Validate, run_doctor, run_validate
 from torchrl_koap.commands.eval import Eval, run_eval
@@ -22,6 +23,7 @@ RUNNERS = {
     Demos: run_demos,
     Train: run_train,
     Eval: run_eval,
+    Curve: run_curve,
     Inspect: run_inspect,
     Suggest: run_suggest,
     Doctor: run_doctor,
@@ -34,6 +36,7 @@ Command = (
     Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Curve, tyro.conf.subcommand("curve")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Suggest, tyro.conf.subcommand("suggest")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
@@ -56,7 +59,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"koap: {one_line(error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("koap: interrupted; `koap train` goes on from its last checkpoint with --resume", file=sys.stderr)
+        print(
+            "koap: interrupted; `koap train --resume` goes on from its last checkpoint, `koap curve` when called again",
+            file=sys.stderr,
+        )
         return 130
     show(result)
     return 0

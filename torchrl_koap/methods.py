@@ -18,8 +18,22 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import LinearInverseDynamics, SupervisedInverseDynamics, make_koopman_inverse_dynamics
-from torchrl_koap.objectives import InverseDynamicsLoss, KOAPLoss
+from torchrl_koap.modules import (
+    LinearInverseDynamics,
+    NonlinearInverseDynamics,
+    QuantizedInverseDynamics,
+    SupervisedInverseDynamics,
+    VariationalInverseDynamics,
+    make_koopman_inverse_dynamics,
+)
+from torchrl_koap.objectives import (
+    InverseDynamicsLoss,
+    KOAPLoss,
+    LatentDecoderLoss,
+    NonlinearLoss,
+    QuantizedDynamicsLoss,
+    VariationalLoss,
+)
 
 LOOK_AHEAD = (1, 2, 3, 4, 5)
 
@@ -80,12 +94,18 @@ def _supervised(state_dim, action_dim, normalizers, options, *, look_ahead):
     return SupervisedInverseDynamics(state_dim, action_dim, look_ahead=look_ahead, **normalizers)
 
 
+def _network(state_dim, action_dim, normalizers, options, *, kind):
+    return kind(state_dim, action_dim, **normalizers)
+
+
 def _without_actions(network: nn.Module) -> LossModule:
     return KOAPLoss(network, action_coeff=0.0)
 
 
 _LABELS = (Phase("controller", InverseDynamicsLoss, "labelled"),)
 _JOINT = (Phase("controller", KOAPLoss, "mixed"),)
+# the decoder that is fitted afterwards, on a frozen encoder
+_DECODER = Phase("decoder", LatentDecoderLoss, "labelled", share=0.5)
 
 METHODS = {
     "koap": Method("KOAP", _koap, (Phase("controller", _without_actions),), closed_form=True, other_decoder="koap_sgd"),
@@ -106,6 +126,21 @@ METHODS = {
     "linear": Method("ridge on raw frames", _linear, closed_form=True),
     "dd": Method("supervised, next state (Decision Diffuser)", partial(_supervised, look_ahead=1), _LABELS),
     "dd_lookahead": Method("supervised, look-ahead", partial(_supervised, look_ahead=LOOK_AHEAD), _LABELS),
+    "vae": Method(
+        "variational autoencoder",
+        partial(_network, kind=VariationalInverseDynamics),
+        (Phase("controller", VariationalLoss, share=0.5), _DECODER),
+    ),
+    "lapo": Method(
+        "LAPO, quantised latent actions",
+        partial(_network, kind=QuantizedInverseDynamics),
+        (Phase("controller", QuantizedDynamicsLoss, share=0.5), _DECODER),
+    ),
+    "nonlinear": Method(
+        "KOAP with nonlinear maps",
+        partial(_network, kind=NonlinearInverseDynamics),
+        (Phase("controller", NonlinearLoss, "mixed"),),
+    ),
     "dp": Method("Diffusion Policy", acts=True),
     "relabel": Method("Diffusion Policy on relabelled data", acts=True, teacher="dd_lookahead"),
 }

@@ -52,6 +52,7 @@ class Eval:
         task: refuse a run of another task than this.
         threads: torch and simulator threads.
         device: "cpu" or "cuda".
+        report: draw the pictures and write the report.
         animate: make an animation of the rollouts for the report.
     """
 
@@ -69,6 +70,7 @@ class Eval:
     task: str | None = None
     threads: int = 2
     device: str = "cpu"
+    report: bool = True
     animate: bool = True
 
 
@@ -206,5 +208,6 @@ def run_eval(options: Eval) -> dict[str, Any]:
         rollouts["context"] = torch.from_numpy(contexts)
     save_tensors(run.path / "rollouts.safetensors", rollouts, {"task": task.name})
     run.write_json("eval.json", result)
-    write_report(run.path, animation=options.animate)
+    if options.report:
+        write_report(run.path, animation=options.animate)
     return result

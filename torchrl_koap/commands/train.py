@@ -102,6 +102,7 @@ def run_train(options: Train) -> dict[str, Any]:
         "train_seconds": {"planner": planned - began, "controller": time.perf_counter() - planned},
         "planner": planner_values,
         "controller": controller_values,
+        "controller_updates": controller_values.pop("updates", 0),
         "decoder_fit": fit,
     }
     if options.analysis and not method.acts:

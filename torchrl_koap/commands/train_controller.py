@@ -56,6 +56,7 @@ def train_controller(
     else:
         view = controller_view(data, task.controller_columns(options.controller_state))
         controller, fit, values = _train_network(train_one, method, config["controller"], task, view)
+    values["updates"] = train_one.updates
     save_weights(run.path / "controller.safetensors", controller, {"task": task.name, "kind": "controller"})
     if isinstance(controller, KoopmanInverseDynamics):
         eigenvalues = controller.operator.eigenvalues()
@@ -68,8 +69,10 @@ class _Training:
 
     def __init__(self, run: RunDirectory, options: Train, logger):
         self.run, self.options, self.logger = run, options, logger
+        self.updates = 0
 
     def __call__(self, name: str, loss: nn.Module, sample: Callable, *, num_steps: int, **settings) -> dict[str, float]:
+        self.updates += num_steps
         with progress_bar(num_steps, name) as bar:
             return train(
                 name,

@@ -47,8 +47,8 @@ class _Supervised(TensorDictModuleBase):
         """Raw actions to the network's units."""
         return action if self.action_normalizer is None else self.action_normalizer(action)
 
-    def predict(self, state: Tensor) -> Tensor:
-        """Normalised actions ``[*B, T, act]`` of raw states ``[*B, T, d]``."""
+    def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Normalised actions ``[*B, T, act]`` of raw states ``[*B, T, d]``, or of some of the window's ``frames``."""
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -126,9 +126,9 @@ class SupervisedInverseDynamics(_Supervised):
         """Sets input scales from windows of raw states ``[*B, T, d]``; no label is read."""
         self.frames.fit_scales(self.normalize_state(windows))
 
-    def predict(self, state: Tensor) -> Tensor:
+    def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Normalised actions ``[*B, T, act]``; frames near the ends read a clamped window."""
-        return self.network(self.frames(self.normalize_state(state)))
+        return self.network(self.frames(self.normalize_state(state), frames))
 
 
 class RecurrentInverseDynamics(_Supervised):
@@ -185,7 +185,8 @@ class RecurrentInverseDynamics(_Supervised):
         """Frames of a window that count in the loss: all but the first and the last."""
         return range(1, num_frames - 1)
 
-    def predict(self, state: Tensor) -> Tensor:
+    def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Normalised actions ``[*B, T, act]``."""
         action = self.network(self.normalize_state(state))[..., 1:, :]
-        return torch.cat([action, action[..., -1:, :]], -2)
+        action = torch.cat([action, action[..., -1:, :]], -2)
+        return action if frames is None else action[..., frames.start : frames.stop, :]

@@ -54,5 +54,5 @@ class InverseDynamicsLoss(WindowLoss):
         # zeroed before the residual: masking afterwards would leave NaN in the gradient
         target = self.network.normalize_action(torch.where(counts.unsqueeze(-1), action, 0.0))
         with self.network_params.to_module(self.network, preserve_module_state=False):
-            error = (self.network.predict(state)[..., frames, :] - target).square().mean(-1)
+            error = (self.network.predict(state, span) - target).square().mean(-1)
         return TensorDict({"loss_action": self._reduce(error, counts)})

@@ -1,0 +1,261 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap curve``: methods x label budgets x seeds in one command, on one shared planner, resumable at any moment."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from tqdm import tqdm
+
+from torchrl_koap.assembly import load_demonstrations
+from torchrl_koap.curve_jobs import Cell, cell_row, do_cell, do_planner, is_done, planner_folder
+from torchrl_koap.curve_report import write_curve_report
+from torchrl_koap.curve_table import write_cells
+from torchrl_koap.data import LabelBudget, limit_observations, save_ted
+from torchrl_koap.launchers import LAUNCHERS, Job, launch
+from torchrl_koap.lookup import lookup
+from torchrl_koap.methods import METHODS, get_method
+from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.tasks import HISTORY, WINDOW, Task, get_task
+
+ALL = "koap,koap_labelled_only,linear,dd,vae,lapo,dp,relabel,nonlinear,pretrain"
+
+
+@dataclass
+class Curve:
+    """Measure success against the number of labels: methods x label fractions x seeds.
+
+    Attributes:
+        out: folder of the curve; the same command goes on where it was interrupted, and may add methods, fractions or
+            seeds.
+        task: name of the task.
+        dataset: "scripted", or a folder: of D3IL raw pickles, a LeRobot data set, or written by `koap demos`.
+        demonstrations: number of scripted demonstrations (default: that of the task).
+        methods: names in torchrl_koap.methods.METHODS, with commas between.
+        fractions: shares of the units that keep their labels, with commas between.
+        units: "trajectory", "window" (the paper's levels) or "transition".
+        observations: shares of the trajectories that are used at all, with commas between.
+        seeds: number of seeds of label choice and training.
+        episodes: rollouts per cell; all cells meet the same ones.
+        steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
+        controller_steps: updates of every controller.
+        workers: cells at a time (default: one per core).
+        launcher: "local" or "ray".
+        address: of a Ray cluster (default: one on this machine).
+    """
+
+    out: Path
+    task: str = "avoiding"
+    dataset: str = "scripted"
+    demonstrations: int | None = None
+    methods: str = ALL
+    fractions: str = "0.01,0.02,0.05,0.1,0.25"
+    units: str = "trajectory"
+    observations: str = "1"
+    seeds: int = 3
+    episodes: int = 60
+    steps: int | None = None
+    controller_steps: int = 500
+    workers: int | None = None
+    launcher: str = "local"
+    address: str | None = None
+
+
+# what all cells of a folder must have in common; the rest may grow
+_FIXED = ("task", "dataset", "demonstrations", "units", "episodes", "steps", "controller_steps")
+
+
+def run_curve(options: Curve) -> dict[str, Any]:
+    """Does what is missing of a curve and writes its report.
+
+    Returns:
+        dict: how many cells are done, failed and missing, and where the report is.
+
+    Raises:
+        ValueError: for unknown methods, fractions out of range or that select nothing.
+        RunDirectoryError: if the folder holds something else, a curve with other settings, or one that is being worked
+            on.
+    """
+    cells = _cells(options)
+    task = get_task(options.task)
+    lookup(LAUNCHERS, options.launcher, "launcher")
+    for name in ("seeds", "episodes", "steps", "controller_steps", "workers"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be >= 1, got {value}")
+    root = RunDirectory(options.out)
+    _check_folder(root, options)
+    with _locked(root):
+        dataset = _demonstrations(root, options, task)
+        _check_budgets(cells, options, load_demonstrations(dataset, task))
+        _write_options(root, options)
+        reasons = _work(root, options, cells, dataset)
+        rows = _rows(root, cells, options, reasons)
+        report = write_curve_report(root.path, rows, title=f"Label efficiency on {task.name}")
+    counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
+    return counts | {"report": str(report)}
+
+
+def _cells(options: Curve) -> list[Cell]:
+    """All cells, those without a planner first: they need not wait for one. Repeated names count once."""
+    methods = _split("methods", options.methods, str)
+    for name in methods:
+        get_method(name)
+    fractions = _split("fractions", options.fractions, float)
+    observations = _split("observations", options.observations, float)
+    for name, values in {"fractions": fractions, "observations": observations}.items():
+        for value in values:
+            if not 0 < value <= 1:
+                raise ValueError(f"{name} must be in (0, 1], got {value:g}")
+    methods = sorted(methods, key=lambda name: not METHODS[name].acts)
+    return [
+        Cell(method, fraction, share, seed)
+        for seed in range(options.seeds)
+        for share in observations
+        for fraction in fractions
+        for method in methods
+    ]
+
+
+def _split(name: str, text: str, kind: type) -> list[Any]:
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if not parts:
+        raise ValueError(f"{name} must name at least one, got {text!r}")
+    try:
+        return list(dict.fromkeys(kind(part) for part in parts))
+    except ValueError:
+        raise ValueError(f"{name} must be numbers with commas between, got {text!r}") from None
+
+
+def _check_folder(root: RunDirectory, options: Curve) -> None:
+    if (root.path / "curve.json").exists():
+        earlier, now = root.read_json("curve.json"), _plain(options)
+        changed = [f"{name} ({earlier.get(name)})" for name in _FIXED if now[name] != earlier.get(name)]
+        if changed:
+            raise RunDirectoryError(
+                f"{root.path} holds a curve with another {', '.join(changed)}; choose another --out"
+            )
+    elif root.path.exists() and any(path.name not in ("lock", "demonstrations") for path in root.path.iterdir()):
+        raise RunDirectoryError(f"{root.path} is not empty and no folder of `koap curve`; choose another --out")
+
+
+def _plain(options: Curve) -> dict[str, Any]:
+    return asdict(options) | {"out": str(options.out)}
+
+
+def _write_options(root: RunDirectory, options: Curve) -> None:
+    """Keeps what was asked for, earlier methods, fractions and seeds included."""
+    content = _plain(options)
+    if (root.path / "curve.json").exists():
+        earlier = root.read_json("curve.json")
+        for name in ("methods", "fractions", "observations"):
+            content[name] = ",".join(dict.fromkeys([*str(earlier[name]).split(","), *content[name].split(",")]))
+        content["seeds"] = max(earlier["seeds"], content["seeds"])
+    root.write_json("curve.json", content)
+
+
+@contextmanager
+def _locked(root: RunDirectory) -> Iterator[None]:
+    root.path.mkdir(parents=True, exist_ok=True)
+    with (root.path / "lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise RunDirectoryError(f"another `koap curve` is working in {root.path}") from None
+        yield  # the system lets go of the lock however this process ends
+
+
+def _demonstrations(root: RunDirectory, options: Curve, task: Task) -> str:
+    """The data set as a folder: scripted demonstrations are recorded once for all cells."""
+    if options.dataset != "scripted":
+        return options.dataset
+    folder = root.path / "demonstrations"
+    if not (folder / "ted").exists():
+        from torchrl_koap.demonstrations import record_demonstrations
+
+        episodes = options.demonstrations or task.demonstrations
+        with tqdm(total=episodes, desc="demonstrations", unit="episode") as bar:
+            data, _ = record_demonstrations(
+                task.name, episodes, 0, progress=lambda recorded, wanted: bar.update(recorded - bar.n)
+            )
+        save_ted(data, folder / "ted", task=task.source)
+    return str(folder)
+
+
+def _check_budgets(cells: Sequence[Cell], options: Curve, data: TensorDictBase) -> None:
+    """Refuses before any work what would fail in a cell: budgets that select nothing, shares below the labelled."""
+    for fraction, share in dict.fromkeys((cell.fraction, cell.observations) for cell in cells):
+        labelled, _ = LabelBudget(fraction, unit=options.units, window=WINDOW, history=HISTORY).apply(data)
+        limit_observations(labelled, share)
+
+
+def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:
+    """Does the cells that are not done; returns why some failed."""
+    common = {
+        "task": options.task,
+        "dataset": dataset,
+        "steps": options.steps,
+        "controller_steps": options.controller_steps,
+    }
+    cell_settings = common | {"label_unit": options.units}
+    evaluation = {"episodes": options.episodes, "threads": 1}
+    todo = [cell for cell in cells if not is_done(root.path / cell.folder)]
+    jobs, names = [], {}
+    for cell in todo:
+        folder = root.path / cell.folder
+        planner = None if cell.planner is None else root.path / cell.planner
+        arguments = {
+            "folder": str(folder),
+            "cell": asdict(cell),
+            "planner": None if planner is None else str(planner),
+            "settings": cell_settings,
+            "evaluation": evaluation,
+        }
+        needs = () if planner is None or is_done(planner) else (cell.planner,)
+        jobs.append(Job(cell.folder, do_cell, arguments, folder / "log.txt", needs))
+        names[cell.folder] = cell
+    planners = dict.fromkeys(need for job in jobs for need in job.needs)
+    shares = {planner_folder(cell.observations): cell.observations for cell in todo}
+    first = [
+        Job(
+            name,
+            do_planner,
+            {"folder": str(root.path / name), "observations": shares[name], "settings": common},
+            root.path / name / "log.txt",
+        )
+        for name in planners
+    ]
+    workers = options.workers or os.cpu_count() or 1
+    reasons: dict[Cell, str] = {}
+    with tqdm(total=len(first) + len(jobs), desc="cells", unit="cell", smoothing=0.1) as bar:
+        ended = launch([*first, *jobs], launcher=options.launcher, workers=workers, address=options.address)
+        with closing(ended):
+            for job, reason in ended:
+                bar.update()
+                bar.set_postfix_str(job.name.removeprefix("cells/") + (" FAILED" if reason else ""))
+                if job.name in names:
+                    if reason is not None:
+                        reasons[names[job.name]] = reason
+                    _rows(root, cells, options, reasons)
+    return reasons
+
+
+def _rows(root: RunDirectory, cells: Sequence[Cell], options: Curve, reasons: dict[Cell, str]) -> list[dict[str, Any]]:
+    """Writes ``cells.csv`` from the folders of all cells, asked for now or earlier, and returns its rows."""
+    known = list(cells)
+    earlier = root.read_json("curve.json")
+    grown = Curve(out=root.path, **{name: earlier[name] for name in ("methods", "fractions", "observations", "seeds")})
+    known += [cell for cell in _cells(grown) if cell not in known and is_done(root.path / cell.folder)]
+    rows = [
+        cell_row(root.path, cell, task=options.task, label_unit=options.units, reason=reasons.get(cell))
+        for cell in known
+    ]
+    write_cells(root.path / "cells.csv", rows)
+    return rows

@@ -1,0 +1,213 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Many independent jobs, in processes of this machine or on a Ray cluster. One that dies takes no other along."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib.util
+import multiprocessing
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any
+
+from torchrl_koap.lookup import lookup
+
+_PRELOAD = ("torchrl_koap.curve_jobs",)  # imported once; every job's process starts as a copy of that
+
+
+@dataclass(frozen=True)
+class Job:
+    """A call that can be sent elsewhere.
+
+    Args:
+        name (str): unique name.
+        function (callable): a module-level function; what it has to say it writes to files.
+        arguments (dict): its keyword arguments, plain values.
+        log (Path): file that what it prints is appended to.
+        needs (tuple of str): names of the jobs that must have succeeded before.
+    """
+
+    name: str
+    function: Callable[..., None]
+    arguments: dict[str, Any] = field(default_factory=dict)
+    log: Path = Path(os.devnull)
+    needs: tuple[str, ...] = ()
+
+
+def launch(
+    jobs: Sequence[Job], *, launcher: str = "local", workers: int = 2, address: str | None = None
+) -> Iterator[tuple[Job, str | None]]:
+    """Runs jobs, each in a process of its own, and yields them as they end with the reason if they failed.
+
+    A job whose need failed is not run and fails too. Closing the iterator stops what is running.
+
+    Args:
+        jobs (sequence of Job): what to do; those that come first are started first.
+
+    Keyword Args:
+        launcher (str): ``"local"`` or ``"ray"`` (extra ``ray``; the folders must be visible to all machines).
+        workers (int): jobs at a time; on a cluster what Ray's own resources allow, one CPU each.
+        address (str, optional): of a Ray cluster. Default: one on this machine with that many workers.
+
+    Raises:
+        ValueError: for an unknown launcher, no workers, a need that is no job, or a launcher that is not installed.
+    """
+    if workers < 1:
+        raise ValueError(f"workers must be >= 1, got {workers}")
+    known = {job.name for job in jobs}
+    for job in jobs:
+        absent = [need for need in job.needs if need not in known]
+        if absent:
+            raise ValueError(f"job {job.name!r} needs {absent}, which are no jobs")
+    make = lookup(LAUNCHERS, launcher, "launcher")
+    return _schedule(list(jobs), make(workers, address))
+
+
+def _schedule(waiting: list[Job], pool: Any) -> Iterator[tuple[Job, str | None]]:
+    succeeded: set[str] = set()
+    failed: dict[str, str] = {}
+    running = 0
+    try:
+        while waiting or running:
+            doomed = [job for job in waiting if any(need in failed for need in job.needs)]
+            for job in doomed:
+                waiting.remove(job)
+                need = next(need for need in job.needs if need in failed)
+                failed[job.name] = f"{need} failed: {failed[need]}"
+                yield job, failed[job.name]
+            ready = [job for job in waiting if succeeded.issuperset(job.needs)]
+            for job in ready[: pool.free]:
+                waiting.remove(job)
+                pool.start(job)
+                running += 1
+            if not running:
+                continue
+            for job, reason in pool.finished():
+                running -= 1
+                if reason is None:
+                    succeeded.add(job.name)
+                else:
+                    failed[job.name] = reason
+                yield job, reason
+    finally:
+        pool.stop()
+
+
+def run_logged(job_log: str, function: Callable[..., None], arguments: dict[str, Any]) -> str | None:
+    """Calls a function with everything it prints going to a file; returns why it failed, if it did."""
+    log = Path(job_log)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+        try:
+            function(**arguments)
+        except Exception as error:
+            import traceback
+
+            traceback.print_exc(file=file)
+            lines = str(error).strip().splitlines() or [""]
+            return f"{type(error).__name__}: {lines[0]}"
+    return None
+
+
+class _LocalPool:
+    """Processes that are copies of a server which has imported everything: a job starts in a fraction of a second."""
+
+    def __init__(self, workers: int, address: str | None):
+        if address is not None:
+            raise ValueError("an address was given, but launcher 'local' works on this machine alone")
+        self.workers = workers
+        self.context = multiprocessing.get_context("forkserver")
+        self.context.set_forkserver_preload(list(_PRELOAD))
+        self.running: dict[Any, tuple[Job, Any, Any]] = {}
+
+    @property
+    def free(self) -> int:
+        return self.workers - len(self.running)
+
+    def start(self, job: Job) -> None:
+        reader, writer = self.context.Pipe(duplex=False)
+        process = self.context.Process(target=_child, args=(writer, str(job.log), job.function, job.arguments))
+        process.start()
+        writer.close()
+        self.running[process.sentinel] = (job, process, reader)
+
+    def finished(self) -> list[tuple[Job, str | None]]:
+        ended = []
+        for sentinel in connection.wait(list(self.running)):
+            job, process, reader = self.running.pop(sentinel)
+            process.join()
+            reason = reader.recv() if reader.poll() else _death(process.exitcode)
+            reader.close()
+            ended.append((job, reason))
+        return ended
+
+    def stop(self) -> None:
+        for _, process, _ in self.running.values():
+            process.kill()
+        for _, process, _ in self.running.values():
+            process.join()
+        self.running.clear()
+
+
+def _death(exit_code: int) -> str:
+    if exit_code == -signal.SIGKILL:
+        return "killed by the system (signal 9): probably out of memory; try fewer --workers"
+    return f"its process ended without a word (exit code {exit_code})"
+
+
+def _child(writer: Any, log: str, function: Callable[..., None], arguments: dict[str, Any]) -> None:
+    if sys.platform == "linux":  # do not outlive a killed parent: the next `koap curve` would meet its own ghost
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    writer.send(run_logged(log, function, arguments))
+    writer.close()
+
+
+class _RayPool:
+    """Tasks of a Ray cluster; a task that dies is not tried again."""
+
+    def __init__(self, workers: int, address: str | None):
+        if importlib.util.find_spec("ray") is None:
+            raise ValueError("launcher 'ray' needs an extra: pip install 'torchrl_koap[ray]'")
+        import ray
+
+        self.ray = ray
+        self.owned = not ray.is_initialized()
+        if self.owned:
+            size = {} if address is not None else {"num_cpus": workers, "include_dashboard": False}
+            ray.init(address=address, log_to_driver=False, **size)
+        self.workers = max(int(ray.cluster_resources().get("CPU", workers)), 1)
+        self.task = ray.remote(num_cpus=1, max_retries=0)(run_logged)
+        self.running: dict[Any, Job] = {}
+
+    @property
+    def free(self) -> int:
+        return self.workers - len(self.running)
+
+    def start(self, job: Job) -> None:
+        self.running[self.task.remote(str(Path(job.log).absolute()), job.function, job.arguments)] = job
+
+    def finished(self) -> list[tuple[Job, str | None]]:
+        (reference,), _ = self.ray.wait(list(self.running), num_returns=1)
+        job = self.running.pop(reference)
+        try:
+            return [(job, self.ray.get(reference))]
+        except self.ray.exceptions.RayError as error:
+            lines = str(error).strip().splitlines() or [""]
+            return [(job, f"{type(error).__name__}: {lines[0]}")]
+
+    def stop(self) -> None:
+        for reference in self.running:
+            self.ray.cancel(reference, force=True)
+        self.running.clear()
+        if self.owned:
+            self.ray.shutdown()
+
+
+LAUNCHERS = {"local": _LocalPool, "ray": _RayPool}
