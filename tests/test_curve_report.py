@@ -120,7 +120,7 @@ def test_page_says_what_was_run_and_what_was_not(folder):
         "avoiding, koap, 1 % labels, seed 0: failed: RuntimeError: <loss> is not finite",
         "avoiding, ridge, 1 % labels, seed 1: missing",
         "1 of 2",
-        "One planner is shared by all cells",
+        "One planner is shared by all cells that plan",
         "resamples contexts and training seeds",
         "All cells together: 10 min 50 s",  # ten times 60 + 5 s
     ):

@@ -55,8 +55,8 @@ seed it holds for that one training only.</li>
 <li><strong>p</strong> flips signs per context: could the advantage of these trained networks be chance of the contexts?
 It does not cover other training seeds: where those matter it is below 0.05 far too often, and the interval is what to
 go by. <strong>p (Holm)</strong> is corrected for the number of comparisons on this page.</li>
-<li><strong>One planner</strong> is shared by all cells of a task and a share of the trajectories. The seeds vary the
-controller and which labels it sees; how much another planner would change is not in any interval here.</li>
+<li><strong>One planner</strong> is shared by all cells that plan, for each task and share of the trajectories. The
+seeds vary the controller and which labels it sees; how much another planner would change is in no interval here.</li>
 <li>Cells that <strong>failed or are missing</strong> are in no average. They are counted and named; if hard cells fail
 more often, the averages of the others flatter the method.</li>
 </ul>
@@ -285,7 +285,9 @@ def _time(rows: Sequence[Mapping[str, Any]]) -> str:
     every = [dict(zip(names, _cell(row), strict=True)) for row in rows]
     if not spent_by:
         return ""
-    text = f"<p>All cells together: {duration(total)} as they report it; the planner is trained once for all.</p>"
+    text = (
+        f"<p>All cells together: {duration(total)} as they report it; a planner is trained once for all that plan.</p>"
+    )
     return text + _wide(spent_by) + f"<details><summary>Every cell</summary>{_wide(every)}</details>"
 
 
