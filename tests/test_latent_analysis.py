@@ -245,6 +245,7 @@ def test_a_method_without_latent_actions_gets_a_note(demonstrations, tmp_path):
     assert koap("inspect", tmp_path / "run", "--latent-only", "--threads", "1") == 0
     written = json.loads((tmp_path / "run" / "inspect.json").read_text())
     assert written["latent"] == {"note": "method 'linear' has no latent actions to look into"}
+    assert written["verdict"] == written["latent"]["note"]
     assert not (tmp_path / "run" / "plots" / "latent.png").exists()
 
 

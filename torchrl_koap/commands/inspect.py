@@ -166,8 +166,11 @@ def _look_into(
 def verdict(result: dict[str, Any], task: Task) -> str:
     """What the figures say: a sentence on the experiments, if there are any, and one on the latent space."""
     sentences = [_experiments_say(result, task)] if "imagined" in result else []
-    if "multi_step" in result.get("latent", {}):
-        sentences.append(_latent_says(result["latent"]))
+    latent = result.get("latent", {})
+    if "multi_step" in latent:
+        sentences.append(_latent_says(latent))
+    elif not sentences:
+        sentences.append(latent["note"])
     return ". ".join(sentences)
 
 
