@@ -217,6 +217,9 @@ def test_verdict_without_experiments_says_whose_labels_were_read():
     text = verdict({"latent": latent}, get_task("avoiding"))
     assert text.startswith("10 steps ahead the latent dynamics miss the measured xy by")
     assert "Outside the budget, for analysis only" in text and "100.0%" in text
+    assert "have labels in the budget" not in text
+    latent = analyse_latent(controller, data, data["episode"] >= 1, {"measured_xy": [0, 1]})
+    assert verdict({"latent": latent}, get_task("avoiding")).endswith("(1 of these 2 have labels in the budget)")
 
 
 @pytest.fixture

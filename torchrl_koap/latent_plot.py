@@ -149,9 +149,9 @@ def _draw_probe(axes: Axes, outside: Mapping[str, Any], names: list[str]) -> Non
         axes.bar(places + offset, np.clip(values, 0, None), width=0.36, color=color, label=label)
         for place, value in zip(places + offset, values, strict=True):
             if np.isfinite(value):
-                text = f"{value:.3f}" if len(names) < 4 else f"{value:.2f}"
-                axes.annotate(text, (place, max(value, 0) + 0.01), ha="center", fontsize=7, color=INK)
-    axes.set_ylim(0, 1.22)
+                style = {"ha": "center", "fontsize": 7, "color": INK, "rotation": 90 if len(names) > 4 else 0}
+                axes.annotate(f"{value:.3f}", (place, max(value, 0) + 0.01), **style)
+    axes.set_ylim(0, 1.3)
     axes.set_xticks(places, names, fontsize=8, rotation=45 if len(names) > 4 else 0)
     axes.set_yticks((0, 0.25, 0.5, 0.75, 1))
     axes.set_ylabel("share of variance explained (R²)")

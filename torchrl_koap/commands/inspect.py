@@ -179,13 +179,15 @@ def _latent_says(latent: dict[str, Any]) -> str:
     part = next(iter(errors["koopman"]))
     ahead = {model: f"{1e3 * errors[model][part][-1]:.3g} {error_unit(part)}" for model in MODELS}
     outside = latent[OUTSIDE_THE_BUDGET]
+    shared = outside["judged_trajectories_in_budget"]
+    reservation = f" ({shared} of these {errors['judged_trajectories']} have labels in the budget)" if shared else ""
     probe, own = (min(outside[name]) for name in ("probe_r2", "decoder_r2"))
     return (
         f"{errors['steps']} steps ahead the latent dynamics miss the {part.replace('_', ' ')} by {ahead['koopman']}"
         f" ({ahead['reconstruction']} of mapping back alone), a linear model on raw states by {ahead['linear']},"
         f" standing still by {ahead['copy_last']}. Outside the budget,"
         f" for analysis only: a linear probe on all labels explains {probe:.1%} of the hardest action dimension on"
-        f" held-out trajectories, the run's own decoder {own:.1%}"
+        f" held-out trajectories, the run's own decoder {own:.1%}{reservation}"
     )
 
 
