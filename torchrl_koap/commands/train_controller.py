@@ -133,9 +133,10 @@ def _train_policy(
     policy = build_diffusion_policy(
         config["planner"], data["state"].shape[-1], task.action_dim, task.planner_features()
     )
-    extended = extrapolate_ends(data, HORIZON - 1)
-    states = cut_windows(extended, WINDOW, select=["state"], pad_before=1)["state"]
-    policy.fit_normalizers(states, data["action"][data["has_action"].squeeze(-1)])
+    has_action = data["has_action"].squeeze(-1)
+    seen = data[torch.isin(data["episode"], data["episode"][has_action])]
+    states = cut_windows(extrapolate_ends(seen, HORIZON - 1), WINDOW, select=["state"], pad_before=1)["state"]
+    policy.fit_normalizers(states, data["action"][has_action])
     policy.to(options.device)
     # at the end of a demonstration only the steps that were recorded count
     buffer = make_window_buffer(
