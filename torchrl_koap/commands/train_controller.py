@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.objectives import SoftUpdate
