@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import importlib.util
 import multiprocessing
 import os
 import signal
-import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing import connection
@@ -162,11 +161,16 @@ def _death(exit_code: int) -> str:
 
 
 def _child(writer: Any, log: str, function: Callable[..., None], arguments: dict[str, Any]) -> None:
-    if sys.platform == "linux":  # do not outlive a killed parent: the next `koap curve` would meet its own ghost
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+    # not to outlive a killed parent: the next `koap curve` in the folder would meet its own ghost
+    threading.Thread(target=_die_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     writer.send(run_logged(log, function, arguments))
     writer.close()
+
+
+def _die_with_parent() -> None:
+    multiprocessing.parent_process().join()
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 class _RayPool:
