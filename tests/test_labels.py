@@ -224,3 +224,19 @@ def test_select_state():
     for wrong in ((), (4,), (-1,)):
         with pytest.raises(ValueError, match=r"0\.\.3"):
             select_state(data, wrong)
+
+
+def test_given_episodes_are_labelled_and_no_others():
+    data = flatten_trajectories([torch.rand(6, 4)] * 5, [torch.rand(5, 2)] * 5)
+    data["episode"] = data["episode"] * 10  # numbers, not positions
+    labelled, report = LabelBudget.of_episodes([40, 10]).apply(data)
+    shown = labelled["has_action"].squeeze(-1)
+    assert labelled["episode"][shown].unique().tolist() == [10, 40] and int(shown.sum()) == 10
+    assert report.selected_units == 2 and report.trajectories_touched == 2
+    with pytest.raises(ValueError, match=r"no episodes \[3\] to label; the data have 0 to 40"):
+        LabelBudget.of_episodes([10, 3]).apply(data)
+    for wrong in ([], [1, 1]):
+        with pytest.raises(ValueError, match="one or more different numbers"):
+            LabelBudget.of_episodes(wrong)
+    with pytest.raises(ValueError, match="without an amount or a unit"):
+        LabelBudget(3, episodes=(1, 2))

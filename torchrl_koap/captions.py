@@ -35,6 +35,17 @@ CAPTIONS = {
         " followed, then replaced (the planner revises). Distances are to the nearest point of the path, whatever the"
         " time; what was planned beyond its end does not count. Failures come first.",
     ),
+    "latent.png": (
+        "What the latent space holds",
+        "Left: eigenvalues of the operator. Middle: errors of predicted states, latent actions given; a test of the"
+        " models, not a forecast. Right, for analysis only: how much of the true actions a linear probe on labels"
+        " outside the budget, and the run's own decoder, explain on held-out demonstrations.",
+    ),
+    "inspect.png": (
+        "Which part fails",
+        "Success of the planner's own imagination, of the controller on recorded states, and of both in closed loop;"
+        " distances of executed states to plans.",
+    ),
     "demonstrations.png": (
         "Demonstrations and labels",
         "Blue: transitions whose action the training may read. Grey: states only.",

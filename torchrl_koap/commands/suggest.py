@@ -67,6 +67,9 @@ class SuggestedLabels:
 
 def budget_of(run: RunDirectory) -> LabelBudget:
     """The label budget that a run was trained with."""
+    episodes = run.read_json("config.json").get("label_episodes")
+    if episodes is not None:
+        return LabelBudget.of_episodes(episodes)
     names = ("label_count", "label_fraction", "label_unit", "seed")
     count, fraction, unit, seed = (run.read_entry("config.json", name) for name in names)
     return LabelBudget(fraction if count is None else count, unit=unit, seed=seed, window=WINDOW, history=HISTORY)

@@ -23,14 +23,14 @@ from torchrl_koap.assembly import (
 )
 from torchrl_koap.checkpoints import load_weights
 from torchrl_koap.commands.train_controller import train_controller
-from torchrl_koap.commands.train_options import Train, configure, started_with, with_task_defaults
+from torchrl_koap.commands.train_options import Train, budget_of, configure, started_with, with_task_defaults
 from torchrl_koap.commands.train_planner import train_planner
-from torchrl_koap.data import LabelBudget, WindowTable, limit_observations
+from torchrl_koap.data import WindowTable, limit_observations
 from torchrl_koap.lookup import lookup
 from torchrl_koap.methods import get_method
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.run_directory import RunDirectory
-from torchrl_koap.tasks import HISTORY, WINDOW, Task, get_task
+from torchrl_koap.tasks import WINDOW, Task, get_task
 
 
 def run_train(options: Train) -> dict[str, Any]:
@@ -56,6 +56,7 @@ def run_train(options: Train) -> dict[str, Any]:
     for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
         if getattr(options, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
+    budget = budget_of(options)
     set_up_torch(options.threads, options.device)
     config = configure(run, options)
     # finds unknown names before any work is done
@@ -73,10 +74,7 @@ def run_train(options: Train) -> dict[str, Any]:
             episodes=options.episodes,
             progress=lambda recorded, wanted: bar.update(recorded - bar.n),
         )
-    amount = options.label_fraction if options.label_count is None else options.label_count
-    budget = LabelBudget(amount, unit=options.label_unit, seed=options.seed, window=WINDOW, history=HISTORY)
-    command = task.observation[task.command]
-    labelled, report = budget.apply(data, command=command)
+    labelled, report = budget.apply(data, command=task.observation[task.command])
     labelled = limit_observations(labelled, options.observation_fraction, seed=options.seed).to(options.device)
     _check_lengths(options, config, task, labelled)
     run.write_json("config.json", config)  # not before the data are known to be good: a wrong call leaves nothing

@@ -10,9 +10,10 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.data import LabelBudget
 from torchrl_koap.methods import get_method
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.tasks import HISTORY, HORIZON, Task
+from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 
 
 @dataclass
@@ -25,6 +26,7 @@ class Train:
         dataset: "scripted", or a folder: of D3IL raw pickles, a LeRobot data set, or written by `koap demos`.
         label_fraction: share of the trajectories, windows or transitions that keep their actions.
         label_count: number of them instead of a share.
+        label_episodes: these trajectories instead of a random choice, as `koap suggest` names them.
         label_unit: "trajectory", "window" (the paper's levels) or "transition".
         seed: seed of label choice, initialisation and batches.
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
@@ -66,6 +68,7 @@ class Train:
     dataset: str = "scripted"
     label_fraction: float = 0.02
     label_count: int | None = None
+    label_episodes: tuple[int, ...] | None = None
     label_unit: str = "trajectory"
     observation_fraction: float = 1.0
     seed: int = 0
@@ -105,6 +108,20 @@ class Train:
 FREE = ("out", "threads", "checkpoint_every", "resume")
 
 
+def budget_of(options: Train) -> LabelBudget:
+    """The label budget that the options describe.
+
+    Raises:
+        ValueError: if it is out of range, or episodes are given together with another choice.
+    """
+    if options.label_episodes is not None:
+        if options.label_count is not None or options.label_unit != "trajectory":
+            raise ValueError("label_episodes are trajectories of their own choice: no label_count or label_unit")
+        return LabelBudget.of_episodes(options.label_episodes)
+    amount = options.label_fraction if options.label_count is None else options.label_count
+    return LabelBudget(amount, unit=options.label_unit, seed=options.seed, window=WINDOW, history=HISTORY)
+
+
 def started_with(run: RunDirectory, options: Train) -> Train:
     """The options of a resumed run: what was not asked for otherwise is as it was."""
     if not (options.resume and (run.path / "config.json").exists()):
@@ -112,8 +129,9 @@ def started_with(run: RunDirectory, options: Train) -> Train:
     earlier = run.read_json("config.json")
     left = [field.name for field in fields(options) if getattr(options, field.name) == field.default]
     kept = {name: earlier[name] for name in left if name in earlier}
-    if kept.get("channels") is not None:
-        kept["channels"] = tuple(kept["channels"])
+    for name in ("channels", "label_episodes"):
+        if kept.get(name) is not None:
+            kept[name] = tuple(kept[name])
     if kept.get("planner_from") is not None:
         kept["planner_from"] = Path(kept["planner_from"])
     return replace(options, **kept)
@@ -158,7 +176,9 @@ def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
         "preset": options.preset,
         "state": "all" if method.acts else options.controller_state,
     }
-    config["channels"] = list(options.channels)
+    for name in ("channels", "label_episodes"):
+        if config[name] is not None:
+            config[name] = list(config[name])
     config["command"] = "koap " + " ".join(sys.argv[1:])
     config["versions"] = {"python": platform.python_version()} | {
         name: importlib.metadata.version(name) for name in ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_HALF_UP, Context, Decimal
 from typing import Any, Literal, get_args
@@ -84,6 +85,7 @@ class LabelBudget:
         seed (int): seed of the draw.
         window (int): frames of a window.
         history (int): frames of a window up to and including "now".
+        episodes (tuple of int): these trajectories instead of a draw, see :meth:`of_episodes`.
 
     Raises:
         ValueError: if an argument is out of range.
@@ -104,8 +106,28 @@ class LabelBudget:
     seed: int = 0
     window: int = 16
     history: int = 2
+    episodes: tuple[int, ...] = ()
+
+    @classmethod
+    def of_episodes(cls, episodes: Sequence[int]) -> LabelBudget:
+        """The labels of given trajectories, such as those that ``koap suggest`` names.
+
+        Raises:
+            ValueError: if there are none, or one occurs twice.
+
+        Examples:
+            >>> from torchrl_koap.data import LabelBudget
+            >>> LabelBudget.of_episodes([57, 79]).amount
+            2
+        """
+        chosen = tuple(int(episode) for episode in episodes)
+        if not chosen or len(set(chosen)) < len(chosen):
+            raise ValueError(f"episodes to label must be one or more different numbers, got {list(chosen)}")
+        return cls(len(chosen), episodes=chosen)
 
     def __post_init__(self):
+        if self.episodes and (self.unit != "trajectory" or self.amount != len(self.episodes)):
+            raise ValueError("episodes are given with LabelBudget.of_episodes(), without an amount or a unit")
         lookup(get_args(Unit), self.unit, "unit")
         if isinstance(self.amount, bool) or not isinstance(self.amount, numbers.Real):
             raise ValueError(f"amount must be a fraction in (0, 1] or a count >= 1, got {self.amount!r}")
@@ -154,6 +176,8 @@ class LabelBudget:
 
         number = self._number_of(len(units))
         chosen = np.random.default_rng(self.seed).permutation(len(units))[:number]
+        if self.episodes:
+            chosen = _positions(data.get(keys.EPISODE).cpu().numpy()[starts], self.episodes)
         kept = np.zeros(lengths.sum(), dtype=bool)
         if labels is None:
             for index in chosen:
@@ -196,6 +220,14 @@ class LabelBudget:
                 f" the smallest fraction that selects one is {least}"
             )
         return number
+
+
+def _positions(present: np.ndarray, wanted: Sequence[int]) -> np.ndarray:
+    """Where the trajectories of some numbers lie."""
+    absent = sorted(set(wanted) - set(present.tolist()))
+    if absent:
+        raise ValueError(f"there are no episodes {absent} to label; the data have {present.min()} to {present.max()}")
+    return np.flatnonzero(np.isin(present, wanted))
 
 
 def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
