@@ -65,7 +65,7 @@ def test_what_a_training_writes(trained_run, demonstrations):
     config, summary = (json.loads((trained_run / f"{name}.json").read_text()) for name in ("config", "summary"))
     assert config["dataset"] == str(demonstrations) and config["steps"] == 20 and config["channels"] == [8, 16]
     assert config["planner"]["horizon"] == 14
-    assert config["controller"] == {"method": "koap", "decoder": None, "preset": "default", "state": "robot"}
+    assert config["controller"]["method"] == "koap" and config["controller"]["state"] == "robot"
     assert config["versions"]["torch"] == torch.__version__
     assert summary["labels"]["selected_units"] == 2 and summary["labels"]["trajectories_touched"] == 2
     assert summary["labels"]["total_transitions"] == sum(29 + index for index in range(8))

@@ -14,7 +14,7 @@ from torch import nn
 from torchrl_koap.data import D3ILExperienceReplay, Normalizer, load_ted, select_state
 from torchrl_koap.demonstrations import record_demonstrations
 from torchrl_koap.lookup import lookup
-from torchrl_koap.methods import get_method, normalizers_of
+from torchrl_koap.methods import Method, get_method, normalizers_of
 from torchrl_koap.modules import (
     DiffusionPolicy,
     MLPDenoiser,
@@ -23,6 +23,7 @@ from torchrl_koap.modules import (
     TemporalUnet,
     TransformerDenoiser,
 )
+from torchrl_koap.released_settings import get_released
 from torchrl_koap.tasks import Task
 
 # what every preset was designed with: how states and actions are normalised
@@ -153,7 +154,7 @@ def build_controller(
     Raises:
         ValueError: for an unknown method, decoder or preset.
     """
-    method = get_method(options["method"], options.get("decoder"))
+    method = method_named(options)
     modes = lookup(NORMALIZATION, options["preset"], "preset")
     if labelled is None:
         normalizers = normalizers_of(Normalizer(), Normalizer())
@@ -164,6 +165,17 @@ def build_controller(
             Normalizer.fit(labelled["action"], mode=modes["action"], mask=labelled["has_action"]),
         )
     return method.build(state_dim, action_dim, normalizers, options)
+
+
+def method_named(options: Mapping[str, Any]) -> Method:
+    """The method that the ``controller`` entry of ``config.json`` names.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    if options.get("released"):
+        return get_released(options["method"]).method
+    return get_method(options["method"], options.get("decoder"))
 
 
 def set_up_torch(threads: int, device: str) -> None:

@@ -42,6 +42,7 @@ def train(
     learning_rate: float,
     weight_decay: float = 0.0,
     warmup: int = 100,
+    decay: bool = True,
     target_update: SoftUpdate | None = None,
     run: RunDirectory | None = None,
     logger: Any = None,
@@ -62,6 +63,7 @@ def train(
         learning_rate (float): peak of :func:`warmup_cosine`.
         weight_decay (float): decoupled weight decay.
         warmup (int): updates of warm-up.
+        decay (bool): let the learning rate fall to 0 after the warm-up; otherwise it stays. Defaults to True.
         target_update (SoftUpdate, optional): moving average of the parameters, stepped after every update.
         run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
         logger (optional): a TorchRL logger; scalars are named ``phase/term``.
@@ -94,7 +96,7 @@ def train(
     values: dict[str, float] = run.last_metrics(phase) if start else {}
     began, mark, marked = time.perf_counter(), time.perf_counter(), start
     for step in range(start, num_steps):
-        rate = learning_rate * warmup_cosine(step, num_steps, warmup)
+        rate = learning_rate * (warmup_cosine(step, num_steps, warmup) if decay else min(1.0, (step + 1) / warmup))
         for group in optimizer.param_groups:
             group["lr"] = rate
         losses = loss_module(sample())

@@ -7,7 +7,7 @@ import fcntl
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from torchrl_koap.data import LabelBudget, limit_observations, save_ted
 from torchrl_koap.launchers import LAUNCHERS, Job, launch
 from torchrl_koap.lookup import lookup
 from torchrl_koap.methods import METHODS, get_method
+from torchrl_koap.released_settings import get_released
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks import HISTORY, WINDOW, Task, get_task
 
@@ -46,6 +47,8 @@ class Curve:
         episodes: rollouts per cell; all cells meet the same ones.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: updates of every controller.
+        released_settings: the unequal settings of the first public code instead of equal ones (koap, pretrain, dd, dp).
+        epochs: with released settings, epochs instead of the first code's.
         workers: cells at a time (default: one per core).
         launcher: "local" or "ray".
         address: of a Ray cluster (default: one on this machine).
@@ -63,13 +66,26 @@ class Curve:
     episodes: int = 60
     steps: int | None = None
     controller_steps: int = 500
+    released_settings: bool = False
+    epochs: int | None = None
     workers: int | None = None
     launcher: str = "local"
     address: str | None = None
 
 
 # what all cells of a folder must have in common; the rest may grow
-_FIXED = ("task", "dataset", "demonstrations", "units", "episodes", "steps", "controller_steps")
+_FIXED = (
+    "task",
+    "dataset",
+    "demonstrations",
+    "units",
+    "episodes",
+    "steps",
+    "controller_steps",
+    "released_settings",
+    "epochs",
+)
+_GROWS = ("methods", "fractions", "observations", "seeds")
 
 
 def run_curve(options: Curve) -> dict[str, Any]:
@@ -107,7 +123,7 @@ def _cells(options: Curve) -> list[Cell]:
     """All cells, those without a planner first: they need not wait for one. Repeated names count once."""
     methods = _split("methods", options.methods, str)
     for name in methods:
-        get_method(name)
+        get_released(name) if options.released_settings else get_method(name)
     fractions = _split("fractions", options.fractions, float)
     observations = _split("observations", options.observations, float)
     for name, values in {"fractions": fractions, "observations": observations}.items():
@@ -204,7 +220,11 @@ def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: st
         "steps": options.steps,
         "controller_steps": options.controller_steps,
     }
-    cell_settings = common | {"label_unit": options.units}
+    cell_settings = common | {
+        "label_unit": options.units,
+        "released_settings": options.released_settings,
+        "epochs": options.epochs,
+    }
     evaluation = {"episodes": options.episodes, "threads": 1}
     todo = [cell for cell in cells if not is_done(root.path / cell.folder)]
     jobs, names = [], {}
@@ -251,7 +271,7 @@ def _rows(root: RunDirectory, cells: Sequence[Cell], options: Curve, reasons: di
     """Writes ``cells.csv`` from the folders of all cells, asked for now or earlier, and returns its rows."""
     known = list(cells)
     earlier = root.read_json("curve.json")
-    grown = Curve(out=root.path, **{name: earlier[name] for name in ("methods", "fractions", "observations", "seeds")})
+    grown = replace(options, **{name: earlier[name] for name in _GROWS})
     known += [cell for cell in _cells(grown) if cell not in known and is_done(root.path / cell.folder)]
     rows = [
         cell_row(root.path, cell, task=options.task, label_unit=options.units, reason=reasons.get(cell))

@@ -18,13 +18,13 @@ from torchrl_koap.assembly import (
     build_diffusion_policy,
     build_planner,
     make_env_of,
+    method_named,
     mode_index_of,
     set_up_torch,
 )
 from torchrl_koap.checkpoints import load_weights, save_tensors
 from torchrl_koap.evaluation import make_policy, measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.lookup import lookup
-from torchrl_koap.methods import get_method
 from torchrl_koap.modules import ChunkedPolicy, StatePlanner
 from torchrl_koap.modules.policies import EXECUTIONS
 from torchrl_koap.report import write_report
@@ -86,7 +86,7 @@ def load_run(run: RunDirectory, task: str | None = None) -> tuple[Task, StatePla
         raise RunDirectoryError(f"{run.path} was trained on task {trained_on!r}, not on {task!r}")
     facts = get_task(trained_on)
     modules: dict[str, nn.Module] = {}
-    if get_method(parts[1]["method"], parts[1].get("decoder")).acts:
+    if method_named(parts[1]).acts:
         modules["controller"] = build_diffusion_policy(
             parts[0], facts.state_dim, facts.action_dim, facts.planner_features()
         )

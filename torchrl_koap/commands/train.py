@@ -23,11 +23,10 @@ from torchrl_koap.assembly import (
 )
 from torchrl_koap.checkpoints import load_weights
 from torchrl_koap.commands.train_controller import train_controller
-from torchrl_koap.commands.train_options import Train, budget_of, configure, started_with, with_task_defaults
+from torchrl_koap.commands.train_options import Train, budget_of, configure, method_of, started_with, with_task_defaults
 from torchrl_koap.commands.train_planner import train_planner
 from torchrl_koap.data import WindowTable, limit_observations
 from torchrl_koap.lookup import lookup
-from torchrl_koap.methods import get_method
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import WINDOW, Task, get_task
@@ -44,7 +43,7 @@ def run_train(options: Train) -> dict[str, Any]:
     options = started_with(run, options)
     task = get_task(options.task)
     options = with_task_defaults(options, task)
-    method = get_method(options.method, options.decoder)
+    method = method_of(options)
     lookup(PRESETS, options.preset, "preset")
     lookup(("csv", "wandb"), options.logger, "logger")
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
@@ -113,7 +112,7 @@ def run_train(options: Train) -> dict[str, Any]:
 
 def _check_lengths(options: Train, config: dict[str, Any], task: Task, data: TensorDictBase) -> None:
     """Finds trajectories that are too short now rather than after the planner was trained."""
-    if get_method(options.method, options.decoder).acts:
+    if method_of(options).acts:
         WindowTable.build(data, WINDOW, pad_before=1)
         return
     width = len(task.controller_columns(options.controller_state))

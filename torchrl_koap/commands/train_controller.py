@@ -12,16 +12,18 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.objectives import SoftUpdate
 
+from torchrl_koap import released_settings
 from torchrl_koap.assembly import build_controller, build_diffusion_policy
 from torchrl_koap.checkpoints import save_tensors, save_weights
 from torchrl_koap.closed_form import fit_closed_form
-from torchrl_koap.commands.train_options import Train
-from torchrl_koap.data import controller_view, cut_windows, extrapolate_ends, make_window_buffer
-from torchrl_koap.methods import METHODS, Method, get_method
+from torchrl_koap.commands.train_options import Train, method_of
+from torchrl_koap.data import WindowTable, controller_view, cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.methods import METHODS, Method, Phase
 from torchrl_koap.modules import DiffusionPolicy, KoopmanInverseDynamics
 from torchrl_koap.objectives import DiffusionPolicyLoss
 from torchrl_koap.progress import progress_bar, show_progress
 from torchrl_koap.relabelling import relabel
+from torchrl_koap.released_settings import epochs_of, get_released
 from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 from torchrl_koap.training import train
@@ -47,8 +49,8 @@ def train_controller(
     Returns:
         tuple: the module, what was found by a closed form (empty if there is none), and the last losses.
     """
-    method = get_method(options.method, options.decoder)
-    train_one = _Training(run, options, logger)
+    method = method_of(options)
+    train_one = _Training(run, options, logger, task)
     if method.acts:
         fit: dict[str, Any] = {}
         if method.teacher:
@@ -68,11 +70,31 @@ def train_controller(
 class _Training:
     """Runs phases with the options of a run."""
 
-    def __init__(self, run: RunDirectory, options: Train, logger):
+    def __init__(self, run: RunDirectory, options: Train, logger, task: Task):
         self.run, self.options, self.logger = run, options, logger
+        self.released = get_released(options.method) if options.released_settings else None
+        self.epochs = epochs_of(task.name)
         self.updates = 0
 
+    def batch_size(self, own: int) -> int:
+        """Windows per update."""
+        return own if self.released is None else released_settings.BATCH_SIZE
+
+    def budget(self, phase: Phase, own: int, table: WindowTable, epochs: int | None = None) -> int:
+        """Updates of a phase: its share of what every method has, or the epochs of the first public code."""
+        if self.released is None:
+            return max(round(own * phase.share), 1)
+        epochs = self.options.epochs or epochs or self.epochs
+        return self.released.updates(phase, table, epochs)
+
     def __call__(self, name: str, loss: nn.Module, sample: Callable, *, num_steps: int, **settings) -> dict[str, float]:
+        if self.released is not None:
+            settings |= {
+                "learning_rate": self.released.learning_rate,
+                "weight_decay": released_settings.WEIGHT_DECAY,
+                "warmup": released_settings.WARMUP,
+                "decay": False,
+            }
         self.updates += num_steps
         with progress_bar(num_steps, name) as bar:
             return train(
@@ -104,11 +126,12 @@ def _train_network(
         controller.fit_scales(windows["state"])
     values: dict[str, float] = {}
     budget = min(options.controller_steps, options.steps)
+    table = WindowTable.build(data, window, pad_before=history)
     for phase in method.phases if budget else ():
         buffer = make_window_buffer(
             data,
             window,
-            options.controller_batch_size,
+            train_one.batch_size(options.controller_batch_size),
             select=_KEYS,
             pad_before=history,
             labelled_share=_LABELLED_SHARE[phase.windows],
@@ -117,7 +140,7 @@ def _train_network(
             phase.name,
             phase.loss(controller),
             buffer.sample,
-            num_steps=max(round(budget * phase.share), 1),
+            num_steps=train_one.budget(phase, budget, table),
             learning_rate=options.controller_learning_rate,
             weight_decay=1e-3,
         )
@@ -143,21 +166,24 @@ def _train_policy(
     buffer = make_window_buffer(
         data,
         WINDOW,
-        options.batch_size,
+        train_one.batch_size(options.batch_size),
         select=_KEYS,
         pad_before=1,
         pad_after=HORIZON - 1,
         labelled_share=_LABELLED_SHARE["labelled"],
     )
     loss = DiffusionPolicyLoss(policy)
+    table = WindowTable.build(data, WINDOW, pad_before=1, pad_after=HORIZON - 1)
+    phase = Phase("policy", DiffusionPolicyLoss, "labelled")
+    num_steps = train_one.budget(phase, options.steps, table, released_settings.POLICY_EPOCHS)
     values = train_one(
-        "policy",
+        phase.name,
         loss,
         buffer.sample,
-        num_steps=options.steps,
+        num_steps=num_steps,
         learning_rate=options.planner_learning_rate,
         weight_decay=1e-4,
-        target_update=SoftUpdate(loss, eps=min(0.998, 1 - 10 / (options.steps + 10))),
+        target_update=SoftUpdate(loss, eps=min(0.998, 1 - 10 / (num_steps + 10))),
     )
     loss.target_policy_params.to_module(policy)
     return policy, values

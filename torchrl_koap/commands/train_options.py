@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.data import LabelBudget
-from torchrl_koap.methods import get_method
+from torchrl_koap.methods import Method, get_method
+from torchrl_koap.released_settings import POLICY, get_released
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 
@@ -32,6 +33,8 @@ class Train:
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
         method: "koap", "linear" (ridge on raw frames), "dd" (supervised inverse dynamics), "dp" (Diffusion Policy), or
             another name in torchrl_koap.methods.METHODS.
+        released_settings: the unequal network, learning rate and updates that the first public code has for the method.
+        epochs: with released settings, epochs instead of the first code's.
         preset: variant of KOAP: "default", "paper" or "released".
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
@@ -73,6 +76,8 @@ class Train:
     observation_fraction: float = 1.0
     seed: int = 0
     method: str = "koap"
+    released_settings: bool = False
+    epochs: int | None = None
     preset: str = "default"
     decoder: str | None = None
     steps: int | None = None
@@ -122,6 +127,21 @@ def budget_of(options: Train) -> LabelBudget:
     return LabelBudget(amount, unit=options.label_unit, seed=options.seed, window=WINDOW, history=HISTORY)
 
 
+def method_of(options: Train) -> Method:
+    """The method that the options name.
+
+    Raises:
+        ValueError: if there is none, or not with that decoder or released settings.
+    """
+    if options.released_settings:
+        if options.decoder is not None:
+            raise ValueError("released settings come with their own decoder: no --decoder")
+        return get_released(options.method).method
+    if options.epochs is not None:
+        raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
+    return get_method(options.method, options.decoder)
+
+
 def started_with(run: RunDirectory, options: Train) -> Train:
     """The options of a resumed run: what was not asked for otherwise is as it was."""
     if not (options.resume and (run.path / "config.json").exists()):
@@ -169,11 +189,14 @@ def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
     }
     if options.planner_from is not None:
         config["planner"] = RunDirectory(options.planner_from).read_entry("config.json", "planner")
-    method = get_method(options.method, options.decoder)
+    method = method_of(options)
+    if method.acts and options.released_settings:
+        config["planner"] |= POLICY
     config["controller"] = {
         "method": options.method,
         "decoder": options.decoder,
-        "preset": options.preset,
+        "released": options.released_settings,
+        "preset": "released" if options.released_settings else options.preset,
         "state": "all" if method.acts else options.controller_state,
     }
     for name in ("channels", "label_episodes"):
