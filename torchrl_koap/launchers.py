@@ -4,20 +4,23 @@
 from __future__ import annotations
 
 import contextlib
+import graphlib
 import importlib.util
 import multiprocessing
 import os
 import signal
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing import connection
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from torchrl_koap.lookup import lookup
 
 _PRELOAD = ("torchrl_koap.curve_jobs",)  # imported once; every job's process starts as a copy of that
+_LONGEST = 500  # characters of a reason
 
 
 @dataclass(frozen=True)
@@ -55,17 +58,45 @@ def launch(
         address (str, optional): of a Ray cluster. Default: one on this machine with that many workers.
 
     Raises:
-        ValueError: for an unknown launcher, no workers, a need that is no job, or a launcher that is not installed.
+        ValueError: for an unknown launcher, no workers, two jobs of one name, a need that is no job, jobs that wait for
+            each other, or a launcher that is not installed.
     """
+    check_launcher(launcher, workers=workers, address=address)
+    needs = {job.name: job.needs for job in jobs}
+    if len(needs) < len(jobs):
+        names = [job.name for job in jobs]
+        raise ValueError(f"jobs need names of their own; twice: {sorted({n for n in names if names.count(n) > 1})}")
+    for name in needs:
+        absent = [need for need in needs[name] if need not in needs]
+        if absent:
+            raise ValueError(f"job {name!r} needs {absent}, which are no jobs")
+    try:
+        graphlib.TopologicalSorter(needs).prepare()
+    except graphlib.CycleError as error:
+        raise ValueError(f"jobs wait for each other: {' -> '.join(error.args[1])}") from None
+    return _schedule(list(jobs), LAUNCHERS[launcher](workers, address))
+
+
+def check_launcher(launcher: str, *, workers: int = 1, address: str | None = None) -> None:
+    """Refuses before any work what :func:`launch` could not do.
+
+    Args:
+        launcher (str): name of the launcher.
+
+    Keyword Args:
+        workers (int): jobs at a time.
+        address (str, optional): of a Ray cluster.
+
+    Raises:
+        ValueError: for an unknown launcher, one that is not installed, no workers, or an address that is of no use.
+    """
+    lookup(LAUNCHERS, launcher, "launcher")
     if workers < 1:
         raise ValueError(f"workers must be >= 1, got {workers}")
-    known = {job.name for job in jobs}
-    for job in jobs:
-        absent = [need for need in job.needs if need not in known]
-        if absent:
-            raise ValueError(f"job {job.name!r} needs {absent}, which are no jobs")
-    make = lookup(LAUNCHERS, launcher, "launcher")
-    return _schedule(list(jobs), make(workers, address))
+    if launcher == "local" and address is not None:
+        raise ValueError("an address was given, but launcher 'local' works on this machine alone")
+    if launcher == "ray" and importlib.util.find_spec("ray") is None:
+        raise ValueError("launcher 'ray' needs an extra: pip install 'torchrl_koap[ray]'")
 
 
 def _schedule(waiting: list[Job], pool: Any) -> Iterator[tuple[Job, str | None]]:
@@ -100,26 +131,33 @@ def _schedule(waiting: list[Job], pool: Any) -> Iterator[tuple[Job, str | None]]
 
 def run_logged(job_log: str, function: Callable[..., None], arguments: dict[str, Any]) -> str | None:
     """Calls a function with everything it prints going to a file; returns why it failed, if it did."""
-    log = Path(job_log)
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
-        try:
-            function(**arguments)
-        except Exception as error:
-            import traceback
-
-            traceback.print_exc(file=file)
-            lines = str(error).strip().splitlines() or [""]
-            return f"{type(error).__name__}: {lines[0]}"
+    try:
+        with _open_log(job_log) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+            try:
+                function(**arguments)
+            except Exception:
+                traceback.print_exc(file=file)
+                raise
+    except Exception as error:  # also where there is no place for a log
+        return _in_words(error)
     return None
+
+
+def _open_log(path: str) -> TextIO:
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    return Path(path).open("a", buffering=1)  # by lines: a job that is killed has said what it did until then
+
+
+def _in_words(error: Exception) -> str:
+    """Type and first line; cut, as a pipe holds 64 KB and nobody reads it before the process has ended."""
+    lines = str(error).strip().splitlines() or [""]
+    return f"{type(error).__name__}: {lines[0][:_LONGEST]}".removesuffix(": ")
 
 
 class _LocalPool:
     """Processes that are copies of a server which has imported everything: a job starts in a fraction of a second."""
 
     def __init__(self, workers: int, address: str | None):
-        if address is not None:
-            raise ValueError("an address was given, but launcher 'local' works on this machine alone")
         self.workers = workers
         self.context = multiprocessing.get_context("forkserver")
         self.context.set_forkserver_preload(list(_PRELOAD))
@@ -141,7 +179,10 @@ class _LocalPool:
         for sentinel in connection.wait(list(self.running)):
             job, process, reader = self.running.pop(sentinel)
             process.join()
-            reason = reader.recv() if reader.poll() else _death(process.exitcode)
+            try:
+                reason = reader.recv() if reader.poll() else _death(process.exitcode)
+            except (EOFError, OSError):  # a pipe at its end is ready to be read as well
+                reason = _death(process.exitcode)
             reader.close()
             ended.append((job, reason))
         return ended
@@ -157,13 +198,17 @@ class _LocalPool:
 def _death(exit_code: int) -> str:
     if exit_code == -signal.SIGKILL:
         return "killed by the system (signal 9): probably out of memory; try fewer --workers"
-    return f"its process ended without a word (exit code {exit_code})"
+    what = f"exit code {exit_code}" if exit_code >= 0 else f"signal {-exit_code}, {signal.strsignal(-exit_code)}"
+    return f"its process ended without a word ({what})"
 
 
 def _child(writer: Any, log: str, function: Callable[..., None], arguments: dict[str, Any]) -> None:
     # not to outlive a killed parent: the next `koap curve` in the folder would meet its own ghost
     threading.Thread(target=_die_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    with contextlib.suppress(OSError), _open_log(log) as file:  # what is not Python prints past sys.stdout
+        for descriptor in (1, 2):
+            os.dup2(file.fileno(), descriptor)
     writer.send(run_logged(log, function, arguments))
     writer.close()
 
@@ -177,15 +222,14 @@ class _RayPool:
     """Tasks of a Ray cluster; a task that dies is not tried again."""
 
     def __init__(self, workers: int, address: str | None):
-        if importlib.util.find_spec("ray") is None:
-            raise ValueError("launcher 'ray' needs an extra: pip install 'torchrl_koap[ray]'")
         import ray
 
         self.ray = ray
         self.owned = not ray.is_initialized()
         if self.owned:
+            # "local", as None means a cluster that happens to run already, which takes no sizes
             size = {} if address is not None else {"num_cpus": workers, "include_dashboard": False}
-            ray.init(address=address, log_to_driver=False, **size)
+            ray.init(address=address or "local", log_to_driver=False, **size)
         self.workers = max(int(ray.cluster_resources().get("CPU", workers)), 1)
         self.task = ray.remote(num_cpus=1, max_retries=0)(run_logged)
         self.running: dict[Any, Job] = {}
@@ -203,8 +247,7 @@ class _RayPool:
         try:
             return [(job, self.ray.get(reference))]
         except self.ray.exceptions.RayError as error:
-            lines = str(error).strip().splitlines() or [""]
-            return [(job, f"{type(error).__name__}: {lines[0]}")]
+            return [(job, _in_words(error))]
 
     def stop(self) -> None:
         for reference in self.running:
