@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from torchrl_koap.commands.bench import Bench, run_bench
 from torchrl_koap.commands.curve import Curve, run_curve
 from torchrl_koap.commands.demos import Demos, run_demos
 from torchrl_koap.commands.doctor import Doctor, Validate, run_doctor, run_validate
@@ -24,6 +25,7 @@ RUNNERS = {
     Train: run_train,
     Eval: run_eval,
     Curve: run_curve,
+    Bench: run_bench,
     Inspect: run_inspect,
     Suggest: run_suggest,
     Doctor: run_doctor,
@@ -37,6 +39,7 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Curve, tyro.conf.subcommand("curve")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Suggest, tyro.conf.subcommand("suggest")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]

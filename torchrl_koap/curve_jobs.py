@@ -47,7 +47,7 @@ class Cell:
     @property
     def folder(self) -> str:
         """Its run directory, relative to the curve's."""
-        return f"cells/{self.method}-{self.fraction:g}-{self.observations:g}-seed{self.seed}"
+        return f"cells/{self.method}-{self.fraction:.15g}-{self.observations:.15g}-seed{self.seed}"
 
     @property
     def planner(self) -> str | None:
@@ -57,12 +57,29 @@ class Cell:
 
 def planner_folder(observations: float) -> str:
     """Folder of the planner that all cells with this share of the trajectories have in common."""
-    return f"planner-{observations:g}"
+    return f"planner-{observations:.15g}"
+
+
+def is_trained(folder: Path) -> bool:
+    """Whether a planner was finished."""
+    return _is_readable(RunDirectory(folder), DONE) and (folder / "planner.safetensors").is_file()
 
 
 def is_done(folder: Path) -> bool:
-    """Whether a cell or planner was finished."""
-    return (folder / DONE).is_file()
+    """Whether a cell was finished and all its results can be read; if not, it is to be done (again)."""
+    try:
+        _results(RunDirectory(folder))
+    except RunDirectoryError:
+        return False
+    return True
+
+
+def _is_readable(run: RunDirectory, name: str) -> bool:
+    try:
+        run.read_json(name)
+    except RunDirectoryError:
+        return False
+    return True
 
 
 def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) -> None:
@@ -105,7 +122,7 @@ def do_cell(
     """
     path, this = Path(folder), Cell(**cell)
     began = time.perf_counter()
-    if not (path / "summary.json").exists():
+    if not _is_readable(RunDirectory(path), "summary.json"):
         run_train(
             Train(
                 out=path,
@@ -147,17 +164,32 @@ def cell_row(root: Path, cell: Cell, *, task: str, label_unit: str, reason: str 
     """
     row: dict[str, Any] = {"task": task, **asdict(cell), "label_unit": label_unit, "run": cell.folder}
     run = RunDirectory(root / cell.folder)
-    if not is_done(run.path):
-        return row | ({"status": "missing"} if reason is None else {"status": "failed", "reason": reason})
     try:
-        done, summary, result = (run.read_json(name) for name in (DONE, "summary.json", "eval.json"))
+        return row | {"status": "done"} | _results(run)
     except RunDirectoryError as error:
-        return row | {"status": "failed", "reason": str(error)}
+        if reason is None and (run.path / DONE).exists():  # it was done once
+            reason = str(error)
+    return row | ({"status": "missing"} if reason is None else {"status": "failed", "reason": reason})
+
+
+def _results(run: RunDirectory) -> dict[str, Any]:
+    """What a finished cell found.
+
+    Raises:
+        RunDirectoryError: if a file is not there, damaged or lacks something.
+    """
+    done, summary, result = (run.read_json(name) for name in (DONE, "summary.json", "eval.json"))
+    try:
+        return _columns(done, summary, result)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise RunDirectoryError(f"{run.path}: its results are damaged ({type(error).__name__}: {error})") from error
+
+
+def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
     labels = done["labels"]
     errors = next((value for name, value in summary.items() if name.startswith("action_error_")), {})
     entropy = result["mode_entropy"]
-    return row | {
-        "status": "done",
+    return {
         "labelled_units": labels["selected_units"],
         "labelled_transitions": labels["labelled_transitions"],
         "trajectories_touched": labels["trajectories_touched"],

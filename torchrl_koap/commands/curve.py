@@ -11,17 +11,18 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
 from torchrl_koap.assembly import load_demonstrations
-from torchrl_koap.curve_jobs import Cell, cell_row, do_cell, do_planner, is_done, planner_folder
+from torchrl_koap.curve_jobs import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
 from torchrl_koap.curve_report import write_curve_report
 from torchrl_koap.curve_table import write_cells
-from torchrl_koap.data import LabelBudget, limit_observations, save_ted
-from torchrl_koap.launchers import LAUNCHERS, Job, launch
-from torchrl_koap.lookup import lookup
+from torchrl_koap.data import LabelBudget, flatten_trajectories, limit_observations, save_ted
+from torchrl_koap.launchers import Job, check_launcher, launch
 from torchrl_koap.methods import METHODS, get_method
+from torchrl_koap.paper_results import paper_points
 from torchrl_koap.released_settings import get_released
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks import HISTORY, WINDOW, Task, get_task
@@ -101,20 +102,25 @@ def run_curve(options: Curve) -> dict[str, Any]:
     """
     cells = _cells(options)
     task = get_task(options.task)
-    lookup(LAUNCHERS, options.launcher, "launcher")
-    for name in ("seeds", "episodes", "steps", "controller_steps", "workers"):
+    for name in ("seeds", "demonstrations", "episodes", "steps", "controller_steps", "epochs", "workers"):
         value = getattr(options, name)
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
-    root = RunDirectory(options.out)
+    if options.epochs is not None and not options.released_settings:
+        raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
+    check_launcher(options.launcher, address=options.address)
+    root = RunDirectory(options.out.absolute())
     _check_folder(root, options)
+    _check_budgets(cells, options, _first_look(root, options, task))
     with _locked(root):
+        _check_folder(root, options)  # another one may have finished here in the meantime
         dataset = _demonstrations(root, options, task)
         _check_budgets(cells, options, load_demonstrations(dataset, task))
         _write_options(root, options)
         reasons = _work(root, options, cells, dataset)
         rows = _rows(root, cells, options, reasons)
-        report = write_curve_report(root.path, rows, title=f"Label efficiency on {task.name}")
+        paper = paper_points(task.name, task.label_levels) if options.units == "window" else None
+        report = write_curve_report(root.path, rows, title=f"Label efficiency on {task.name}", paper=paper)
     counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
     return counts | {"report": str(report)}
 
@@ -153,17 +159,24 @@ def _split(name: str, text: str, kind: type) -> list[Any]:
 def _check_folder(root: RunDirectory, options: Curve) -> None:
     if (root.path / "curve.json").exists():
         earlier, now = root.read_json("curve.json"), _plain(options)
-        changed = [f"{name} ({earlier.get(name)})" for name in _FIXED if now[name] != earlier.get(name)]
+        # an option that is younger than the folder was at its default
+        earlier = {name: earlier.get(name, getattr(Curve, name)) for name in _FIXED}
+        changed = [f"{name} ({value})" for name, value in earlier.items() if now[name] != value]
         if changed:
             raise RunDirectoryError(
                 f"{root.path} holds a curve with another {', '.join(changed)}; choose another --out"
             )
-    elif root.path.exists() and any(path.name not in ("lock", "demonstrations") for path in root.path.iterdir()):
+        return
+    if root.path.exists() and not root.path.is_dir():
+        raise RunDirectoryError(f"{root.path} is a file; choose another --out")
+    # what a curve leaves that was killed before it came to write its options
+    own = ("lock", "demonstrations", ".curve.json.")
+    if root.path.exists() and not all(path.name.startswith(own) for path in root.path.iterdir()):
         raise RunDirectoryError(f"{root.path} is not empty and no folder of `koap curve`; choose another --out")
 
 
 def _plain(options: Curve) -> dict[str, Any]:
-    return asdict(options) | {"out": str(options.out)}
+    return asdict(options) | {"out": str(options.out), "dataset": _dataset(options)}
 
 
 def _write_options(root: RunDirectory, options: Curve) -> None:
@@ -183,15 +196,33 @@ def _locked(root: RunDirectory) -> Iterator[None]:
     with (root.path / "lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             raise RunDirectoryError(f"another `koap curve` is working in {root.path}") from None
         yield  # the system lets go of the lock however this process ends
+
+
+def _dataset(options: Curve) -> str:
+    """The data set by its whole path: a cell may run in another working directory."""
+    return options.dataset if options.dataset == "scripted" else str(Path(options.dataset).absolute())
+
+
+def _first_look(root: RunDirectory, options: Curve, task: Task) -> TensorDictBase | None:
+    """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
+    if options.dataset != "scripted":
+        return load_demonstrations(_dataset(options), task)
+    if (root.path / "demonstrations" / "ted").exists():
+        return load_demonstrations(str(root.path / "demonstrations"), task)
+    if options.units != "trajectory":
+        LabelBudget(1, unit=options.units)  # knows the units
+        return None
+    number = options.demonstrations or task.demonstrations
+    return flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number)
 
 
 def _demonstrations(root: RunDirectory, options: Curve, task: Task) -> str:
     """The data set as a folder: scripted demonstrations are recorded once for all cells."""
     if options.dataset != "scripted":
-        return options.dataset
+        return _dataset(options)
     folder = root.path / "demonstrations"
     if not (folder / "ted").exists():
         from torchrl_koap.demonstrations import record_demonstrations
@@ -205,11 +236,14 @@ def _demonstrations(root: RunDirectory, options: Curve, task: Task) -> str:
     return str(folder)
 
 
-def _check_budgets(cells: Sequence[Cell], options: Curve, data: TensorDictBase) -> None:
+def _check_budgets(cells: Sequence[Cell], options: Curve, data: TensorDictBase | None) -> None:
     """Refuses before any work what would fail in a cell: budgets that select nothing, shares below the labelled."""
-    for fraction, share in dict.fromkeys((cell.fraction, cell.observations) for cell in cells):
-        labelled, _ = LabelBudget(fraction, unit=options.units, window=WINDOW, history=HISTORY).apply(data)
-        limit_observations(labelled, share)
+    if data is None:
+        return
+    # windows of another seed lie in another number of trajectories
+    for fraction, share, seed in dict.fromkeys((cell.fraction, cell.observations, cell.seed) for cell in cells):
+        budget = LabelBudget(fraction, unit=options.units, seed=seed, window=WINDOW, history=HISTORY)
+        limit_observations(budget.apply(data)[0], share, seed=seed)
 
 
 def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:
@@ -238,7 +272,7 @@ def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: st
             "settings": cell_settings,
             "evaluation": evaluation,
         }
-        needs = () if planner is None or is_done(planner) else (cell.planner,)
+        needs = () if planner is None or is_trained(planner) else (cell.planner,)
         jobs.append(Job(cell.folder, do_cell, arguments, folder / "log.txt", needs))
         names[cell.folder] = cell
     planners = dict.fromkeys(need for job in jobs for need in job.needs)
@@ -272,7 +306,7 @@ def _rows(root: RunDirectory, cells: Sequence[Cell], options: Curve, reasons: di
     known = list(cells)
     earlier = root.read_json("curve.json")
     grown = replace(options, **{name: earlier[name] for name in _GROWS})
-    known += [cell for cell in _cells(grown) if cell not in known and is_done(root.path / cell.folder)]
+    known += [cell for cell in _cells(grown) if cell not in known and (root.path / cell.folder).exists()]
     rows = [
         cell_row(root.path, cell, task=options.task, label_unit=options.units, reason=reasons.get(cell))
         for cell in known
