@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from torchrl_koap.curve_plots import _spread, method_styles, plot_action_error, plot_success
+from torchrl_koap.curve_plots import _spread, method_styles, plot_action_error, plot_entropy, plot_success
 from torchrl_koap.curve_report import write_curve_report
 from torchrl_koap.curve_summary import summarise
 
@@ -135,7 +135,8 @@ def test_paper_stands_beside_what_was_measured(folder):
 
 def test_pictures_exist_and_nothing_comes_from_elsewhere(folder):
     links = Page(folder / "index.html").links
-    assert {"plots/avoiding_success.png", "plots/avoiding_action_error.png"} == set(links)
+    names = ("success", "entropy", "action_error")
+    assert {f"plots/avoiding_{name}.png" for name in names} == set(links)
     names = {path.name for path in (folder / "plots").iterdir()}
     ways = ("success", "success_labels", "success_transitions", "action_error")
     assert names == {f"avoiding_{way}.png" for way in ways}
@@ -247,3 +248,18 @@ def test_pictures_of_nothing_are_refused(tmp_path):
     with pytest.raises(ValueError, match="no action error"):
         plot_action_error(summarise(rows), tmp_path / "a.png")
     assert not list(tmp_path.iterdir())
+
+
+def test_entropy_is_drawn_from_best_to_worst_seed(tmp_path):
+    rows = make_cells(None)
+    for row in rows:
+        row["mode_entropy"] = 0.2 * row["seed"]
+    items = [item for item in summarise(rows) if item.entropy is not None]
+    assert items and all(
+        item.entropy_low == 0 and item.entropy_high == pytest.approx(0.2 * max(item.done)) for item in items
+    )
+    assert plot_entropy(items, tmp_path / "entropy.png").stat().st_size > 5000
+    for row in rows:
+        row["mode_entropy"] = None
+    with pytest.raises(ValueError, match="no entropy to draw"):
+        plot_entropy(summarise(rows), tmp_path / "none.png")

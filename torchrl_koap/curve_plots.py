@@ -161,22 +161,55 @@ def plot_action_error(
     lines = [line for line in _lines(summaries, "fraction", wanted, methods).values() if line.x]
     if not lines or min(min(line.low) for line in lines) <= 0:
         raise ValueError("there is no action error above 0 to draw")
-    figure = Figure(figsize=(6, 4.1), layout="constrained")
-    axes = figure.add_subplot()
-    _draw(axes, lines)
+    figure, axes = _from_best_to_worst(lines, label, f"action error ({unit})" if unit else "action error")
     axes.set_yscale("log")
-    axes.set_xlabel(AXES["fraction"] + (f" ({label})" if label else ""))
-    axes.set_ylabel(f"action error ({unit})" if unit else "action error")
-    _log_x(axes, lines, ticks=True)
     low, high = min(min(line.low) for line in lines), max(max(line.high) for line in lines)
     wide = max(1.15, (2.2 * low / high) ** 0.5)  # at least a factor of two is shown, or chance looks like a trend
     axes.set_ylim(low / wide, high * wide)
     _log_y_ticks(axes)
     axes.grid(axis="y", which="both", color=FAINT, linewidth=0.5)
-    set_title(axes, "mean over seeds, from best to worst seed")
-    tidy(axes)
     _name_lines(axes, lines)
     return save_figure(figure, path)
+
+
+def plot_entropy(
+    summaries: Sequence[Summary], path: str | Path, *, methods: Sequence[str] | None = None, label: str = ""
+) -> Path:
+    """Entropy of the modes of successful rollouts against the labelled share; bands from best to worst seed.
+
+    Args:
+        summaries (sequence of Summary): of one task.
+        path (str or Path): png to write.
+
+    Keyword Args:
+        methods (sequence of str, optional): see :func:`plot_success`.
+        label (str): what the budget counts.
+
+    Raises:
+        ValueError: if no cell has an entropy.
+    """
+    wanted = ("entropy", "entropy_low", "entropy_high")
+    lines = [line for line in _lines(summaries, "fraction", wanted, methods).values() if line.x]
+    if not lines:
+        raise ValueError("there is no entropy to draw")
+    figure, axes = _from_best_to_worst(lines, label, "entropy of the modes")
+    axes.set_ylim(-0.03, 1.03)
+    axes.grid(axis="y", color=FAINT, linewidth=0.5)
+    _name_lines(axes, lines)
+    return save_figure(figure, path)
+
+
+def _from_best_to_worst(lines: Sequence[_Line], label: str, name: str) -> tuple[Figure, Axes]:
+    """A single panel along the labelled share, limits and grid of the other axis left to the caller."""
+    figure = Figure(figsize=(6, 4.1), layout="constrained")
+    axes = figure.add_subplot()
+    _draw(axes, lines)
+    axes.set_xlabel(AXES["fraction"] + (f" ({label})" if label else ""))
+    axes.set_ylabel(name)
+    _log_x(axes, lines, ticks=True)
+    set_title(axes, "mean over seeds, from best to worst seed")
+    tidy(axes)
+    return figure, axes
 
 
 def _lines(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.comparison import COMPARISON_COLUMNS, compare_cells, p_text
-from torchrl_koap.curve_plots import plot_action_error, plot_success
+from torchrl_koap.curve_plots import plot_action_error, plot_entropy, plot_success
 from torchrl_koap.curve_summary import Summary, cell_name, percent, plural, summarise
 from torchrl_koap.curve_table import markdown_table, table_rows, why_not_done
 from torchrl_koap.data.saving import replacing_file
@@ -28,6 +28,12 @@ _CAPTIONS = {
         " label on a window or a trajectory is many actions, and overlapping windows share them. Bands (whiskers where"
         " there are many methods, drawn a little beside each other) are 95 % Wilson intervals over all rollouts of all"
         " seeds.",
+    ),
+    "entropy": (
+        "Modes against the labels",
+        "Entropy of the modes of successful rollouts, 1 if all are equally frequent: mean over seeds, with the best and"
+        " the worst seed. Success alone can be had by playing one demonstration again, wherever episodes start alike;"
+        " then the entropy is 0.",
     ),
     "action_error": (
         "Action error against the labels",
@@ -188,6 +194,9 @@ def _draw(
             used = f" All with {percent(shares[-1])} of the trajectories." if shares[-1] != 1 else ""
             hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""
             text += _figure(name, "success", task, used + hollow)
+        if any(item.entropy is not None for item in main):
+            plot_entropy(main, base / f"{name}_entropy.png", **common)
+            text += _figure(name, "entropy", task, "")
         if any((item.action_error_low or 0) > 0 for item in main):
             plot_action_error(main, base / f"{name}_action_error.png", unit=_error_unit(task), **common)
             text += _figure(name, "action_error", task, "")

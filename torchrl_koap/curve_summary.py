@@ -32,7 +32,8 @@ class Summary:
         episodes (int): over all done cells.
         success (float, optional): their ratio; ``low`` and ``high`` are its Wilson 95 % interval.
         lowest (float, optional): success of the worst seed; ``highest`` that of the best.
-        entropy (float, optional): mean entropy of the modes.
+        entropy (float, optional): mean entropy of the modes; ``entropy_low`` and ``entropy_high`` are those of single
+            seeds.
         action_error (float, optional): mean; ``action_error_low`` and ``action_error_high`` are those of single seeds.
         labelled_transitions (float, optional): mean number of distinct transitions whose action was read.
         trajectories_touched (float, optional): mean number of trajectories they lie in.
@@ -55,6 +56,8 @@ class Summary:
     lowest: float | None
     highest: float | None
     entropy: float | None
+    entropy_low: float | None
+    entropy_high: float | None
     action_error: float | None
     action_error_low: float | None
     action_error_high: float | None
@@ -114,7 +117,7 @@ def _summary(task: str, method: str, fraction: float, observations: float, unit:
     successes, episodes = (sum(row[name] for row in done) for name in ("successes", "episodes"))
     low, high = wilson_interval(successes, episodes) if episodes else (None, None)
     rates = [row["successes"] / row["episodes"] for row in done]
-    errors = _values(done, "action_error")
+    errors, entropies = _values(done, "action_error"), _values(done, "mode_entropy")
     return Summary(
         task=task,
         method=method,
@@ -130,6 +133,8 @@ def _summary(task: str, method: str, fraction: float, observations: float, unit:
         lowest=min(rates, default=None),
         highest=max(rates, default=None),
         entropy=_mean(done, "mode_entropy"),
+        entropy_low=min(entropies, default=None),
+        entropy_high=max(entropies, default=None),
         action_error=_mean(done, "action_error"),
         action_error_low=min(errors, default=None),
         action_error_high=max(errors, default=None),
