@@ -247,7 +247,8 @@ class _RayPool:
         try:
             return [(job, self.ray.get(reference))]
         except self.ray.exceptions.RayError as error:
-            return [(job, _in_words(error))]
+            # what a task raised is wrapped, with its traceback as the message
+            return [(job, _in_words(getattr(error, "cause", None) or error))]
 
     def stop(self) -> None:
         for reference in self.running:
