@@ -138,7 +138,7 @@ def test_pictures_exist_and_nothing_comes_from_elsewhere(folder):
     names = ("success", "entropy", "action_error")
     assert {f"plots/avoiding_{name}.png" for name in names} == set(links)
     names = {path.name for path in (folder / "plots").iterdir()}
-    ways = ("success", "success_labels", "success_transitions", "action_error")
+    ways = ("success", "success_labels", "success_transitions", "entropy", "action_error")
     assert names == {f"avoiding_{way}.png" for way in ways}
     for path in (folder / "plots").iterdir():
         width, height = Image.open(path).size
