@@ -14,6 +14,7 @@ from torchrl_koap.envs import tracking
 from torchrl_koap.envs.avoiding import START_JOINTS
 from torchrl_koap.envs.scene import compile_scene, scene
 from torchrl_koap.envs.simulation import SimulationBatch
+from torchrl_koap.envs.small_matrices import solve_clipped
 
 SHARED = Path(os.environ.get("KOAP_SHARED", Path(__file__).parents[2] / "shared"))
 RECORDINGS = SHARED / "d3il_reference" / "avoiding.npz"
@@ -85,7 +86,7 @@ def test_clipped_solve_equals_svd(generator, smallest, largest):
     left, values, right = np.linalg.svd(matrix)
     wanted = right.T @ np.diag(1 / np.clip(values, 0.01, 100)) @ left.T @ rhs
     got = rhs.copy()
-    tracking._solve_clipped(matrix.copy(), got, np.empty((6, 6)), np.empty((6, 6)))
+    solve_clipped(matrix.copy(), got, np.empty((6, 6)), np.empty((6, 6)))
     np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-9)
 
 

@@ -21,6 +21,8 @@ from llvmlite import ir
 from numba import carray, njit, types
 from numba.extending import intrinsic
 
+from torchrl_koap.envs.small_matrices import clip, solve_clipped
+
 TIMESTEP = 0.001
 KP = np.array([120.0, 120.0, 120.0, 120.0, 50.0, 30.0, 10.0])
 KD = np.array([10.0, 10.0, 10.0, 10.0, 6.0, 5.0, 3.0])
@@ -30,7 +32,6 @@ Q_MAX = np.array([2.8973, 1.7628, 2.0, -0.0698, 2.8973, 3.7525, 2.8973])
 Q_REST = np.array([0.0, 0.174, 0.0, -0.872, 0.0, 1.222, 0.785])
 
 IK_ITERATIONS = 3
-EIGENVALUE_MIN, EIGENVALUE_MAX = 0.01, 100.0
 FINGER_OPEN = 0.04
 FINGER_RESET = 0.001
 
@@ -178,95 +179,6 @@ def _quaternion(axes, quat):
 
 
 @njit(cache=True)
-def _clip(value, low, high):
-    return min(max(value, low), high)
-
-
-@njit(cache=True)
-def _cholesky(matrix, shift, factor):
-    """Lower Cholesky factor of ``matrix - shift * I``; False if that is not positive definite."""
-    for i in range(6):
-        for j in range(i + 1):
-            total = matrix[i, j] - (shift if i == j else 0.0)
-            for k in range(j):
-                total -= factor[i, k] * factor[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                factor[i, i] = np.sqrt(total)
-            else:
-                factor[i, j] = total / factor[j, j]
-    return True
-
-
-@njit(cache=True)
-def _solve_clipped(matrix, rhs, factor, vectors):
-    """Solves ``A x = rhs`` in place for symmetric ``A`` whose eigenvalues are clipped to [0.01, 100] first.
-
-    Clipping is rarely active. Two cheap tests say so: ``A - 0.01 I`` has a Cholesky factor, and the trace is below 100.
-    """
-    trace = 0.0
-    for i in range(6):
-        trace += matrix[i, i]
-    if trace <= EIGENVALUE_MAX and _cholesky(matrix, EIGENVALUE_MIN, factor):
-        _cholesky(matrix, 0.0, factor)
-        for i in range(6):
-            for k in range(i):
-                rhs[i] -= factor[i, k] * rhs[k]
-            rhs[i] /= factor[i, i]
-        for i in range(5, -1, -1):
-            for k in range(i + 1, 6):
-                rhs[i] -= factor[k, i] * rhs[k]
-            rhs[i] /= factor[i, i]
-        return
-    _diagonalise(matrix, vectors)
-    for j in range(6):
-        total = 0.0
-        for i in range(6):
-            total += vectors[i, j] * rhs[i]
-        factor[0, j] = total / _clip(matrix[j, j], EIGENVALUE_MIN, EIGENVALUE_MAX)
-    for i in range(6):
-        rhs[i] = 0.0
-        for j in range(6):
-            rhs[i] += vectors[i, j] * factor[0, j]
-
-
-@njit(cache=True)
-def _diagonalise(matrix, vectors):
-    """Cyclic Jacobi rotations: ``matrix`` becomes diagonal, the columns of ``vectors`` are the eigenvectors."""
-    for i in range(6):
-        for j in range(6):
-            vectors[i, j] = 1.0 if i == j else 0.0
-    for _ in range(30):
-        off, diagonal = 0.0, 0.0
-        for i in range(6):
-            diagonal += matrix[i, i] ** 2
-            for j in range(i):
-                off += matrix[i, j] ** 2
-        if off <= 1e-32 * diagonal:
-            break
-        for p in range(5):
-            for r in range(p + 1, 6):
-                if matrix[p, r] == 0.0:
-                    continue
-                theta = (matrix[r, r] - matrix[p, p]) / (2.0 * matrix[p, r])
-                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
-                if theta < 0.0:
-                    t = -t
-                c = 1.0 / np.sqrt(t * t + 1.0)
-                s = t * c
-                for k in range(6):
-                    a, b = matrix[k, p], matrix[k, r]
-                    matrix[k, p], matrix[k, r] = c * a - s * b, s * a + c * b
-                for k in range(6):
-                    a, b = matrix[p, k], matrix[r, k]
-                    matrix[p, k], matrix[r, k] = c * a - s * b, s * a + c * b
-                for k in range(6):
-                    a, b = vectors[k, p], vectors[k, r]
-                    vectors[k, p], vectors[k, r] = c * a - s * b, s * a + c * b
-
-
-@njit(cache=True)
 def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors):
     """Moves ``q`` in place by three damped steps towards the pose ``target`` (position and unit quaternion)."""
     for _ in range(IK_ITERATIONS):
@@ -278,17 +190,17 @@ def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, ta
         tw, tx, ty, tz = sign * target[3], sign * target[4], sign * target[5], sign * target[6]
         w, x, y, z = quat[0], quat[1], quat[2], quat[3]
         for k in range(3):
-            task[k] = (800.0 if k == 2 else 200.0) * _clip(target[k] - tcp[k], -0.01, 0.01)
-        task[3] = 30.0 * _clip(w * tx - tw * x + (y * tz - z * ty), -0.1, 0.1)
-        task[4] = 30.0 * _clip(w * ty - tw * y + (z * tx - x * tz), -0.1, 0.1)
-        task[5] = 30.0 * _clip(w * tz - tw * z + (x * ty - y * tx), -0.1, 0.1)
+            task[k] = (800.0 if k == 2 else 200.0) * clip(target[k] - tcp[k], -0.01, 0.01)
+        task[3] = 30.0 * clip(w * tx - tw * x + (y * tz - z * ty), -0.1, 0.1)
+        task[4] = 30.0 * clip(w * ty - tw * y + (z * tx - x * tz), -0.1, 0.1)
+        task[5] = 30.0 * clip(w * tz - tw * z + (x * ty - y * tx), -0.1, 0.1)
 
         for j in range(7):
             zx, zy, zz = axes[j + 1, 2, 0], axes[j + 1, 2, 1], axes[j + 1, 2, 2]
             rx, ry, rz = tcp[0] - origins[j + 1, 0], tcp[1] - origins[j + 1, 1], tcp[2] - origins[j + 1, 2]
             jacobian[0, j], jacobian[1, j], jacobian[2, j] = zy * rz - zz * ry, zz * rx - zx * rz, zx * ry - zy * rx
             jacobian[3, j], jacobian[4, j], jacobian[5, j] = zx, zy, zz
-            null[j] = 40.0 * _clip(Q_REST[j] - q[j], -0.2, 0.2)
+            null[j] = 40.0 * clip(Q_REST[j] - q[j], -0.2, 0.2)
         for i in range(6):
             for k in range(7):
                 task[i] -= jacobian[i, k] * null[k]
@@ -298,7 +210,7 @@ def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, ta
                     total += jacobian[i, k] * jacobian[j, k]
                 matrix[i, j] = matrix[j, i] = total
             matrix[i, i] += 1e-12
-        _solve_clipped(matrix, task, factor, vectors)
+        solve_clipped(matrix, task, factor, vectors)
 
         square = 0.0
         for j in range(7):
@@ -307,7 +219,7 @@ def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, ta
             square += null[j] * null[j]
         scale = 3.0 / np.sqrt(square) if square > 9.0 else 1.0
         for j in range(7):
-            q[j] = _clip(q[j] + TIMESTEP * scale * null[j], Q_MIN[j], Q_MAX[j])
+            q[j] = clip(q[j] + TIMESTEP * scale * null[j], Q_MIN[j], Q_MAX[j])
 
 
 @njit(cache=True)
@@ -317,7 +229,7 @@ def _finger_forces(position, velocity, width, grasping, ctrl):
         if mean - width > 0.005:
             hold = -20.0 if grasping else 10.0 * (-0.2 - velocity[i])
         else:
-            hold = _clip(500.0 * (width - position[i]) - 10.0 * velocity[i], -5.0, 5.0)
+            hold = clip(500.0 * (width - position[i]) - 10.0 * velocity[i], -5.0, 5.0)
         ctrl[i] = 500.0 * (mean - position[i]) + hold
 
 
