@@ -145,7 +145,8 @@ def do_cell(
             "labels": run.read_entry("summary.json", "labels"),
             "train_seconds": trained - began,
             "eval_seconds": time.perf_counter() - trained,
-            "successes": round(result["success_rate"] * result["episodes"]),
+            "episodes": result["episodes"],
+            "successes": _successes(result),
         },
     )
 
@@ -176,13 +177,22 @@ def _results(run: RunDirectory) -> dict[str, Any]:
     """What a finished cell found.
 
     Raises:
-        RunDirectoryError: if a file is not there, damaged or lacks something.
+        RunDirectoryError: if a file is not there, damaged or lacks something, or somebody evaluated the cell otherwise.
     """
     done, summary, result = (run.read_json(name) for name in (DONE, "summary.json", "eval.json"))
     try:
-        return _columns(done, summary, result)
+        columns = _columns(done, summary, result)
+        episodes = done.get("episodes", result["episodes"])  # a cell of before says nothing of them
+        same = (done["successes"], episodes) == (_successes(result), result["episodes"])
     except (KeyError, TypeError, AttributeError) as error:
         raise RunDirectoryError(f"{run.path}: its results are damaged ({type(error).__name__}: {error})") from error
+    if not same:
+        raise RunDirectoryError(f"{run.path / 'eval.json'} is another evaluation than the curve's")
+    return columns
+
+
+def _successes(result: dict[str, Any]) -> int:
+    return round(result["success_rate"] * result["episodes"])
 
 
 def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
