@@ -163,7 +163,7 @@ def test_supervised_network_normalises_both_sides_and_scales_steps():
     state = torch.randn(4, 12, 3).cumsum(1)
     plain.fit_scales(state)
     model.fit_scales(state * scale + shift)
-    torch.testing.assert_close(model.frames.scales, plain.frames.scales)
+    torch.testing.assert_close(model.reader.scales, plain.reader.scales)
     expected = plain(TensorDict({"state": state}, [4]))["action"] * torch.tensor([0.5, 0.25]) + torch.tensor([5.0, 6.0])
     actual = model(TensorDict({"state": state * scale + shift}, [4]))["action"]
     torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-4)

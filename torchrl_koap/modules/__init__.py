@@ -23,7 +23,8 @@ from torchrl_koap.modules.presets import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.modules.quantized import QuantizedInverseDynamics
 from torchrl_koap.modules.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.unet import TemporalUnet
-from torchrl_koap.modules.variational import LatentInverseDynamics, VariationalInverseDynamics
+from torchrl_koap.modules.variational import VariationalInverseDynamics
+from torchrl_koap.modules.window_controller import LatentInverseDynamics, WindowController
 
 __all__ = [
     "PRESETS",
@@ -53,6 +54,7 @@ __all__ = [
     "TemporalUnet",
     "TransformerDenoiser",
     "VariationalInverseDynamics",
+    "WindowController",
     "join_plan",
     "make_koopman_inverse_dynamics",
     "policy_transforms",

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl_koap.modules.koopman import KoopmanLifting
 from torchrl_koap.modules.latent_action import LatentActionMLP
 from torchrl_koap.modules.recurrent import mlp
-from torchrl_koap.modules.variational import LatentInverseDynamics
+from torchrl_koap.modules.window_controller import LatentInverseDynamics
 
 
 class NonlinearInverseDynamics(LatentInverseDynamics):

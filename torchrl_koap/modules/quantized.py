@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl_koap.modules.finite_scalar_quantization import FiniteScalarQuantizer
 from torchrl_koap.modules.recurrent import mlp
 from torchrl_koap.modules.transition_frames import TransitionFrames
-from torchrl_koap.modules.variational import LatentInverseDynamics
+from torchrl_koap.modules.window_controller import LatentInverseDynamics
 
 
 class QuantizedInverseDynamics(LatentInverseDynamics):

@@ -6,46 +6,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from tensordict import TensorDictBase
+from torch import Tensor
 
-from torchrl_koap.keys import ACTION, STATE
 from torchrl_koap.modules.recurrent import SequenceLSTM, mlp
 from torchrl_koap.modules.transition_frames import TransitionFrames
+from torchrl_koap.modules.window_controller import WindowController
 
 
-class _Supervised(TensorDictModuleBase):
-    """Keys and normalisers; what is predicted is the subclass's."""
-
-    history: int
-
-    def __init__(
-        self,
-        *,
-        state_normalizer: nn.Module | None,
-        action_normalizer: nn.Module | None,
-        in_key: NestedKey,
-        out_key: NestedKey,
-    ):
-        super().__init__()
-        self.in_keys, self.out_keys = [in_key], [out_key]
-        self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
-
-    def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
-        """Renames the entries read and written."""
-        if state is not None:
-            self.in_keys = [state]
-        if action is not None:
-            self.out_keys = [action]
-
-    def normalize_state(self, state: Tensor) -> Tensor:
-        """Raw states to the network's units."""
-        return state if self.state_normalizer is None else self.state_normalizer(state)
-
-    def normalize_action(self, action: Tensor) -> Tensor:
-        """Raw actions to the network's units."""
-        return action if self.action_normalizer is None else self.action_normalizer(action)
+class _Supervised(WindowController):
+    """States to actions in one step; what is predicted is the subclass's."""
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Normalised actions ``[*B, T, act]`` of raw states ``[*B, T, d]``, or of some of the window's ``frames``."""
@@ -53,9 +23,7 @@ class _Supervised(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of every frame."""
-        action = self.predict(tensordict.get(self.in_keys[0]))
-        action = action if self.action_normalizer is None else self.action_normalizer.inverse(action)
-        return tensordict.set(self.out_keys[0], action)
+        return tensordict.set(self.out_keys[0], self.raw_action(self.predict(tensordict.get(self.in_keys[0]))))
 
 
 class SupervisedInverseDynamics(_Supervised):
@@ -76,10 +44,7 @@ class SupervisedInverseDynamics(_Supervised):
         hidden_dims (sequence of int): widths. Defaults to ``(128, 128)``.
         history (int): frames ``n`` before the current one. Defaults to ``4``.
         look_ahead (int or sequence of int): offsets ``k >= 1``. Defaults to ``1``.
-        state_normalizer (nn.Module, optional): maps raw states to the network's units.
-        action_normalizer (nn.Module, optional): its ``inverse`` maps network outputs to raw actions.
-        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
-        out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
+        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.WindowController`.
 
     Raises:
         ValueError: for a negative history or an offset below 1.
@@ -101,34 +66,14 @@ class SupervisedInverseDynamics(_Supervised):
         hidden_dims: Sequence[int] = (128, 128),
         history: int = 4,
         look_ahead: int | Sequence[int] = 1,
-        state_normalizer: nn.Module | None = None,
-        action_normalizer: nn.Module | None = None,
-        in_key: NestedKey = STATE,
-        out_key: NestedKey = ACTION,
+        **kwargs,
     ):
-        super().__init__(
-            state_normalizer=state_normalizer, action_normalizer=action_normalizer, in_key=in_key, out_key=out_key
-        )
-        self.frames = TransitionFrames(state_dim, history=history, look_ahead=look_ahead)
-        self.history = history
-        self.network = mlp(self.frames.num_features, hidden_dims, action_dim)
-
-    @property
-    def num_window_frames(self) -> int:
-        """Frames of the shortest complete window."""
-        return self.frames.num_window_frames
-
-    def span(self, num_frames: int) -> range:
-        """Frames of a window that count in the loss: those that have all they read inside it."""
-        return self.frames.span(num_frames)
-
-    def fit_scales(self, windows: Tensor) -> None:
-        """Sets input scales from windows of raw states ``[*B, T, d]``; no label is read."""
-        self.frames.fit_scales(self.normalize_state(windows))
+        super().__init__(TransitionFrames(state_dim, history=history, look_ahead=look_ahead), **kwargs)
+        self.network = mlp(self.reader.num_features, hidden_dims, action_dim)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Normalised actions ``[*B, T, act]``; frames near the ends read a clamped window."""
-        return self.network(self.frames(self.normalize_state(state), frames))
+        return self.network(self.reader(self.normalize_state(state), frames))
 
 
 class RecurrentInverseDynamics(_Supervised):
@@ -144,10 +89,7 @@ class RecurrentInverseDynamics(_Supervised):
     Keyword Args:
         hidden_dim (int): width of the LSTM. Defaults to ``256``.
         history (int): frames before the current one that a policy hands over. Defaults to ``1``.
-        state_normalizer (nn.Module, optional): maps raw states to the network's units.
-        action_normalizer (nn.Module, optional): its ``inverse`` maps network outputs to raw actions.
-        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
-        out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
+        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.WindowController`.
 
     Examples:
         >>> import torch
@@ -165,16 +107,16 @@ class RecurrentInverseDynamics(_Supervised):
         *,
         hidden_dim: int = 256,
         history: int = 1,
-        state_normalizer: nn.Module | None = None,
-        action_normalizer: nn.Module | None = None,
-        in_key: NestedKey = STATE,
-        out_key: NestedKey = ACTION,
+        **kwargs,
     ):
-        super().__init__(
-            state_normalizer=state_normalizer, action_normalizer=action_normalizer, in_key=in_key, out_key=out_key
-        )
-        self.history = history
+        super().__init__(**kwargs)
+        self._history = history
         self.network = SequenceLSTM(state_dim, hidden_dim, action_dim)
+
+    @property
+    def history(self) -> int:
+        """Frames before the current one that a policy hands over."""
+        return self._history
 
     @property
     def num_window_frames(self) -> int:

@@ -49,13 +49,9 @@ class _KoopmanLoss(WindowLoss):
     def _action(
         self, tensordict: TensorDictBase, state: Tensor, latent: Tensor, span: range, recorded: Tensor
     ) -> Tensor:
-        action = self._read(tensordict, self.tensor_keys.action)[..., span.start : span.stop, :]
-        labelled = self._read_mask(tensordict, self.tensor_keys.has_action, state)[..., span.start : span.stop]
-        labelled = labelled & recorded[..., span.start : span.stop]
-        # zeroed before the residual: masking afterwards would leave NaN in the gradient
-        target = self.network.normalize_action(torch.where(labelled.unsqueeze(-1), action, 0.0))
+        target, counts = self._targets(tensordict, state, recorded, span)
         error = (self.network.action_decoder.linear(latent) - target).square().mean(-1)
-        return self._reduce(error, labelled)
+        return self._reduce(error, counts)
 
 
 class KoopmanReconstructionLoss(_KoopmanLoss):

@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
 
-from torchrl_koap.modules.variational import LatentInverseDynamics
+from torchrl_koap.modules.window_controller import LatentInverseDynamics
 from torchrl_koap.objectives.windows import WindowLoss
 
 
@@ -54,11 +53,7 @@ class LatentDecoderLoss(WindowLoss):
         """Computes the loss from ``state``, ``action`` and ``has_action``."""
         state, recorded = self._inputs(tensordict)
         span = self.network.span(state.shape[-2])
-        frames = slice(span.start, span.stop)
-        action = self._read(tensordict, self.tensor_keys.action)[..., frames, :]
-        counts = self._read_mask(tensordict, self.tensor_keys.has_action, state)[..., frames] & recorded[..., frames]
-        # zeroed before the residual: masking afterwards would leave NaN in the gradient
-        target = self.network.normalize_action(torch.where(counts.unsqueeze(-1), action, 0.0))
+        target, counts = self._targets(tensordict, state, recorded, span)
         with self.network_params.to_module(self.network, preserve_module_state=False):
             latent = self.network.infer(state, span)
             latent = latent if self.train_encoder else latent.detach()

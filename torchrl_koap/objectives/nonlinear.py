@@ -74,10 +74,7 @@ class NonlinearLoss(WindowLoss):
         state, recorded = self._inputs(tensordict)
         span = self.network.span(state.shape[-2])
         frames = slice(span.start, span.stop)
-        action = self._read(tensordict, self.tensor_keys.action)[..., frames, :]
-        counts = self._read_mask(tensordict, self.tensor_keys.has_action, state)[..., frames] & recorded[..., frames]
-        # zeroed before the residual: masking afterwards would leave NaN in the gradient
-        target = self.network.normalize_action(torch.where(counts.unsqueeze(-1), action, 0.0))
+        target, counts = self._targets(tensordict, state, recorded, span)
         with self.network_params.to_module(self.network, preserve_module_state=False):
             lifted, latent = self.network.lift(state), self.network.infer(state, span)
             predicted = self.network.predict_next(lifted[..., frames, :], latent)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
 
@@ -48,11 +47,7 @@ class InverseDynamicsLoss(WindowLoss):
         """Computes the loss."""
         state, recorded = self._inputs(tensordict)
         span = self.network.span(state.shape[-2])
-        frames = slice(span.start, span.stop)
-        action = self._read(tensordict, self.tensor_keys.action)[..., frames, :]
-        counts = self._read_mask(tensordict, self.tensor_keys.has_action, state)[..., frames] & recorded[..., frames]
-        # zeroed before the residual: masking afterwards would leave NaN in the gradient
-        target = self.network.normalize_action(torch.where(counts.unsqueeze(-1), action, 0.0))
+        target, counts = self._targets(tensordict, state, recorded, span)
         with self.network_params.to_module(self.network, preserve_module_state=False):
             error = (self.network.predict(state, span) - target).square().mean(-1)
         return TensorDict({"loss_action": self._reduce(error, counts)})

@@ -120,6 +120,16 @@ class WindowLoss(LossModule):
             raise ValueError(f"{key!r} must be bool {[*state.shape[:-1], 1]}, got {mask.dtype} {list(mask.shape)}")
         return mask
 
+    def _targets(
+        self, tensordict: TensorDictBase, state: Tensor, recorded: Tensor, span: range
+    ) -> tuple[Tensor, Tensor]:
+        """Normalised actions ``[*B, frames, act]`` of a span, 0 where they do not count; and where they do."""
+        frames = slice(span.start, span.stop)
+        action = self._read(tensordict, self.tensor_keys.action)[..., frames, :]
+        counts = self._read_mask(tensordict, self.tensor_keys.has_action, state)[..., frames] & recorded[..., frames]
+        # zeroed before the residual: masking afterwards would leave NaN in the gradient
+        return self.network.normalize_action(torch.where(counts.unsqueeze(-1), action, 0.0)), counts
+
     def _reduce(self, error: Tensor, mask: Tensor) -> Tensor:
         error = torch.where(mask, error, 0.0)
         if self.reduction == "none":
