@@ -207,7 +207,11 @@ def test_jobs_do_not_outlive_a_parent_that_is_killed(tmp_path):
     finally:
         parent.kill()
         parent.wait()
-    wait_for(lambda: not any(map(is_alive, [*pids, server])))
+    try:
+        wait_for(lambda: not any(map(is_alive, [*pids, server])))
+    finally:
+        for pid in filter(is_alive, pids):
+            os.kill(pid, signal.SIGKILL)
 
 
 def test_a_function_called_with_its_words_in_a_log(tmp_path, capsys):
