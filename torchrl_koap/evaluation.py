@@ -103,9 +103,7 @@ def roll_out(
             noise = RecordedFutures(futures[begin : begin + size])
         else:
             draws = (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
-            # a planner made for a test may know its sizes alone
-            shape = getattr(planner, "sample_shape", None) or (planner.horizon, planner.state_dim)
-            noise = EpisodeNoise(part, (*draws, *shape), num_steps=max_steps)
+            noise = EpisodeNoise(part, (*draws, *planner.sample_shape), num_steps=max_steps)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(
