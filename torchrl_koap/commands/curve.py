@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import fcntl
+import importlib.util
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -193,6 +193,11 @@ def _write_options(root: RunDirectory, options: Curve) -> None:
 @contextmanager
 def _locked(root: RunDirectory) -> Iterator[None]:
     root.path.mkdir(parents=True, exist_ok=True)
+    if importlib.util.find_spec("fcntl") is None:  # Windows, on which the other commands are to work nevertheless
+        yield
+        return
+    import fcntl
+
     with (root.path / "lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -286,7 +291,9 @@ def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: st
         )
         for name in planners
     ]
-    workers = options.workers or os.cpu_count() or 1
+    # a job of a cluster may not use all cores of its machine
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = options.workers or cores
     reasons: dict[Cell, str] = {}
     with tqdm(total=len(first) + len(jobs), desc="cells", unit="cell", smoothing=0.1) as bar:
         ended = launch([*first, *jobs], launcher=options.launcher, workers=workers, address=options.address)
