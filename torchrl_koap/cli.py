@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -82,15 +82,26 @@ def show(result: Any) -> None:
     if not isinstance(result, Mapping):
         print(result)
         return
-    flat = {key: value for key, value in result.items() if key != "episode"}
-    width = max(len(key) for key in flat)
-    for key, value in flat.items():
-        if isinstance(value, Mapping):
-            value = json.dumps({k: _short(v) for k, v in value.items()})
-        print(f"{key:<{width}}  {_short(value)}")
+    lines = [line for key, value in result.items() if key != "episode" for line in _lines(key, value)]
+    width = min(max(len(name) for name, _ in lines), 45)
+    for name, text in lines:
+        print(f"{name:<{width}}  {text}")
+
+
+def _lines(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """A line per value; a mapping of plain values is one line, a nested one a line for each of its entries."""
+    if isinstance(value, Mapping) and any(isinstance(entry, Mapping) for entry in value.values()):
+        for key, entry in value.items():
+            yield from _lines(f"{name} {key}", entry)
+    elif isinstance(value, Mapping):
+        yield name, json.dumps({key: _short(entry) for key, entry in value.items()})
+    else:
+        yield name, _short(value)
 
 
 def _short(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_short(entry) for entry in value]
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
