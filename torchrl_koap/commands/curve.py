@@ -111,11 +111,13 @@ def run_curve(options: Curve) -> dict[str, Any]:
     check_launcher(options.launcher, address=options.address)
     root = RunDirectory(options.out.absolute())
     _check_folder(root, options)
+    to_record = options.dataset == "scripted" and not (root.path / "demonstrations" / "ted").exists()
     _check_budgets(cells, options, _first_look(root, options, task))
     with _locked(root):
         _check_folder(root, options)  # another one may have finished here in the meantime
         dataset = _demonstrations(root, options, task)
-        _check_budgets(cells, options, load_demonstrations(dataset, task))
+        if to_record:
+            _check_budgets(cells, options, load_demonstrations(dataset, task))
         _write_options(root, options)
         reasons = _work(root, options, cells, dataset)
         rows = _rows(root, cells, options, reasons)
