@@ -118,6 +118,19 @@ def test_part_of_the_trajectories_has_a_planner_of_its_own(curve, demonstrations
     assert json.loads((cell / "summary.json").read_text())["trajectories_used"] == 4
 
 
+def test_scripted_demonstrations_are_recorded_once_and_a_call_that_finds_too_few_may_be_repeated(
+    tmp_path, capsys, monkeypatch
+):
+    out, options = tmp_path / "curve", {"demonstrations": 4, "methods": "linear", "units": "window"}
+    assert koap(*command_of(out, "scripted", fractions="0.0001", **options)) == 1
+    assert "selects none of the" in capsys.readouterr().err.splitlines()[-1]
+    assert {path.name for path in out.iterdir()} == {"demonstrations", "lock"}
+    monkeypatch.setattr("torchrl_koap.demonstrations.record_demonstrations", lambda *rest, **more: pytest.fail("again"))
+    assert run(out, "scripted", fractions="0.25", **options)["done"] == 1
+    (row,) = rows_of(out).values()
+    assert row["label_unit"] == "window" and row["trajectories_touched"] == 4
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
