@@ -100,7 +100,7 @@ def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) ->
     data = load_demonstrations(options.dataset, task)
     data["action"] = torch.full_like(data["action"], math.nan)
     data["has_action"] = torch.zeros_like(data["has_action"])
-    data = limit_observations(data, observations, seed=options.seed).to(options.device)
+    data = limit_observations(data, observations).to(options.device)
     config = configure(run, options)
     run.write_json("config.json", config)
     torch.manual_seed(options.seed)

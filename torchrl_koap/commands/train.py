@@ -74,7 +74,8 @@ def run_train(options: Train) -> dict[str, Any]:
             progress=lambda recorded, wanted: bar.update(recorded - bar.n),
         )
     labelled, report = budget.apply(data, command=task.observation[task.command])
-    labelled = limit_observations(labelled, options.observation_fraction, seed=options.seed).to(options.device)
+    # not drawn by the seed: planner and controllers of all seeds know the same unlabelled trajectories
+    labelled = limit_observations(labelled, options.observation_fraction).to(options.device)
     _check_lengths(options, config, task, labelled)
     run.write_json("config.json", config)  # not before the data are known to be good: a wrong call leaves nothing
 
