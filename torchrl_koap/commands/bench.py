@@ -83,7 +83,7 @@ class Bench:
     seeds: int = 3
     episodes: int = 60
     steps: int | None = None
-    controller_steps: int = 500
+    controller_steps: int = 1000
     released_settings: bool = False
     epochs: int | None = None
     workers: int | None = None
