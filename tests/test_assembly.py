@@ -119,8 +119,10 @@ def test_unknown_planner_options_suggest_the_nearest(option, value, message):
         build_planner(PLANNER | {option: value}, 2)
 
 
-@pytest.mark.parametrize("method", [name for name, method in METHODS.items() if not method.acts])
-@pytest.mark.parametrize("preset", NORMALIZATION)
+@pytest.mark.parametrize(
+    ("preset", "method"),
+    [(preset, name) for name, method in METHODS.items() if not method.acts for preset in method.presets],
+)
 def test_every_controller_acts_and_takes_over_weights(method, preset, data):
     labelled, _ = LabelBudget(2).apply(data)
     options = {"method": method, "preset": preset}

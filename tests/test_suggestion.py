@@ -127,7 +127,7 @@ def run(trained_run, tmp_path):
 def test_suggest_from_the_shell(run, capsys):
     assert koap("suggest", run, "--count", "3") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["rank", "episode", "steps", "gain"] and len(lines) == 4
+    assert lines[0].split() == ["rank", "episode", "steps", "gain"] and len(lines) == 5
     written = json.loads((run / "suggestions.json").read_text())
     rows = written["suggestions"]
     labels = json.loads((run / "summary.json").read_text())["labels"]
@@ -136,7 +136,12 @@ def test_suggest_from_the_shell(run, capsys):
     assert written["labelled_steps"] == labels["labelled_transitions"]
     # demonstration i has 30 + i rows and one step less
     assert all(row["steps"] == 29 + row["episode"] for row in rows)
-    assert [line.split()[1] for line in lines[1:]] == [str(row["episode"]) for row in rows]
+    assert [line.split()[1] for line in lines[1:4]] == [str(row["episode"]) for row in rows]
+    # what to call next keeps the labels that are there
+    assert lines[4].split("--label-episodes ")[1].split()[:-1] == [
+        str(episode) for episode in [*written["labelled_episodes"], *(row["episode"] for row in rows)]
+    ]
+    assert len(written["labelled_episodes"]) == labels["trajectories_touched"]
     assert koap("suggest", run, "--count", "7") == 1  # 2 of 8 are labelled
     assert "count must be in 1..6" in capsys.readouterr().err
     assert koap("suggest", run, "--criterion", "variants") == 1

@@ -50,8 +50,8 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a sub-command; returns the exit status.
 
-    It is 1 for a job that could not be done and 130 for one that was interrupted, each with one line that says why. A
-    wrong call leaves with 2. ``KOAP_TRACEBACK=1`` shows where an error is from.
+    It is 1 for a job that could not be done, or not all of it, and 130 for one that was interrupted, each with one
+    line that says why. A wrong call leaves with 2. ``KOAP_TRACEBACK=1`` shows where an error is from.
     """
     options = tyro.cli(Command, args=arguments, prog="koap")
     try:
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return 130
     show(result)
-    return 0
+    return 1 if isinstance(result, Mapping) and result.get("failed") else 0
 
 
 def one_line(error: Exception) -> str:

@@ -23,7 +23,7 @@ from torchrl_koap.plots import save_figure
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#56b4e9", "#882255", "#7a8b00")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
 _DASHES = ("solid", (0, (5, 1.6)), (0, (1.2, 1.2)))
-_BANDS = 6  # more bands than these hide each other: whiskers instead
+_BANDS = 3  # more bands than these hide each other: whiskers instead
 AXES = {
     "fraction": "labelled share",
     "labelled_transitions": "distinct labelled transitions",

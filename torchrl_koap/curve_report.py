@@ -15,6 +15,7 @@ from torchrl_koap.curve_plots import plot_action_error, plot_entropy, plot_succe
 from torchrl_koap.curve_summary import Summary, cell_name, percent, plural, summarise
 from torchrl_koap.curve_table import markdown_table, table_rows, why_not_done
 from torchrl_koap.data.saving import replacing_file
+from torchrl_koap.methods import METHODS
 from torchrl_koap.report_html import STYLE, definition, duration, table
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks import get_task
@@ -60,7 +61,8 @@ training seeds both: a few seeds say little about the next training, and the int
 seed it holds for that one training only.</li>
 <li><strong>p</strong> flips signs per context: could the advantage of these trained networks be chance of the contexts?
 It does not cover other training seeds: where those matter it is below 0.05 far too often, and the interval is what to
-go by. <strong>p (Holm)</strong> is corrected for the number of comparisons on this page.</li>
+go by. Where episodes have no contexts (Avoiding) a pair shares its evaluation seed alone, and pairing gains little.
+<strong>p (Holm)</strong> is corrected for the number of comparisons on this page.</li>
 <li><strong>One planner</strong> is shared by all cells that plan, for each task and share of the trajectories. The
 seeds vary the controller and which labels it sees; how much another planner would change is in no interval here.</li>
 <li>Cells that <strong>failed or are missing</strong> are in no average. They are counted and named; if hard cells fail
@@ -170,7 +172,9 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]], options: Mapping[str, Any])
     )
     done = f"Of {len(rows)} cells {count['done']} are done; failed: {count['failed']}, missing: {count['missing']}."
     every = f"<details><summary>Every option</summary>{table(options)}</details>" if options else ""
-    return _section("What was run", f"<p>{escape(text)}.</p><p>{escape(done)}</p>{every}")
+    known = [{"method": name, "what it is": METHODS[name].title} for name in names["method"] if name in METHODS]
+    what = definition("", known) if known else ""
+    return _section("What was run", f"<p>{escape(text)}.</p><p>{escape(done)}</p>{what}{every}")
 
 
 def _draw(

@@ -161,7 +161,7 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
                 "not done": _not_done(item),
                 "range of seeds": _range(item.lowest, item.highest, len(item.done)),
                 "mode entropy": _number(item.entropy, ".2f"),
-                "action error": _number(item.action_error, ".3g"),
+                "action error (mm, mrad)": _number(item.action_error, ".3g"),
                 "labelled transitions": _number(item.labelled_transitions, ",.0f"),
                 "in trajectories": _number(item.trajectories_touched, ".4g"),
             }

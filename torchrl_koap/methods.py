@@ -1,9 +1,14 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Every method that the library compares, one entry each: the network, and what it is trained on.
 
-Fair by construction: all controllers get the same labelled windows, the same planner and the same number of updates;
-those that may look ahead read the same frames (4 before, 5 after the present one). Decision Diffuser's controller may
-not: it is defined by the next state.
+Fair by construction: all controllers get the same labelled windows, the same planner and the same number of updates
+(two-stage methods share theirs between the stages). Networks that may look ahead read the same frames, 4 before and up
+to 5 after the present one; Decision Diffuser's controller may not, it is defined by the next state. ``dp`` and
+``relabel`` have no planner and make its number of updates instead, ``relabel`` those of its teacher besides.
+
+Three controls say what the Koopman model itself is worth: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
+none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action reads, with its scales, penalty and prior;
+``koap_untrained``, KOAP with random features, of which nothing but the decoder is fitted.
 """
 
 from __future__ import annotations
@@ -19,6 +24,7 @@ from torchrl.objectives import LossModule
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import (
+    PRESETS,
     LinearInverseDynamics,
     NonlinearInverseDynamics,
     QuantizedInverseDynamics,
@@ -68,6 +74,7 @@ class Method:
         acts (bool): a policy of its own, Diffusion Policy: it needs no planner and has the planner's updates instead.
         teacher (str): the method whose controller labels the rest of the data first.
         other_decoder (str): the same method with the other way to get a decoder.
+        presets (tuple of str): values of ``--preset`` that it can be built with; the first is its own.
     """
 
     title: str
@@ -78,12 +85,11 @@ class Method:
     acts: bool = False
     teacher: str = ""
     other_decoder: str = ""
+    presets: tuple[str, ...] = ("default",)
 
 
-def _koap(state_dim, action_dim, normalizers, options, *, preset=None):
-    return make_koopman_inverse_dynamics(
-        state_dim, action_dim, preset=options["preset"] if preset is None else preset, **normalizers
-    )
+def _koap(state_dim, action_dim, normalizers, options, **overrides):
+    return make_koopman_inverse_dynamics(state_dim, action_dim, preset=options["preset"], **normalizers, **overrides)
 
 
 def _linear(state_dim, action_dim, normalizers, options):
@@ -107,22 +113,35 @@ _JOINT = (Phase("controller", KOAPLoss, "mixed"),)
 # the decoder that is fitted afterwards, on a frozen encoder
 _DECODER = Phase("decoder", LatentDecoderLoss, "labelled", share=0.5)
 
+_ANY_PRESET = tuple(PRESETS)
+
 METHODS = {
-    "koap": Method("KOAP", _koap, (Phase("controller", _without_actions),), closed_form=True, other_decoder="koap_sgd"),
-    "koap_sgd": Method("KOAP, decoder trained with the rest", _koap, _JOINT, other_decoder="koap"),
-    "koap_paper": Method("KOAP as in the paper", partial(_koap, preset="paper"), _JOINT),
+    "koap": Method(
+        "KOAP",
+        _koap,
+        (Phase("controller", _without_actions),),
+        closed_form=True,
+        other_decoder="koap_sgd",
+        presets=_ANY_PRESET,
+    ),
+    "koap_sgd": Method("KOAP, decoder trained with the rest", _koap, _JOINT, other_decoder="koap", presets=_ANY_PRESET),
+    "koap_paper": Method("KOAP as in the paper", _koap, _JOINT, presets=("paper",)),
     "koap_labelled_only": Method(
         "KOAP, labelled windows alone",
         _koap,
         (Phase("controller", _without_actions, "labelled"),),
         closed_form=True,
         labelled_only=True,
+        presets=_ANY_PRESET,
     ),
+    "koap_untrained": Method("KOAP, nothing trained but the decoder", _koap, closed_form=True, presets=_ANY_PRESET),
     "pretrain": Method(
         "KOAP, pre-trained and fine-tuned",
         _koap,
         (Phase("controller", _without_actions, share=0.5), Phase("finetune", KOAPLoss, "labelled", share=0.5)),
+        presets=_ANY_PRESET,
     ),
+    "linear_steps": Method("ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
     "linear": Method("ridge on raw frames", _linear, closed_form=True),
     "dd": Method("supervised, next state (Decision Diffuser)", partial(_supervised, look_ahead=1), _LABELS),
     "dd_lookahead": Method("supervised, look-ahead", partial(_supervised, look_ahead=LOOK_AHEAD), _LABELS),

@@ -12,6 +12,7 @@ from torchrl_koap.curve_report import write_curve_report
 from torchrl_koap.curve_table import read_cells, write_cells
 from torchrl_koap.lookup import lookup
 from torchrl_koap.paper_results import paper_points
+from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks import get_task
 
 TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_1")
@@ -99,7 +100,8 @@ def run_bench(options: Bench) -> dict[str, Any]:
 
     Raises:
         ValueError: if not exactly one of table and study is given, or there is no such one, or for an unknown task.
-        RunDirectoryError: see :func:`~torchrl_koap.commands.curve.run_curve`.
+        RunDirectoryError: if the folder holds another comparison, or one of its curves cannot go on
+            (:func:`~torchrl_koap.commands.curve.run_curve`).
     """
     if (options.table is None) == (options.study is None):
         raise ValueError("exactly one of --table and --study is needed")
@@ -109,6 +111,10 @@ def run_bench(options: Bench) -> dict[str, Any]:
     facts = [get_task(task) for task in tasks]
     # the study needs labels of whole trajectories: windows of a share touch nearly all of them
     units = options.units or ("window" if options.study is None else "trajectory")
+    root = RunDirectory(options.out)
+    if (root.path / "bench.json").exists() and root.read_entry("bench.json", "comparison") != name:
+        raise RunDirectoryError(f"{root.path} holds another comparison than {name!r}; choose another --out")
+    root.write_json("bench.json", {"comparison": name})
     rows, paper = [], []
     for task in facts:
         fractions = [task.label_levels[level - 1] for level in preset.levels]

@@ -21,7 +21,7 @@ from torchrl_koap.curve_report import write_curve_report
 from torchrl_koap.curve_table import write_cells
 from torchrl_koap.data import LabelBudget, flatten_trajectories, limit_observations, save_ted
 from torchrl_koap.launchers import Job, check_launcher, launch
-from torchrl_koap.methods import METHODS, get_method
+from torchrl_koap.methods import get_method
 from torchrl_koap.paper_results import paper_points
 from torchrl_koap.released_settings import get_released
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
@@ -50,7 +50,7 @@ class Curve:
         controller_steps: updates of every controller.
         released_settings: the unequal settings of the first public code instead of equal ones (koap, pretrain, dd, dp).
         epochs: with released settings, epochs instead of the first code's.
-        workers: cells at a time (default: one per core).
+        workers: cells at a time (default: one per core; a cluster given by its address decides for itself).
         launcher: "local" or "ray".
         address: of a Ray cluster (default: one on this machine).
     """
@@ -128,7 +128,7 @@ def run_curve(options: Curve) -> dict[str, Any]:
 
 
 def _cells(options: Curve) -> list[Cell]:
-    """All cells, those without a planner first: they need not wait for one. Repeated names count once."""
+    """All cells in the order asked for; repeated names count once."""
     methods = _split("methods", options.methods, str)
     for name in methods:
         get_released(name) if options.released_settings else get_method(name)
@@ -138,7 +138,6 @@ def _cells(options: Curve) -> list[Cell]:
         for value in values:
             if not 0 < value <= 1:
                 raise ValueError(f"{name} must be in (0, 1], got {value:g}")
-    methods = sorted(methods, key=lambda name: not METHODS[name].acts)
     return [
         Cell(method, fraction, share, seed)
         for seed in range(options.seeds)
@@ -268,6 +267,7 @@ def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: st
     }
     evaluation = {"episodes": options.episodes, "threads": 1}
     todo = [cell for cell in cells if not is_done(root.path / cell.folder)]
+    todo.sort(key=lambda cell: cell.planner is not None)  # those without a planner need not wait for one
     jobs, names = [], {}
     for cell in todo:
         folder = root.path / cell.folder

@@ -49,12 +49,14 @@ class SuggestedLabels:
         criterion (str): how they were chosen.
         penalty (float): ridge of the run's decoder.
         labelled_steps (int): labels of the run that the choice builds on.
+        labelled_episodes (list of int): trajectories with a label in the run.
         suggestions (list of dict): ``rank``, ``episode``, ``steps`` to label and ``score``, best first.
     """
 
     criterion: str
     penalty: float
     labelled_steps: int
+    labelled_episodes: list[int]
     suggestions: list[dict[str, Any]]
 
     def __str__(self) -> str:
@@ -62,6 +64,8 @@ class SuggestedLabels:
         for row in self.suggestions:
             score = "-" if row["score"] is None else f"{row['score']:.4g}"
             lines.append(f"{row['rank']:>4}  {row['episode']:>7}  {row['steps']:>5}  {score:>10}")
+        every = [*self.labelled_episodes, *(row["episode"] for row in self.suggestions)]
+        lines.append(f"with these labelled: koap train --label-episodes {' '.join(map(str, every))} ...")
         return "\n".join(lines)
 
 
@@ -125,6 +129,7 @@ def run_suggest(options: Suggest) -> SuggestedLabels:
         }
         for rank, choice in enumerate(choices, 1)
     ]
-    result = SuggestedLabels(options.criterion, penalty, report.labelled_transitions, rows)
+    labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
+    result = SuggestedLabels(options.criterion, penalty, report.labelled_transitions, labelled, rows)
     run.write_json("suggestions.json", asdict(result))
     return result

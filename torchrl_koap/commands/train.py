@@ -27,7 +27,6 @@ from torchrl_koap.commands.train_options import Train, budget_of, configure, met
 from torchrl_koap.commands.train_planner import train_planner
 from torchrl_koap.data import WindowTable, limit_observations
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import PRESETS
 from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import WINDOW, Task, get_task
 
@@ -44,7 +43,6 @@ def run_train(options: Train) -> dict[str, Any]:
     task = get_task(options.task)
     options = with_task_defaults(options, task)
     method = method_of(options)
-    lookup(PRESETS, options.preset, "preset")
     lookup(("csv", "wandb"), options.logger, "logger")
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
@@ -74,7 +72,7 @@ def run_train(options: Train) -> dict[str, Any]:
             progress=lambda recorded, wanted: bar.update(recorded - bar.n),
         )
     labelled, report = budget.apply(data, command=task.observation[task.command])
-    # not drawn by the seed: planner and controllers of all seeds know the same unlabelled trajectories
+    # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
     labelled = limit_observations(labelled, options.observation_fraction).to(options.device)
     _check_lengths(options, config, task, labelled)
     run.write_json("config.json", config)  # not before the data are known to be good: a wrong call leaves nothing

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.data import LabelBudget
+from torchrl_koap.lookup import lookup
 from torchrl_koap.methods import Method, get_method
+from torchrl_koap.modules import PRESETS
 from torchrl_koap.released_settings import POLICY, get_released
 from torchrl_koap.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
@@ -35,7 +37,7 @@ class Train:
             another name in torchrl_koap.methods.METHODS.
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
-        preset: variant of KOAP: "default", "paper" or "released".
+        preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: controller updates.
@@ -78,7 +80,7 @@ class Train:
     method: str = "koap"
     released_settings: bool = False
     epochs: int | None = None
-    preset: str = "default"
+    preset: str | None = None
     decoder: str | None = None
     steps: int | None = None
     controller_steps: int = 500
@@ -134,12 +136,21 @@ def method_of(options: Train) -> Method:
         ValueError: if there is none, or not with that decoder or released settings.
     """
     if options.released_settings:
-        if options.decoder is not None:
-            raise ValueError("released settings come with their own decoder: no --decoder")
+        if options.decoder is not None or options.preset is not None:
+            raise ValueError("released settings come with their own decoder and preset: no --decoder, no --preset")
+        if options.epochs is not None and options.epochs < 1:
+            raise ValueError(f"epochs must be >= 1, got {options.epochs}")
         return get_released(options.method).method
     if options.epochs is not None:
         raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
-    return get_method(options.method, options.decoder)
+    method = get_method(options.method, options.decoder)
+    if (
+        options.preset is not None
+        and lookup(PRESETS, options.preset, "preset")
+        and (options.preset not in method.presets)
+    ):
+        raise ValueError(f"method {options.method!r} has no preset {options.preset!r}, it has {list(method.presets)}")
+    return method
 
 
 def started_with(run: RunDirectory, options: Train) -> Train:
@@ -196,7 +207,7 @@ def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
         "method": options.method,
         "decoder": options.decoder,
         "released": options.released_settings,
-        "preset": "released" if options.released_settings else options.preset,
+        "preset": "released" if options.released_settings else options.preset or method.presets[0],
         "state": "all" if method.acts else options.controller_state,
     }
     for name in ("channels", "label_episodes"):

@@ -205,7 +205,8 @@ class LatentActionFourier(LatentActionModule):
 
     Args:
         state_dim (int): size ``d`` of a state.
-        num_features (int): number ``p`` of Fourier features; ``latent_dim`` becomes ``p + D``.
+        num_features (int): number ``p`` of Fourier features; ``latent_dim`` becomes ``p + D``. With 0 only the linear
+            part is left.
 
     Keyword Args:
         curvature (float): prior variance ``c`` of the curved part against the linear one. Defaults to ``0.1``.
@@ -235,7 +236,7 @@ class LatentActionFourier(LatentActionModule):
         motion_dim = (history + len(check_offsets(history, look_ahead))) * state_dim
         super().__init__(state_dim, num_features + motion_dim, relative=True, **kwargs)
         self.motion_dim = motion_dim
-        self.amplitude = math.sqrt(2 * curvature / num_features)
+        self.amplitude = math.sqrt(2 * curvature / max(num_features, 1))
         self.motion_scale, self.position_scale = motion_scale, position_scale
         self.frequency = nn.Parameter(torch.empty(motion_dim + state_dim, num_features))
         self.phase = nn.Parameter(torch.empty(num_features))

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -24,7 +26,7 @@ class LinearInverseDynamics(TensorDictModuleBase):
 
     Keyword Args:
         history (int): frames before the current one. Defaults to ``1``.
-        look_ahead (int): offset ``k``. Defaults to ``8``.
+        look_ahead (int or sequence of int): offsets ``k >= 2``, as for KOAP. Defaults to ``8``.
         in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
         out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
 
@@ -46,7 +48,7 @@ class LinearInverseDynamics(TensorDictModuleBase):
         action_dim: int,
         *,
         history: int = 1,
-        look_ahead: int = 8,
+        look_ahead: int | Sequence[int] = 8,
         in_key: NestedKey = STATE,
         out_key: NestedKey = ACTION,
     ):
@@ -56,6 +58,13 @@ class LinearInverseDynamics(TensorDictModuleBase):
         self.decoder = LinearActionDecoder((history + 1 + len(self.look_ahead)) * state_dim, action_dim)
         self.register_buffer("offset", torch.zeros(self.decoder.linear.in_features))
         self.register_buffer("scale", torch.ones(self.decoder.linear.in_features))
+
+    def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
+        """Renames the entries read and written."""
+        if state is not None:
+            self.in_keys = [state]
+        if action is not None:
+            self.out_keys = [action]
 
     @property
     def num_window_frames(self) -> int:
