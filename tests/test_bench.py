@@ -11,6 +11,7 @@ from torchrl_koap.commands import bench
 from torchrl_koap.commands.bench import PRESETS, Bench, run_bench
 from torchrl_koap.curve_table import read_cells, write_cells
 from torchrl_koap.methods import METHODS
+from torchrl_koap.run_directory import RunDirectoryError
 from torchrl_koap.tasks import TASKS, get_task
 
 
@@ -64,6 +65,13 @@ def test_the_observation_study_varies_what_is_known_at_fixed_labels(asked, tmp_p
     (curve,) = asked
     assert (curve.task, curve.fractions, curve.observations) == ("avoiding", "0.02", "0.1,0.25,0.5,1")
     assert curve.units == "trajectory"  # 2 % of the windows would touch most trajectories, and those must stay
+
+
+def test_a_folder_holds_one_comparison(asked, tmp_path):
+    run_bench(Bench(tmp_path / "t", study="observations"))
+    with pytest.raises(RunDirectoryError, match="holds another comparison than 'table 1'"):
+        run_bench(Bench(tmp_path / "t", table=1))
+    assert len(asked) == 1
 
 
 def test_wrong_calls_are_explained_before_any_work(asked, tmp_path):
