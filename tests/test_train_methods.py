@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_runs import koap
+from tiny_runs import TINY as TINY_CALL
+from tiny_runs import koap, write_demonstrations
 
 from torchrl_koap import training
 from torchrl_koap.assembly import load_demonstrations
@@ -206,3 +207,18 @@ def test_a_policy_takes_no_planner_over(method, planner, demonstrations, tmp_pat
     err = capsys.readouterr().err
     assert err == f"koap: method '{method}' is a policy of its own and has no planner to take over\n"
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_goes_on_after_it_was_moved_together_with_what_it_builds_on(tmp_path):
+    """As when the folder of a curve moves to another machine with cells half done."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    data = write_demonstrations(here / "raw")
+    assert koap("train", "--dataset", data, "--out", here / "planner", *TINY_CALL) == 0
+    call = ("--method", "linear", *TINY_CALL)
+    assert koap("train", "--dataset", data, "--out", here / "run", "--planner-from", here / "planner", *call) == 0
+    weights = (here / "run" / "controller.safetensors").read_bytes()
+    (here / "run" / "controller.safetensors").unlink()
+    here.rename(there)
+    again = ("--dataset", there / "raw", "--out", there / "run", "--planner-from", there / "planner", *call, "--resume")
+    assert koap("train", *again) == 0
+    assert (there / "run" / "controller.safetensors").read_bytes() == weights

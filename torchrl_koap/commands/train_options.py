@@ -222,6 +222,9 @@ def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
             raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
         earlier = run.read_json("config.json")
         free = {*FREE, "command", "versions"}
+        # a folder that is gone was moved, probably together with this run: there is nothing to compare with
+        paths = {name: earlier.get(name) for name in ("dataset", "planner_from")}
+        free |= {name for name, path in paths.items() if path not in (None, "scripted") and not Path(path).exists()}
         changed = [key for key in config if key not in free and config[key] != earlier.get(key)]
         if changed:
             raise RunDirectoryError(
