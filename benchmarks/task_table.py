@@ -17,10 +17,9 @@ import time
 from pathlib import Path
 
 from torchrl_koap.metrics import wilson_interval
+from torchrl_koap.paper_results import paper_success
 from torchrl_koap.tasks import get_task
 
-# success rates of KOAP in its paper at label levels 1 and 5, in per cent
-PAPER = {"aligning": (80, 92), "sorting": (62, 66), "po_sorting": (46, 58), "stacking_1": (27, 46)}
 LEVELS = (1, 5)
 METHODS = ("koap", "dd")
 
@@ -61,6 +60,11 @@ def row(runs: list[Path], metric: str = "success") -> str:
     return f"{100 * good / total:.1f} ({100 * low:.1f}-{100 * high:.1f}), n = {total}"
 
 
+def per_cent(share: float | None) -> str:
+    """A share as a whole number of per cent; nothing if it is not known."""
+    return "" if share is None else f"{100 * share:.0f}"
+
+
 def main() -> None:
     """Does the cells, prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -93,11 +97,11 @@ def main() -> None:
             seconds = "/".join(
                 (run / "seconds.txt").read_text().strip() for run in runs if (run / "seconds.txt").exists()
             )
-            paper = PAPER.get(task, (None, None))[LEVELS.index(level)]
+            paper = per_cent(paper_success(task, "koap", level))
             mean = sum(entropy) / len(entropy)
-            print(f"| {task} | {level} | {method} | {row(runs)} | {mean:.2f} | {paper or ''} | {seconds} |", flush=True)
+            print(f"| {task} | {level} | {method} | {row(runs)} | {mean:.2f} | {paper} | {seconds} |", flush=True)
             for count in (1, 2) if task == "stacking" else ():
-                known = PAPER["stacking_1"][LEVELS.index(level)] if count == 1 else ""
+                known = per_cent(paper_success("stacking_1", "koap", level)) if count == 1 else ""
                 boxes = row(runs, f"stacked_{count}")
                 print(f"| {task}, {count} of 3 boxes | {level} | {method} | {boxes} | | {known} | |")
 

@@ -104,7 +104,8 @@ def _network(state_dim, action_dim, normalizers, options, *, kind):
     return kind(state_dim, action_dim, **normalizers)
 
 
-def _without_actions(network: nn.Module) -> LossModule:
+def without_actions(network: nn.Module) -> LossModule:
+    """KOAP's loss on states alone."""
     return KOAPLoss(network, action_coeff=0.0)
 
 
@@ -119,7 +120,7 @@ METHODS = {
     "koap": Method(
         "KOAP",
         _koap,
-        (Phase("controller", _without_actions),),
+        (Phase("controller", without_actions),),
         closed_form=True,
         other_decoder="koap_sgd",
         presets=_ANY_PRESET,
@@ -129,7 +130,7 @@ METHODS = {
     "koap_labelled_only": Method(
         "KOAP, labelled windows alone",
         _koap,
-        (Phase("controller", _without_actions, "labelled"),),
+        (Phase("controller", without_actions, "labelled"),),
         closed_form=True,
         labelled_only=True,
         presets=_ANY_PRESET,
@@ -138,7 +139,7 @@ METHODS = {
     "pretrain": Method(
         "KOAP, pre-trained and fine-tuned",
         _koap,
-        (Phase("controller", _without_actions, share=0.5), Phase("finetune", KOAPLoss, "labelled", share=0.5)),
+        (Phase("controller", without_actions, share=0.5), Phase("finetune", KOAPLoss, "labelled", share=0.5)),
         presets=_ANY_PRESET,
     ),
     "linear_steps": Method("ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),

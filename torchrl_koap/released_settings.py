@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from torchrl_koap.data import WindowTable
 from torchrl_koap.lookup import lookup
-from torchrl_koap.methods import METHODS, Method, Phase
+from torchrl_koap.methods import METHODS, Method, Phase, without_actions
 from torchrl_koap.modules import RecurrentInverseDynamics, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import InverseDynamicsLoss, KOAPLoss
 
@@ -54,17 +54,13 @@ def _recurrent(state_dim, action_dim, normalizers, options):
     return RecurrentInverseDynamics(state_dim, action_dim, **normalizers)
 
 
-def _without_actions(network):
-    return KOAPLoss(network, action_coeff=0.0)
-
-
 RELEASED = {
     "koap": Released(Method("KOAP, first code", _koap, (Phase("controller", KOAPLoss),)), 3e-4),
     "pretrain": Released(
         Method(
             "KOAP pre-trained, first code",
             _koap,
-            (Phase("controller", _without_actions), Phase("finetune", KOAPLoss, "labelled")),
+            (Phase("controller", without_actions), Phase("finetune", KOAPLoss, "labelled")),
         ),
         3e-4,
     ),

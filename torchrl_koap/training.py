@@ -29,6 +29,11 @@ def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
     return min(1.0, (step + 1) / max(warmup, 1)) * 0.5 * (1 + math.cos(math.pi * step / num_steps))
 
 
+def moving_average(loss_module: nn.Module, num_steps: int) -> SoftUpdate:
+    """The average of a loss's parameters that is used after training; its memory is a share of a short training."""
+    return SoftUpdate(loss_module, eps=min(0.998, 1 - 10 / (num_steps + 10)))
+
+
 class DivergedError(RuntimeError):
     """A loss that became NaN or infinite."""
 

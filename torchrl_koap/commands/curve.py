@@ -249,7 +249,7 @@ def _check_budgets(cells: Sequence[Cell], options: Curve, data: TensorDictBase |
     # windows of another seed lie in another number of trajectories
     for fraction, share, seed in dict.fromkeys((cell.fraction, cell.observations, cell.seed) for cell in cells):
         budget = LabelBudget(fraction, unit=options.units, seed=seed, window=WINDOW, history=HISTORY)
-        limit_observations(budget.apply(data)[0], share, seed=seed)
+        limit_observations(budget.apply(data)[0], share)
 
 
 def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.objectives import SoftUpdate
 
 from torchrl_koap import released_settings
 from torchrl_koap.assembly import build_controller, build_diffusion_policy
@@ -26,7 +25,7 @@ from torchrl_koap.relabelling import relabel
 from torchrl_koap.released_settings import epochs_of, get_released
 from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
-from torchrl_koap.training import train
+from torchrl_koap.training import moving_average, train
 
 _KEYS = ["state", "action", "has_action"]
 # share of every batch that has labels; None: as it comes
@@ -183,7 +182,7 @@ def _train_policy(
         num_steps=num_steps,
         learning_rate=options.planner_learning_rate,
         weight_decay=1e-4,
-        target_update=SoftUpdate(loss, eps=min(0.998, 1 - 10 / (num_steps + 10))),
+        target_update=moving_average(loss, num_steps),
     )
     loss.target_policy_params.to_module(policy)
     return policy, values

@@ -8,7 +8,6 @@ from typing import Any
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
-from torchrl.objectives import SoftUpdate
 
 from torchrl_koap.assembly import build_planner
 from torchrl_koap.checkpoints import load_weights, save_weights
@@ -26,7 +25,7 @@ from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.progress import progress_bar, show_progress
 from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
-from torchrl_koap.training import phase_finished, train
+from torchrl_koap.training import moving_average, phase_finished, train
 
 
 def train_planner(
@@ -55,7 +54,7 @@ def train_planner(
             num_steps=options.steps,
             learning_rate=options.planner_learning_rate,
             weight_decay=1e-4,
-            target_update=SoftUpdate(loss, eps=min(0.998, 1 - 10 / (options.steps + 10))),
+            target_update=moving_average(loss, options.steps),
             run=run,
             logger=logger,
             checkpoint_every=options.checkpoint_every,

@@ -145,6 +145,23 @@ class ConditionedDiffusion(TensorDictModuleBase):
         shape = (*history.shape[:-2], *self.sample_shape)
         return torch.randn(shape, dtype=history.dtype, device=history.device, generator=generator)
 
+    def denoising_error(
+        self, condition: Tensor, sample: Tensor, noise: Tensor | None = None, time: Tensor | None = None
+    ) -> Tensor:
+        """Squared error ``[*B, H, width]`` of the denoiser on noised sequences: what training minimises.
+
+        Args:
+            condition (Tensor): of :meth:`encode_history`, ``[*B, h * d + f]``.
+            sample (Tensor): clean normalised sequences ``[*B, H, width]``.
+            noise (Tensor, optional): of the same shape. Default: random.
+            time (Tensor, optional): ``[*B]`` in training steps. Default: random.
+        """
+        with torch.no_grad():
+            noise = torch.randn_like(sample) if noise is None else noise
+            time = self.schedule.sample_time(sample) if time is None else time.to(sample.dtype)
+            noisy, target = self.schedule.add_noise(sample, noise, time), self.schedule.target(sample, noise, time)
+        return (self.denoiser(noisy, time, condition) - target).square()
+
     def solve(self, history: Tensor, noise: Tensor | None, generator: torch.Generator | None) -> Tensor:
         """Samples normalised sequences ``[*B, H, width]`` for raw histories ``[*B, h, d]``.
 

@@ -14,6 +14,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_koap import keys
 from torchrl_koap.modules.diffusion_policy import DiffusionPolicy
+from torchrl_koap.objectives.windows import read_entry, read_mask
 
 
 class DiffusionPolicyLoss(LossModule):
@@ -129,22 +130,18 @@ class DiffusionPolicyLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes ``loss_policy``; the input is not changed."""
         names = self.tensor_keys
-        state = self._read(tensordict, names.state)
+        state = read_entry(tensordict, names.state)
         history, _ = self.policy.split_window(state)
         action, counts = self._actions(tensordict, state)
 
         with self.policy_params.to_module(self.policy, preserve_module_state=False):
-            schedule = self.policy.schedule
             with torch.no_grad():
                 condition = self.policy.encode_history(history)
                 # before the network and the residual: masking afterwards would leave NaN in the gradient
                 sample = self.policy.encode_actions(torch.where(counts, action, 0.0))
                 sample = torch.where(counts, sample, 0.0)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
-                noise = torch.randn_like(sample) if noise is None else noise
-                time = schedule.sample_time(sample) if time is None else time.to(sample.dtype)
-                noisy, target = schedule.add_noise(sample, noise, time), schedule.target(sample, noise, time)
-            error = (self.policy.denoiser(noisy, time, condition) - target).square()  # [*B, H, act]
+            error = self.policy.denoising_error(condition, sample, noise, time)  # [*B, H, act]
 
         loss = torch.where(counts, error, 0.0)
         if self.reduction != "none":
@@ -158,28 +155,12 @@ class DiffusionPolicyLoss(LossModule):
     def _actions(self, tensordict: TensorDictBase, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Actions of the current and later steps ``[*B, H, act]``, and which of them count ``[*B, H, 1]``."""
         names, now = self.tensor_keys, self.policy.history - 1
-        action = self._read(tensordict, names.action)
+        action = read_entry(tensordict, names.action)
         wanted = (*state.shape[:-1], self.policy.action_dim)
         if action.shape != wanted:
             raise ValueError(f"{names.action!r} must be {list(wanted)} ([*B, T, act]), got {list(action.shape)}")
-        counts = self._read_mask(tensordict, names.has_action, state)[..., now:-1]
+        counts = read_mask(tensordict, names.has_action, state)[..., now:-1]
         if tensordict.get(names.padded, None) is not None:
-            padded = self._read_mask(tensordict, names.padded, state)[..., now:]
+            padded = read_mask(tensordict, names.padded, state)[..., now:]
             counts = counts & ~(padded[..., 1:] | padded[..., :-1])
         return action[..., now:-1, :], counts.unsqueeze(-1)
-
-    @staticmethod
-    def _read(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            raise KeyError(f"the loss needs the entry {key!r}; there are {sorted(map(str, tensordict.keys(True)))}")
-        return value
-
-    def _read_mask(self, tensordict: TensorDictBase, key: NestedKey, state: torch.Tensor) -> torch.Tensor:
-        """A mask of frames as bool ``[*B, T]``."""
-        mask = self._read(tensordict, key)
-        if mask.shape == (*state.shape[:-1], 1):
-            mask = mask.squeeze(-1)
-        if mask.shape != state.shape[:-1] or mask.dtype != torch.bool:
-            raise ValueError(f"{key!r} must be bool {[*state.shape[:-1], 1]}, got {mask.dtype} {list(mask.shape)}")
-        return mask

@@ -135,15 +135,11 @@ class PlannerLoss(LossModule):
             plan = torch.where(mask, plan, history[..., -1:, :])
 
         with self.planner_params.to_module(self.planner, preserve_module_state=False):
-            schedule = self.planner.schedule
             with torch.no_grad():
                 condition = self.planner.encode_history(history)
                 sample = self.planner.encode_plan(history, plan)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
-                noise = torch.randn_like(sample) if noise is None else noise
-                time = schedule.sample_time(sample) if time is None else time.to(sample.dtype)
-                noisy, target = schedule.add_noise(sample, noise, time), schedule.target(sample, noise, time)
-            error = (self.planner.denoiser(noisy, time, condition) - target).square()  # [*B, H, d]
+            error = self.planner.denoising_error(condition, sample, noise, time)  # [*B, H, d]
 
         if mask is None:
             loss = self._reduce_loss(error)

@@ -14,6 +14,33 @@ from torchrl.objectives.common import LossModule
 from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
 
 
+def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """An entry that must be there.
+
+    Raises:
+        KeyError: if it is not; the message lists what is.
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        raise KeyError(f"the loss needs the entry {key!r}; there are {sorted(map(str, tensordict.keys(True)))}")
+    return value
+
+
+def read_mask(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
+    """A mask of the frames of windows ``[*B, T, d]`` as bool ``[*B, T]``; stored with a trailing 1 or not.
+
+    Raises:
+        KeyError: if it is not there.
+        ValueError: if it has another shape or type.
+    """
+    mask = read_entry(tensordict, key)
+    if mask.shape == (*state.shape[:-1], 1):
+        mask = mask.squeeze(-1)
+    if mask.shape != state.shape[:-1] or mask.dtype != torch.bool:
+        raise ValueError(f"{key!r} must be bool {[*state.shape[:-1], 1]}, got {mask.dtype} {list(mask.shape)}")
+    return mask
+
+
 class WindowLoss(LossModule):
     """Base of the losses on windows of states of which some frames have an action label.
 
@@ -96,37 +123,21 @@ class WindowLoss(LossModule):
 
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The raw states and the transitions between two recorded frames ``[*B, T - 1]``."""
-        state = self._read(tensordict, self.tensor_keys.state)
+        state = read_entry(tensordict, self.tensor_keys.state)
         if tensordict.get(self.tensor_keys.padded, None) is None:
             recorded = torch.ones(state.shape[:-2] + (state.shape[-2] - 1,), dtype=torch.bool, device=state.device)
         else:
-            padded = self._read_mask(tensordict, self.tensor_keys.padded, state)
+            padded = read_mask(tensordict, self.tensor_keys.padded, state)
             recorded = ~(padded[..., 1:] | padded[..., :-1])
         return state, recorded
-
-    @staticmethod
-    def _read(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            raise KeyError(f"the loss needs the entry {key!r}; there are {sorted(map(str, tensordict.keys(True)))}")
-        return value
-
-    def _read_mask(self, tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
-        """A mask of frames as bool ``[*B, T]``."""
-        mask = self._read(tensordict, key)
-        if mask.shape == (*state.shape[:-1], 1):
-            mask = mask.squeeze(-1)
-        if mask.shape != state.shape[:-1] or mask.dtype != torch.bool:
-            raise ValueError(f"{key!r} must be bool {[*state.shape[:-1], 1]}, got {mask.dtype} {list(mask.shape)}")
-        return mask
 
     def _targets(
         self, tensordict: TensorDictBase, state: Tensor, recorded: Tensor, span: range
     ) -> tuple[Tensor, Tensor]:
         """Normalised actions ``[*B, frames, act]`` of a span, 0 where they do not count; and where they do."""
         frames = slice(span.start, span.stop)
-        action = self._read(tensordict, self.tensor_keys.action)[..., frames, :]
-        counts = self._read_mask(tensordict, self.tensor_keys.has_action, state)[..., frames] & recorded[..., frames]
+        action = read_entry(tensordict, self.tensor_keys.action)[..., frames, :]
+        counts = read_mask(tensordict, self.tensor_keys.has_action, state)[..., frames] & recorded[..., frames]
         # zeroed before the residual: masking afterwards would leave NaN in the gradient
         return self.network.normalize_action(torch.where(counts.unsqueeze(-1), action, 0.0)), counts
 
