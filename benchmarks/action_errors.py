@@ -18,13 +18,13 @@ from pathlib import Path
 import torch
 from scipy.stats import t as student
 
-from torchrl_koap.analysis import UNITS, hidden_action_errors, rmse_mm
-from torchrl_koap.assembly import load_demonstrations, set_up_torch
-from torchrl_koap.commands.train_controller import train_controller
-from torchrl_koap.commands.train_options import Train, configure, with_task_defaults
 from torchrl_koap.data import LabelBudget, controller_view
-from torchrl_koap.run_directory import RunDirectory
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training.action_errors import UNITS, hidden_action_errors, rmse_mm
+from torchrl_koap.training.builders import load_demonstrations, set_up_torch
+from torchrl_koap.training.config import Train, configure, with_task_defaults
+from torchrl_koap.training.controller import train_controller
+from torchrl_koap.training.run_directory import RunDirectory
 
 
 def action_error(task, data, method: str, fraction: float, seed: int, updates: int) -> float:

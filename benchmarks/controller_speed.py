@@ -15,8 +15,8 @@ import time
 
 import torch
 
-from torchrl_koap.data import Normalizer, flatten_trajectories, make_window_buffer, select_state
-from torchrl_koap.modules import PRESETS, make_koopman_inverse_dynamics
+from torchrl_koap.data import flatten_trajectories, make_window_buffer, select_state
+from torchrl_koap.modules import PRESETS, Normalizer, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss
 
 ANCHOR = 3.35

@@ -16,9 +16,9 @@ import matplotlib
 import numpy as np
 
 from torchrl_koap.data import RawEpisode, read_raw_episode
-from torchrl_koap.demonstrations import record_episodes
 from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES
-from torchrl_koap.envs.avoiding_expert import ROD_RADIUS
+from torchrl_koap.envs.experts.avoiding import ROD_RADIUS
+from torchrl_koap.envs.experts.demonstrations import record_episodes
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402  (the backend comes first)

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 
 from torchrl_koap.envs.contexts import evaluation_contexts
-from torchrl_koap.metrics import wilson_interval
-from torchrl_koap.recording import RECIPES, play
+from torchrl_koap.envs.experts.recording import RECIPES, play
+from torchrl_koap.evaluation.statistics import wilson_interval
 
 
 def main() -> None:

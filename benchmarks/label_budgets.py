@@ -14,9 +14,9 @@ import json
 import statistics
 from pathlib import Path
 
-from torchrl_koap.commands.eval import Eval, run_eval
-from torchrl_koap.commands.train import Train, run_train
-from torchrl_koap.metrics import mode_entropy, wilson_interval
+from torchrl_koap.evaluation.run import Eval, run_eval
+from torchrl_koap.evaluation.statistics import mode_entropy, wilson_interval
+from torchrl_koap.training.run import Train, run_train
 
 
 def run_cell(arguments: argparse.Namespace, method: str, count: int, seed: int) -> dict:

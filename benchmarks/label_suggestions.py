@@ -21,16 +21,16 @@ import torch
 from scipy.stats import t as student
 from tensordict import TensorDictBase
 
-from torchrl_koap.analysis import rmse_mm
-from torchrl_koap.assembly import NORMALIZATION, build_controller, load_demonstrations, set_up_torch
-from torchrl_koap.closed_form import DEFAULT_PENALTY, fit_closed_form
-from torchrl_koap.data import Normalizer, controller_view, cut_windows, make_window_buffer
-from torchrl_koap.latent_analysis import infer_steps
-from torchrl_koap.modules import KoopmanInverseDynamics
+from torchrl_koap.data import controller_view, cut_windows, make_window_buffer
+from torchrl_koap.evaluation.active_labelling import CRITERIA, rank_trajectories
+from torchrl_koap.evaluation.latent_space import infer_steps
+from torchrl_koap.modules import KoopmanInverseDynamics, Normalizer
 from torchrl_koap.objectives import KOAPLoss
-from torchrl_koap.suggestion import CRITERIA, rank_trajectories
 from torchrl_koap.tasks import WINDOW, Task, get_task
-from torchrl_koap.training import train
+from torchrl_koap.training.action_errors import rmse_mm
+from torchrl_koap.training.builders import NORMALIZATION, build_controller, load_demonstrations, set_up_torch
+from torchrl_koap.training.closed_form import DEFAULT_PENALTY, fit_closed_form
+from torchrl_koap.training.loop import train
 
 CHOICES = (*CRITERIA, "longest")
 

@@ -16,8 +16,8 @@ import sys
 import time
 from pathlib import Path
 
-from torchrl_koap.metrics import wilson_interval
-from torchrl_koap.paper_results import paper_success
+from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.studies.paper_results import paper_success
 from torchrl_koap.tasks import get_task
 
 LEVELS = (1, 5)
@@ -26,7 +26,9 @@ METHODS = ("koap", "dd")
 
 def koap(*arguments: object) -> None:
     """Runs a command of the library in a process of its own."""
-    subprocess.run([sys.executable, "-m", "torchrl_koap.cli", *map(str, arguments)], check=True, stdout=sys.stderr)
+    subprocess.run(
+        [sys.executable, "-m", "torchrl_koap.commands.cli", *map(str, arguments)], check=True, stdout=sys.stderr
+    )
 
 
 def cell(options: argparse.Namespace, task: str, seed: int, level: int, method: str, planner: Path | None) -> Path:

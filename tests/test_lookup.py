@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import pytest
 
-from torchrl_koap.data.normalizers import Normalizer
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import KoopmanOperator, make_koopman_inverse_dynamics
-from torchrl_koap.modules.denoisers import check_activation
-from torchrl_koap.modules.diffusion import NoiseSchedule
+from torchrl_koap.modules.diffusion.denoisers import check_activation
+from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
+from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.tasks import get_task
 
 TABLE = {"dense": 1, "diagonal": 2, "dpm++2m": None}

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from torchrl_koap.cli import Command
+from torchrl_koap.commands.cli import Command
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -77,7 +77,7 @@ def test_links_lead_somewhere(path):
 def test_options_named_in_the_text_exist():
     """Every ``--option`` in running text is one of some command."""
     text = re.sub(r"^```.*?^```", "", README, flags=re.MULTILINE | re.DOTALL)
-    sources = "".join(path.read_text() for path in (ROOT / "torchrl_koap" / "commands").glob("*.py"))
+    sources = "".join(path.read_text() for path in (ROOT / "torchrl_koap").rglob("*.py"))
     for option in re.findall(r"`--([a-z][a-z-]*)", text):
         assert re.search(rf"^    {option.replace('-', '_')}:", sources, re.MULTILINE), option
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_koap.cli import main
+from torchrl_koap.commands.cli import main
 from torchrl_koap.data import RawEpisode, write_raw_episode
 
 TINY = (

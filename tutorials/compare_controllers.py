@@ -24,15 +24,20 @@ from matplotlib.figure import Figure
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torchrl_koap.analysis import hidden_action_errors, rmse_mm
-from torchrl_koap.closed_form import fit_closed_form
-from torchrl_koap.data import LabelBudget, Normalizer, cut_windows, make_window_buffer, select_state
-from torchrl_koap.demonstrations import record_demonstrations
-from torchrl_koap.latent_analysis import infer_steps
-from torchrl_koap.modules import LinearInverseDynamics, SupervisedInverseDynamics, make_koopman_inverse_dynamics
+from torchrl_koap.data import LabelBudget, cut_windows, make_window_buffer, select_state
+from torchrl_koap.envs.experts.demonstrations import record_demonstrations
+from torchrl_koap.evaluation.active_labelling import rank_trajectories
+from torchrl_koap.evaluation.latent_space import infer_steps
+from torchrl_koap.modules import (
+    LinearInverseDynamics,
+    Normalizer,
+    SupervisedInverseDynamics,
+    make_koopman_inverse_dynamics,
+)
 from torchrl_koap.objectives import InverseDynamicsLoss, KOAPLoss
-from torchrl_koap.suggestion import rank_trajectories
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training.action_errors import hidden_action_errors, rmse_mm
+from torchrl_koap.training.closed_form import fit_closed_form
 
 torch.manual_seed(0)
 task = get_task("avoiding")
@@ -172,4 +177,4 @@ figure.savefig("compare_controllers.png", dpi=120)
 # ----------
 # ``errors`` holds the curve of each controller. An action error is not a success rate: ``koap curve`` puts planner,
 # controller and environment together, over seeds, with intervals and paired comparisons, one method per line of
-# ``torchrl_koap/methods.py``.
+# ``torchrl_koap/training/methods.py``.

@@ -22,24 +22,23 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
-from torchrl_koap.closed_form import fit_closed_form
 from torchrl_koap.data import (
     LabelBudget,
-    Normalizer,
     RecoveryAugmentation,
     cut_windows,
     extrapolate_ends,
     make_window_buffer,
     select_state,
 )
-from torchrl_koap.demonstrations import record_demonstrations
 from torchrl_koap.envs import AvoidingEnv, mode_index
-from torchrl_koap.evaluation import make_policy, roll_out, rollouts_to_tensors
-from torchrl_koap.modules import NoiseSchedule, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+from torchrl_koap.envs.experts.demonstrations import record_demonstrations
+from torchrl_koap.evaluation.rollouts import make_policy, roll_out, rollouts_to_tensors
+from torchrl_koap.evaluation.scores import score
+from torchrl_koap.modules import NoiseSchedule, Normalizer, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
-from torchrl_koap.path_plots import plot_rollouts
-from torchrl_koap.scores import score
+from torchrl_koap.reports.rollout_plots import plot_rollouts
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training.closed_form import fit_closed_form
 
 torch.manual_seed(0)
 task = get_task("avoiding")

@@ -9,7 +9,12 @@ from pathlib import Path
 from tqdm import tqdm
 
 from torchrl_koap.data import save_ted
-from torchrl_koap.demonstrations import RecordingReport, episodes_to_ted, record_episodes, write_raw_episodes
+from torchrl_koap.envs.experts.demonstrations import (
+    RecordingReport,
+    episodes_to_ted,
+    record_episodes,
+    write_raw_episodes,
+)
 from torchrl_koap.tasks import get_task
 
 

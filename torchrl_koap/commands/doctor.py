@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 import tyro
 
-from torchrl_koap.assembly import load_demonstrations
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training.builders import load_demonstrations
 
 
 @dataclass
@@ -63,7 +63,7 @@ def run_doctor(options: Doctor) -> dict[str, str]:
 
 
 def _rendering() -> str:
-    from torchrl_koap.envs.rendering import backends
+    from torchrl_koap.envs.mujoco.rendering import backends
 
     usable = backends()
     return ", ".join(usable) if usable else "no OpenGL library (apt install libegl1, then MUJOCO_GL=egl)"

@@ -13,11 +13,9 @@ from tensordict import TensorDictBase
 from torch import nn
 from tqdm import tqdm
 
-from torchrl_koap.assembly import load_demonstrations, make_env_of, set_up_torch
-from torchrl_koap.commands.eval import choose_contexts, columns_of, load_run
 from torchrl_koap.commands.suggest import budget_of
 from torchrl_koap.data import controller_view, trajectory_lengths
-from torchrl_koap.diagnosis import (
+from torchrl_koap.evaluation.diagnosis import (
     coverage,
     executed_success,
     follow_recordings,
@@ -26,15 +24,17 @@ from torchrl_koap.diagnosis import (
     rate,
     tracking_errors,
 )
-from torchrl_koap.evaluation import make_policy, roll_out
-from torchrl_koap.inspection_plot import plot_inspection
-from torchrl_koap.latent_analysis import MODELS, OUTSIDE_THE_BUDGET, analyse_latent
-from torchrl_koap.latent_plot import error_unit, plot_latent
+from torchrl_koap.evaluation.latent_space import MODELS, OUTSIDE_THE_BUDGET, analyse_latent
+from torchrl_koap.evaluation.rollouts import make_policy, roll_out
+from torchrl_koap.evaluation.run import choose_contexts, columns_of, load_run
 from torchrl_koap.modules import KoopmanInverseDynamics, StatePlanner
-from torchrl_koap.pictures import FOLDER
-from torchrl_koap.report import write_report
-from torchrl_koap.run_directory import RunDirectory
+from torchrl_koap.reports.diagnosis_plot import plot_inspection
+from torchrl_koap.reports.latent_plot import error_unit, plot_latent
+from torchrl_koap.reports.pictures import FOLDER
+from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task
+from torchrl_koap.training.builders import load_demonstrations, make_env_of, set_up_torch
+from torchrl_koap.training.run_directory import RunDirectory
 
 _NEAR = 0.015  # m; recorded tool paths followed within this are followed well
 
@@ -72,8 +72,8 @@ def run_inspect(options: Inspect) -> dict[str, Any]:
     """Runs the three experiments and looks into the latent space; returns what is written to ``inspect.json``.
 
     ``imagined`` is the planner alone, ``followed`` the controller alone on recorded states (blind to where objects
-    went), ``closed_loop`` both. ``latent`` (:func:`~torchrl_koap.latent_analysis.analyse_latent`) reads labels outside
-    the budget, for analysis only.
+    went), ``closed_loop`` both. ``latent`` (:func:`~torchrl_koap.evaluation.latent_space.analyse_latent`) reads labels
+    outside the budget, for analysis only.
 
     Raises:
         ValueError: for fewer than one episode or step, or a run without a planner.

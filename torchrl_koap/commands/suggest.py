@@ -9,16 +9,16 @@ from typing import Any
 
 import tyro
 
-from torchrl_koap.assembly import load_demonstrations, set_up_torch
-from torchrl_koap.commands.eval import columns_of, load_run
 from torchrl_koap.data import LabelBudget, controller_view
+from torchrl_koap.evaluation.active_labelling import CRITERIA, rank_trajectories
+from torchrl_koap.evaluation.latent_space import infer_steps
+from torchrl_koap.evaluation.run import columns_of, load_run
 from torchrl_koap.keys import EPISODE, HAS_ACTION
-from torchrl_koap.latent_analysis import infer_steps
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.run_directory import RunDirectory
-from torchrl_koap.suggestion import CRITERIA, rank_trajectories
 from torchrl_koap.tasks import HISTORY, WINDOW
+from torchrl_koap.training.builders import load_demonstrations, set_up_torch
+from torchrl_koap.training.run_directory import RunDirectory
 
 
 @dataclass

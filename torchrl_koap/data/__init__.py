@@ -7,20 +7,18 @@ from torchrl_koap.data.augmentation import (
     SceneAugmentation,
     extrapolate_ends,
 )
-from torchrl_koap.data.conversion import CONVERTERS, Converter, RawFolderError, convert_raw_files, find_raw_files
-from torchrl_koap.data.d3il import D3ILExperienceReplay
-from torchrl_koap.data.labels import LabelBudget, LabelReport, hide_commands
-from torchrl_koap.data.lerobot import read_lerobot
-from torchrl_koap.data.normalizers import Normalizer
+from torchrl_koap.data.d3il.conversion import CONVERTERS, Converter, RawFolderError, convert_raw_files, find_raw_files
+from torchrl_koap.data.d3il.raw import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
+from torchrl_koap.data.d3il.replay import D3ILExperienceReplay
+from torchrl_koap.data.d3il.unpickling import DamagedPickleError, UnsafePickleError, load_pickle, loads_pickle
+from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands
+from torchrl_koap.data.lerobot.reader import read_lerobot
 from torchrl_koap.data.observation_budget import limit_observations
-from torchrl_koap.data.raw import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
-from torchrl_koap.data.saving import replacing_file, replacing_folder
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
 from torchrl_koap.data.trajectories import controller_view, flatten_trajectories, select_state, trajectory_lengths
-from torchrl_koap.data.unpickling import DamagedPickleError, UnsafePickleError, load_pickle, loads_pickle
 from torchrl_koap.data.window_buffer import cut_windows, make_window_buffer
+from torchrl_koap.data.window_sampler import WindowSampler, WindowSamplerWithoutReplacement, WindowUnit
 from torchrl_koap.data.window_table import WindowTable
-from torchrl_koap.data.windows import WindowSampler, WindowSamplerWithoutReplacement, WindowUnit
 
 __all__ = [
     "CONVERTERS",
@@ -31,7 +29,6 @@ __all__ = [
     "ExchangeAugmentation",
     "LabelBudget",
     "LabelReport",
-    "Normalizer",
     "RawEpisode",
     "RawEpisodeError",
     "RawFolderError",
@@ -57,8 +54,6 @@ __all__ = [
     "read_about",
     "read_lerobot",
     "read_raw_episode",
-    "replacing_file",
-    "replacing_folder",
     "save_ted",
     "select_state",
     "trajectory_lengths",

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.keys import EPISODE, STATE
-from torchrl_koap.panda_kinematics import tool_position
+from torchrl_koap.tasks.panda_kinematics import tool_position
 
 
 class RecoveryAugmentation(TensorDictModuleBase):
@@ -32,7 +32,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
         decay (float): share ``rho`` of the shift that remains after each planned frame. Defaults to ``0.7``.
         columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
         tool (sequence of int, optional): state columns of the tool's position; they follow the arm's seven joints,
-            which are then ``columns`` (:func:`~torchrl_koap.panda_kinematics.tool_position`).
+            which are then ``columns`` (:func:`~torchrl_koap.tasks.panda_kinematics.tool_position`).
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
 
     Examples:

@@ -22,8 +22,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 
 from torchrl_koap import keys
-from torchrl_koap.data.saving import replacing_folder
 from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.files import replacing_folder
 from torchrl_koap.tasks import TASKS
 
 FORMAT = 1

@@ -8,7 +8,7 @@ import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
-from torchrl_koap.envs.scene import compile_scene, scene
+from torchrl_koap.envs.mujoco.scene import compile_scene, scene
 from torchrl_koap.tasks import get_task
 
 START_JOINTS = (

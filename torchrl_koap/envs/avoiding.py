@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.scene import PANDA, compile_scene, scene
+from torchrl_koap.envs.mujoco.scene import PANDA, compile_scene, scene
 from torchrl_koap.tasks import get_task
 
 START_JOINTS = (

@@ -23,10 +23,10 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_koap import keys
-from torchrl_koap.envs import tracking
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
-from torchrl_koap.envs.rendering import Renderer
-from torchrl_koap.envs.simulation import SimulationBatch
+from torchrl_koap.envs.mujoco import controller
+from torchrl_koap.envs.mujoco.rendering import Renderer
+from torchrl_koap.envs.mujoco.simulation import SimulationBatch
 from torchrl_koap.envs.snapshots import Snapshots
 from torchrl_koap.tasks import Task
 
@@ -90,7 +90,7 @@ class ManipulationEnv(Snapshots, EnvBase):
         device: torch.device | str | None = None,
         dtype: torch.dtype = torch.float32,
         contexts=None,
-        reset_width: float = tracking.FINGER_RESET,
+        reset_width: float = controller.FINGER_RESET,
         command_dim: int = 7,
     ):
         for name, value in (("num_envs", num_envs), ("num_threads", num_threads), ("max_steps", max_steps)):
@@ -193,7 +193,7 @@ class ManipulationEnv(Snapshots, EnvBase):
         rows = self._rows(tensordict, "_reset")
         self._draw_contexts(rows, contexts)
         self.sims.reset(rows, self._start_joints, self._place(rows), width=self._reset_width)
-        self.sims.widths[rows] = tracking.FINGER_OPEN
+        self.sims.widths[rows] = controller.FINGER_OPEN
         self._begin_episode(rows)
         return self._leaves(np.zeros(self.batch_size[0], dtype=bool))
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_koap.data.unpickling import load_pickle
+from torchrl_koap.data.d3il.unpickling import load_pickle
 from torchrl_koap.tasks import Task, get_task
 
 TABLE = Path(__file__).with_name("evaluation_contexts.json")

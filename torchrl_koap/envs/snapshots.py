@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_koap.envs import tracking
+from torchrl_koap.envs.mujoco import controller
 
 
 class Snapshots:
@@ -55,7 +55,7 @@ class Snapshots:
             ValueError: if a size is wrong.
         """
         self.sims.set_physics(index, qpos, qvel, qacc_warmstart=qacc_warmstart, ctrl=ctrl, time=time)
-        self.sims.widths[index] = tracking.FINGER_OPEN
+        self.sims.widths[index] = controller.FINGER_OPEN
         self._begin_episode(np.array([index]))
 
     def raw_log(self) -> dict[str, np.ndarray]:
@@ -68,11 +68,11 @@ class Snapshots:
             dict: ``j_pos, j_vel, des_j_pos, des_j_vel, des_j_acc`` [n, 7], ``c_pos, c_vel, des_c_pos`` [n, 3],
             ``c_quat, des_c_quat`` [n, 4], ``gripper_width, sim_step, time_stamp`` [n].
         """
-        row = {name: self.sims.log[:, columns].copy() for name, columns in tracking.LOG_COLUMNS.items()}
+        row = {name: self.sims.log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
         row["gripper_width"] = row["gripper_width"][:, 0]
         row |= self._logged_command()
         row["time_stamp"] = self.sims.log_time.copy()
-        row["sim_step"] = np.rint(self.sims.log_time / tracking.TIMESTEP).astype(np.int64)
+        row["sim_step"] = np.rint(self.sims.log_time / controller.TIMESTEP).astype(np.int64)
         return row
 
     def _logged_command(self) -> dict[str, np.ndarray]:
@@ -84,5 +84,5 @@ class Snapshots:
         Returns:
             dict: pose [n, 7] (m, quaternion) per object, in the order and with the names of ``task.objects``.
         """
-        poses = self.sims.log[:, tracking.LOG_WIDTH :].reshape(len(self.sims), -1, 7)
+        poses = self.sims.log[:, controller.LOG_WIDTH :].reshape(len(self.sims), -1, 7)
         return {name: poses[:, index].copy() for index, name in enumerate(self.task.objects[: poses.shape[1]])}

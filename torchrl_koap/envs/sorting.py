@@ -11,9 +11,9 @@ import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
-from torchrl_koap.envs.scene import compile_scene, scene
-from torchrl_koap.rotations import tan_yaw
+from torchrl_koap.envs.mujoco.scene import compile_scene, scene
 from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.rotations import tan_yaw
 
 START_JOINTS = (
     -0.32682662579052857,

@@ -6,12 +6,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from torchrl_koap.envs import tracking
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
-from torchrl_koap.envs.scene import compile_scene, scene
-from torchrl_koap.rotations import tan_yaw
+from torchrl_koap.envs.mujoco import controller
+from torchrl_koap.envs.mujoco.scene import compile_scene, scene
 from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.rotations import tan_yaw
 
 START_JOINTS = (
     -1.1708457375867388e-08,
@@ -149,7 +149,7 @@ class StackingEnv(ManipulationEnv):
             device=device,
             dtype=dtype,
             contexts=contexts,
-            reset_width=tracking.FINGER_OPEN,
+            reset_width=controller.FINGER_OPEN,
             command_dim=8,
         )
         self.num_boxes = num_boxes
@@ -166,7 +166,7 @@ class StackingEnv(ManipulationEnv):
         self._commands[rows, :7] += action[:, :7]
         self._commands[rows, 7] = action[:, 7]
         opens = action[:, 7] > OPEN_ABOVE
-        self.sims.widths[rows] = np.where(opens, tracking.FINGER_OPEN, 0.0)
+        self.sims.widths[rows] = np.where(opens, controller.FINGER_OPEN, 0.0)
         self.sims.grasping[rows] = ~opens
 
     def _advance(self, rows: np.ndarray) -> None:

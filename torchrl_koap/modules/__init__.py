@@ -1,30 +1,31 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
 
-from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
-from torchrl_koap.modules.chunked_policy import ChunkedPolicy
-from torchrl_koap.modules.denoisers import MLPDenoiser, TransformerDenoiser
-from torchrl_koap.modules.diffusion import NoiseSchedule
-from torchrl_koap.modules.diffusion_policy import DiffusionPolicy
-from torchrl_koap.modules.finite_scalar_quantization import FiniteScalarQuantizer
-from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
-from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
-from torchrl_koap.modules.latent_action import (
+from torchrl_koap.modules.baselines.finite_scalar_quantization import FiniteScalarQuantizer
+from torchrl_koap.modules.baselines.linear import LinearInverseDynamics
+from torchrl_koap.modules.baselines.nonlinear import NonlinearInverseDynamics
+from torchrl_koap.modules.baselines.quantized import QuantizedInverseDynamics
+from torchrl_koap.modules.baselines.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
+from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
+from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser, TransformerDenoiser
+from torchrl_koap.modules.diffusion.planner import StatePlanner
+from torchrl_koap.modules.diffusion.policy import DiffusionPolicy
+from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
+from torchrl_koap.modules.diffusion.unet import TemporalUnet
+from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics, WindowController
+from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
+from torchrl_koap.modules.koopman.latent_action import (
     LatentActionFourier,
     LatentActionLSTM,
     LatentActionMLP,
     LatentActionModule,
 )
-from torchrl_koap.modules.linear import LinearInverseDynamics
-from torchrl_koap.modules.nonlinear import NonlinearInverseDynamics
-from torchrl_koap.modules.planner import StatePlanner
-from torchrl_koap.modules.policies import EpisodeNoise, PlanThenControl, join_plan, policy_transforms
-from torchrl_koap.modules.presets import PRESETS, make_koopman_inverse_dynamics
-from torchrl_koap.modules.quantized import QuantizedInverseDynamics
-from torchrl_koap.modules.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
-from torchrl_koap.modules.unet import TemporalUnet
-from torchrl_koap.modules.variational import VariationalInverseDynamics
-from torchrl_koap.modules.window_controller import LatentInverseDynamics, WindowController
+from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
+from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_dynamics
+from torchrl_koap.modules.normalizer import Normalizer
+from torchrl_koap.modules.policies.action_chunks import ChunkedPolicy
+from torchrl_koap.modules.policies.plan_then_control import EpisodeNoise, PlanThenControl, join_plan, policy_transforms
 
 __all__ = [
     "PRESETS",
@@ -45,6 +46,7 @@ __all__ = [
     "MLPDenoiser",
     "NoiseSchedule",
     "NonlinearInverseDynamics",
+    "Normalizer",
     "PlanThenControl",
     "QuantizedInverseDynamics",
     "RecurrentInverseDynamics",

@@ -1,256 +1,114 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The Koopman inverse dynamics model: state windows in, latent actions and robot actions out."""
+"""What the controllers beside KOAP share: a window of raw states in, raw actions out, and how they look at it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torchrl_koap.keys import ACTION, STATE
-from torchrl_koap.modules.action_decoder import LinearActionDecoder, RidgeFit
-from torchrl_koap.modules.koopman import KoopmanLifting, KoopmanOperator
-from torchrl_koap.modules.latent_action import LatentActionFourier, LatentActionModule
-from torchrl_koap.modules.shared_filter import fit_shared_filter
-
-NORMALIZED_STATE = "normalized_state"
-NORMALIZED_ACTION = "normalized_action"
+from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE
+from torchrl_koap.modules.koopman.latent_action import LatentActionModule
+from torchrl_koap.modules.transition_frames import TransitionFrames
 
 
-class KoopmanInverseDynamics(TensorDictSequential):
-    r"""Infers latent actions from a window of states and decodes them linearly to robot actions.
-
-    The *sequence* is the inference path: normalise, :math:`u_t = f_\theta(\cdot)`, :math:`a_t = D u_t + b`,
-    de-normalise. Lifting and operator take no part in it; they are attributes that shape the latent actions in
-    training through :math:`z_{t+1} = K z_t + u_t`.
+class WindowController(TensorDictModuleBase):
+    """Base of the controllers: keys, normalisers, and which frames of a window are read.
 
     Args:
-        latent_action (LatentActionModule): the network ``f``.
-        action_decoder (LinearActionDecoder): the decoder ``d``.
+        reader (TransitionFrames or LatentActionModule, optional): gathers what a frame reads. A controller without one
+            says itself what it needs (``history``, ``num_window_frames``, ``span``).
 
     Keyword Args:
-        lifting (KoopmanLifting): the networks ``g``.
-        operator (KoopmanOperator): the matrix ``K``.
-        state_normalizer (nn.Module, optional): maps raw states to the networks' units, which are written under
-            ``"normalized_state"``.
-        action_normalizer (nn.Module, optional): its ``inverse`` maps decoded actions, under ``"normalized_action"``, to
-            raw units.
-        state_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
-        action_key (NestedKey): raw actions ``[*B, T, act]``; frame ``t`` holds the action from ``x_t`` to
-            ``x_{t+1}``. Defaults to ``"action"``.
-
-    The in-key of the network and the out-key of the decoder are set to fit.
-
-    Raises:
-        ValueError: if the sizes of the parts do not fit together, or the decoder does not read what the network writes.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
-        >>> model = make_koopman_inverse_dynamics(2, 2, preset="paper", latent_dim=16, hidden_dim=32)
-        >>> td = model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))
-        >>> td["action"].shape, td["latent_action"].shape
-        (torch.Size([3, 16, 2]), torch.Size([3, 16, 16]))
+        state_normalizer (nn.Module, optional): maps raw states to the networks' units.
+        action_normalizer (nn.Module, optional): its ``inverse`` maps predicted actions to raw units.
+        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
+        out_key (NestedKey): raw actions ``[*B, T, act]``, the last out-key. Defaults to ``"action"``.
     """
 
     def __init__(
         self,
-        latent_action: LatentActionModule,
-        action_decoder: LinearActionDecoder,
+        reader: TransitionFrames | LatentActionModule | None = None,
         *,
-        lifting: KoopmanLifting,
-        operator: KoopmanOperator,
         state_normalizer: nn.Module | None = None,
         action_normalizer: nn.Module | None = None,
-        state_key: NestedKey = STATE,
-        action_key: NestedKey = ACTION,
+        in_key: NestedKey = STATE,
+        out_key: NestedKey = ACTION,
     ):
-        sizes = {
-            "latent_action": latent_action.latent_dim,
-            "action_decoder": action_decoder.linear.in_features,
-            "operator input": operator.input_dim,
-        }
-        if len(set(sizes.values())) > 1:
-            raise ValueError(f"the sizes of a latent action differ: {sizes}")
-        if lifting.latent_dim != operator.latent_dim:
-            raise ValueError(f"latent_dim differs: lifting {lifting.latent_dim}, operator {operator.latent_dim}")
-        if latent_action.state_dim != lifting.state_dim:
-            raise ValueError(f"state_dim differs: latent_action {latent_action.state_dim}, lifting {lifting.state_dim}")
-
-        if latent_action.out_keys != action_decoder.in_keys:
-            written, read = latent_action.out_keys[0], action_decoder.in_keys[0]
-            raise ValueError(f"latent_action writes {written!r}, but action_decoder reads {read!r}")
-
-        # normalised values get entries of their own: written over raw ones they would be normalised twice
-        latent_action.in_keys = [state_key] if state_normalizer is None else [NORMALIZED_STATE]
-        action_decoder.out_keys = [action_key] if action_normalizer is None else [NORMALIZED_ACTION]
-        steps = [latent_action, action_decoder]
-        if state_normalizer is not None:
-            steps.insert(0, TensorDictModule(state_normalizer, [state_key], [NORMALIZED_STATE]))
-        if action_normalizer is not None:
-            steps.append(TensorDictModule(_Inverse(action_normalizer), [NORMALIZED_ACTION], [action_key]))
-        super().__init__(*steps)
-        self.latent_action, self.action_decoder = latent_action, action_decoder
-        self.lifting, self.operator = lifting, operator
+        super().__init__()
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        self.reader = reader
         self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
-        self.state_key, self.action_key = state_key, action_key
 
     def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
         """Renames the entries read and written."""
         if state is not None:
-            self.state_key, self.module[0].in_keys = state, [state]
+            self.in_keys = [state]
         if action is not None:
-            self.action_key, self.module[-1].out_keys = action, [action]
-        self.in_keys, self.out_keys = self._compute_in_and_out_keys(self.module)
+            self.out_keys = [*self.out_keys[:-1], action]
 
     @property
     def history(self) -> int:
         """Frames before the current one that are read."""
-        return self.latent_action.history
+        return self.reader.history
 
     @property
     def num_window_frames(self) -> int:
-        """Frames of the shortest complete window (:attr:`LatentActionModule.num_window_frames`)."""
-        return self.latent_action.num_window_frames
+        """Frames of the shortest window in which a frame has all it reads."""
+        return self.reader.num_window_frames
+
+    def span(self, num_frames: int) -> range:
+        """Frames of a window of ``num_frames`` that count in the losses: they have all they read inside it."""
+        return self.reader.span(num_frames)
 
     def normalize_state(self, state: Tensor) -> Tensor:
         """Raw states to the networks' units."""
         return state if self.state_normalizer is None else self.state_normalizer(state)
 
     def normalize_action(self, action: Tensor) -> Tensor:
-        """Raw actions to the decoder's units."""
+        """Raw actions to the networks' units."""
         return action if self.action_normalizer is None else self.action_normalizer(action)
 
-    def lift(self, state: Tensor) -> Tensor:
-        """Lifted states ``[*B, T, m]`` of raw states ``[*B, T, d]``."""
-        return self.lifting.encode(self.normalize_state(state))
-
-    def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Latent actions ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
-        return self.latent_action.infer(self.latent_action.gather(self.normalize_state(state), frames))
+    def raw_action(self, action: Tensor) -> Tensor:
+        """Inverse of :meth:`normalize_action`."""
+        return action if self.action_normalizer is None else self.action_normalizer.inverse(action)
 
     @torch.no_grad()
     def fit_scales(self, windows: Tensor) -> None:
-        """Sets input scales from windows of raw states ``[*B, T, d]`` (:meth:`LatentActionModule.fit_scales`)."""
-        self.latent_action.fit_scales(self.normalize_state(windows))
-
-    def decode(self, latent_action: Tensor) -> Tensor:
-        """Raw actions ``[*B, T, act]`` of latent actions."""
-        action = self.action_decoder.linear(latent_action)
-        return action if self.action_normalizer is None else self.action_normalizer.inverse(action)
-
-    def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """``K z_t + u_t``, the prediction of ``z_{t+1}``."""
-        return self.operator.step(lifted, latent_action)
-
-    def rollout_latent(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """Rolls the linear dynamics out from one lifted state.
-
-        Args:
-            lifted (Tensor): first lifted state ``[*B, m]``.
-            latent_action (Tensor): latent actions ``[*B, T, m]`` of the following steps.
-
-        Returns:
-            Tensor: lifted states ``[*B, T, m]`` after each of the steps.
-        """
-        states = []
-        for step in latent_action.unbind(-2):
-            lifted = self.predict_next(lifted, step)
-            states.append(lifted)
-        return torch.stack(states, -2)
-
-    @torch.no_grad()
-    def fit_decoder(
-        self,
-        windows: TensorDictBase,
-        mask: Tensor,
-        *,
-        groups: Tensor | None = None,
-        shared_axes: Sequence[int] | None = None,
-        batch_size: int = 4096,
-        **kwargs,
-    ) -> RidgeFit:
-        """Fits the decoder in closed form on the labelled frames of windows (:meth:`LinearActionDecoder.fit_ridge`).
-
-        Args:
-            windows (TensorDictBase): ``state_key`` ``[*B, T, d]`` and ``action_key`` ``[*B, T, act]``.
-            mask (Tensor): labelled frames to use, bool ``[*B, T]``; no action outside of it is read. Frames that do
-                not count in the losses (:meth:`LatentActionModule.span`) are left out.
-            groups (Tensor, optional): trajectory of every window, int64 ``[*B]``, to be left out together.
-            shared_axes (sequence of int, optional): the state column that each action entry moves. The decoder is then
-                shrunk towards one filter of the steps that all axes share, instead of towards 0; needs a
-                :class:`LatentActionFourier`.
-            batch_size (int): windows per forward pass.
-            **kwargs: options of :meth:`LinearActionDecoder.fit_ridge`.
-
-        Returns:
-            RidgeFit: the ridge chosen and its held-out error in normalised units.
-
-        Raises:
-            ValueError: if no labelled frame counts, shapes disagree, or ``shared_axes`` do not fit.
-        """
-        shape = windows.get(self.state_key).shape[:-1]
-        if mask.shape != shape or mask.dtype != torch.bool:
-            raise ValueError(f"mask must be bool {list(shape)} ([*B, T]), got {mask.dtype} {list(mask.shape)}")
-        if groups is not None and groups.shape != shape[:-1]:
-            raise ValueError(f"groups must be {list(shape[:-1])} ([*B]), got {list(groups.shape)}")
-        span = self.latent_action.span(mask.shape[-1])
-        mask = mask[..., span.start : span.stop]
-        rows = mask.any(-1)
-        if not rows.any():
-            raise ValueError(f"no labelled frame lies in frames {span.start}..{span.stop - 1} of any window")
-        states, action, mask = windows.get(self.state_key)[rows], windows.get(self.action_key)[rows], mask[rows]
-        was_training = self.latent_action.training
-        self.latent_action.eval()  # dropout would blur the latent actions that the decoder is fitted to
-        try:
-            latent = torch.cat([self.infer(part, span) for part in states.split(batch_size)])
-        finally:
-            self.latent_action.train(was_training)
-        # unlabelled entries are zeroed before the normaliser sees them: it may refuse NaN
-        action = action[:, span.start : span.stop]
-        action = self.normalize_action(torch.where(mask.unsqueeze(-1), action, 0.0))
-        if groups is not None:
-            groups = groups[rows].unsqueeze(-1).expand_as(mask)
-        if shared_axes is not None:
-            kwargs["prior"] = self._shared_prior(latent[mask], action[mask], shared_axes)
-        return self.action_decoder.fit_ridge(latent, action, mask, groups=groups, **kwargs)
-
-    def _shared_prior(self, latent: Tensor, action: Tensor, axes: Sequence[int]) -> Tensor:
-        """The decoder ``[act, m]`` that applies one and the same filter to the steps of every axis."""
-        if not isinstance(self.latent_action, LatentActionFourier) or len(axes) != action.shape[-1]:
-            raise ValueError(
-                f"shared_axes need a LatentActionFourier and one state column per action entry ({action.shape[-1]}),"
-                f" got {type(self.latent_action).__name__} and {list(axes)}"
-            )
-        entries, factors = self.latent_action.steps(axes)  # [S, act]
-        size = _unit(self.state_normalizer, self.latent_action.state_dim, factors)[list(axes)]
-        action_size = _unit(self.action_normalizer, action.shape[-1], factors)
-        per_unit = (factors * size).double()
-        shared = fit_shared_filter(latent[:, entries].double() * per_unit, (action * action_size).double())
-        prior = torch.zeros(action.shape[-1], latent.shape[-1], dtype=torch.float64, device=latent.device)
-        rows = torch.arange(action.shape[-1], device=latent.device).expand_as(entries)
-        prior[rows, entries] = shared[:, None] * per_unit / action_size
-        return prior
+        """Sets the spread of every step read from windows of raw states ``[*B, T, d]``; no label is read."""
+        if self.reader is not None:
+            self.reader.fit_scales(self.normalize_state(windows))
 
 
-def _unit(normalizer: nn.Module | None, width: int, like: Tensor) -> Tensor:
-    """Raw size of one normalised unit of every column ``[width]``."""
-    if normalizer is None:
-        return torch.ones(width, dtype=like.dtype, device=like.device)
-    ones = torch.ones(width, dtype=like.dtype, device=like.device)
-    return normalizer.inverse(ones) - normalizer.inverse(torch.zeros_like(ones))
+class LatentInverseDynamics(WindowController):
+    """Base of the controllers with a latent: states to latents to actions.
 
+    A subclass says how a latent is inferred (:meth:`infer`). ``forward`` writes the latent under ``"latent_action"``
+    and then the raw action of every frame; offsets beyond the window are clamped to it.
 
-class _Inverse(nn.Module):
-    """The inverse of a normaliser, as a module whose buffers live where the normaliser's do."""
+    Args:
+        reader (TransitionFrames or LatentActionModule): gathers what a latent is inferred from.
+        action_decoder (nn.Module): maps latents to actions in normalised units.
 
-    def __init__(self, normalizer: nn.Module):
-        super().__init__()
-        self.normalizer = normalizer
+    Keyword Args:
+        **kwargs: normalisers and keys, see :class:`WindowController`.
+    """
 
-    def forward(self, value: Tensor) -> Tensor:
-        return self.normalizer.inverse(value)
+    def __init__(self, reader: TransitionFrames | LatentActionModule, action_decoder: nn.Module, **kwargs):
+        super().__init__(reader, **kwargs)
+        self.out_keys = [LATENT_ACTION, *self.out_keys]
+        self.action_decoder = action_decoder
+
+    def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Latents ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
+        raise NotImplementedError
+
+    def decode(self, latent: Tensor) -> Tensor:
+        """Actions ``[*B, T, act]`` in normalised units."""
+        return self.action_decoder(latent)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes latent and action of every frame."""
+        latent = self.infer(tensordict.get(self.in_keys[0]))
+        return tensordict.set(self.out_keys[0], latent).set(self.out_keys[1], self.raw_action(self.decode(latent)))

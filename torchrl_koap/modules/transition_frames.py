@@ -15,8 +15,8 @@ class TransitionFrames(nn.Module):
     """Gathers ``x_t`` and the steps between the frames around it, each step divided by its own spread.
 
     ``x_{t-n+1} - x_{t-n}, ..., x_t - x_{t-1}, x_t, x_{t+k_1} - x_t, x_{t+k_2} - x_{t+k_1}, ...``: the input of
-    :class:`~torchrl_koap.modules.latent_action.LatentActionModule` with ``relative=True``, except that the successor
-    ``x_{t+1}`` is allowed, which a Koopman model has to predict and other inverse models are given.
+    :class:`~torchrl_koap.modules.koopman.latent_action.LatentActionModule` with ``relative=True``, except that the
+    successor ``x_{t+1}`` is allowed, which a Koopman model has to predict and other inverse models are given.
 
     Args:
         state_dim (int): size ``d`` of a state.

@@ -13,8 +13,8 @@ from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
 from torchrl_koap import keys
-from torchrl_koap.modules.diffusion_policy import DiffusionPolicy
-from torchrl_koap.objectives.windows import read_entry, read_mask
+from torchrl_koap.modules.diffusion.policy import DiffusionPolicy
+from torchrl_koap.objectives.base import read_entry, read_mask
 
 
 class DiffusionPolicyLoss(LossModule):

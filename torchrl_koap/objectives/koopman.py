@@ -18,8 +18,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
 from torch import Tensor
 
-from torchrl_koap.modules.inverse_dynamics import KoopmanInverseDynamics
-from torchrl_koap.objectives.windows import WindowLoss
+from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
+from torchrl_koap.objectives.base import WindowLoss
 
 
 class _KoopmanLoss(WindowLoss):

@@ -6,8 +6,8 @@ from __future__ import annotations
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
 
-from torchrl_koap.modules.window_controller import LatentInverseDynamics
-from torchrl_koap.objectives.windows import WindowLoss
+from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
+from torchrl_koap.objectives.base import WindowLoss
 
 
 class LatentDecoderLoss(WindowLoss):

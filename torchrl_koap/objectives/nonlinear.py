@@ -13,8 +13,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
 from torch import Tensor
 
-from torchrl_koap.modules.nonlinear import NonlinearInverseDynamics
-from torchrl_koap.objectives.windows import WindowLoss
+from torchrl_koap.modules.baselines.nonlinear import NonlinearInverseDynamics
+from torchrl_koap.objectives.base import WindowLoss
 
 
 class NonlinearLoss(WindowLoss):

@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
 from torchrl_koap import keys
-from torchrl_koap.modules.planner import StatePlanner
+from torchrl_koap.modules.diffusion.planner import StatePlanner
 
 
 class PlannerLoss(LossModule):
@@ -43,8 +43,8 @@ class PlannerLoss(LossModule):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.objectives import SoftUpdate
-        >>> from torchrl_koap.modules.unet import TemporalUnet
-        >>> from torchrl_koap.modules.planner import StatePlanner
+        >>> from torchrl_koap.modules.diffusion.unet import TemporalUnet
+        >>> from torchrl_koap.modules.diffusion.planner import StatePlanner
         >>> from torchrl_koap.objectives.planner import PlannerLoss
         >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
         >>> loss = PlannerLoss(planner)

@@ -10,8 +10,8 @@ from __future__ import annotations
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
 
-from torchrl_koap.modules.quantized import QuantizedInverseDynamics
-from torchrl_koap.objectives.windows import WindowLoss
+from torchrl_koap.modules.baselines.quantized import QuantizedInverseDynamics
+from torchrl_koap.objectives.base import WindowLoss
 
 
 class QuantizedDynamicsLoss(WindowLoss):

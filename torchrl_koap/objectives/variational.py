@@ -15,8 +15,8 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
 from torch import Tensor
 
-from torchrl_koap.modules.variational import VariationalInverseDynamics
-from torchrl_koap.objectives.windows import WindowLoss
+from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
+from torchrl_koap.objectives.base import WindowLoss
 
 
 class VariationalLoss(WindowLoss):

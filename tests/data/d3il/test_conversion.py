@@ -1,0 +1,331 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Raw episodes of every task become the specification's columns; D3IL's folders and lists; files of another task."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.data import (
+    CONVERTERS,
+    D3ILExperienceReplay,
+    RawEpisode,
+    RawFolderError,
+    convert_raw_files,
+    find_raw_files,
+    save_ted,
+    write_raw_episode,
+)
+from torchrl_koap.data.d3il.conversion import OBJECTS, get_converter
+from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
+from torchrl_koap.keys import validate
+from torchrl_koap.tasks import TASKS, get_task
+from torchrl_koap.training.builders import load_demonstrations
+
+ROOT3 = math.sqrt(3)
+
+
+def turned(*degrees, sign=1.0):
+    """Quaternions of a rotation about z, one row per angle."""
+    half = np.radians(np.array(degrees)) / 2
+    zeros = np.zeros_like(half)
+    return sign * np.stack([np.cos(half), zeros, zeros, np.sin(half)], 1)
+
+
+def pose(positions, quat):
+    return {"pos": np.array(positions, dtype=float), "quat": quat}
+
+
+def made_up(task, rows=5, seed=0, extra=()):
+    """Any episode of a task, with everything that is logged."""
+    rng = np.random.default_rng(seed)
+    robot = {key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()}
+    names = (*get_converter(task).objects, *extra)
+    objects = {name: pose(rng.normal(size=(rows, 3)), turned(*rng.uniform(-80, 80, rows))) for name in names}
+    return RawEpisode(robot=robot, objects=objects)
+
+
+def write_folder(folder, task, episodes=3, **kwargs):
+    files = [Path(folder) / f"env_{index:03d}_00.pkl" for index in range(episodes)]
+    for index, file in enumerate(files):
+        write_raw_episode(file, made_up(task, rows=4 + index, seed=index, **kwargs))
+    return files
+
+
+def convert(task, episode):
+    return CONVERTERS[task].convert(episode)
+
+
+def same(array, wanted):
+    assert array.dtype == np.float64 and array.shape == np.shape(wanted)
+    np.testing.assert_allclose(array, wanted, rtol=1e-12, atol=1e-14)
+
+
+def test_avoiding():
+    robot = {
+        "des_c_pos": np.array([[0.5, -0.28, 0.12], [0.508, -0.28, 0.13], [0.508, -0.272, 0.14]]),
+        "c_pos": np.array([[0.51, -0.29, 0.2], [0.52, -0.3, 0.3], [0.53, -0.31, 0.4]]),
+    }
+    frames, actions = convert("avoiding", RawEpisode(robot=robot))
+    same(frames, [[0.5, -0.28, 0.51, -0.29], [0.508, -0.28, 0.52, -0.3], [0.508, -0.272, 0.53, -0.31]])
+    same(actions, [[0.008, 0.0], [0.0, 0.008]])
+
+
+def test_aligning():
+    robot = {
+        "des_c_pos": np.array([[0.5, -0.35, 0.25], [0.508, -0.35, 0.25], [0.508, -0.342, 0.24]]),
+        "c_pos": np.array([[0.51, -0.36, 0.26], [0.52, -0.37, 0.27], [0.53, -0.38, 0.28]]),
+    }
+    objects = {  # in another order than that of the columns
+        "target-box": pose([[0.45, 0.25, 0.0]] * 3, turned(90, 90, 90)),
+        "push-box": pose([[0.4, -0.2, 0.01], [0.41, -0.21, 0.02], [0.42, -0.22, 0.03]], turned(0, 60, 120)),
+    }
+    frames, actions = convert("aligning", RawEpisode(robot=robot, objects=objects))
+    half = math.sqrt(0.5)
+    target = [0.45, 0.25, 0.0, half, 0, 0, half]
+    box = [[0.4, -0.2, 0.01, 1, 0, 0, 0], [0.41, -0.21, 0.02, ROOT3 / 2, 0, 0, 0.5]]
+    box.append([0.42, -0.22, 0.03, 0.5, 0, 0, ROOT3 / 2])
+    same(frames[0], [0.5, -0.35, 0.25, 0.51, -0.36, 0.26, *box[0], *target])
+    same(frames[1], [0.508, -0.35, 0.25, 0.52, -0.37, 0.27, *box[1], *target])
+    same(frames[2], [0.508, -0.342, 0.24, 0.53, -0.38, 0.28, *box[2], *target])
+    same(actions, [[0.008, 0.0, 0.0], [0.0, 0.008, -0.01]])
+
+
+def test_sorting():
+    robot = {
+        "des_c_pos": np.array([[0.5, -0.3, 0.25], [0.51, -0.31, 0.26]]),
+        "c_pos": np.array([[0.52, -0.32, 0.27], [0.53, -0.33, 0.28]]),
+    }
+    objects = {
+        "blue-box2": pose([[0.6, 0.05, 0.13], [0.61, 0.06, 0.13]], turned(30, -30)),
+        "blue-box1": pose([[0.62, -0.02, 0.13], [0.63, -0.03, 0.13]], turned(-60, 120)),
+        "red-box1": pose([[0.41, -0.12, 0.13], [0.42, -0.13, 0.13]], turned(45, 135, sign=-1)),
+        "red-box2": pose([[0.43, 0.07, 0.13], [0.44, 0.08, 0.13]], turned(0, 180)),
+    }
+    frames, actions = convert("sorting", RawEpisode(robot=robot, objects=objects))
+    wanted = [
+        [0.5, -0.3, 0.52, -0.32, 0.41, -0.12, 1, 0.43, 0.07, 0, 0.62, -0.02, -ROOT3, 0.6, 0.05, 1 / ROOT3],
+        [0.51, -0.31, 0.53, -0.33, 0.42, -0.13, -1, 0.44, 0.08, 0, 0.63, -0.03, -ROOT3, 0.61, 0.06, -1 / ROOT3],
+    ]
+    same(frames, wanted)
+    same(actions, [[0.01, -0.01]])
+
+
+@pytest.mark.parametrize("num_boxes", [2, 6])
+def test_the_boxes_of_other_sortings_follow_by_colour(num_boxes):
+    task, half = f"sorting_{num_boxes}", num_boxes // 2
+    boxes = [*(f"red-box{index + 1}" for index in range(half)), *(f"blue-box{index + 1}" for index in range(half))]
+    episode = made_up(task)
+    assert set(episode.objects) == set(boxes)
+    frames, actions = convert(task, episode)
+    assert frames.shape == (5, 4 + 3 * num_boxes) and actions.shape == (4, 2)
+    for index, box in enumerate(boxes):
+        same(frames[:, 4 + 3 * index : 6 + 3 * index], episode.objects[box]["pos"][:, :2])
+        yaw = 2 * np.arctan2(episode.objects[box]["quat"][:, 3], episode.objects[box]["quat"][:, 0])
+        same(frames[:, 6 + 3 * index], np.tan(yaw))
+
+
+def test_the_yaw_of_a_tilted_box_is_the_original_s():
+    """About z by 50 deg after about its own x by 20 deg: not 50 deg again, because the original turns ``x y`` over."""
+    z, x = np.radians([50, 20]) / 2
+    quat = np.array([[np.cos(z) * np.cos(x), np.cos(z) * np.sin(x), np.sin(z) * np.sin(x), np.sin(z) * np.cos(x)]] * 2)
+    episode = made_up("sorting", rows=2)
+    frames, _ = convert(
+        "sorting", dataclasses.replace(episode, objects=episode.objects | {"red-box1": pose(quat[:, :3], quat)})
+    )
+    w, x, y, z = quat[0]
+    yaw = np.arctan2(2 * (w * z - x * y), 1 - 2 * (y * y + z * z))
+    same(frames[:, 6], np.tan([yaw, yaw]))
+    assert 1 < 50 - np.degrees(yaw) < 3
+
+
+def test_while_the_gripper_opens_its_action_means_open():
+    width = np.array([0.0007, 0.029, 0.056, 0.069, 0.0749, 0.078, 0.08, 0.08, 0.07, 0.062, 0.06, 0.0601, 0.0599])
+    robot = {
+        "des_j_pos": np.zeros((len(width), 7)),
+        "j_pos": np.zeros((len(width), 7)),
+        "gripper_width": width,
+        "c_pos": np.zeros((len(width), 3)),
+    }
+    box = pose(np.zeros((len(width), 3)), np.tile([1.0, 0, 0, 0], (len(width), 1)))
+    objects = {f"{colour}-box": box for colour in ("red", "green", "blue")}
+    _, actions = convert("stacking", RawEpisode(robot=robot, objects=objects))
+    same(actions[:, 7], [0.08] * 7 + [0.07, 0.062, 0.06, 0.0601, 0.0599])
+
+
+def test_boxes_turned_by_a_right_angle_give_finite_numbers(tmp_path):
+    episode = made_up("sorting", rows=3)
+    for name in episode.objects:
+        episode.objects[name]["quat"] = turned(90, -90, 270)
+    write_raw_episode(tmp_path / "env_000_00.pkl", episode)
+    data = validate(D3ILExperienceReplay("sorting", tmp_path).data)
+    assert data["observation"][:, 6].abs().min() > 1e15
+    # cos 2 yaw, sin 2 yaw
+    assert torch.allclose(data["state"][:, 4:6], torch.tensor([[-1.0, 0.0]]), atol=1e-6)
+
+
+@pytest.mark.parametrize("target", [False, True])
+def test_stacking(target):
+    rows = np.arange(3.0)[:, None]
+    robot = {
+        "des_j_pos": rows * [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7] + [1, 2, 3, 4, 5, 6, 7],
+        "j_pos": rows * 0.01 + [11, 12, 13, 14, 15, 16, 17],
+        "gripper_width": np.array([0.08, 0.07, 0.06]),
+        "c_pos": rows * 0.001 + [0.5, 0.0, 0.3],
+    }
+    objects = {
+        "blue-box": pose([[0.57, -0.1, 0.011]] * 3, turned(-45, -45, -45)),
+        "green-box": pose([[0.4, -0.05, 0.012]] * 3, turned(60, 60, 60)),
+        "red-box": pose([[0.41, -0.2, 0.013], [0.42, -0.19, 0.02], [0.43, -0.18, 0.03]], turned(0, 45, 30)),
+    }
+    if target:
+        objects["target-box"] = pose([[0.5, 0.2, 0.0]] * 3, turned(7, 7, 7))
+    frames, actions = convert("stacking", RawEpisode(robot=robot, objects=objects))
+    boxes = [0.4, -0.05, 0.012, ROOT3, 0.57, -0.1, 0.011, -1]
+    assert frames.shape == (3, 31)
+    wanted = [1, 2, 3, 4, 5, 6, 7, 0.08, 0.41, -0.2, 0.013, 0, *boxes, 11, 12, 13, 14, 15, 16, 17, 0.08, 0.5, 0, 0.3]
+    same(frames[0], wanted)
+    wanted = [1.1, 2.2, 3.3, 4.4, 5.5, 6.6, 7.7, 0.07, 0.42, -0.19, 0.02, 1, *boxes]
+    wanted += [11.01, 12.01, 13.01, 14.01, 15.01, 16.01, 17.01, 0.07, 0.501, 0.001, 0.301]
+    same(frames[1], wanted)
+    # seven changes and the width that the gripper is about to have
+    same(actions, [[0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.07], [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.06]])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_gets_its_columns(tmp_path, task):
+    facts = get_task(task)
+    write_folder(tmp_path / "raw", task)
+    dataset = D3ILExperienceReplay(task, tmp_path / "raw")
+    data = validate(dataset.data)
+    assert data["observation"].shape == (12, facts.observation_dim) and data["action"].shape == (12, facts.action_dim)
+    assert torch.equal(data["state"], facts.state_of(data["observation"]))
+    # the command and the action give the next command
+    command, size = facts.observation[facts.command], facts.same_unit
+    reached = data["observation"][:, command][:, :size] + data["action"][:, :size]
+    torch.testing.assert_close(reached, data["next", "observation"][:, command][:, :size], rtol=0, atol=1e-6)
+    assert torch.equal(load_demonstrations(str(tmp_path / "raw"), facts)["state"], data["state"])
+
+
+@pytest.mark.parametrize(("task", "source"), [("po_sorting", "sorting"), ("stacking_1", "stacking")])
+def test_demonstrations_of_another_task_are_used_where_that_is_meant(tmp_path, task, source):
+    assert OBJECTS[source] == get_converter(task).objects
+    write_folder(tmp_path / "raw", source)
+    theirs = D3ILExperienceReplay(source, tmp_path / "raw").data
+    save_ted(theirs.exclude("state"), tmp_path / "demos" / "ted", task=source)
+    save_ted(theirs, tmp_path / "with state", task=source)
+    wanted = get_task(task).state_of(theirs["observation"])
+    for data in (
+        load_demonstrations(str(tmp_path / "raw"), get_task(task)),
+        load_demonstrations(str(tmp_path / "demos"), get_task(task)),
+        D3ILExperienceReplay.from_folder(tmp_path / "demos" / "ted", task=task).data,
+        D3ILExperienceReplay.from_folder(tmp_path / "with state", task=task).data,
+    ):
+        assert torch.equal(data["state"], wanted) and torch.equal(data["action"], theirs["action"])
+    with pytest.raises(ValueError, match=f"holds demonstrations of '{source}', wanted 'aligning'"):
+        D3ILExperienceReplay.from_folder(tmp_path / "demos" / "ted", task="aligning")
+    cached = D3ILExperienceReplay(task, tmp_path / "raw").data_path
+    assert torch.equal(D3ILExperienceReplay.from_folder(cached, task=task).data["state"], wanted)
+
+
+def test_po_sorting_sees_no_yaw(tmp_path):
+    write_folder(tmp_path, "sorting")
+    state = D3ILExperienceReplay("po_sorting", tmp_path).data["state"]
+    observation = D3ILExperienceReplay("sorting", tmp_path).data["observation"]
+    assert torch.equal(state, observation[:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]])
+
+
+FOLDERS = {  # where D3IL keeps the files and its lists
+    "aligning": ("aligning/all_data/state", "aligning/{}_files.pkl"),
+    "sorting": ("sorting/4_boxes/state", "sorting/4_boxes_{}_files.pkl"),
+    "po_sorting": ("sorting/4_boxes/state", "sorting/4_boxes_{}_files.pkl"),
+    "sorting_2": ("sorting/2_boxes/state", "sorting/2_boxes_{}_files.pkl"),
+    "sorting_6": ("sorting/6_boxes/state", "sorting/6_boxes_{}_files.pkl"),
+    "stacking": ("stacking/all_data", "stacking/{}_files.pkl"),
+    "stacking_1": ("stacking/all_data", "stacking/{}_files.pkl"),
+}
+
+
+@pytest.mark.parametrize("task", FOLDERS)
+def test_the_folders_and_lists_of_d3il(tmp_path, task):
+    inside, lists = FOLDERS[task]
+    data = tmp_path / "environments/dataset/data"
+    files = write_folder(data / inside, task)
+    (data / lists.format("train")).write_bytes(pickle.dumps([files[2].name, files[0].name]))
+    (data / lists.format("eval")).write_bytes(pickle.dumps(np.array([files[1].name])))
+    (data / inside).parent.joinpath("9_boxes_train_files.pkl").write_bytes(pickle.dumps(["absent.pkl"]))  # of others
+    steps = {None: 12, "train": 8, "eval": 4, Path(lists.format("train")).name: 8}
+    folder = data / inside
+    for root in {tmp_path, data, *folder.parents[: len(Path(inside).parts)], folder}:
+        if root == data.parent:
+            continue
+        for split, count in steps.items():
+            assert find_raw_files(task, root, split_file=split)[0] == folder
+            assert len(D3ILExperienceReplay(task, root, split_file=split)) == count, (root, split)
+
+
+def test_lists_that_are_not_there(tmp_path):
+    write_folder(tmp_path / "stacking" / "all_data", "stacking")
+    with pytest.raises(FileNotFoundError, match=r"no split file at .*stacking/train_files\.pkl"):
+        find_raw_files("stacking", tmp_path, split_file="train")
+
+
+def faults(task, files):
+    with pytest.raises(RawFolderError) as error:
+        convert_raw_files(get_converter(task), files, Path("folder"))
+    return error.value.problems
+
+
+@pytest.mark.parametrize("wanted", CONVERTERS)
+@pytest.mark.parametrize("logged", CONVERTERS)
+def test_demonstrations_of_another_task_are_refused_by_name(tmp_path, wanted, logged):
+    files = write_folder(tmp_path, logged, episodes=1)
+    if wanted == logged:
+        assert convert_raw_files(get_converter(wanted), files, tmp_path).shape == (3,)
+        return
+    (problem,) = faults(wanted, files)
+    assert problem.startswith(f"{files[0]}: a demonstration of {logged!r}: it logs ")
+    assert problem.endswith(f", wanted {', '.join(OBJECTS[wanted]) or 'no objects'}")
+
+
+def test_the_target_of_stacking_is_no_other_task(tmp_path):
+    files = write_folder(tmp_path, "stacking", extra=["target-box"])
+    assert convert_raw_files(get_converter("stacking_1"), files, tmp_path).shape == (12,)
+    (problem, *_) = faults("aligning", files)
+    assert "a demonstration of 'stacking': it logs red-box, green-box, blue-box, target-box" in problem
+    files = write_folder(tmp_path / "avoiding", "avoiding", extra=["target-box"], episodes=1)
+    (problem,) = faults("avoiding", files)
+    assert "env_000_00.pkl: of an unknown task: it logs target-box, wanted no objects" in problem
+
+
+@pytest.mark.parametrize(
+    ("change", "problems"),
+    [
+        (lambda c: c.pop("red-box2"), ["missing key 'red-box2'"]),
+        (lambda c: c["blue-box1"].pop("quat"), ["missing key 'blue-box1/quat'"]),
+        (lambda c: c["robot"].pop("c_pos"), ["missing key 'robot/c_pos'"]),
+        (
+            lambda c: c["blue-box2"]["pos"].__setitem__((2, 1), np.nan),
+            ["'blue-box2/pos' is NaN or infinite in 1 values, first in row 2"],
+        ),
+        (lambda c: c["red-box1"].update(quat=np.zeros((5, 3))), ["'red-box1/quat' must have shape (T, 4), got (5, 3)"]),
+        (lambda c: c["red-box1"].update(pos=np.zeros((4, 3))), ["unequal lengths"]),
+        (lambda c: (c.pop("red-box1"), c.pop("blue-box2")), ["missing key 'red-box1'", "missing key 'blue-box2'"]),
+    ],
+)
+def test_what_is_missing_or_broken_is_named(tmp_path, change, problems):
+    episode = made_up("sorting")
+    content = {"robot": dict(episode.robot), **{name: dict(entry) for name, entry in episode.objects.items()}}
+    change(content)
+    file = tmp_path / "env_007_01.pkl"
+    file.write_bytes(pickle.dumps(content))
+    found = faults("sorting", [file])
+    assert len(found) == len(problems)
+    for problem in problems:
+        assert any(line.startswith(f"{file}: {problem}") for line in found), found

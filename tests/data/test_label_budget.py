@@ -1,0 +1,236 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The label budget spends what it reports, hides everything else, and nothing downstream can see what it hid."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchrl_koap.data import LabelBudget, flatten_trajectories, hide_commands, make_window_buffer, select_state
+from torchrl_koap.keys import validate
+from torchrl_koap.modules import Normalizer
+
+UNITS = ("trajectory", "window", "transition")
+COMMAND = slice(0, 2)
+
+
+def demonstrations(lengths=(20, 33, 16, 40), seed=0):
+    """Observations [command, measured] whose command differences are the actions."""
+    generator = torch.Generator().manual_seed(seed)
+    frames = [torch.randn(length + 1, 4, generator=generator).double() for length in lengths]
+    return flatten_trajectories(frames, [torch.diff(f[:, :2], dim=0) for f in frames], dtype=torch.float64)
+
+
+def same_bits(left, right):
+    assert left.dtype == right.dtype and left.shape == right.shape
+    assert left.numpy().tobytes() == right.numpy().tobytes()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.integers(16, 40), min_size=1, max_size=12),
+    st.sampled_from(UNITS),
+    st.one_of(st.integers(1, 60), st.floats(0.01, 1.0)),
+    st.integers(0, 5),
+)
+def test_the_account_is_right(lengths, unit, amount, seed):
+    data = demonstrations(lengths)
+    totals = {"trajectory": len(lengths), "window": sum(n - 15 for n in lengths), "transition": sum(lengths)}
+    expected = amount if isinstance(amount, int) else math.floor(amount * totals[unit] + 0.5)
+    if not 1 <= expected <= totals[unit]:
+        with pytest.raises(ValueError, match=f"{totals[unit]}"):
+            LabelBudget(amount, unit, seed).apply(data)
+        return
+    labelled, report = LabelBudget(amount, unit, seed).apply(data)
+    validate(labelled)
+    kept = labelled["has_action"].squeeze(-1)
+    assert report.selected_units == expected and report.total_units == totals[unit]
+    assert report.labelled_transitions == int(kept.sum())
+    assert report.total_transitions == sum(lengths)
+    assert report.trajectories_touched == len(data["episode"][kept].unique())
+    assert report.total_trajectories == len(lengths)
+    same_bits(labelled["action"][kept], data["action"][kept])
+    assert labelled["action"][~kept].isnan().all()
+    if unit == "trajectory":
+        assert report.trajectories_touched == expected
+        assert set(data["episode"][kept].tolist()).isdisjoint(data["episode"][~kept].tolist())
+    elif unit == "transition":
+        assert report.labelled_transitions == expected
+    else:
+        assert 14 <= report.labelled_transitions <= 14 * expected
+        assert not kept[data["step_count"] == 0].any()  # no window has frame 0 as an inner frame
+        assert not kept[data["next", "done"].squeeze(-1)].any()
+    assert json.loads(json.dumps(report.as_dict())) == report.as_dict()
+
+
+def test_one_window_is_fourteen_labels():
+    data = demonstrations()
+    labelled, report = LabelBudget(1, "window").apply(data)
+    rows = labelled["has_action"].squeeze(-1).nonzero().squeeze(-1)
+    assert len(rows) == 14 == report.labelled_transitions
+    assert rows.tolist() == list(range(int(rows[0]), int(rows[0]) + 14))
+    assert len(data["episode"][int(rows[0]) - 1 : int(rows[-1]) + 2].unique()) == 1  # frames 0 and 15 are there too
+    wide, _ = LabelBudget(1, "window", window=10, history=3).apply(data)
+    assert int(wide["has_action"].sum()) == 7
+
+
+def test_all_windows_leave_out_the_ends():
+    labelled, report = LabelBudget(1.0, "window").apply(demonstrations((20, 16)))
+    inner = [False] + [True] * 18 + [False] + [False] + [True] * 14 + [False]
+    assert labelled["has_action"].squeeze(-1).tolist() == inner
+    assert report.selected_units == 6
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_input_is_untouched(unit):
+    data = demonstrations()
+    before = data.clone()
+    labelled, _ = LabelBudget(2, unit).apply(data, command=COMMAND)
+    labelled.apply_(lambda value: value.zero_())
+    assert (data == before).all()
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_seed_alone_decides(unit):
+    data = demonstrations()
+    draws = []
+    for seed, threads in ((0, 1), (0, 2), (1, 1)):
+        torch.manual_seed(len(draws))
+        np.random.seed(len(draws))
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        state = torch.get_rng_state()
+        draws.append(LabelBudget(2, unit, seed).apply(data)[0]["has_action"])
+        assert torch.equal(torch.get_rng_state(), state)
+        torch.set_num_threads(before)
+    assert torch.equal(draws[0], draws[1])
+    seeds = {tuple(LabelBudget(2, unit, seed).apply(data)[0]["has_action"].flatten().tolist()) for seed in range(8)}
+    assert len(seeds) > 2
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_larger_budgets_contain_smaller_ones(unit):
+    data = demonstrations()
+    kept = [LabelBudget(count, unit, seed=4).apply(data)[0]["has_action"] for count in (1, 2, 4)]
+    for small, large in zip(kept[:-1], kept[1:], strict=True):
+        assert (large | ~small).all() and large.sum() > small.sum()
+
+
+@pytest.mark.parametrize(
+    ("amount", "total", "expected"),
+    [(0.02, 96, 2), (0.005, 100, 1), (0.145, 100, 15), (0.01, 96, 1), (1.0, 7, 7), (1, 7, 1), (0.5, 3, 2), (0.3, 5, 2)],
+)
+def test_rounding_is_half_up_in_decimals(amount, total, expected):
+    assert LabelBudget(amount).apply(demonstrations((2,) * total))[1].selected_units == expected
+
+
+@pytest.mark.parametrize("total", [3, 7, 30, 96])
+def test_selecting_nothing_names_a_fraction_that_works(total):
+    data = demonstrations((3,) * total)
+    with pytest.raises(ValueError, match=f"none of the {total} trajectories") as error:
+        LabelBudget(0.49 / total).apply(data)
+    least = float(str(error.value).split()[-1])
+    assert LabelBudget(least).apply(data)[1].selected_units == 1
+    assert least <= 0.5 / total * 1.001
+
+
+@pytest.mark.parametrize("amount", [0, 0.0, -1, -0.5, 1.5, math.nan, math.inf, True, None, "0.1"])
+def test_wrong_amounts(amount):
+    with pytest.raises(ValueError, match="fraction|count"):
+        LabelBudget(amount)
+
+
+def test_wrong_options():
+    with pytest.raises(ValueError, match="unknown unit 'windows'"):
+        LabelBudget(1, "windows")
+    with pytest.raises(ValueError, match="history"):
+        LabelBudget(1, "window", window=2)
+    with pytest.raises(ValueError, match="9 labelled trajectories asked for, there are 4"):
+        LabelBudget(9).apply(demonstrations())
+    with pytest.raises(ValueError, match="longest: 12"):
+        LabelBudget(1, "window").apply(demonstrations((12, 3)))
+    with pytest.raises(ValueError, match="fully labelled data; "):
+        LabelBudget(1).apply(LabelBudget(1).apply(demonstrations())[0])
+
+
+def test_commands_hide_with_the_actions():
+    data = demonstrations()
+    labelled, _ = LabelBudget(2, "trajectory", seed=1).apply(data, command=COMMAND)
+    kept = labelled["has_action"].squeeze(-1)
+    for key in ("observation", ("next", "observation")):
+        assert labelled[key][~kept][:, COMMAND].isnan().all()
+        same_bits(labelled[key][kept], data[key][kept])
+        same_bits(labelled[key][:, 2:].contiguous(), data[key][:, 2:].contiguous())
+    validate(labelled, command=COMMAND)
+    # with single labels no trajectory is complete, and no command may be seen: their differences are sums of actions
+    labelled, _ = LabelBudget(0.5, "transition").apply(data, command=COMMAND)
+    assert labelled["observation"][:, COMMAND].isnan().all()
+    assert labelled["next", "observation"][:, COMMAND].isnan().all()
+    full, _ = LabelBudget(1.0).apply(data, command=COMMAND)
+    assert (full == data).all()
+    assert (hide_commands(data, COMMAND) == data).all()
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("amount", [1, 0.4])
+def test_nothing_outside_the_budget_leaks(unit, amount):
+    """Poison all actions and commands outside the budget: everything downstream is the same, bit for bit."""
+    clean = demonstrations()
+    budget = LabelBudget(amount, unit, seed=2)
+    kept = budget.apply(clean)[0]["has_action"].squeeze(-1)
+    poisoned = clean.clone()
+    poisoned["action"][~kept] = 1e6
+    complete = torch.tensor([bool(kept[clean["episode"] == e].all()) for e in clean["episode"]])
+    for key in ("observation", ("next", "observation")):
+        poisoned.get(key)[~complete, COMMAND] = -1e6
+    results = []
+    for data in (clean, poisoned):
+        labelled, report = budget.apply(data, command=COMMAND)
+        labelled = select_state(labelled, (2, 3))
+        state = Normalizer.fit(labelled["state"])
+        action = Normalizer.fit(labelled["action"], mode="standard", mask=labelled["has_action"])
+        buffer = make_window_buffer(labelled, 16, 32, labelled_share=0.5)
+        torch.manual_seed(0)
+        batches = [buffer.sample() for _ in range(3)]
+        results.append((labelled, report, state.state_dict(), action.state_dict(), batches))
+    left, right = results
+    assert left[1] == right[1]
+    for key in left[0].keys(True, True):
+        same_bits(left[0][key], right[0][key])
+    for one, other in zip(left[2:4], right[2:4], strict=True):
+        for key in one:
+            same_bits(one[key], other[key])
+    for one, other in zip(left[4], right[4], strict=True):
+        for key in one.keys(True, True):
+            same_bits(one[key], other[key])
+
+
+def test_select_state():
+    data = demonstrations()
+    assert torch.equal(select_state(data, (3, 2))["state"], data["observation"][:, [3, 2]])
+    assert "state" not in data.keys()
+    for wrong in ((), (4,), (-1,)):
+        with pytest.raises(ValueError, match=r"0\.\.3"):
+            select_state(data, wrong)
+
+
+def test_given_episodes_are_labelled_and_no_others():
+    data = flatten_trajectories([torch.rand(6, 4)] * 5, [torch.rand(5, 2)] * 5)
+    data["episode"] = data["episode"] * 10  # numbers, not positions
+    labelled, report = LabelBudget.of_episodes([40, 10]).apply(data)
+    shown = labelled["has_action"].squeeze(-1)
+    assert labelled["episode"][shown].unique().tolist() == [10, 40] and int(shown.sum()) == 10
+    assert report.selected_units == 2 and report.trajectories_touched == 2
+    with pytest.raises(ValueError, match=r"no episodes \[3\] to label; the data have 0 to 40"):
+        LabelBudget.of_episodes([10, 3]).apply(data)
+    for wrong in ([], [1, 1]):
+        with pytest.raises(ValueError, match="one or more different numbers"):
+            LabelBudget.of_episodes(wrong)
+    with pytest.raises(ValueError, match="without an amount or a unit"):
+        LabelBudget(3, episodes=(1, 2))

@@ -1,0 +1,148 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Relabelling: which window an action is read from, what stays, and that no hidden action is read."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from toy_policies import EchoController
+
+from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+from torchrl_koap.data.pseudo_labels import relabel
+from torchrl_koap.modules import LinearInverseDynamics, make_koopman_inverse_dynamics
+
+LENGTHS = (1, 3, 20, 7)
+
+
+class WindowController(EchoController):
+    """The action of every frame is its whole window, so that a test sees which one was read."""
+
+    def __init__(self, history=1, window=6):
+        super().__init__(history)
+        self.num_window_frames, self.batches = window, []
+        self.dropout = torch.nn.Dropout(0.5)
+
+    def forward(self, tensordict):
+        state = tensordict["state"]
+        self.batches.append(len(state))
+        number = state[..., 0] + 1000 * torch.arange(state.shape[-2])  # tells the frame from the others
+        action = torch.cat([state[..., 0].unsqueeze(-2).expand(-1, state.shape[-2], -1), number.unsqueeze(-1)], -1)
+        return tensordict.set("action", self.dropout(action))
+
+
+def make_data(labelled=1, act=2, dtype=torch.float32):
+    """Trajectory ``i`` stands at ``100 i + t^2``, so that its velocity changes."""
+    frames = [
+        (100.0 * i + torch.arange(n + 1.0)[:, None] ** 2).repeat(1, 2) + torch.tensor([0.0, 0.5])
+        for i, n in enumerate(LENGTHS)
+    ]
+    actions = [torch.randn(n, act) for n in LENGTHS]
+    data = select_state(flatten_trajectories(frames, actions, dtype=dtype), (0, 1))
+    return LabelBudget(labelled, seed=2).apply(data)[0] if labelled else data
+
+
+def expected_window(data, row, window, now):
+    """Written from the picture in the docstring, one frame at a time."""
+    states = data["state"][data["episode"] == data["episode"][row], 0]
+    over = min(3, len(states) - 1)
+    velocity = (states[-1] - states[-1 - over]) / max(over, 1)
+    values = []
+    for frame in range(window):
+        step = int(data["step_count"][row]) - now + frame
+        if step >= len(states):
+            values.append(float(states[-1] + (step - len(states) + 1) * velocity))
+        else:
+            values.append(float(states[max(step, 0)]))
+    return values
+
+
+@pytest.mark.parametrize("now", [0, 1, 4])
+@pytest.mark.parametrize("batch_size", [3, 4096])
+def test_every_unlabelled_step_gets_the_action_of_its_own_window(now, batch_size):
+    window = 6
+    data = make_data(act=window + 1)
+    controller = WindowController(now, window)
+    result = relabel(controller, data, window=window, batch_size=batch_size)
+    rows = result["relabelled"].squeeze(-1).nonzero().flatten().tolist()
+    assert len(rows) == 24 and {int(data["episode"][row]) for row in rows} == {0, 1, 2}
+    for row in rows:
+        states = expected_window(data, row, window, now)
+        torch.testing.assert_close(result["action"][row], torch.tensor([*states, states[now] + 1000 * now]))
+    assert sum(controller.batches) == 24 and max(controller.batches) <= batch_size
+    assert controller.training  # it was, and is again; in between dropout was off
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_labelled_steps_and_the_data_stay(dtype):
+    data = make_data(dtype=dtype)
+    before = data.clone()
+    controller = make_koopman_inverse_dynamics(2, 2, latent_dim=8, hidden_dim=8).to(dtype)
+    result = relabel(controller, data, window=16)
+    kept = data["has_action"].squeeze(-1)
+    assert 0 < kept.sum() < len(kept)
+    assert torch.equal(result["action"][kept], data["action"][kept])
+    assert torch.equal(result["relabelled"], ~data["has_action"]) and result["relabelled"].shape == (31, 1)
+    assert result["has_action"].all() and result["has_action"].dtype == torch.bool
+    assert result["action"].isfinite().all() and result["action"].dtype == dtype
+    assert result["state"] is data["state"]  # a shallow copy
+    assert set(data.keys(True)) == set(before.keys(True))
+    for key, value in before.items(True, True):
+        torch.testing.assert_close(data[key], value, rtol=0, atol=0, equal_nan=True)
+
+
+def test_no_hidden_action_is_read():
+    data = make_data()
+    poisoned = data.clone()
+    poisoned["action"][~poisoned["has_action"].squeeze(-1)] = 1e9
+    torch.manual_seed(0)
+    controller = make_koopman_inverse_dynamics(2, 2, latent_dim=8, hidden_dim=8)
+    torch.nn.init.normal_(controller.action_decoder.linear.weight)
+    clean, other = relabel(controller, data, window=16), relabel(controller, poisoned, window=16)
+    assert torch.equal(clean["action"], other["action"]) and clean["action"].abs().max() < 1e6
+    assert torch.equal(clean["relabelled"], other["relabelled"])
+
+
+def test_a_known_law_is_recovered():
+    torch.manual_seed(0)
+    states = [torch.randn(31, 2).cumsum(0) for _ in range(12)]
+    truth = flatten_trajectories([x[:-1] for x in states], [x[2:] - x[:-2] for x in states])
+    truth = select_state(truth, (0, 1))
+    data, _ = LabelBudget(4, seed=1).apply(truth)
+    controller = LinearInverseDynamics(2, 2, look_ahead=2)
+    windows = torch.stack(list(data["state"].split(29)))
+    actions = torch.stack(list(data["action"].split(29)))
+    mask = torch.stack([part.squeeze(-1) for part in data["has_action"].split(29)])
+    controller.fit_decoder(TensorDict({"state": windows, "action": actions}, [12, 29]), mask)
+    result = relabel(controller, data, window=5)
+    inner = truth["step_count"] < 27  # states after the last step are not part of the data
+    torch.testing.assert_close(result["action"][inner], truth["action"][inner], atol=1e-2, rtol=0)
+    assert (result["action"][~inner] - truth["action"][~inner]).abs().max() > 0.1
+
+
+def test_fully_labelled_and_unlabelled_data():
+    controller = WindowController()
+    full = make_data(labelled=0)
+    result = relabel(controller, full, window=6)
+    assert torch.equal(result["action"], full["action"]) and not result["relabelled"].any()
+    assert controller.batches == []
+    nothing = full.clone()
+    nothing["has_action"] = torch.zeros_like(full["has_action"])
+    nothing["action"] = torch.full((31, 7), torch.nan)
+    assert relabel(controller, nothing, window=6)["relabelled"].all()
+
+
+def test_bad_input_is_explained():
+    data = make_data()
+    with pytest.raises(KeyError, match="needs the entry 'state'; there are"):
+        relabel(WindowController(), data.exclude("state"), window=6)
+    with pytest.raises(ValueError, match="needs windows of 6 frames, got 5"):
+        relabel(WindowController(), data, window=5)
+    with pytest.raises(ValueError, match="actions have 7 columns, those of the data 2"):
+        relabel(WindowController(), data, window=6)
+    with pytest.raises(ValueError, match="batch_size must be >= 1, got 0"):
+        relabel(WindowController(), data, window=6, batch_size=0)
+    model = LinearInverseDynamics(2, 2)
+    torch.nn.init.constant_(model.decoder.linear.bias, torch.nan)
+    with pytest.raises(ValueError, match="not finite in 24 of 24 steps"):
+        relabel(model, data, window=10)

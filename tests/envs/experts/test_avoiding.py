@@ -1,0 +1,127 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The simulated player: takes the asked mode, repeats itself from its seed, and moves like the human ones."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from shared_data import HUMAN
+
+from torchrl_koap.data import read_raw_episode
+from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs.experts.avoiding import _HAND, _HAND_REST, FULL_PUSH, GAPS, AvoidingExpert, mode_gaps
+from torchrl_koap.envs.experts.demonstrations import record_episodes
+
+STATISTICS = Path(__file__).parents[3] / "benchmarks" / "demonstration_statistics.py"
+
+
+def play(expert, count, steps=150):
+    env = AvoidingEnv(count, dtype=torch.float64)
+    actions = []
+
+    def policy(td):
+        actions.append(expert.act(td["observation"].numpy()))
+        return td.set("action", torch.from_numpy(actions[-1]))
+
+    data = env.rollout(steps, policy, break_when_any_done=False, break_when_all_done=True)
+    return data["next"], np.stack(actions, axis=1)
+
+
+def test_mode_gaps_count_like_the_environment():
+    assert [12 * row1 + 4 * row2 + row3 for row1, row2, row3 in map(mode_gaps, range(24))] == list(range(24))
+    for wrong in (-1, 24):
+        with pytest.raises(ValueError, match="mode must be 0 to 23"):
+            mode_gaps(wrong)
+
+
+def test_gaps_lie_between_the_cylinders():
+    edges = ([0.5], [0.425, 0.575], [0.35, 0.5, 0.65])
+    for row, gaps in zip(edges, GAPS, strict=True):
+        assert [int(np.searchsorted(row, x)) for gap in gaps for x in gap] == np.repeat(range(len(gaps)), 2).tolist()
+
+
+def test_most_first_attempts_take_the_asked_mode():
+    modes = list(range(24)) * 2
+    data, _ = play(AvoidingExpert(modes, [(11, index) for index in range(48)]), 48)
+    good = data["success"][:, -1, 0] & (mode_index(data["mode"][:, -1]) == torch.tensor(modes))
+    assert good.sum() >= 42
+
+
+def test_an_episode_depends_on_its_seed_alone():
+    torch.manual_seed(0)
+    np.random.seed(0)  # noqa: NPY002
+    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    _, alone = play(AvoidingExpert([7], [(3, 1)]), 1, 60)
+    _, batch = play(AvoidingExpert([20, 7, 7], [5, (3, 1), (3, 2)]), 3, 60)
+    assert np.allclose(alone[0], batch[1, : alone.shape[1]], atol=1e-12)
+    assert np.abs(alone[0] - batch[2, : alone.shape[1]]).max() > 1e-3
+    assert torch.equal(torch.random.get_rng_state(), before[0])
+    assert np.array_equal(np.random.get_state()[1], before[1])  # noqa: NPY002
+
+
+def test_the_hand_ends_where_the_decision_wants():
+    """A push that is held moves the command by its own size per step; what is still to come adds up to all of it."""
+    assert _HAND.sum() == pytest.approx(1)
+    assert np.cumsum(_HAND) + _HAND_REST == pytest.approx(1)
+    response = np.cumsum(_HAND)
+    rise = np.argmax(response > 0.9) - np.argmax(response > 0.1)
+    assert 3 <= rise <= 5  # control steps from 10 to 90 %, as in the human recordings
+    assert 1.01 < response.max() < 1.08
+
+
+def test_it_stops_for_a_cylinder_ahead():
+    """Shown that it stands right before the first cylinder, the player never decides to go on forwards."""
+    expert = AvoidingExpert([0] * 8, range(8))
+    expert._pause[:] = 0
+    expert._misjudgement[:] = expert._tremor[:] = 0.0
+    expert.act(np.tile([0.5, -0.16, 0.5, -0.16], (8, 1)))
+    assert (expert._decisions[:, 0, 1] == 0).all() and expert._blocked.all()
+    expert = AvoidingExpert([0] * 8, range(8))
+    expert._pause[:] = 0
+    expert.act(np.tile([0.42, -0.2, 0.42, -0.2], (8, 1)))
+    assert (expert._decisions[:, 0, 1] > 0.005).all()
+
+
+def test_it_lingers_behind_the_line_and_finishes():
+    expert = AvoidingExpert([1], [0])
+    seen = np.array([[0.42, 0.36, 0.42, 0.36]])
+    rows = 0
+    while not expert.finished.all():
+        push = expert.act(seen)
+        assert np.abs(push).max() < 1.2 * FULL_PUSH
+        rows += 1
+        assert rows < 60
+    assert rows >= 5
+    assert not AvoidingExpert([1], [0]).finished.any()
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="2 and 1"):
+        AvoidingExpert([0, 1], [0])
+    with pytest.raises(ValueError, match="at least one"):
+        AvoidingExpert([], [])
+    with pytest.raises(ValueError, match=r"shape \[1, 4\], got \[1, 2\]"):
+        AvoidingExpert([0], [0]).act(np.zeros((1, 2)))
+
+
+@pytest.mark.skipif(not HUMAN.is_dir(), reason=f"the human demonstrations are not at {HUMAN}")
+@pytest.mark.skipif(not STATISTICS.is_file(), reason=f"{STATISTICS} is not there")
+def test_scripted_medians_lie_in_the_human_range():
+    specification = importlib.util.spec_from_file_location("demonstration_statistics", STATISTICS)
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    human = [module.statistics(read_raw_episode(file)) for file in sorted(HUMAN.glob("env_*.pkl"))]
+    raw, _ = record_episodes("avoiding", 48, seed=1)
+    scripted = [module.statistics(episode) for episode in raw]
+    outside = {}
+    for name in human[0]:
+        low, high = np.percentile([row[name] for row in human], [5, 95])
+        median = np.median([row[name] for row in scripted])
+        if not low <= median <= high + 1e-9:
+            outside[name] = (low, median, high)
+    assert len(outside) <= 1, outside
+    assert module.ridge_error(raw[:24]) == pytest.approx(2.22, abs=0.4)  # 2.22 mm: the human ones

@@ -1,0 +1,171 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recorded demonstrations: right modes, right rows, the same through TED and raw pickles, repeatable."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.data import D3ILExperienceReplay, read_raw_episode, trajectory_lengths
+from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
+from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES
+from torchrl_koap.envs.experts import demonstrations
+from torchrl_koap.envs.experts.avoiding import ROD_RADIUS
+from torchrl_koap.envs.experts.demonstrations import (
+    RecordingError,
+    balanced_modes,
+    episodes_to_ted,
+    record_demonstrations,
+    record_episodes,
+    write_raw_episodes,
+)
+from torchrl_koap.envs.experts.recording import RECIPES
+from torchrl_koap.keys import validate
+
+EPISODES = 26
+
+
+@pytest.fixture(scope="module")
+def recording():
+    calls = []
+    raw, report = record_episodes(
+        "avoiding", EPISODES, seed=5, progress=lambda done, total: calls.append((done, total))
+    )
+    return raw, report, calls
+
+
+def test_report(recording):
+    raw, report, calls = recording
+    assert len(raw) == len(report.rows) == len(report.attempts) == EPISODES
+    assert report.rows == [len(episode) for episode in raw]
+    assert np.bincount(report.modes, minlength=24).min() == 1 and len(set(report.modes[24:])) == 2
+    assert sum(report.attempts) - EPISODES == report.failed_attempts == sum(report.failures.values())
+    assert f"{EPISODES} demonstrations" in str(report)
+    done = [call[0] for call in calls]
+    assert done == sorted(done) and calls[-1] == (EPISODES, EPISODES)
+
+
+def test_rows_are_those_of_the_original_recorder(recording):
+    raw, _, _ = recording
+    for episode in raw:
+        robot = episode.robot
+        assert set(robot) == set(ROBOT_COLUMNS)
+        assert np.array_equal(robot["sim_step"], 2 + 35 * np.arange(len(episode)))
+        assert np.allclose(robot["time_stamp"], robot["sim_step"] * 1e-3)
+        assert np.allclose(robot["c_pos"][0], (0.524928, -0.279737, 0.122359), atol=1e-5)
+        assert np.ptp(robot["des_c_pos"][:, 2]) == 0
+
+
+def test_demonstrations_are_successes_with_clearance(recording):
+    for episode in recording[0]:
+        path = episode.robot["c_pos"][:, :2]
+        assert path[-1, 1] > FINISH_Y
+        for _, x, y, radius, _ in OBSTACLES:
+            assert np.linalg.norm(path - (x, y), axis=1).min() > radius + ROD_RADIUS + 0.003
+
+
+def test_replayed_actions_give_the_same_episode(recording):
+    """Recorded actions, sent to a fresh environment, reproduce the rows, outcome and mode."""
+    raw, report, _ = recording
+    data = episodes_to_ted(raw, "avoiding", dtype=torch.float64)
+    for index in (0, 13, 25):
+        part, robot = data[data["episode"] == index], raw[index].robot
+        env = AvoidingEnv(1, dtype=torch.float64)
+        step = env.reset()
+        first = (
+            part["observation"][:1, :2] - step["observation"][:, :2]
+        )  # the command of row 0 is a step from the start
+        for row, action in enumerate(torch.cat([first, part["action"]])):
+            step = env.step(step.set("action", action[None]))["next"]
+            assert np.allclose(env.raw_log()["j_pos"][0], robot["j_pos"][row], atol=1e-9, rtol=0)
+            frame = np.concatenate([robot["des_c_pos"][row, :2], robot["c_pos"][row, :2]])
+            seen = step["observation"][0].numpy()
+            assert np.allclose(seen[:2], frame[:2], atol=1e-12, rtol=0)
+            # the environment hands out the position of 1 ms before the recorder's
+            assert np.allclose(seen[2:], frame[2:], atol=1e-3, rtol=0)
+        assert step["success"].item() and not step["collision"].item()
+        assert mode_index(step["mode"]).item() == report.modes[index]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_raw_files_read_back_equal_the_recorded_data(recording, tmp_path, monkeypatch, dtype):
+    raw, report, _ = recording
+    monkeypatch.setenv("KOAP_CACHE", str(tmp_path / "cache"))
+    files = write_raw_episodes(tmp_path / "raw", raw)
+    assert [file.name for file in files[:2]] == ["env_000_00.pkl", "env_001_00.pkl"]
+    data = validate(episodes_to_ted(raw, "avoiding", dtype=dtype))
+    read = D3ILExperienceReplay("avoiding", tmp_path / "raw", dtype=dtype).data.exclude("state")
+    assert set(read.keys(True, True)) == set(data.keys(True, True))
+    assert (read == data).all()
+    assert trajectory_lengths(data).tolist() == [rows - 1 for rows in report.rows]
+    again = read_raw_episode(files[3])
+    assert all(np.array_equal(again.robot[name], raw[3].robot[name]) for name in ROBOT_COLUMNS)
+    with pytest.raises(FileExistsError, match="left as they are"):
+        write_raw_episodes(tmp_path / "raw", raw[:1])
+    assert len(list((tmp_path / "raw").iterdir())) == EPISODES
+
+
+def test_same_seed_same_data_whatever_threads_and_progress():
+    torch.manual_seed(0)
+    state = torch.random.get_rng_state()
+    first, report = record_demonstrations(episodes=3, seed=2, num_threads=1)
+    second, _ = record_demonstrations(episodes=3, seed=2, num_threads=2, progress=lambda done, total: None)
+    other, _ = record_demonstrations(episodes=3, seed=3)
+    assert (first == second).all()
+    assert first["has_action"].all() and validate(first) is first and first["action"].dtype == torch.float32
+    assert first.shape != other.shape or not torch.equal(first["action"], other["action"])
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert int(first["episode"].max()) + 1 == len(report.modes) == 3
+
+
+def test_modes_are_balanced():
+    assert np.bincount(balanced_modes(96, 24, 0)).tolist() == [4] * 24
+    counts = np.bincount(balanced_modes(29, 24, 1), minlength=24)
+    assert counts.sum() == 29 and set(counts) == {1, 2}
+    assert balanced_modes(5, 24, 1) != balanced_modes(5, 24, 2)
+
+
+def change_recipe(monkeypatch, **changes):
+    recipe = replace(RECIPES["avoiding"](), **changes)
+    monkeypatch.setitem(RECIPES, "avoiding", lambda: recipe)
+
+
+def test_failed_attempts_are_counted_and_given_up_on(monkeypatch):
+    class Blind:
+        def __init__(self, modes, contexts, seeds):
+            self.finished = np.zeros(len(modes), dtype=bool)
+
+        def act(self, observation):
+            return np.tile([-0.0006, 0.012], (len(observation), 1))  # straight into the first cylinder
+
+    change_recipe(monkeypatch, make_expert=Blind)
+    monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 2)
+    with pytest.raises(RecordingError, match=r"episodes \[0, 1\].*'collision': 4"):
+        record_demonstrations(episodes=2)
+
+
+@pytest.mark.parametrize(("limit", "reason"), [({"least_clearance": 1.0}, "close"), ({"most_rows": 30}, "slow")])
+def test_attempts_unlike_human_ones_are_discarded(monkeypatch, limit, reason):
+    change_recipe(monkeypatch, **limit)
+    monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 1)
+    with pytest.raises(RecordingError, match=f"'{reason}': 1"):
+        record_demonstrations(episodes=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"task": "avoidng"}, "did you mean 'avoiding'"),
+        ({"episodes": 0}, "episodes must be an integer of at least 1, got 0"),
+        ({"episodes": 2.5}, "episodes must be an integer"),
+        ({"seed": -1}, "seed must be an integer of at least 0"),
+        ({"num_threads": 0}, "num_threads must be an integer of at least 1"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        record_demonstrations(**arguments)

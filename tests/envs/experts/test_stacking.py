@@ -1,0 +1,137 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""StackingExpert: takes the wanted order, plays through the environment alone, repeatable, independent of the batch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.envs import StackingEnv
+from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
+from torchrl_koap.envs.experts.stacking import ORDERS, StackingExpert
+from torchrl_koap.envs.mujoco.inverse_kinematics import follow_pose, tcp_pose
+from torchrl_koap.envs.stacking import START_JOINTS, mode_index
+
+LIMIT = 1000
+
+
+def play(modes, contexts, seeds, steps=LIMIT):
+    """Whole episodes: outcome, order, control steps until success, and all actions [n, T, 8]."""
+    count = len(modes)
+    env, expert = StackingEnv(count, max_steps=LIMIT, dtype=torch.float64), StackingExpert(modes, contexts, seeds)
+    out, actions, length = env.reset(contexts=contexts), [], np.full(count, -1)
+    for step in range(steps):
+        action = expert.act(out["observation"].numpy())
+        actions.append(action)
+        if expert.finished.all():
+            break
+        mask = torch.as_tensor(~expert.finished)[:, None]
+        out = env.step(TensorDict({"action": torch.as_tensor(action), "_step": mask}, [count]))["next"]
+        length[(length < 0) & out["success"][:, 0].numpy()] = step + 1
+    return out["success"][:, 0].numpy(), mode_index(out["mode"]).numpy(), length, np.stack(actions, 1), env, expert
+
+
+@pytest.fixture(scope="module")
+def played():
+    return play(range(6), evaluation_contexts("stacking", 6), [(1, mode) for mode in range(6)])
+
+
+def test_every_order_is_stacked(played):
+    success, modes, length, _, env, expert = played
+    right = success & (modes == np.arange(6))
+    assert right.sum() >= 5
+    assert ((length[right] > 250) & (length[right] < 650)).all()
+    assert expert.finished[right].all()
+    for row in np.flatnonzero(right & expert.finished):  # let go, and the pile stands
+        boxes = env.sims.object_poses[row, list(ORDERS[row])]
+        np.testing.assert_allclose(boxes[:, :2], [(0.5, 0.2)] * 3, atol=0.03)
+        np.testing.assert_allclose(boxes[:, 2], [0.011, 0.071, 0.131], atol=0.006)
+        assert env.sims.gripper_width[row] > 0.07
+
+
+def test_motion_is_smooth(played):
+    actions = played[3]
+    opens = actions[..., 7] > 0.075
+    assert (np.diff(opens, axis=1).sum(1) == 6).all()  # closed on every box once, opened once
+    assert set(np.unique(actions[..., 7])) == {0.06, 0.08}
+    assert np.abs(actions[..., :7]).max() < 0.08
+    assert np.quantile(np.abs(actions[..., :7]), 0.99) < 0.04
+    assert np.quantile(np.abs(np.diff(actions[..., :7], axis=1)), 0.99) < 0.01
+
+
+def test_same_seed_same_episode_in_any_batch():
+    contexts = draw_contexts("stacking", 3, 5)
+    modes, seeds = [4, 0, 2], [(7, 0), (7, 1), (7, 2)]
+    together = play(modes, contexts, seeds, steps=150)[3]
+    np.testing.assert_array_equal(play(modes, contexts, seeds, steps=150)[3], together)
+    np.testing.assert_array_equal(play(modes[1:2], contexts[1:2], seeds[1:2], steps=150)[3], together[1:2])
+    other = play(modes[1:2], contexts[1:2], [(7, 9)], steps=150)[3]
+    assert np.abs(other - together[1:2]).max() > 1e-3
+
+
+def test_a_box_that_was_taken_away_is_fetched_again():
+    context = evaluation_contexts("stacking", 1)
+    env, expert = StackingEnv(1, max_steps=LIMIT, dtype=torch.float64), StackingExpert([0], context, [0])
+    out, stolen = env.reset(contexts=context), False
+    for _ in range(LIMIT):
+        out = env.step(TensorDict({"action": torch.as_tensor(expert.act(out["observation"].numpy()))}, [1]))["next"]
+        data = env.sims.data[0]
+        if not stolen and data.qpos[2] > 0.06:  # the red box is in the air: back to where it was
+            data.qpos[:7], data.qvel[:6], stolen = (*context[0, 0, :2], 0.02, 1, 0, 0, 0), 0, True
+        if out["success"].item():
+            break
+    assert stolen and out["success"].item() and out["mode"].tolist() == [[0, 1, 2]]
+
+
+def test_inverse_kinematics_reaches_poses():
+    generator = np.random.default_rng(0)
+    joints = np.array([START_JOINTS] * 5)
+    position, quaternion = tcp_pose(joints)
+    position = position + generator.uniform(-0.02, 0.02, (5, 3))
+    half = generator.uniform(-0.03, 0.03, 5)
+    quaternion = np.stack([0 * half, np.cos(half), np.sin(half), 0 * half], 1)
+    poses = np.concatenate([position, quaternion], 1)
+    once = follow_pose(joints, poses)
+    np.testing.assert_allclose(tcp_pose(once)[0], position, atol=1e-4)
+    missing = np.abs(2 * half - 2 * np.arctan2(*tcp_pose(once)[1][:, [2, 1]].T))
+    assert (missing < 0.4 * np.abs(2 * half) + 1e-3).all()
+    reached = tcp_pose(follow_pose(joints, poses, substeps=300))
+    np.testing.assert_allclose(reached[0], position, atol=1e-6)
+    assert (np.abs((reached[1] * quaternion).sum(1)) > 1 - 1e-9).all()
+    with pytest.raises(ValueError, match=r"joints must be \[n, 7\].*\[5, 6\]"):
+        follow_pose(joints[:, :6], joints)
+    with pytest.raises(ValueError, match="as many poses"):
+        follow_pose(joints, joints[:2])
+
+
+@pytest.mark.parametrize(
+    ("modes", "contexts", "seeds", "message"),
+    [
+        ([6], np.zeros((1, 3, 3)), [0], "mode must be 0 to 5, got 6"),
+        ([0, 1], np.zeros((2, 3, 3)), [0], "2 modes, 1 seeds"),
+        ([0], np.zeros((1, 2, 3)), [0], r"shape \[1, 2, 3\]"),
+        ([], np.zeros((0, 3, 3)), [], "at least one"),
+    ],
+)
+def test_bad_arguments_are_named(modes, contexts, seeds, message):
+    with pytest.raises(ValueError, match=message):
+        StackingExpert(modes, contexts, seeds)
+
+
+def test_observation_of_a_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match=r"\[1, 31\], got \[1, 20\]"):
+        StackingExpert([0], np.zeros((1, 3, 3)), [0]).act(np.zeros((1, 20)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contexts", [evaluation_contexts("stacking"), draw_contexts("stacking", 60, 11)])
+def test_success_in_many_contexts(contexts):
+    count = len(contexts)
+    wanted = np.arange(count) % 6
+    success, modes, length, _, _, _ = play(wanted, contexts, [(2, row) for row in range(count)])
+    right = success & (modes == wanted)
+    assert right.mean() > 0.9
+    assert all(right[wanted == mode].mean() > 0.7 for mode in range(6))
+    assert np.median(length[right]) < 600

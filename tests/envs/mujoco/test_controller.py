@@ -1,0 +1,203 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The compiled controller against MuJoCo's kinematics, NumPy's linear algebra and the recorded substeps."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from shared_data import SHARED
+
+from torchrl_koap.envs.avoiding import START_JOINTS
+from torchrl_koap.envs.mujoco import controller
+from torchrl_koap.envs.mujoco.linear_algebra import solve_clipped
+from torchrl_koap.envs.mujoco.scene import compile_scene, scene
+from torchrl_koap.envs.mujoco.simulation import SimulationBatch
+
+RECORDINGS = SHARED / "d3il_reference" / "avoiding.npz"
+
+
+@pytest.fixture(scope="module")
+def model():
+    return compile_scene(scene(rod=True))
+
+
+@pytest.fixture
+def generator():
+    return np.random.default_rng(0)
+
+
+def kinematics(q):
+    axes, origins, tcp, quat = np.empty((8, 3, 3)), np.empty((8, 3)), np.empty(3), np.empty(4)
+    controller.forward_kinematics(q, axes, origins, tcp, quat)
+    return axes, origins, tcp, quat
+
+
+def numpy_inverse_kinematics(target, q):
+    """Spec section 3.1 in plain NumPy, with an explicit singular value decomposition."""
+    q = q.copy()
+    for _ in range(3):
+        axes, origins, tcp, r = kinematics(q)
+        t = target[3:] if target[3:] @ r >= 0 else -target[3:]
+        e_p = np.clip(target[:3] - tcp, -0.01, 0.01)
+        e_o = np.clip(r[0] * t[1:] - t[0] * r[1:] + np.cross(r[1:], t[1:]), -0.1, 0.1)
+        u = np.concatenate([[200, 200, 800] * e_p, 30 * e_o])
+        z = axes[1:, 2]
+        jacobian = np.concatenate([np.cross(z, tcp - origins[1:]), z], axis=1).T
+        left, values, right = np.linalg.svd(jacobian @ jacobian.T + 1e-12 * np.eye(6))
+        inverse = right.T @ np.diag(1 / np.clip(values, 0.01, 100)) @ left.T
+        null = 40 * np.clip(controller.Q_REST - q, -0.2, 0.2)
+        v = jacobian.T @ inverse @ (u - jacobian @ null) + null
+        v *= min(1.0, 3 / np.linalg.norm(v))
+        q = np.clip(q + 0.001 * v, controller.Q_MIN, controller.Q_MAX)
+    return q
+
+
+def compiled_inverse_kinematics(target, q):
+    q = q.copy()
+    shapes = [(8, 3, 3), (8, 3), (3,), (4,), (6, 7), (6, 6), (6,), (7,), (6, 6), (6, 6)]
+    controller.inverse_kinematics(target, q, *[np.empty(shape) for shape in shapes])
+    return q
+
+
+def test_forward_kinematics_agree_with_mujoco(model, generator):
+    data, tcp_body = mujoco.MjData(model), model.body("panda/tcp").id
+    for _ in range(50):
+        q = generator.uniform(controller.Q_MIN, controller.Q_MAX)
+        data.qpos[:7] = q
+        mujoco.mj_kinematics(model, data)
+        _, origins, tcp, quat = kinematics(q)
+        np.testing.assert_allclose(tcp, data.xpos[tcp_body], atol=1e-12)
+        np.testing.assert_allclose(origins[1:], data.xanchor[:7], atol=1e-12)
+        # the physics model's hand is turned by a rounded -45 deg, 1.2e-6 rad off
+        assert abs(abs(quat @ data.xquat[tcp_body]) - 1) < 1e-11
+
+
+@pytest.mark.parametrize("smallest", [1e-9, 1e-3, 0.00999, 0.0101, 0.3])
+@pytest.mark.parametrize("largest", [4.0, 200.0])
+def test_clipped_solve_equals_svd(generator, smallest, largest):
+    basis, _ = np.linalg.qr(generator.standard_normal((6, 6)))
+    matrix = basis @ np.diag([smallest, 0.05, 0.4, 1.0, 2.0, largest]) @ basis.T
+    matrix = 0.5 * (matrix + matrix.T)
+    rhs = generator.standard_normal(6)
+    left, values, right = np.linalg.svd(matrix)
+    wanted = right.T @ np.diag(1 / np.clip(values, 0.01, 100)) @ left.T @ rhs
+    got = rhs.copy()
+    solve_clipped(matrix.copy(), got, np.empty((6, 6)), np.empty((6, 6)))
+    np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_inverse_kinematics_equal_the_numpy_version(generator):
+    start = np.array(START_JOINTS)
+    pose = np.concatenate([kinematics(start)[2], [0, 1, 0, 0]])
+    for index in range(60):
+        # far commands, both signs of the quaternion, and postures near singularities and joint limits
+        q = start if index < 20 else generator.uniform(controller.Q_MIN, controller.Q_MAX)
+        target = pose.copy()
+        target[:3] += generator.normal(0, 0.05, 3)
+        target[3:] *= 1 if index % 2 else -1
+        np.testing.assert_allclose(
+            compiled_inverse_kinematics(target, q), numpy_inverse_kinematics(target, q), rtol=0, atol=1e-10
+        )
+
+
+def test_inverse_kinematics_converge_and_respect_the_bound_of_joint_3():
+    q = np.array(START_JOINTS)
+    target = np.concatenate([kinematics(q)[2] + [0.05, 0.1, 0.02], [0, 1, 0, 0]])
+    for _ in range(1000):
+        q = compiled_inverse_kinematics(target, q)
+    _, _, tcp, quat = kinematics(q)
+    np.testing.assert_allclose(tcp, target[:3], atol=1e-6)
+    assert abs(quat[1]) > 1 - 1e-10
+    assert compiled_inverse_kinematics(target, np.array([0, 0.5, 2.8, -2, 0, 2, 0.0]))[2] == 2.0
+
+
+@pytest.mark.parametrize(
+    "positions, velocities, width, grasping, wanted",
+    [
+        ((0.0, 0.0), (0.0, 0.0), 0.001, False, (0.5, 0.5)),
+        ((0.03, 0.03), (0.0, 0.0), 0.0, True, (-20.0, -20.0)),
+        ((0.03, 0.03), (-0.1, 0.0), 0.0, False, (-1.0, -2.0)),
+        ((0.02, 0.03), (0.0, 0.0), 0.04, False, (2.5 + 5.0, -2.5 + 5.0)),
+        ((0.040, 0.038), (0.01, 0.0), 0.039, False, (-0.5 - 0.5 - 0.1, 0.5 + 0.5)),
+    ],
+)
+def test_finger_forces(positions, velocities, width, grasping, wanted):
+    position, velocity, ctrl = np.zeros(9), np.zeros(9), np.zeros(9)
+    position[7:], velocity[7:] = positions, velocities
+    controller._finger_forces(position, velocity, width, grasping, ctrl)
+    np.testing.assert_allclose(ctrl[7:], wanted, atol=1e-12)
+
+
+def drive(model, num_sims, num_threads, steps=6):
+    sims = SimulationBatch(model, num_sims, num_threads)
+    sims.reset(np.arange(num_sims), np.array(START_JOINTS))
+    commands = np.zeros((num_sims, 7))
+    commands[:, :3], commands[:, 4] = sims.tcp_position, 1.0
+    for _ in range(steps):
+        commands[:, 0] += 0.001 * np.arange(num_sims)
+        sims.track_pose(np.arange(num_sims), commands, 35)
+    state = np.stack([np.concatenate([data.qpos, data.qvel, data.qacc_warmstart]) for data in sims.data])
+    sims.close()
+    return state
+
+
+def test_threads_and_batch_size_change_nothing(model):
+    alone = drive(model, 7, 1)
+    np.testing.assert_array_equal(alone, drive(model, 7, 2))
+    np.testing.assert_array_equal(alone, drive(model, 7, 5))
+    np.testing.assert_array_equal(alone[:3], drive(model, 3, 1))
+
+
+def test_state_round_trip_continues_bit_for_bit(model):
+    sims = SimulationBatch(model, 2)
+    sims.reset(np.array([0]), np.array(START_JOINTS))
+    command = np.tile([0.55, -0.2, 0.12, 0, 1, 0, 0], (2, 1))
+    sims.track_pose(np.array([0]), command, 20)
+    sims.set_state(1, sims.get_state(0))
+    np.testing.assert_array_equal(sims.tcp_position[0], sims.tcp_position[1])
+    sims.track_pose(np.array([0, 1]), command, 20)
+    np.testing.assert_array_equal(sims.data[0].qpos, sims.data[1].qpos)
+    np.testing.assert_array_equal(sims.data[0].qacc_warmstart, sims.data[1].qacc_warmstart)
+
+
+def test_logged_velocity_is_jacobian_times_joint_velocity(model):
+    sims = SimulationBatch(model, 1)
+    sims.reset(np.array([0]), np.array(START_JOINTS))
+    command = np.array([[0.55, -0.2, 0.12, 0, 1, 0, 0]])
+    sims.track_pose(np.array([0]), command, 10)
+    sims.track_pose(np.array([0]), command, 1)
+    data, jacobian = sims.data[0], np.zeros((3, model.nv))
+    mujoco.mj_jacBody(model, data, jacobian, None, model.body("panda/tcp").id)
+    np.testing.assert_allclose(sims.log[0, controller.LOG_COLUMNS["c_vel"]], jacobian @ data.qvel, atol=1e-13)
+    np.testing.assert_array_equal(sims.log[0, controller.LOG_COLUMNS["j_pos"]], data.qpos[:7])
+
+
+def test_physics_state_of_a_wrong_size_is_refused(model):
+    sims = SimulationBatch(model, 1)
+    with pytest.raises(ValueError, match="'qpos' must be 9 finite numbers"):
+        sims.set_physics(0, np.zeros(8))
+    with pytest.raises(ValueError, match="'qvel' must be 9 finite numbers"):
+        sims.set_physics(0, np.zeros(9), np.full(9, np.nan))
+
+
+@pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings of the original simulator at {RECORDINGS}")
+def test_every_substep_of_the_recorded_trace(model):
+    recorded = np.load(RECORDINGS)
+    sims = SimulationBatch(model, 1)
+    sims.reset(np.array([0]), recorded["ep0_robot_init_qpos"])
+    np.testing.assert_allclose(sims.data[0].qpos, recorded["ep0_init_qpos"], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(sims.data[0].ctrl, recorded["ep0_init_ctrl"], rtol=0, atol=1e-10)
+    sims.widths[:] = controller.FINGER_OPEN
+    for substep in range(len(recorded["ep0_trace_qpos"])):
+        sims.track_pose(np.array([0]), recorded["ep0_action"][[substep // 35]], 1)
+        data = sims.data[0]
+        for got, name, tolerance in (
+            (data.qpos, "qpos", 1e-10),
+            (data.qvel, "qvel", 1e-8),
+            (data.ctrl, "ctrl", 1e-5),
+            (sims.joint_targets[0], "des_j_pos", 1e-10),
+            (sims.joint_speeds[0], "des_j_vel", 1e-6),
+            (sims.tcp_position[0], "c_pos", 1e-10),
+        ):
+            np.testing.assert_allclose(got, recorded[f"ep0_trace_{name}"][substep], rtol=0, atol=tolerance)

@@ -1,0 +1,345 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""AligningEnv: parity with recordings of the original, contexts, success rule, partial resets, pictures."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from shared_data import SHARED
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_koap.envs import AligningEnv
+from torchrl_koap.envs.aligning import INSIDE_REACH, WALLS, mode_index
+from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts, yaw_quaternions
+
+RECORDINGS = SHARED / "d3il_reference" / "aligning.npz"
+needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")
+
+SENSITIVE = 1  # the recorded episode in which a start error of 1e-8 rad grows to millimetres
+CONTEXT = np.array([[(0.5, -0.15, 0.3), (0.55, 0.3, -0.7)]])
+DOWN = torch.tensor([0.0, 0.0, -0.01], dtype=torch.float64)
+
+
+def act(env, action, mask=None):
+    tensordict = TensorDict({"action": action.expand(env.batch_size[0], 3).to(env._dtype)}, env.batch_size)
+    if mask is not None:
+        tensordict["_step"] = torch.as_tensor(mask).reshape(-1, 1)
+    return env.step(tensordict)["next"]
+
+
+def put(env, tray, tcp=None):
+    """Shows the checks a tray pose [7] and a TCP position [3] without running physics."""
+    env.sims._object_views[0][:] = tray
+    if tcp is not None:
+        env.sims._tcp_views[0][:] = tcp
+
+
+@needs_recordings
+def test_parity_with_the_original():
+    recorded = np.load(RECORDINGS)
+    lengths, names = recorded["n_steps"], range(4)
+    env = AligningEnv(4, max_steps=1000, dtype=torch.float64)
+    contexts = np.stack([recorded[f"ep{i}_context"][:, :3] for i in names])
+    contexts[..., 2] = np.radians(contexts[..., 2])
+    first = env.reset(contexts=contexts)
+    for i in names:
+        np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(env.sims.data[i].qvel, recorded[f"ep{i}_init_qvel"], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(first["observation"][i, 3:], recorded[f"ep{i}_init_obs"], rtol=0, atol=1e-7)
+        state = {name: recorded[f"ep{i}_init_{name}"] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
+        env.set_physics(i, **state)
+    first_contact = np.append(np.flatnonzero(recorded[f"ep{SENSITIVE}_robot_touches_object"]), 10**6)[0]
+    success_told = np.zeros(4, dtype=bool)
+    for k in range(max(lengths)):
+        running = lengths > k
+        targets = np.stack([recorded[f"ep{i}_action"][min(k, lengths[i] - 1), :3] for i in names])
+        out = act(env, torch.as_tensor(targets - env.commands[:, :3]), running)
+        for i in np.flatnonzero(running):
+            where = f"episode {i}, step {k}"
+            assert out["done"][i].item() == bool(recorded[f"ep{i}_done"][k]), where
+            assert out["mode"][i].item() == recorded[f"ep{i}_mode"][k], where
+            success_told[i] = recorded[f"ep{i}_success"][k]
+            if i == SENSITIVE and k >= first_contact:
+                continue
+            assert np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max() < 1e-6, where
+            qpos = np.abs(env.sims.data[i].qpos - recorded[f"ep{i}_qpos"][k])
+            assert qpos[:3].max() < 1e-5 and qpos[3:].max() < 1e-5, where  # tray (m); its rotation and the joints
+            observed = np.abs(out["observation"][i, 3:].numpy() - recorded[f"ep{i}_obs_step"][k]).max()
+            assert observed < 1e-6, where  # recorded in float32
+    # the original tells success with the step that reaches it, this environment with the one that ends the episode
+    assert out["success"][:, 0].tolist() == success_told.tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_specs(num_envs, dtype):
+    env = AligningEnv(num_envs, dtype=dtype)
+    check_env_specs(env)
+    assert env.rollout(2)["next", "observation"].dtype == dtype
+
+
+def test_first_observation_and_latency_of_one_step():
+    env = AligningEnv(1, dtype=torch.float64)
+    first = env.reset(contexts=CONTEXT)
+    seen = first["observation"][0].numpy()
+    np.testing.assert_allclose(seen[:3], [0.524958, -0.348818, 0.251598], rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(seen[3:6], seen[:3])
+    np.testing.assert_allclose(seen[6:9], [0.5, -0.15, 0.0], rtol=0, atol=1e-4)  # one substep of falling
+    np.testing.assert_allclose(seen[9:13], yaw_quaternions(np.array(0.3)), rtol=0, atol=1e-4)
+    np.testing.assert_allclose(seen[13:16], [0.55, 0.3, 0.0])
+    np.testing.assert_allclose(seen[16:], yaw_quaternions(np.array(-0.7)))
+    np.testing.assert_array_equal(first["context"], CONTEXT)
+    assert mode_index(first["mode"]).tolist() == [-1]
+    step, before = torch.tensor([0.005, 0.010, -0.006], dtype=torch.float64), seen[3:13]
+    for k in range(1, 6):
+        out = act(env, step)["observation"][0].numpy()
+        np.testing.assert_allclose(out[:3], seen[:3] + k * step.numpy(), rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(out[3:13], before)
+        before = np.concatenate([env.sims.tcp_position[0], env.sims.object_poses[0, 0]])
+    np.testing.assert_array_equal(env.commands[0, 3:], [0, 1, 0, 0])
+
+
+def test_tray_comes_to_rest_on_the_table():
+    env = AligningEnv(1, dtype=torch.float64)
+    env.reset(contexts=CONTEXT)
+    for _ in range(15):
+        out = act(env, torch.zeros(3))
+    np.testing.assert_allclose(out["observation"][0, 6:9], [0.5, -0.15, -0.0091], rtol=0, atol=1e-4)
+    tray = env.sims.model.body("box")
+    assert tray.mass[0] == pytest.approx(1.004)
+    np.testing.assert_allclose(tray.inertia, [0.00168003, 0.00088542, 0.00088542], rtol=1e-5)
+
+
+def test_rod_pushes_the_tray_from_inside():
+    env = AligningEnv(1, dtype=torch.float64)
+    env.reset(contexts=np.array([[(0.525, -0.15, 0.0), (0.525, 0.3, 0.0)]]))
+    ways = ((0.0, 0.199), (0.0, 0.0, -0.1), (0.0, 0.15))  # over the tray, down into it, against its far wall
+    for way in ways:
+        way = torch.tensor([*way, 0.0][:3], dtype=torch.float64)
+        steps = max(1, round(float(way.abs().max()) / 0.008))
+        for _ in range(steps):
+            out = act(env, way / steps)
+        for _ in range(6):
+            out = act(env, torch.zeros(3))
+    assert mode_index(out["mode"]).tolist() == [0]
+    tray = out["observation"][0, 6:9].numpy()
+    # the wall's inner side is 45 mm from the centre, the rod's radius is 10 mm
+    assert tray[1] == pytest.approx(float(out["observation"][0, 4]) - 0.035, abs=0.004)
+    assert tray[1] > -0.06 and abs(tray[0] - 0.525) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn", "wanted"),
+    [
+        ((0.0, 0.0, 0.0), 0.0, True),  # exact alignment: the original's arccos of more than 1 would be NaN
+        ((0.0, 0.0, 0.0), 1e-9, True),
+        ((0.015, 0.0, -0.0091), 0.0, True),
+        ((0.016, 0.0, -0.0091), 0.0, False),  # the height takes part
+        ((0.0, 0.0179, 0.0), 0.0, True),
+        ((0.0, 0.0181, 0.0), 0.0, False),
+        ((0.0, 0.0, 0.0), 8.6, True),
+        ((0.0, 0.0, 0.0), -8.6, True),
+        ((0.0, 0.0, 0.0), 8.7, False),
+        ((0.0, 0.0, 0.0), 180.0, False),
+        ((0.0, 0.0, 0.0), 352.0, True),
+    ],
+)
+def test_success_rule(shift, turn, wanted):
+    env = AligningEnv(1, dtype=torch.float64)
+    env.reset(contexts=CONTEXT)
+    x, y, yaw = CONTEXT[0, 1]
+    tray = np.append(np.add([x, y, 0.0], shift), yaw_quaternions(np.array(yaw + math.radians(turn))))
+    for sign in (1, -1):  # q and -q are the same rotation
+        put(env, np.append(tray[:3], sign * tray[3:]))
+        success, failure = env._check(np.array([0]))
+        assert success.tolist() == [wanted] and failure.tolist() == [False]
+    distance, angle = env.errors()
+    assert distance[0] == pytest.approx(np.linalg.norm(shift), abs=1e-12)
+    assert angle[0] * 180 == pytest.approx(min(abs(turn), 360 - abs(turn)), abs=1e-5)
+
+
+def test_success_is_told_one_step_late_and_stays():
+    env = AligningEnv(2, dtype=torch.float64)
+    env.reset(contexts=np.repeat(CONTEXT, 2, 0))
+    qpos = env.sims.data[0].qpos.copy()
+    qpos[:7] = env.targets[0]
+    env.set_physics(0, qpos)
+    env._seen[0] = False  # as if it had come there during a step
+    assert not act(env, torch.zeros(3))["success"].any()
+    out = act(env, torch.zeros(3))
+    assert out["success"][:, 0].tolist() == out["terminated"][:, 0].tolist() == [True, False]
+    assert out["reward"][:, 0].tolist() == [1.0, 0.0] and not out["truncated"].any()
+    env.sims._object_views[0][0] += 0.1
+    for _ in range(2):
+        out = act(env, torch.zeros(3))
+    assert out["success"][:, 0].tolist() == [True, False]
+
+
+def test_mode_is_that_of_the_last_instant():
+    env = AligningEnv(1, dtype=torch.float64)
+    env.reset(contexts=CONTEXT)
+    for tcp, mode in (
+        ((0.5, -0.15, 0.3), 0),
+        ((0.5 + INSIDE_REACH + 1e-6, -0.15, 0.1), 1),
+        ((0.5, -0.15 - INSIDE_REACH + 1e-6, 0.1), 0),
+        ((0.54, -0.19, 0.1), 1),
+    ):
+        put(env, [0.5, -0.15, 0, 1, 0, 0, 0], tcp)
+        env._update_mode(np.array([0]))
+        assert env._mode.tolist() == [[mode]], tcp
+
+
+def test_random_contexts_come_from_the_seed():
+    first = [AligningEnv(3, seed=4).reset()["context"] for _ in range(2)]
+    torch.testing.assert_close(first[0], first[1], rtol=0, atol=0)
+    np.testing.assert_allclose(first[0], draw_contexts("aligning", 3, 4), rtol=0, atol=1e-7)
+    env = AligningEnv(3, seed=4)
+    draws = [env.reset()["context"] for _ in range(2)]
+    assert (draws[0] != draws[1]).all()
+    env.set_seed(9)
+    again = env.reset()["context"]
+    env.set_seed(9)
+    torch.testing.assert_close(env.reset()["context"], again, rtol=0, atol=0)
+
+
+def test_a_table_of_contexts_is_taken_in_turn():
+    table = evaluation_contexts("aligning", 5)
+    env = AligningEnv(3, contexts=table, dtype=torch.float64)
+    for turn in range(4):
+        wanted = table[[(row + 3 * turn) % 5 for row in range(3)]]
+        np.testing.assert_array_equal(env.reset()["context"], wanted)
+    env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))  # only this one goes on
+    wanted = table[[(0 + 9) % 5, (1 + 12) % 5, (2 + 9) % 5]]
+    np.testing.assert_array_equal(env._contexts, wanted)
+    np.testing.assert_array_equal(env.reset(contexts=table[:3])["context"], table[:3])
+
+
+def test_wrong_contexts_are_named():
+    env = AligningEnv(2)
+    far = np.repeat(CONTEXT, 2, 0)
+    far[1, 1, 0] = 0.7
+    with pytest.raises(ValueError, match=r"context 1 puts 'target' at \(0.7, 0.3\)"):
+        env.reset(contexts=far)
+    with pytest.raises(ValueError, match=r"\[C, 2, 3\].*got shape \[2, 3, 3\]"):
+        env.reset(contexts=np.zeros((2, 3, 3)))
+    with pytest.raises(ValueError, match="wanted 2, got 1"):
+        env.reset(contexts=CONTEXT)
+    with pytest.raises(ValueError, match="context 1 puts 'target'"):
+        AligningEnv(2, contexts=far)
+
+
+def leaves(env, steps=30):
+    table = evaluation_contexts("aligning", 5)[: env.batch_size[0]]
+    env.reset(contexts=table)
+    generator = torch.Generator().manual_seed(3)
+    actions = (torch.rand(steps, 5, 3, generator=generator) * 0.02 - torch.tensor([0.01, 0.004, 0.014]))[
+        :, : env.batch_size[0]
+    ]
+    return torch.stack([act(env, action) for action in actions])
+
+
+def test_batch_size_and_threads_change_nothing():
+    alone = leaves(AligningEnv(5))
+    torch.testing.assert_close(leaves(AligningEnv(5, num_threads=2)), alone, rtol=0, atol=0)
+    torch.testing.assert_close(leaves(AligningEnv(2)), alone[:, :2], rtol=0, atol=0)
+
+
+def test_partial_reset_leaves_the_others_alone():
+    env, plain = AligningEnv(3, dtype=torch.float64), AligningEnv(3, dtype=torch.float64)
+    contexts = np.repeat(CONTEXT, 3, 0)
+    start = env.reset(contexts=contexts)
+    plain.reset(contexts=contexts)
+    for _ in range(10):
+        act(env, DOWN), act(plain, DOWN)
+    mask = torch.tensor([[False], [True], [False]])
+    out = env.reset(TensorDict({"_reset": mask}, [3]), contexts=CONTEXT)
+    torch.testing.assert_close(out["observation"][1], start["observation"][1], rtol=0, atol=0)
+    for _ in range(10):
+        got, wanted = act(env, DOWN), act(plain, DOWN)
+        torch.testing.assert_close(got[[0, 2]], wanted[[0, 2]], rtol=0, atol=0)
+    assert env._steps.tolist() == [20, 10, 20]
+
+
+def test_full_state_round_trip_takes_the_target_along():
+    env = AligningEnv(2, dtype=torch.float64)
+    other = CONTEXT + np.array([0.04, 0.02, 0.5])
+    env.reset(contexts=np.concatenate([CONTEXT, other]))
+    for _ in range(8):
+        act(env, DOWN)
+    env.set_state(1, env.get_state(0))
+    data = env.sims.data
+    np.testing.assert_array_equal(data[1].mocap_pos, [[0.55, 0.3, 0.0]])
+    np.testing.assert_array_equal(data[1].mocap_quat, data[0].mocap_quat)
+    for _ in range(8):
+        out = act(env, DOWN + torch.tensor([0.0, 0.01, 0.0]))
+        torch.testing.assert_close(out[1], out[0], rtol=0, atol=0)
+        np.testing.assert_array_equal(data[1].qpos, data[0].qpos)
+    np.testing.assert_array_equal(out["context"][1], CONTEXT[0])
+
+
+def drawn_target(env, index):
+    """Where pictures show the target's base: position, and direction of its x axis."""
+    site, data = env.sims.model.site("target_base").id, env.sims.data[index]
+    return data.site_xpos[site].copy(), data.site_xmat[site].reshape(3, 3)[:2, 0].copy()
+
+
+def test_target_is_drawn_at_its_place_from_the_first_picture_on():
+    env = AligningEnv(2, dtype=torch.float64)
+    other = CONTEXT + np.array([0.04, 0.02, 0.5])
+    for contexts in (np.concatenate([CONTEXT, other]), np.concatenate([other, CONTEXT])):
+        env.reset(contexts=contexts)
+        for moment in ("reset", "step", "set_physics"):
+            for index in range(2):
+                if moment == "set_physics":
+                    env.set_physics(index, env.sims.data[index].qpos.copy())
+                position, axis = drawn_target(env, index)
+                x, y, yaw = contexts[index, 1]
+                np.testing.assert_allclose(position, [x, y, 0.0], atol=1e-12, err_msg=moment)
+                np.testing.assert_allclose(axis, [math.cos(yaw), math.sin(yaw)], atol=1e-12, err_msg=moment)
+            act(env, DOWN)
+
+
+def test_target_cannot_be_touched():
+    model = AligningEnv(1).sims.model
+    assert model.body("target").geomnum[0] == 0 and model.body("target").mocapid[0] == 0
+    for name, (x, y), _ in WALLS:
+        np.testing.assert_allclose(model.geom(name).pos, [0.05 * x, 0.05 * y, 0.0485])
+        np.testing.assert_array_equal(model.site(f"target_{name}").pos, model.geom(name).pos)
+        np.testing.assert_array_equal(model.site(f"target_{name}").size, model.geom(name).size)
+
+
+def test_picture_shows_the_target():
+    env = AligningEnv(1)
+    try:
+        env.render(0, 32, 32)
+    except RuntimeError as error:
+        pytest.skip(f"no picture can be drawn on this machine: {error}")
+    pictures = []
+    for target in ((0.42, 0.22, 0.0), (0.58, 0.33, 0.0)):
+        env.reset(contexts=np.array([[(0.5, -0.2, 0.0), target]]))
+        pictures.append(env.render(0, 240, 240, "front").astype(int))
+    changed = np.abs(pictures[0] - pictures[1]).max(-1) > 25
+    assert 300 < changed.sum() < 12000
+    columns = np.nonzero(changed)[1]
+    assert columns.min() > 120  # y grows to the right, both targets lie at y > 0
+    env.close()
+
+
+def test_actions_that_cannot_be_executed_are_refused():
+    env = AligningEnv(2)
+    with pytest.raises(RuntimeError, match="before the first reset"):
+        act(env, DOWN)
+    tensordict = env.reset()
+    with pytest.raises(ValueError, match=r"shape \[2, 3\].*got shape \[2, 2\]"):
+        env.step(tensordict.clone().set("action", torch.zeros(2, 2)))
+    with pytest.raises(ValueError, match="'action' must be finite.*environment 0"):
+        act(env, torch.full((3,), float("nan")))
+
+
+def test_truncation():
+    out = AligningEnv(2, max_steps=4, seed=0).rollout(10)
+    assert out.shape == (2, 4) and out["next", "truncated"][:, -1].all() and not out["next", "success"].any()

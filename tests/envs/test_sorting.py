@@ -1,0 +1,269 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""SortingEnv: parity with recordings of the original, contexts, rules of success and order, numbers of boxes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from shared_data import SHARED
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_koap.envs import SortingEnv
+from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
+from torchrl_koap.envs.sorting import BIN_X, BIN_Y, box_colours, mode_colours, mode_index
+from torchrl_koap.tasks import get_task
+
+RECORDINGS = SHARED / "d3il_reference" / "sorting.npz"
+needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")
+SENSITIVE = (1, 2)  # episodes in which a change of 1e-8 rad grows to millimetres
+INTO_BOXES = torch.tensor([0.001, 0.010], dtype=torch.float64)
+
+
+def act(env, action, mask=None):
+    tensordict = TensorDict({"action": action.expand(env.batch_size[0], 2).to(env._dtype)}, env.batch_size)
+    if mask is not None:
+        tensordict["_step"] = torch.as_tensor(mask).reshape(-1, 1)
+    return env.step(tensordict)["next"]
+
+
+def recorded_contexts(recorded):
+    contexts = np.stack([recorded[f"ep{i}_context"][:4, :3] for i in range(4)])
+    contexts[..., 2] = np.radians(contexts[..., 2])
+    return contexts
+
+
+def replay(env, recorded, check):
+    """Sends the recorded commands; ``check(episode, step, leaves)`` after every control step."""
+    lengths = recorded["n_steps"]
+    for k in range(max(lengths)):
+        running = lengths > k
+        targets = np.stack([recorded[f"ep{i}_action"][min(k, lengths[i] - 1), :2] for i in range(4)])
+        out = act(env, torch.as_tensor(targets - env.commands[:, :2]), running)
+        for i in np.flatnonzero(running):
+            check(i, k, out)
+
+
+def packed(mode):
+    """The byte the original shows: unfilled entries are -1, which packs as 1; four more bits are 0."""
+    return int(np.packbits(np.append(np.asarray(mode) != 0, np.zeros(4, bool)))[0])
+
+
+@needs_recordings
+def test_parity_with_the_original_from_its_state():
+    recorded = np.load(RECORDINGS)
+    env = SortingEnv(4, max_steps=1000, dtype=torch.float64, contexts=recorded_contexts(recorded))
+    env.reset()
+    for i in range(4):
+        state = {name: recorded[f"ep{i}_init_{name}"] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
+        env.set_physics(i, **state)
+    touched = [False] * 4
+    worst = {"tcp": np.zeros(4), "objects": np.zeros(4)}
+
+    def check(i, k, out):
+        where = f"episode {i}, step {k}"
+        touched[i] |= bool(recorded[f"ep{i}_robot_touches_object"][k])
+        if not (i in SENSITIVE and touched[i]):
+            tcp = np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max()
+            objects = np.abs(env.sims.data[i].qpos[:28] - recorded[f"ep{i}_qpos"][k][:28]).max()
+            worst["tcp"][i], worst["objects"][i] = max(worst["tcp"][i], tcp), max(worst["objects"][i], objects)
+            observed = np.abs(out["observation"][i, 2:].numpy() - recorded[f"ep{i}_obs_step"][k])
+            wanted = recorded[f"ep{i}_obs_step"][k]
+            assert (observed < 1e-6 * (1 + wanted**2)).all(), where  # recorded in float32; the tangent has poles
+        assert out["done"][i].item() == bool(recorded[f"ep{i}_done"][k]), where
+        assert out["success"][i].item() == bool(recorded[f"ep{i}_success"][k - 1] if k else False), where
+        assert packed(out["mode"][i]) == recorded[f"ep{i}_mode"][k], where
+        third = recorded[f"ep{i}_min_inds"][k]  # there blue boxes count from 3
+        assert env.arrivals[i].tolist() == np.where(third >= 3, third - 1, third)[:4].tolist(), where
+
+    replay(env, recorded, check)
+    assert worst["tcp"].max() < 1e-9, worst  # 1e-6 mm
+    assert worst["objects"].max() < 1e-6, worst  # 1e-3 mm
+    assert env._seen[:, 0].tolist() == [bool(recorded[f"ep{i}_success"][-1]) for i in range(4)]
+    assert touched[:3] == [True, True, True]
+
+
+@needs_recordings
+def test_reset_from_the_recorded_context():
+    recorded = np.load(RECORDINGS)
+    env = SortingEnv(4, max_steps=1000, dtype=torch.float64)
+    first = env.reset(contexts=recorded_contexts(recorded))
+    for i in range(4):
+        np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-6)
+        expected = recorded[f"ep{i}_init_obs"]
+        np.testing.assert_allclose(first["observation"][i, 2:], expected, rtol=1e-5, atol=1e-5)
+    outcome = {}
+
+    def check(i, k, out):
+        outcome[i] = (out["success"][i].item(), packed(out["mode"][i]))
+
+    replay(env, recorded, check)
+    assert [outcome[i] for i in (0, 3)] == [(True, 80), (False, 240)]
+
+
+@pytest.mark.parametrize("num_boxes", [2, 4, 6])
+def test_specs(num_boxes):
+    for dtype in (torch.float32, torch.float64):
+        env = SortingEnv(2, num_boxes=num_boxes, dtype=dtype, seed=1)
+        check_env_specs(env)
+        out = env.rollout(2)
+        assert out["next", "observation"].shape == (2, 2, 4 + 3 * num_boxes)
+        assert out["next", "observation"].dtype == dtype
+        assert out["next", "mode"].shape == (2, 2, num_boxes) and (out["next", "mode"] == -1).all()
+
+
+@pytest.mark.parametrize("num_boxes", [2, 4, 6])
+def test_contexts_place_the_boxes(num_boxes):
+    name = get_task("sorting" if num_boxes == 4 else f"sorting_{num_boxes}").name
+    table = evaluation_contexts(name, 3)
+    env = SortingEnv(2, num_boxes=num_boxes, contexts=table, dtype=torch.float64)
+    boxes = env.reset()["observation"][:, 4:].reshape(2, num_boxes, 3)
+    torch.testing.assert_close(boxes[..., :2], torch.as_tensor(table[:2, :, :2]), rtol=0, atol=1e-4)
+    torch.testing.assert_close(boxes[..., 2], torch.as_tensor(np.tan(table[:2, :, 2])), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(env.reset()["context"][0], torch.as_tensor(table[2]), rtol=0, atol=0)
+    heights = []
+    for _ in range(30):
+        act(env, torch.zeros(2))
+        heights.append(env.sims.object_poses[..., 2])
+    np.testing.assert_allclose(heights[-1], 0.13, atol=5e-4)  # pushed out of the platform, as measured
+
+
+def test_random_contexts_differ_and_repeat_with_the_seed():
+    first = SortingEnv(3, seed=5).reset()["context"]
+    assert torch.equal(first, SortingEnv(3, seed=5).reset()["context"])
+    assert not torch.equal(first, SortingEnv(3, seed=6).reset()["context"])
+    assert first[..., :2].flatten(1).unique(dim=0).shape[0] == 3
+    with pytest.raises(ValueError, match="outside its region"):
+        SortingEnv(1, contexts=np.zeros((1, 4, 3)))
+
+
+@pytest.mark.parametrize("num_boxes", [0, 3, 8, "four"])
+def test_other_numbers_of_boxes_are_refused(num_boxes):
+    with pytest.raises(ValueError, match="num_boxes must be one of 2, 4, 6"):
+        SortingEnv(1, num_boxes=num_boxes)
+
+
+@pytest.mark.parametrize("num_boxes", [2, 4, 6])
+def test_modes_are_numbered_in_lexicographic_order(num_boxes):
+    sequences = sorted({*itertools.permutations([0, 1] * (num_boxes // 2))})
+    leaf = torch.tensor(sequences).reshape(2, -1, num_boxes)
+    assert mode_index(leaf).flatten().tolist() == list(range(len(sequences)))
+    assert [mode_colours(index, num_boxes) for index in range(len(sequences))] == sequences
+    leaf[..., -1] = -1
+    assert (mode_index(leaf) == -1).all()
+    assert len(sequences) == math.comb(num_boxes, num_boxes // 2)
+    assert box_colours(num_boxes).sum() == num_boxes // 2
+    with pytest.raises(ValueError, match=f"mode must be 0 to {len(sequences) - 1}"):
+        mode_colours(len(sequences), num_boxes)
+    with pytest.raises(ValueError, match="num_boxes"):
+        mode_index(torch.zeros(3, num_boxes + 1))
+
+
+def put(env, places):
+    """Writes box positions [num_boxes, 2] into environment 0 and looks at them without moving anything."""
+    for index, place in enumerate(places):
+        env.sims.data[0].qpos[7 * index : 7 * index + 2] = place
+    env._update_mode(np.array([0]))
+    return env._check(np.array([0]))[0].item(), env._mode[0].tolist()
+
+
+def test_success_needs_every_box_in_its_own_bin_and_ignores_height():
+    env = SortingEnv(1, dtype=torch.float64)
+    env.reset()
+    centres = [(BIN_X[colour], BIN_Y) for colour in box_colours(4)]
+    edges = [((0.301, 0.221), True), ((0.499, 0.409), True), ((0.299, 0.3), False), ((0.501, 0.3), False)]
+    edges += [((0.4, 0.219), False), ((0.4, 0.411), False), ((0.625, 0.32), False)]
+    for place, inside in edges:
+        assert put(env, [place, *centres[1:]])[0] is inside, place
+    blue = [((0.526, 0.3), True), ((0.724, 0.3), True), ((0.524, 0.3), False), ((0.726, 0.3), False)]
+    for place, inside in blue:
+        assert put(env, [*centres[:3], place])[0] is inside, place
+    env.sims.data[0].qpos[2] = 5.0
+    assert put(env, centres)[0]
+
+
+def test_one_arrival_per_step_nearest_first_and_never_taken_back():
+    env = SortingEnv(1, dtype=torch.float64)
+    env.reset()
+    away = (0.3, -0.3)
+    assert put(env, [away] * 4) == (False, [-1] * 4)
+    red, blue = (0.41, 0.32), (0.625, 0.32)
+    assert put(env, [red, away, away, blue]) == (False, [1, -1, -1, -1])  # the blue one lies nearer to its centre
+    assert put(env, [red, away, away, blue])[1] == [1, 0, -1, -1]
+    assert env.arrivals[0].tolist() == [3, 0, -1, -1]
+    assert put(env, [away, (0.4, 0.215), (0.7, 0.40), away])[1] == [1, 0, -1, -1]  # the nearest is not inside: nothing
+    assert put(env, [away, away, (0.7, 0.40), away])[1] == [1, 0, 1, -1]
+    assert put(env, [away, (0.625, 0.32), away, away])[1] == [1, 0, 1, -1]  # red in the blue bin
+    assert put(env, [away, red, away, away]) == (False, [1, 0, 1, 0])
+    assert put(env, [red, red, blue, blue]) == (True, [1, 0, 1, 0])
+    assert mode_index(torch.as_tensor(env._mode)).tolist() == [4]
+    env.reset()
+    assert env._mode.tolist() == [[-1] * 4] and env.arrivals.tolist() == [[-1] * 4]
+
+
+def test_success_is_told_one_step_late():
+    env = SortingEnv(1, dtype=torch.float64)
+    env.reset()
+    for index, colour in enumerate(box_colours(4)):
+        env.sims.data[0].qpos[7 * index : 7 * index + 3] = BIN_X[colour] + 0.04 * (-1) ** index, BIN_Y, 0.02
+    out = act(env, torch.zeros(2))
+    assert not out["done"].item() and not out["success"].item() and env._seen[0, 0]
+    out = act(env, torch.zeros(2))
+    assert out["done"].item() and out["success"].item() and out["terminated"].item() and out["reward"].item() == 1.0
+    assert (out["mode"] >= 0).sum() == 2
+
+
+def test_batch_size_and_threads_change_nothing():
+    contexts = draw_contexts("sorting", 5, 3)
+
+    def leaves(count, threads=1):
+        env = SortingEnv(count, threads, contexts=contexts, dtype=torch.float64)
+        push = torch.tensor([[0.001 * index, 0.010] for index in range(count)], dtype=torch.float64)
+        return env.rollout(30, lambda td: td.set("action", push), break_when_any_done=False)
+
+    alone = leaves(5)
+    torch.testing.assert_close(leaves(5, 2), alone, rtol=0, atol=0)
+    torch.testing.assert_close(leaves(2), alone[:2], rtol=0, atol=0)
+
+
+def test_partial_reset_leaves_the_others_alone():
+    contexts = draw_contexts("sorting", 3, 4)
+    env, plain = (SortingEnv(3, contexts=contexts, dtype=torch.float64) for _ in range(2))
+    env.reset(), plain.reset()
+    for _ in range(20):
+        act(env, INTO_BOXES), act(plain, INTO_BOXES)
+    before = [data.qpos.copy() for data in env.sims.data]
+    out = env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]), contexts=contexts[:1])
+    torch.testing.assert_close(out["context"][1], torch.as_tensor(contexts[0]), rtol=0, atol=0)
+    for i in (0, 2):
+        np.testing.assert_array_equal(env.sims.data[i].qpos, before[i])
+    for _ in range(10):
+        got, wanted = act(env, INTO_BOXES), act(plain, INTO_BOXES)
+        torch.testing.assert_close(got[[0, 2]], wanted[[0, 2]], rtol=0, atol=0)
+    assert env._steps.tolist() == [30, 10, 30]
+
+
+def test_full_state_round_trip_keeps_the_arrivals():
+    env = SortingEnv(2, dtype=torch.float64, contexts=draw_contexts("sorting", 2, 4))
+    env.reset()
+    put(env, [(0.4, 0.32), (0.5, 0.0), (0.6, 0.0), (0.6, -0.1)])
+    env.set_state(1, env.get_state(0))
+    assert env.arrivals[1].tolist() == [0, -1, -1, -1] and env._mode[1].tolist() == [0, -1, -1, -1]
+    for _ in range(3):
+        out = act(env, INTO_BOXES)
+        torch.testing.assert_close(out[1], out[0], rtol=0, atol=0)
+
+
+def test_raw_log_names_the_boxes():
+    env = SortingEnv(2, seed=0, dtype=torch.float64)
+    env.reset()
+    out = act(env, INTO_BOXES)
+    objects = env.raw_objects()
+    assert list(objects) == ["red_1", "red_2", "blue_1", "blue_2"]
+    for index, pose in enumerate(objects.values()):
+        assert pose.shape == (2, 7)
+        np.testing.assert_allclose(pose[:, :2], out["observation"][:, 4 + 3 * index : 6 + 3 * index], atol=1e-3)

@@ -1,0 +1,284 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""StackingEnv: parity with recordings of the original, what counts as success, gripper, contexts, partial steps."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from shared_data import SHARED
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_koap.envs import StackingEnv
+from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
+from torchrl_koap.envs.stacking import mode_index
+from torchrl_koap.tasks import get_task
+
+RECORDINGS = SHARED / "d3il_reference" / "stacking.npz"
+needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")
+
+STILL_OPEN = torch.tensor([0.0] * 7 + [0.08], dtype=torch.float64)
+STILL_CLOSED = torch.zeros(8, dtype=torch.float64)
+
+
+def act(env, action, mask=None):
+    action = torch.as_tensor(action, dtype=env._dtype).expand(env.batch_size[0], 8)
+    tensordict = TensorDict({"action": action}, env.batch_size)
+    if mask is not None:
+        tensordict["_step"] = torch.as_tensor(mask).reshape(-1, 1)
+    return env.step(tensordict)["next"]
+
+
+def recorded_contexts(recorded):
+    poses = np.stack([recorded[f"ep{i}_context"][:3] for i in range(4)])
+    return np.concatenate([poses[..., :2], np.deg2rad(poses[..., 2:3])], axis=-1)
+
+
+def put_boxes(env, positions, index=0):
+    """Starts an episode with the boxes in the air at ``positions`` [3, 3]."""
+    qpos = env.sims.data[index].qpos.copy()
+    qpos[:21] = np.concatenate([positions, np.tile((1, 0, 0, 0), (3, 1))], axis=1).ravel()
+    env.set_physics(index, qpos)
+
+
+@needs_recordings
+@pytest.mark.parametrize("start", ["reset", "recorded state"])
+def test_parity_with_the_original(start):
+    recorded = np.load(RECORDINGS)
+    lengths = recorded["n_steps"]
+    env = StackingEnv(4, max_steps=5000, dtype=torch.float64)
+    env.reset(contexts=recorded_contexts(recorded))
+    for i in range(4):
+        np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-14)
+        np.testing.assert_allclose(env.sims.data[i].qvel, recorded[f"ep{i}_init_qvel"], rtol=0, atol=1e-12)
+        if start == "recorded state":
+            names = ("qpos", "qvel", "qacc_warmstart", "ctrl")
+            env.set_physics(i, **{name: recorded[f"ep{i}_init_{name}"] for name in names})
+    succeeded = np.zeros(4, dtype=bool)
+    for k in range(max(lengths)):
+        running = lengths > k
+        commands = np.stack([recorded[f"ep{i}_action"][min(k, lengths[i] - 1)] for i in range(4)])
+        commands[:, :7] -= env.commands[:, :7]
+        out = act(env, commands, running)
+        for i in np.flatnonzero(running):
+            where = f"episode {i}, step {k}"
+            assert np.abs(env.sims.tcp_position[i] - recorded[f"ep{i}_c_pos"][k]).max() < 1e-7, where  # 1e-4 mm
+            assert np.abs(env.sims.object_poses[i] - recorded[f"ep{i}_obj_pose"][k]).max() < 1e-6, where
+            assert np.abs(env.sims.joint_positions[i] - recorded[f"ep{i}_j_pos"][k]).max() < 1e-6, where
+            assert np.abs(env.sims.gripper_width[i] - recorded[f"ep{i}_gripper_width"][k]) < 1e-6, where
+            seen = out["observation"][i, 8:20].reshape(3, 4).numpy()
+            wanted = recorded[f"ep{i}_obs_step"][k].reshape(3, 4)
+            np.testing.assert_allclose(seen[:, :3], wanted[:, :3], rtol=0, atol=1e-6, err_msg=where)
+            turn = np.arctan(seen[:, 3]) - np.arctan(wanted[:, 3].astype(np.float64))
+            assert np.abs(np.sin(turn)).max() < 1e-5, where  # the tangent has poles, its angle has none
+            assert out["mode"][i].tolist() == recorded[f"ep{i}_mode"][k].tolist(), where
+            done = bool(recorded[f"ep{i}_done"][k])
+            assert out["done"][i].item() == out["success"][i].item() == done, where
+            # the original's success flag is that of the state after the step: ours, told a step later
+            assert env._seen[i, 0] == bool(recorded[f"ep{i}_success"][k]), where
+            succeeded[i] |= done
+            arrived = (out["mode"][i] >= 0).sum().item()
+            first, second, _ = recorded[f"ep{i}_success1_success2_meandist"][k]
+            assert (arrived >= 1, arrived >= 2) == (bool(first), bool(second)), where
+    assert succeeded.tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_specs(num_envs, dtype):
+    env = StackingEnv(num_envs, dtype=dtype, seed=0)
+    check_env_specs(env)
+    out = env.rollout(2)["next"]
+    assert out["observation"].dtype == dtype and out["mode"].dtype == torch.int64
+    bounds = env.action_spec.space
+    assert bounds.low[0].tolist() == pytest.approx([-0.03] * 7 + [0.0])
+    assert bounds.high[0].tolist() == pytest.approx([0.03] * 7 + [0.08])
+
+
+def test_columns_of_the_observation():
+    env, parts = StackingEnv(2, dtype=torch.float64, seed=1), get_task("stacking").observation
+    first = env.reset()
+    seen = {name: first["observation"][:, columns] for name, columns in parts.items()}
+    equal = {"rtol": 0, "atol": 0}
+    torch.testing.assert_close(seen["desired_joints_and_gripper"][:, :7], seen["measured_joints"], **equal)
+    torch.testing.assert_close(seen["desired_joints_and_gripper"][:, 7:], seen["gripper_width"], **equal)
+    tcp = torch.tensor([[0.524978, 0.0, 0.301514]], dtype=torch.float64).expand(2, 3)
+    torch.testing.assert_close(seen["tcp_position"], tcp, rtol=0, atol=1e-6)
+    for index, name in enumerate(("red", "green", "blue")):
+        torch.testing.assert_close(seen[f"{name}_position"][:, :2], first["context"][:, index, :2], rtol=0, atol=1e-6)
+        tangent = first["context"][:, index, 2:].tan()
+        torch.testing.assert_close(seen[f"{name}_tan_yaw"], tangent, rtol=1e-4, atol=1e-6)
+    action = torch.arange(8, dtype=torch.float64) * 1e-3
+    for step in range(1, 4):
+        after = act(env, action)["observation"]
+        torch.testing.assert_close(after[:, :7] - first["observation"][:, :7], step * action[:7].expand(2, 7))
+        torch.testing.assert_close(after[:, 7], torch.full((2,), 0.007, dtype=torch.float64), **equal)
+
+
+def test_observation_is_one_step_old():
+    env = StackingEnv(1, dtype=torch.float64, seed=2)
+    env.reset()
+    for _ in range(4):
+        before = np.concatenate([env.sims.joint_positions[0], env.sims.gripper_width, env.sims.tcp_position[0]])
+        seen = act(env, [0.01] * 7 + [0.08])["observation"][0, 20:].numpy()
+        np.testing.assert_array_equal(seen, before)
+
+
+@pytest.mark.parametrize(
+    ("number", "opens"), [(0.08, True), (0.0751, True), (0.075, False), (0.06, False), (0.0, False)]
+)
+def test_gripper_threshold(number, opens):
+    env = StackingEnv(1, dtype=torch.float64, seed=0)
+    env.reset()
+    for _ in range(12):
+        act(env, STILL_OPEN)
+    assert env.sims.gripper_width[0] == pytest.approx(0.08, abs=2e-3)
+    for _ in range(12):
+        act(env, [0.0] * 7 + [number])
+    assert env.sims.gripper_width[0] == pytest.approx(0.08 if opens else 0.0, abs=5e-3)
+
+
+def test_fingers_hold_a_box():
+    env = StackingEnv(1, dtype=torch.float64, seed=0)
+    env.reset()
+    for _ in range(12):
+        act(env, STILL_OPEN)
+    x, y, z = env.sims.tcp_position[0]
+    put_boxes(env, [(x, y, z), (0.4, -0.05, 0.011), (0.6, -0.1, 0.011)])
+    for _ in range(40):
+        act(env, STILL_CLOSED)
+    assert env.sims.gripper_width[0] == pytest.approx(0.06, abs=2e-3)
+    assert abs(env.sims.object_poses[0, 0, 2] - z) < 0.03
+    for _ in range(30):
+        act(env, STILL_OPEN)
+    assert env.sims.object_poses[0, 0, 2] == pytest.approx(0.011, abs=1e-3)  # fell onto the table
+
+
+PILED = [(0.50, 0.20, 0.011), (0.52, 0.20, 0.072), (0.49, 0.21, 0.133)]
+
+
+@pytest.mark.parametrize(
+    ("positions", "outcome"),
+    [
+        (PILED, (True, True, True)),
+        ([PILED[0], PILED[1], (0.6, -0.1, 0.011)], (True, True, False)),
+        ([(0.4, -0.2, 0.011), PILED[0], (0.6, -0.1, 0.011)], (True, False, False)),
+        ([(0.4, -0.2, 0.011), (0.4, -0.05, 0.011), (0.6, -0.1, 0.011)], (False, False, False)),
+        # all three in the zone, two of them side by side
+        ([(0.465, 0.2, 0.011), (0.535, 0.2, 0.011), (0.5, 0.2, 0.072)], (True, True, False)),
+    ],
+)
+def test_success_of_one_two_or_three_boxes(positions, outcome):
+    for num_boxes, wanted in zip((1, 2, 3), outcome, strict=True):
+        env = StackingEnv(1, num_boxes=num_boxes, dtype=torch.float64, seed=0)
+        env.reset()
+        put_boxes(env, positions)
+        told = [act(env, STILL_OPEN) for _ in range(5)]
+        assert told[-1]["success"].item() == told[-1]["terminated"].item() == wanted, num_boxes
+        assert told[-1]["reward"].item() == float(wanted)
+        if wanted and num_boxes < 3:  # boxes arrive one per step and success comes a step after the last of them
+            assert [out["success"].item() for out in told] == [step >= num_boxes for step in range(5)]
+
+
+def test_boxes_are_recorded_nearest_first_and_stay_recorded():
+    env = StackingEnv(1, dtype=torch.float64, seed=0)
+    env.reset()
+    put_boxes(env, [(0.53, 0.20, 0.011), (0.50, 0.20, 0.072), (0.6, -0.1, 0.011)])
+    assert [act(env, STILL_OPEN)["mode"][0].tolist() for _ in range(3)] == [[1, -1, -1], [1, 0, -1], [1, 0, -1]]
+    away = env.sims.data[0].qpos.copy()
+    away[:14] = np.concatenate([[0.4, -0.2, 0.011, 1, 0, 0, 0], [0.4, -0.05, 0.011, 1, 0, 0, 0]])
+    env.sims.set_physics(0, away)
+    assert act(env, STILL_OPEN)["mode"][0].tolist() == [1, 0, -1]
+
+
+def test_mode_index_numbers_the_orders():
+    orders = torch.tensor(list(itertools.permutations(range(3))))
+    assert mode_index(orders).tolist() == list(range(6))
+    assert mode_index(orders, 1).tolist() == [0, 0, 1, 1, 2, 2]
+    unfinished = orders.clone()
+    unfinished[:, 2] = -1
+    assert mode_index(unfinished).tolist() == [-1] * 6
+    assert mode_index(unfinished, 2).tolist() == list(range(6))
+    assert mode_index(torch.full((2, 5, 3), -1)).tolist() == [[-1] * 5] * 2
+    with pytest.raises(ValueError, match="3 entries"):
+        mode_index(torch.zeros(4, 2, dtype=torch.int64))
+
+
+@pytest.mark.parametrize("num_boxes", [0, 4, -1, "two"])
+def test_other_counts_are_refused(num_boxes):
+    with pytest.raises(ValueError, match=f"num_boxes must be 1, 2 or 3.*{num_boxes}"):
+        StackingEnv(1, num_boxes=num_boxes)
+
+
+def test_contexts_place_the_boxes():
+    table = evaluation_contexts("stacking", 5)
+    env = StackingEnv(2, contexts=table, dtype=torch.float64)
+    for rows in ([0, 1], [2, 3], [4, 0]):
+        out = env.reset()
+        np.testing.assert_array_equal(out["context"], table[rows])
+        np.testing.assert_allclose(env.sims.object_poses[:, :, :2], table[rows][..., :2], atol=1e-6)
+    for _ in range(20):
+        act(env, STILL_OPEN)
+    np.testing.assert_allclose(env.sims.object_poses[:, :, 2], 0.011, atol=1e-3)  # popped up onto the table
+
+
+def leaves(env, table, steps=25):
+    generator = torch.Generator().manual_seed(0)
+    actions = (torch.rand(len(table), steps, 8, generator=generator, dtype=torch.float64) - 0.5) * 0.05
+    actions[..., 7] += 0.06
+    actions, count = iter(actions[: env.batch_size[0]].unbind(1)), env.batch_size[0]
+    start = env.reset(contexts=table[:count])
+    return env.rollout(steps, lambda td: td.set("action", next(actions)), auto_reset=False, tensordict=start)
+
+
+def test_batch_size_and_threads_change_nothing():
+    table = draw_contexts("stacking", 4, 0)
+    alone = leaves(StackingEnv(4, dtype=torch.float64), table)
+    torch.testing.assert_close(leaves(StackingEnv(4, 2, dtype=torch.float64), table), alone, rtol=0, atol=0)
+    torch.testing.assert_close(leaves(StackingEnv(2, dtype=torch.float64), table), alone[:2], rtol=0, atol=0)
+
+
+def test_partial_reset_and_step_leave_the_others_alone():
+    env = StackingEnv(3, dtype=torch.float64, seed=0)
+    env.reset()
+    for _ in range(5):
+        act(env, [0.01] * 7 + [0.08])
+    before = [data.qpos.copy() for data in env.sims.data]
+    out = env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
+    for row in (0, 2):
+        np.testing.assert_array_equal(env.sims.data[row].qpos, before[row])
+    np.testing.assert_allclose(out["observation"][1, :7], env._start_joints, atol=1e-6)
+    held = act(env, STILL_CLOSED)["observation"]
+    before = [data.qpos.copy() for data in env.sims.data]
+    out = act(env, [0.01] * 7 + [0.08], mask=[True, False, False])
+    for row in (1, 2):
+        np.testing.assert_array_equal(env.sims.data[row].qpos, before[row])
+        torch.testing.assert_close(out["observation"][row], held[row], rtol=0, atol=0)
+    assert env._steps.tolist() == [7, 1, 6] and env.sims.grasping.tolist() == [False, True, True]
+
+
+def test_raw_log_holds_joints_and_boxes_but_no_pose_command():
+    env = StackingEnv(2, dtype=torch.float64, seed=0)
+    env.reset()
+    act(env, [0.01] * 7 + [0.08])
+    log, objects = env.raw_log(), env.raw_objects()
+    assert not {"des_c_pos", "des_c_quat"} & set(log)
+    np.testing.assert_array_equal(log["des_j_pos"], env.commands[:, :7])
+    assert log["gripper_width"].shape == (2,) and not log["des_j_vel"].any()
+    assert list(objects) == ["red", "green", "blue"] and objects["blue"].shape == (2, 7)
+    act(env, STILL_OPEN)
+    assert env.raw_log()["sim_step"].tolist() == [32, 32]
+
+
+def test_full_state_round_trip():
+    env = StackingEnv(2, dtype=torch.float64, seed=0)
+    env.reset()
+    for _ in range(8):
+        act(env, [0.01] * 7 + [0.0], mask=[True, False])
+    env.set_state(1, env.get_state(0))
+    for _ in range(5):
+        out = act(env, STILL_OPEN)
+        torch.testing.assert_close(out[1], out[0], rtol=0, atol=0)

@@ -1,0 +1,202 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Which demonstrations to label next: against brute force, and blind to every label."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+import torch
+from tiny_runs import TINY, koap
+
+from torchrl_koap.commands import suggest
+from torchrl_koap.commands.suggest import Suggest, run_suggest
+from torchrl_koap.evaluation.active_labelling import rank_trajectories
+from torchrl_koap.modules import LinearActionDecoder
+
+EPISODE = torch.arange(7).repeat_interleave(torch.tensor([5, 3, 6, 4, 5, 2, 5]))
+KNOWN = EPISODE == 2
+
+
+def latents(width=4):
+    generator = torch.Generator().manual_seed(3)
+    # every trajectory has directions of its own
+    sizes = torch.rand(7, width, generator=generator, dtype=torch.float64) ** 2
+    return torch.randn(len(EPISODE), width, generator=generator, dtype=torch.float64) * sizes[EPISODE]
+
+
+def mean_leverage(latent, rows, scale, where=slice(None)):
+    precision = latent[rows].T @ latent[rows] + scale * torch.eye(latent.shape[1], dtype=latent.dtype)
+    return ((latent @ precision.inverse()) * latent).sum(-1)[where].mean().item()
+
+
+def test_greedy_gain_equals_brute_force():
+    latent, penalty = latents(), 0.05
+    scale = penalty * latent[KNOWN].square().sum(-1).mean()
+    rows, wanted = KNOWN.clone(), []
+    for _ in range(4):
+        now = mean_leverage(latent, rows, scale)
+        gains = {
+            name: now - mean_leverage(latent, rows | (name == EPISODE), scale)
+            for name in range(7)
+            if name not in EPISODE[rows]
+        }
+        best = max(gains, key=gains.get)
+        wanted.append((best, gains[best]))
+        rows |= best == EPISODE
+    found = rank_trajectories(latent, EPISODE, KNOWN, penalty=penalty, count=4)
+    assert [choice.episode for choice in found] == [best for best, _ in wanted]
+    assert [choice.score for choice in found] == pytest.approx([gain for _, gain in wanted])
+
+
+def test_variance_counts_what_was_chosen_before_as_labelled():
+    latent, penalty = latents(), 0.05
+    scale = penalty * latent[KNOWN].square().sum(-1).mean()
+    found = rank_trajectories(latent, EPISODE, KNOWN, penalty=penalty, criterion="variance", count=3)
+    rows = KNOWN.clone()
+    for choice in found:
+        left = {name: mean_leverage(latent, rows, scale, name == EPISODE) for name in set(EPISODE[~rows].tolist())}
+        assert choice.episode == max(left, key=left.get) and choice.score == pytest.approx(left[choice.episode])
+        rows |= choice.episode == EPISODE
+
+
+@pytest.mark.parametrize(("bias", "tolerance"), [(False, 1e-9), (True, 2e-3)])
+def test_scores_are_the_decoder_s_own_uncertainty(bias, tolerance):
+    latent = latents() + (2 if bias else 0)
+    decoder = LinearActionDecoder(4, 1).double()
+    action = torch.randn(len(latent), 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    decoder.fit_ridge(latent, action, KNOWN, penalties=(0.05,), bias=bias)
+    relative = (decoder.predictive_variance(latent) / decoder.noise_variance - 1).squeeze(-1)
+    chosen = rank_trajectories(latent, EPISODE, KNOWN, penalty=0.05, criterion="variance", count=1, bias=bias)[0]
+    assert chosen.score == pytest.approx(relative[chosen.episode == EPISODE].mean().item(), rel=tolerance)
+
+
+def test_only_unlabelled_steps_are_offered_and_counted():
+    latent = latents()
+    labelled = EPISODE != 0
+    labelled[1:5] = True  # of trajectory 0 the first step is left
+    chosen = rank_trajectories(latent, EPISODE, labelled, penalty=0.1, criterion="variance", count=1)[0]
+    scale = 0.1 * latent[labelled].square().sum(-1).mean()
+    assert chosen.episode == 0
+    assert chosen.score == pytest.approx(mean_leverage(latent, labelled, scale, slice(0, 1)))
+    with pytest.raises(ValueError, match="count must be in 1..1"):
+        rank_trajectories(latent, EPISODE, labelled, penalty=0.1, count=2)
+
+
+def test_a_first_choice_needs_no_label():
+    found = rank_trajectories(latents(), EPISODE, torch.zeros_like(KNOWN), penalty=0.05, count=7)
+    assert sorted(choice.episode for choice in found) == list(range(7))
+    scores = [choice.score for choice in found]
+    assert scores[0] == max(scores) and min(scores) > 0
+
+
+def test_random_choices_are_seeded():
+    draws = [
+        [c.episode for c in rank_trajectories(latents(), EPISODE, KNOWN, penalty=1, criterion="random", seed=seed)]
+        for seed in (0, 0, 1)
+    ]
+    assert draws[0] == draws[1] != draws[2] and 2 not in draws[0] and len(set(draws[0])) == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"criterion": "gian"}, "unknown criterion 'gian'; did you mean 'gain'"),
+        ({"count": 0}, "count must be in 1..6"),
+        ({"count": 7}, "count must be in 1..6, the trajectories that are not labelled yet, got 7"),
+        ({"penalty": 0.0}, "penalty must be positive"),
+        ({"labelled": torch.ones_like(KNOWN)}, "nothing is left to suggest"),
+        ({"labelled": KNOWN.float()}, "labelled must be bool"),
+        ({"labelled": KNOWN[:-1]}, "wanted latent"),
+        ({"latent": torch.full((30, 4), torch.nan)}, "latent actions must be finite"),
+    ],
+)
+def test_bad_arguments(change, message):
+    arguments = {"latent": latents(), "episode": EPISODE, "labelled": KNOWN, "penalty": 0.1} | change
+    with pytest.raises(ValueError, match=message):
+        rank_trajectories(**arguments)
+
+
+@pytest.fixture
+def run(trained_run, tmp_path):
+    shutil.copytree(trained_run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_suggest_from_the_shell(run, capsys):
+    assert koap("suggest", run, "--count", "3") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["rank", "episode", "steps", "gain"] and len(lines) == 5
+    written = json.loads((run / "suggestions.json").read_text())
+    rows = written["suggestions"]
+    labels = json.loads((run / "summary.json").read_text())["labels"]
+    assert [row["rank"] for row in rows] == [1, 2, 3]
+    assert rows[0]["score"] >= rows[1]["score"] >= rows[2]["score"] > 0
+    assert written["labelled_steps"] == labels["labelled_transitions"]
+    # demonstration i has 30 + i rows and one step less
+    assert all(row["steps"] == 29 + row["episode"] for row in rows)
+    assert [line.split()[1] for line in lines[1:4]] == [str(row["episode"]) for row in rows]
+    # what to call next keeps the labels that are there
+    assert lines[4].split("--label-episodes ")[1].split()[:-1] == [
+        str(episode) for episode in [*written["labelled_episodes"], *(row["episode"] for row in rows)]
+    ]
+    assert len(written["labelled_episodes"]) == labels["trajectories_touched"]
+    assert koap("suggest", run, "--count", "7") == 1  # 2 of 8 are labelled
+    assert "count must be in 1..6" in capsys.readouterr().err
+    assert koap("suggest", run, "--criterion", "variants") == 1
+    assert "did you mean 'variance'" in capsys.readouterr().err
+
+
+def test_no_hidden_label_has_a_say(run, monkeypatch):
+    load = suggest.load_demonstrations
+    first = run_suggest(Suggest(run, count=6))
+
+    def other_labels(*arguments, **options):
+        data = load(*arguments, **options)
+        return data.set("action", torch.randn_like(data["action"]) * 1e3)
+
+    monkeypatch.setattr(suggest, "load_demonstrations", other_labels)
+    assert run_suggest(Suggest(run, count=6)) == first
+    seen, infer = [], suggest.infer_steps
+    monkeypatch.setattr(suggest, "infer_steps", lambda controller, data: seen.append(data) or infer(controller, data))
+    run_suggest(Suggest(run, count=1))
+    assert seen[0]["action"].isnan().all(-1).equal(~seen[0]["has_action"].squeeze(-1))
+
+
+@pytest.mark.parametrize(("preset", "bias"), [("default", False), ("paper", True)])
+def test_the_choice_is_made_for_the_decoder_of_the_run(demonstrations, tmp_path, monkeypatch, preset, bias):
+    out = tmp_path / "run"
+    assert koap("train", "--out", out, "--dataset", demonstrations, *TINY, "--preset", preset) == 0
+    seen, rank = {}, suggest.rank_trajectories
+    monkeypatch.setattr(
+        suggest, "rank_trajectories", lambda *args, **options: seen.update(options) or rank(*args, **options)
+    )
+    run_suggest(Suggest(out, count=1))
+    fit = json.loads((out / "summary.json").read_text())["decoder_fit"]
+    assert seen["bias"] is bias and seen["penalty"] == fit["penalty"]
+
+
+def test_other_demonstrations_than_those_of_the_training_are_refused(run, monkeypatch):
+    def without_last(data):
+        return data[data["episode"] < 7]
+
+    load = suggest.load_demonstrations
+    monkeypatch.setattr(suggest, "load_demonstrations", lambda *args, **options: without_last(load(*args, **options)))
+    with pytest.raises(ValueError, match="are not those that"):
+        run_suggest(Suggest(run))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--decoder", "sgd"), "train with `--decoder ridge`"),
+        (("--method", "linear"), "suggestions need latent actions"),
+        (("--label-fraction", "1.0"), "nothing is left to suggest"),
+    ],
+)
+def test_runs_that_cannot_be_asked(demonstrations, tmp_path, capsys, options, message):
+    tiny = [word for word in TINY if word not in ("--label-count", "2")] if "1.0" in options else TINY
+    assert koap("train", "--out", tmp_path / "run", "--dataset", demonstrations, *tiny, *options) == 0
+    assert koap("suggest", tmp_path / "run") == 1
+    assert message in capsys.readouterr().err

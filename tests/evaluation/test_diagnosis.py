@@ -1,0 +1,137 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Planner alone, controller alone, both: the figures that `koap inspect` tells them apart by."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tiny_runs import koap
+
+from torchrl_koap.commands.inspect import verdict
+from torchrl_koap.envs.contexts import evaluation_contexts
+from torchrl_koap.envs.registry import ENVIRONMENTS
+from torchrl_koap.evaluation.diagnosis import (
+    contexts_of,
+    coverage,
+    executed_success,
+    imagine,
+    imagined_success,
+    rate,
+    recorded_futures,
+    tracking_errors,
+)
+from torchrl_koap.tasks import get_task
+
+AVOIDING = get_task("avoiding")
+
+
+class Straight(torch.nn.Module):
+    """Plans that go on by the last step."""
+
+    history, horizon, state_dim = 2, 14, 2
+
+    def plan(self, history, noise=None, generator=None):
+        step = history[:, -1] - history[:, -2] + torch.tensor([0.0, 0.01])
+        ahead = torch.arange(1, 15)[:, None]
+        return history[:, -1:] + ahead * step[:, None]
+
+
+def test_an_imagined_episode_goes_on_from_its_own_plans():
+    path = imagine(Straight(), torch.tensor([[0.5, -0.3], [0.4, 0.0]]), interval=4, max_steps=13)
+    assert path.shape == (2, 13, 2) and torch.equal(path[:, 0], torch.tensor([[0.5, -0.3], [0.4, 0.0]]))
+    # the first plan starts at rest: 0.01 per step; every later one goes on at the speed reached plus 0.01
+    steps = path[0, :, 1].diff()
+    torch.testing.assert_close(steps, torch.tensor([0.01] * 4 + [0.02] * 4 + [0.03] * 4))
+    assert imagined_success(AVOIDING, path) == [False, False]
+    assert imagined_success(AVOIDING, imagine(Straight(), path[:, 0], interval=4, max_steps=41)) == [True, True]
+
+
+@pytest.mark.parametrize("name", ["aligning", "sorting", "stacking"])
+def test_contexts_are_found_again_in_the_first_observation(name):
+    task, contexts = get_task(name), evaluation_contexts(name, 3)
+    env = ENVIRONMENTS[name](3, dtype=torch.float64)
+    found = contexts_of(task, env.reset(contexts=contexts)["observation"]).numpy()
+    assert abs(found[..., :2] - contexts[..., :2]).max() < 1e-3  # the reset lasts 1 ms
+    turn = found[..., 2] - contexts[..., 2]
+    assert abs(math.pi * (turn / math.pi).round() - turn).max() < 1e-2  # a box looks the same after half a turn
+    assert env.reset(contexts=found)["observation"].shape == (3, task.observation_dim)
+
+
+def test_futures_of_recordings_by_hand():
+    futures = recorded_futures([torch.arange(4.0)[:, None], torch.arange(2.0)[:, None]], horizon=3)
+    assert futures[..., 0].tolist() == [
+        [[1, 2, 3], [2, 3, 3], [3, 3, 3], [3, 3, 3]],
+        [[1, 1, 1], [1, 1, 1], [1, 1, 1], [1, 1, 1]],
+    ]
+
+
+def episode(offset, steps=8, success=True):
+    """Moves by 1 per step along x; plans say the same, ``offset`` beside it."""
+    frames = torch.zeros(steps + 1, 4)
+    frames[:, 2] = torch.arange(steps + 1.0)
+    ahead = frames[:steps, None, 2:] + torch.arange(1, 15)[:, None] * torch.tensor([1.0, 0.0])
+    flags = torch.zeros(steps, 1, dtype=torch.bool)
+    flags[-1] = success
+    chunk = (ahead + torch.tensor([0.0, offset]))[:, None]
+    nested = {"observation": frames[1:], "success": flags}
+    return TensorDict({"observation": frames[:-1], "remaining_plan_chunk": chunk, "next": nested}, [steps])
+
+
+def test_distance_from_plan_to_execution_by_hand():
+    errors = tracking_errors(AVOIDING, [episode(0.3), episode(0.4)], 4)
+    assert list(errors) == ["measured_xy"]
+    assert errors["measured_xy"] == pytest.approx([math.sqrt((0.09 + 0.16) / 2)] * 4)
+    assert tracking_errors(AVOIDING, [episode(0.3).exclude("remaining_plan_chunk")], 4) == {}
+    assert executed_success([episode(0), episode(0, success=False)]) == [True, False]
+    half = rate([True, False])
+    assert (half["rate"], half["episodes"]) == (0.5, 2) and 0 < half["low"] < 0.2 < 0.8 < half["high"] < 1
+
+
+def test_states_beside_the_demonstrations_are_far():
+    shown = torch.rand(400, 2, generator=torch.Generator().manual_seed(0))
+    data = TensorDict({"state": shown, "episode": torch.arange(400) // 10}, [400])
+    near, far = episode(0), episode(0)
+    near["observation"][:, 2:] = shown[:8] + 0.001
+    far["observation"][:, 2:] = shown[:8] + 5
+    assert coverage(AVOIDING, [near], data)["visited_95"] < 1.5 * coverage(AVOIDING, [near], data)["demonstrated_95"]
+    assert coverage(AVOIDING, [far], data)["visited_median"] > 5
+
+
+@pytest.mark.parametrize(
+    ("rates", "words"),
+    [
+        ((0.5, 1.0, 1.0), "nothing to find"),
+        ((0.5, 1.0, 0.4), "the planner's own imagination reaches the goal in 50%"),
+        ((1.0, 0.3, 0.4), "the controller follows recorded states to the goal in 30%"),
+        ((1.0, 1.0, 0.4), "planner and controller work alone, not together"),
+    ],
+)
+def test_verdicts(rates, words):
+    result = {name: {"rate": value} for name, value in zip(("imagined", "followed", "closed_loop"), rates, strict=True)}
+    assert verdict(result | {"distance_to_demonstrations": {}}, AVOIDING).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("off", "words"), [(0.007, "planner and controller work alone"), (0.04, "the controller leaves")]
+)
+def test_a_blind_push_is_not_held_against_the_controller(off, words):
+    rates = {"imagined": 1.0, "followed": 0.0, "closed_loop": 0.4}
+    result = {name: {"rate": value} for name, value in rates.items()}
+    result |= {"distance_to_demonstrations": {}, "recording_to_execution": {"measured_xy": [0.001, off]}}
+    assert verdict(result, get_task("sorting")).startswith(words)
+
+
+def test_inspect_from_the_shell(trained_run, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(trained_run, run)
+    assert koap("inspect", run, "--episodes", "2", "--threads", "1") == 0
+    written = json.loads((run / "inspect.json").read_text())
+    assert {"imagined", "followed", "closed_loop", "plan_to_execution", "verdict"} <= set(written)
+    assert written["closed_loop"]["episodes"] == 2 and (run / "plots" / "inspect.png").exists()
+    assert koap("inspect", run, "--episodes", "0") == 1
+    assert "episodes must be >= 1, got 0" in capsys.readouterr().err

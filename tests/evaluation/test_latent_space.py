@@ -1,0 +1,279 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Spectrum, multi-step errors and linear probe: against systems whose answers are known."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+
+import pytest
+import torch
+from tiny_runs import TINY, koap
+from torch import nn
+
+from torchrl_koap.commands.inspect import verdict
+from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+from torchrl_koap.evaluation.latent_space import (
+    OUTSIDE_THE_BUDGET,
+    analyse_latent,
+    explained,
+    infer_steps,
+    prediction_errors,
+    probe,
+    spectrum,
+    split_trajectories,
+)
+from torchrl_koap.modules import (
+    KoopmanInverseDynamics,
+    KoopmanLifting,
+    KoopmanOperator,
+    LinearActionDecoder,
+    Normalizer,
+    make_koopman_inverse_dynamics,
+)
+from torchrl_koap.modules.koopman.latent_action import LatentActionModule
+from torchrl_koap.reports.latent_plot import plot_latent
+from torchrl_koap.tasks import get_task
+
+
+def turn(angle, size=1.0):
+    cos, sin = math.cos(angle) * size, math.sin(angle) * size
+    return torch.tensor([[cos, -sin], [sin, cos]], dtype=torch.float64)
+
+
+# x_{t+1} = A x_t + w_t with w_{t+1} = R w_t: from x_t and x_{t+2} alone w_t is known
+DRIFT, WIND = turn(0.3, 0.95), turn(1.1)
+
+
+class KnowsTheWind(LatentActionModule):
+    def infer(self, frames):
+        now, later = frames.unbind(-2)
+        return (later - now @ (DRIFT @ DRIFT).T) @ (DRIFT + WIND).inverse().T
+
+
+def knowing(normalizer=None):
+    lifting = KoopmanLifting(2, 2, include_state=True)  # z = x
+    lifting.decoder = nn.Identity()
+    operator = KoopmanOperator(2)
+    operator.double().weight.data.copy_(DRIFT)
+    decoder = LinearActionDecoder(2, 2).double()
+    nn.init.eye_(decoder.linear.weight), nn.init.zeros_(decoder.linear.bias)
+    infer = KnowsTheWind(2, 2, history=0, look_ahead=2)
+    return KoopmanInverseDynamics(infer, decoder, lifting=lifting, operator=operator, state_normalizer=normalizer)
+
+
+def blown(lengths=(12, 15, 11, 20), drifts=None):
+    """Flat data whose actions are the wind."""
+    generator = torch.Generator().manual_seed(0)
+    frames, winds = [], []
+    for index, length in enumerate(lengths):
+        x, w = torch.randn(2, 2, dtype=torch.float64, generator=generator)
+        path, wind = [x], []
+        for _ in range(length):
+            wind.append(w)
+            path.append((DRIFT if drifts is None else drifts[index]) @ path[-1] + w)
+            w = WIND @ w
+        frames.append(torch.stack(path)), winds.append(torch.stack(wind))
+    return select_state(flatten_trajectories(frames, winds, dtype=torch.float64), (0, 1))
+
+
+PARTS = {"whole": [0, 1], "second": [1]}
+
+
+@pytest.mark.parametrize("normalizer", [None, Normalizer(torch.zeros(2).double(), torch.full((2,), 3.0).double())])
+def test_an_exactly_linear_system_is_predicted_without_error(normalizer):
+    data = blown()
+    errors = prediction_errors(knowing(normalizer), data, torch.tensor([0, 1]), PARTS, horizon=4)
+    for model in ("koopman", "linear", "reconstruction"):
+        assert max(errors[model]["whole"]) < 1e-9, model
+    paths = data["state"].split([12, 15, 11, 20])[2:]
+    for step in range(1, 5):
+        # every start whose last latent action still sees its look-ahead
+        gaps = torch.cat([path[step : step + len(path) - 5] - path[: len(path) - 5] for path in paths])
+        assert errors["copy_last"]["whole"][step - 1] == pytest.approx(gaps.square().sum(-1).mean().sqrt().item())
+        assert errors["copy_last"]["second"][step - 1] == pytest.approx(gaps[:, 1].square().mean().sqrt().item())
+
+
+def test_a_wrong_operator_errs_by_what_it_adds():
+    data, controller = blown(), knowing()
+    controller.operator.weight.data.add_(0.1 * torch.eye(2, dtype=torch.float64))
+    errors = prediction_errors(controller, data, torch.tensor([0]), PARTS, horizon=1)
+    starts = torch.cat([path[:-2] for path in data["state"].split([12, 15, 11, 20])[1:]])
+    assert errors["koopman"]["whole"] == pytest.approx([0.1 * starts.square().sum(-1).mean().sqrt().item()])
+
+
+def test_the_linear_model_learns_from_its_half_alone():
+    data = blown(drifts=[DRIFT, DRIFT, turn(-0.8, 0.9), turn(-0.8, 0.9)])
+    errors = prediction_errors(knowing(), data, torch.tensor([0, 1]), PARTS, horizon=2)
+    assert min(errors["linear"]["whole"]) > 0.1
+
+
+def test_a_horizon_out_of_range_is_an_error():
+    with pytest.raises(ValueError, match="horizon must be >= 1"):
+        prediction_errors(knowing(), blown(), torch.tensor([0]), PARTS, horizon=0)
+    with pytest.raises(ValueError, match="shorter than a window"):
+        prediction_errors(knowing(), blown(), torch.tensor([0]), PARTS, horizon=11)
+    with pytest.raises(ValueError, match="leave some out"):
+        prediction_errors(knowing(), blown(), torch.arange(4), PARTS, horizon=2)
+
+
+@pytest.mark.parametrize("preset", ["default", "paper", "released"])
+def test_every_preset_can_be_analysed(preset):
+    torch.manual_seed(0)
+    data = blown((30, 31, 32, 33)).float()
+    controller = make_koopman_inverse_dynamics(2, 2, preset=preset, state_normalizer=Normalizer.fit(data["state"]))
+    before = {name: value.clone() for name, value in controller.state_dict().items()}
+    result = analyse_latent(controller.eval(), data, data["episode"] == 3, PARTS, horizon=50)
+    shortest = 30 - (controller.num_window_frames - 1 - controller.history)  # steps that all see their look-ahead
+    assert result["multi_step"]["steps"] == shortest == len(result["multi_step"]["koopman"]["whole"])
+    counted = sum(result["eigenvalues"][where] for where in ("inside", "on", "outside"))
+    assert counted == controller.operator.latent_dim
+    after = controller.state_dict()
+    assert all(torch.equal(value.nan_to_num(9), before[name].nan_to_num(9)) for name, value in after.items())
+
+
+def test_spectrum_by_hand():
+    values = torch.tensor([0.5, 0.9j, -1.0, 1.0005, 1.2], dtype=torch.complex128)
+    found = spectrum(values, slowest=1)
+    assert (found["inside"], found["on"], found["outside"]) == (2, 2, 1)
+    assert found["spectral_radius"] == pytest.approx(1.2)
+    assert found["slowest_decay_steps"] == pytest.approx([-1 / math.log(0.9)])
+
+
+def test_steps_are_inferred_once_each_whatever_the_labels():
+    data, controller = blown(), knowing()
+    hidden, _ = LabelBudget(1, seed=2).apply(data)
+    steps = infer_steps(controller, hidden)
+    lengths = [12, 15, 11, 20]
+    usable = torch.cat([torch.arange(length) < length - 2 for length in lengths])
+    torch.testing.assert_close(steps["latent_action"], data["action"][usable])  # here u is the wind itself
+    assert torch.equal(steps["episode"], data["episode"][usable])
+    assert torch.equal(steps["has_action"], hidden["has_action"][usable, 0])
+    assert steps["action"].isnan().any(-1).equal(~steps["has_action"])
+
+
+def independent(seed):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(1200, 3, generator=generator), torch.arange(1200) // 30
+
+
+def test_a_probe_finds_what_lies_linearly_in_the_latent_and_nothing_else():
+    latent, groups = independent(0)
+    noise, _ = independent(1)
+    linear = latent @ torch.tensor([[1.0, 2.0], [0.0, -1.0], [3.0, 0.5]]) + 4
+    found = probe(latent, torch.cat([linear, noise[:, :1]], -1), groups, groups < 20)
+    assert found[:2] == pytest.approx([1, 1], abs=1e-5) and abs(found[2]) < 0.05
+    # what holds in one half and is the other way round in the other explains -3: 1 - (2 a)^2 / a^2
+    sign = torch.where(groups < 20, 1.0, -1.0)[:, None]
+    assert probe(latent, sign * (linear - 4), groups, groups < 20) == pytest.approx([-3, -3], abs=0.02)
+    with pytest.raises(ValueError, match="judged on others, got 1200 of 1200"):
+        probe(latent, linear, groups, groups < 40)
+
+
+def test_explained_variance_by_hand():
+    true = torch.tensor([[0.0, 5.0], [2.0, 5.0]])
+    first, constant = explained(true + torch.tensor([[1.0, 0.0], [0.0, 0.0]]), true)
+    assert first == pytest.approx(0.5) and math.isnan(constant)
+
+
+def test_the_budget_is_in_the_fitted_half():
+    episode = torch.arange(11).repeat_interleave(3)
+    halves = [split_trajectories(episode, (episode == 4) | (episode == 9), seed=seed) for seed in range(5)]
+    assert all(len(half) == 5 == len(half.unique()) and {4, 9} <= set(half.tolist()) for half in halves)
+    assert len({tuple(half.tolist()) for half in halves}) > 1
+    assert torch.equal(halves[1], split_trajectories(episode, (episode == 4) | (episode == 9), seed=1))
+    with pytest.raises(ValueError, match="at least two, got 1"):
+        split_trajectories(torch.zeros(3), torch.zeros(3, dtype=torch.bool))
+
+
+def test_the_decoder_of_the_run_is_judged_beside_the_probe():
+    data, controller = blown((20, 20, 20, 20)), knowing()
+    labelled = data["episode"] == 1
+    result = analyse_latent(controller, data, labelled, PARTS)[OUTSIDE_THE_BUDGET]
+    assert result["probe_r2"] == pytest.approx([1, 1], abs=1e-6) and result["decoder_r2"] == pytest.approx([1, 1])
+    assert (result["labels_read"], result["steps_judged"]) == (4 * 18, 2 * 18)
+    assert result["judged_trajectories_in_budget"] == 0
+    nn.init.zeros_(controller.action_decoder.linear.weight)
+    worse = analyse_latent(controller, data, data["episode"] >= 0, PARTS)[OUTSIDE_THE_BUDGET]
+    assert max(worse["decoder_r2"]) < 0.1 and worse["judged_trajectories_in_budget"] == 2
+
+
+def test_what_blew_up_is_drawn_all_the_same(tmp_path):
+    controller = knowing()
+    controller.operator.weight.data.mul_(1e200)
+    data = blown((20, 20, 20, 20))
+    result = analyse_latent(controller, data, data["episode"] == 0, {"measured_xy": [0, 1]})
+    assert result["multi_step"]["steps"] == 10
+    assert not math.isfinite(result["multi_step"]["koopman"]["measured_xy"][-1])
+    path = plot_latent(
+        result, tmp_path / "latent.png", task=get_task("avoiding"), eigenvalues=controller.operator.eigenvalues()
+    )
+    assert path.stat().st_size > 10000
+
+
+def test_verdict_without_experiments_says_whose_labels_were_read():
+    controller, data = knowing(), blown((20, 20, 20, 20))
+    latent = analyse_latent(controller, data, data["episode"] == 0, {"measured_xy": [0, 1]})
+    text = verdict({"latent": latent}, get_task("avoiding"))
+    assert text.startswith("10 steps ahead the latent dynamics miss the measured xy by")
+    assert "Outside the budget, for analysis only" in text and "100.0%" in text
+    assert "have labels in the budget" not in text
+    latent = analyse_latent(controller, data, data["episode"] >= 1, {"measured_xy": [0, 1]})
+    assert verdict({"latent": latent}, get_task("avoiding")).endswith("(1 of these 2 have labels in the budget)")
+
+
+@pytest.fixture
+def run(trained_run, tmp_path):
+    shutil.copytree(trained_run, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_inspect_the_latent_space_alone(run, capsys):
+    (run / "inspect.json").write_text(json.dumps({"followed": {"rate": 0.5}, "verdict": "old", "latent": "old"}))
+    assert koap("inspect", run, "--latent-only", "--latent-steps", "3", "--threads", "1") == 0
+    written = json.loads((run / "inspect.json").read_text())
+    assert written["followed"] == {"rate": 0.5}  # an earlier experiment is kept
+    latent = written["latent"]
+    assert list(latent["multi_step"]["koopman"]) == ["measured_xy"] and latent["multi_step"]["steps"] == 3
+    assert len(latent[OUTSIDE_THE_BUDGET]["probe_r2"]) == 2
+    assert latent[OUTSIDE_THE_BUDGET]["judged_trajectories_in_budget"] == 0  # 2 of 8 are labelled
+    assert "for analysis only" in written["verdict"] and (run / "plots" / "latent.png").exists()
+    assert not (run / "plots" / "inspect.png").exists()
+    assert koap("inspect", run, "--latent-only", "--latent-steps", "0") == 1
+    assert "latent_steps must be >= 1, got 0" in capsys.readouterr().err
+
+
+def test_a_method_without_latent_actions_gets_a_note(demonstrations, tmp_path):
+    assert koap("train", "--out", tmp_path / "run", "--dataset", demonstrations, *TINY, "--method", "linear") == 0
+    assert koap("inspect", tmp_path / "run", "--latent-only", "--threads", "1") == 0
+    written = json.loads((tmp_path / "run" / "inspect.json").read_text())
+    assert written["latent"] == {"note": "method 'linear' has no latent actions to look into"}
+    assert written["verdict"] == written["latent"]["note"]
+    assert not (tmp_path / "run" / "plots" / "latent.png").exists()
+
+
+@pytest.mark.parametrize("preset", ["default", "released"])
+def test_a_rollout_without_error_is_a_reconstruction(preset):
+    """Where K z + u hits g(x) exactly, what is left is the error of mapping back, whatever the lifting remembers."""
+    torch.manual_seed(0)
+    data = blown((20, 20, 20, 20)).float()
+    controller = make_koopman_inverse_dynamics(2, 2, preset=preset, latent_dim=8).eval()
+    recorded = {}
+    lift = controller.lift
+
+    def spy(states):
+        recorded["lifted"] = lift(states)
+        return recorded["lifted"]
+
+    controller.lift = spy
+    controller.rollout_latent = lambda lifted, latent: recorded["lifted"][:, -latent.shape[1] :]
+    errors = prediction_errors(controller, data, torch.tensor([0, 1]), PARTS, horizon=3)
+    assert errors["koopman"] == errors["reconstruction"] and min(errors["koopman"]["whole"]) > 0
+
+
+def test_data_are_not_changed():
+    data = blown()
+    before = data.clone()
+    analyse_latent(knowing(), data, data["episode"] == 0, PARTS)
+    assert (data == before).all()

@@ -1,0 +1,171 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Rollouts that depend on nothing but their seed, and the numbers made of them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torchrl.envs import TransformedEnv
+from toy_episodes import episode_of, number
+from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength, PlannedStep, wandering_planner
+
+from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs.transforms import EndEffectorNoise
+from torchrl_koap.evaluation.rollouts import (
+    make_policy,
+    measure_latency,
+    roll_out,
+    rollouts_to_tensors,
+)
+from torchrl_koap.evaluation.scores import score
+from torchrl_koap.modules import NoiseSchedule, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+
+SEEDS = [100, 101, 102, 103, 104, 105, 106, 107]
+
+
+def toy_rollouts(seeds, execution="feedback", batch_size=None, **options):
+    policy = make_policy(wandering_planner(), PlannedStep(), state_columns=(2, 3), execution=execution)
+    return roll_out(policy, AvoidingEnv, seeds, max_steps=90, batch_size=batch_size, **options)
+
+
+@pytest.fixture(scope="module")
+def together():
+    return toy_rollouts(SEEDS)
+
+
+def facts(episodes, seeds=SEEDS):
+    rows = score(episodes, seeds, num_modes=24, mode_index=mode_index)["episode"]
+    return [(row["seed"], row["outcome"], row["mode"], row["steps"]) for row in rows]
+
+
+def test_the_episodes_are_worth_comparing(together):
+    outcomes = [outcome for _, outcome, _, _ in facts(together)]
+    assert {"success", "collision"} <= set(outcomes), outcomes
+    assert len({steps for *_, steps in facts(together)}) >= 4
+    assert len({mode for _, _, mode, _ in facts(together)}) >= 3
+
+
+@pytest.mark.parametrize("batch_size", [3, 1])
+def test_results_do_not_depend_on_the_batch_size(together, batch_size):
+    finished = []
+    apart = toy_rollouts(SEEDS, batch_size=batch_size, progress=finished.append)
+    assert facts(apart) == facts(together)
+    for one, other in zip(apart, together, strict=True):
+        assert (one["observation"] - other["observation"]).abs().max() < 1e-4
+        assert (one["next", "observation"] - other["next", "observation"]).abs().max() < 1e-4
+    assert finished == [min(done, 8) for done in range(batch_size, 8 + batch_size, batch_size)]
+
+
+@pytest.mark.parametrize("solver", ["dpm++2m", "ddpm"])
+@pytest.mark.parametrize("execution", ["feedback", "open_loop"])
+def test_real_networks_and_a_stochastic_solver_do_not_depend_on_it_either(solver, execution):
+    torch.manual_seed(0)
+    planner = StatePlanner(
+        TemporalUnet(2, 4, channels=(8, 16)), NoiseSchedule(), state_dim=2, solver=solver, num_steps=3, clip=1.0
+    )
+    planner.fit_normalizers(0.01 * torch.randn(50, 16, 2).cumsum(1))
+    controller = make_koopman_inverse_dynamics(2, 2)
+    torch.nn.init.normal_(controller.action_decoder.linear.weight, std=1e-3)
+    policy = make_policy(planner.eval(), controller.eval(), state_columns=(2, 3), execution=execution)
+    together, apart = (roll_out(policy, AvoidingEnv, SEEDS[:3], max_steps=9, batch_size=size) for size in (None, 1))
+    for one, other in zip(apart, together, strict=True):
+        assert (one["next", "observation"] - other["next", "observation"]).abs().max() < 1e-4
+        assert (one["action"] - other["action"]).abs().max() < 1e-4
+    assert not torch.allclose(together[0]["action"], together[1]["action"])
+
+
+def test_observation_noise_of_an_episode_depends_on_its_seed_alone():
+    def noisy(num_envs):
+        return TransformedEnv(AvoidingEnv(num_envs), EndEffectorNoise("avoiding", sigma=0.003))
+
+    policy = make_policy(wandering_planner(), PlannedStep(), state_columns=(2, 3))
+    paths = [
+        roll_out(policy, noisy, SEEDS[:3], max_steps=12, batch_size=size)[2]["observation"] for size in (None, 2, 1)
+    ]
+    assert torch.equal(paths[0], paths[1]) and torch.equal(paths[0], paths[2])
+    clean = roll_out(policy, AvoidingEnv, SEEDS[2:3], max_steps=12)[0]["observation"]
+    assert 1e-4 < (paths[0][0] - clean[0])[2:].abs().max() < 0.02
+
+
+def test_the_seed_decides_not_the_place_and_not_the_global_generator(together):
+    torch.manual_seed(123)
+    before = torch.get_rng_state()
+    other = toy_rollouts([107, 7, 100])
+    assert torch.equal(torch.get_rng_state(), before)
+    for new, old in ((other[0], together[7]), (other[2], together[0])):
+        assert len(new) == len(old)
+        assert (new["next", "observation"] - old["next", "observation"]).abs().max() < 1e-4
+    assert not any(len(other[1]) == len(e) and torch.allclose(other[1]["action"], e["action"]) for e in together)
+
+
+def test_episodes_are_cut_at_their_own_end(together):
+    assert len({len(episode) for episode in together}) > 1
+    for episode in together:
+        done = episode["next", "done"].squeeze(-1)
+        assert done[-1] or len(episode) == 90
+        assert not done[:-1].any()
+        step = episode["next", "observation"][:-1] - episode["observation"][1:]
+        assert step.abs().max() == 0  # one episode from its beginning, no reset inside
+
+
+def test_one_episode_per_environment_even_if_some_end_early():
+    """The first to finish are not over-represented: short and long episodes count once each."""
+    lengths = ((3, 3, 3, 3), (9,), (1,), (30,))
+    policy = make_policy(CountingPlanner(), EchoController(), state_columns=(1, 2))
+    episodes = roll_out(policy, lambda n: EpisodesOfRandomLength(n, lengths), [0, 1, 2, 3], max_steps=12)
+    assert [len(episode) for episode in episodes] == [3, 9, 1, 12]
+    assert not episodes[3]["next", "done"].any()
+
+
+@pytest.mark.parametrize(("seeds", "size"), [([], None), ([1], 0), ([1], -2)])
+def test_nothing_to_roll_out_is_refused(seeds, size):
+    with pytest.raises(ValueError, match="at least one seed and a batch size >= 1"):
+        toy_rollouts(seeds, batch_size=size)
+
+
+def test_history_is_that_of_the_longer_sighted():
+    short = make_policy(CountingPlanner(), EchoController(history=0), state_columns=(1, 2))
+    long = make_policy(CountingPlanner(), EchoController(history=4), state_columns=(1, 2))
+    assert (short.history, long.history) == (2, 5)
+
+
+def test_pictures_get_padded_paths_and_the_plans_that_were_made():
+    episodes = [episode_of(6, success=True, mode=1), episode_of(3, collision=True, mode=-1, start=50.0)]
+    tensors = rollouts_to_tensors(episodes, position=slice(2, 4), mode_index=number, interval=4)
+    assert tensors["length"].tolist() == [6, 3] and tensors["outcome"].tolist() == [1, 2]
+    assert tensors["mode"].tolist() == [1, -1]
+    assert tensors["position"].shape == (2, 7, 2)
+    assert tensors["position"][0, :, 0].tolist() == [0, 1, 2, 3, 4, 5, 6]
+    assert tensors["position"][1, :4, 0].tolist() == [50, 51, 52, 53]
+    assert tensors["position"][1, 4:].isnan().all()
+    assert tensors["plan"].shape == (2, 2, 14, 2) and tensors["plan_step"].tolist() == [[0, 4], [0, -1]]
+    assert tensors["plan"][0, :, 0, 0].tolist() == [0, 4] and tensors["plan"][1, 0, 0, 0] == 50
+    assert tensors["plan"][1, 1].isnan().all()
+    plain = rollouts_to_tensors([episode_of(3, plans=False)], position=slice(2, 4), mode_index=number, interval=4)
+    assert plain["plan"].shape[:2] == (1, 0) and plain["plan_step"].shape == (1, 0)
+
+
+def test_plans_of_a_rollout_start_where_the_arm_was(together):
+    tensors = rollouts_to_tensors(together, position=slice(2, 4), mode_index=mode_index, interval=4)
+    for episode in range(8):
+        for index, step in enumerate(tensors["plan_step"][episode].tolist()):
+            if step >= 0:
+                ahead = tensors["plan"][episode, index, 0] - tensors["position"][episode, step]
+                assert ahead[1].item() == pytest.approx(0.009, abs=1e-5)
+
+
+def test_latency_is_measured_per_plan_and_per_step():
+    class Slow(CountingPlanner):
+        def plan(self, history, noise=None):
+            torch.randn(400, 400) @ torch.randn(400, 400)
+            return super().plan(history, noise)
+
+    planner = Slow()
+    policy = make_policy(planner, EchoController(), state_columns=(1, 2), replan_interval=4)
+    result = measure_latency(policy, 3, repeats=5)
+    assert len(planner.calls) == 5 + 3  # one plan for two steps
+    assert result["plan_ms"] > 0 and result["control_ms"] > 0
+    assert result["control_hz"] == pytest.approx(1e3 / (result["control_ms"] + result["plan_ms"] / 4))
+    assert math.isfinite(result["control_hz"])

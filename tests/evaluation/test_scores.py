@@ -1,0 +1,141 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Scores of made-up episodes, computed by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from toy_episodes import episode_of, number
+
+from torchrl_koap.evaluation.scores import STACKING_PRIOR, d3il_score, divergence, outcome_of, score, stacking_scores
+from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, mode_entropy, wilson_interval
+from torchrl_koap.tasks import get_task
+
+
+def test_outcomes():
+    assert outcome_of(episode_of(3, success=True)) == "success"
+    assert outcome_of(episode_of(3, collision=True)) == "collision"
+    assert outcome_of(episode_of(3)) == "timeout"
+    without = episode_of(3)
+    del without["next", "collision"]
+    assert outcome_of(without) == "timeout"
+
+
+def test_scores_by_hand():
+    episodes = [
+        episode_of(10, success=True, mode=0),
+        episode_of(20, success=True, mode=0),
+        episode_of(30, success=True, mode=1),
+        episode_of(40, success=True, mode=2),
+        episode_of(50, success=True, mode=-1),  # crossed the line without completing its mode
+        episode_of(7, collision=True, mode=3),
+        episode_of(90, mode=3),
+        episode_of(8, collision=True, mode=-1),
+    ]
+    result = score(episodes, range(8), num_modes=4, mode_index=number)
+    rows = result.pop("episode")
+    low, high = wilson_interval(5, 8)
+    assert 0 <= result.pop("mode_entropy_low") < 0.75 < result.pop("mode_entropy_high") <= 1
+    assert result == {
+        "episodes": 8,
+        "success_rate": 0.625,
+        "success_low": low,
+        "success_high": high,
+        "mode_entropy": pytest.approx(0.75),
+        "distinct_modes": 3,
+        "collisions": 2,
+        "mean_steps": pytest.approx(255 / 8),
+    }
+    assert rows[2] == {"seed": 2, "outcome": "success", "mode": 1, "steps": 30}
+    assert rows[5]["outcome"] == "collision" and rows[6]["outcome"] == "timeout"
+    with pytest.raises(ValueError, match="longer"):
+        score(episodes, range(7), num_modes=4, mode_index=number)
+
+
+def test_entropy_per_context_by_hand():
+    modes = [(0, 1), (1, 1), (-1, 0), (0, 0)]
+    episodes = [episode_of(5, success=context < 3, mode=mode) for context in range(4) for mode in modes[context]]
+    contexts = [context for context in range(4) for _ in range(2)]
+    options = {"num_modes": 2, "mode_index": number, "contexts": contexts}
+    # entropies 1, 0, 0 (one of the two modes was not complete) of the contexts with success
+    result = score(episodes, range(8), **options)
+    assert result["mode_entropy"] == pytest.approx(1 / 3) and result["contexts"] == 4
+    assert result["success_rate"] == 6 / 8 and result["episode"][3]["context"] == 1
+    assert result["pooled_mode_entropy"] == pytest.approx(0.9709505944546686)  # 2 of 0, 3 of 1
+    assert 0 <= result["mode_entropy_low"] <= 1 / 3 <= result["mode_entropy_high"] <= 1
+    assert score(episodes, range(8), unsolved="zero", **options)["mode_entropy"] == pytest.approx(1 / 4)
+
+
+def test_one_rollout_per_context_has_no_entropy_per_context():
+    episodes = [episode_of(5, success=True, mode=mode) for mode in (0, 1)]
+    result = score(episodes, [7, 8], num_modes=2, mode_index=number, contexts=[0, 1])
+    assert result["mode_entropy"] is None and result["pooled_mode_entropy"] == pytest.approx(1.0)
+
+
+def stack_of(letters, success):
+    episode = episode_of(4, success=success)
+    letters = torch.tensor([*letters, -1, -1, -1])[:3]
+    episode["next", "mode"] = letters.expand(4, 3).clone()
+    return episode
+
+
+def test_stacked_boxes_by_hand():
+    episodes = [
+        stack_of((0, 1, 2), True),
+        stack_of((0, 2, 1), True),
+        stack_of((1, 0, 2), False),
+        stack_of((), False),
+    ]
+    result = stacking_scores(episodes, [0, 0, 1, 1])
+    rates = [result[f"stacked_{count}_rate"] for count in (1, 2, 3)]
+    assert rates == [0.75, 0.75, 0.5]
+    assert result["stacked_3_low"], result["stacked_3_high"] == wilson_interval(2, 4)
+    # context 0: same first box, two orders of two, two orders of three; context 1: one episode, none in the last
+    two = conditional_entropy([[0, 1]], 6)
+    assert result["stacked_1_entropy"] == 0
+    assert result["stacked_2_entropy"] == pytest.approx(two / 2)
+    assert result["stacked_3_entropy"] == pytest.approx(two)
+    assert set(stacking_scores(episodes, [0, 0, 1, 1], complete=False)) == {
+        "stacked_1_rate",
+        "stacked_1_low",
+        "stacked_1_high",
+        "stacked_1_entropy",
+    }
+
+
+def test_the_figure_that_d3il_ranks_by():
+    assert d3il_score(get_task("avoiding"), {"success_rate": 0.5, "mode_entropy": 1.0})["d3il_score"] == pytest.approx(
+        0.6
+    )
+    assert d3il_score(get_task("aligning"), {"success_rate": 0.5, "mode_entropy": 1.0}) == {"d3il_score": 0.75}
+    assert d3il_score(get_task("sorting"), {"success_rate": 0.5, "mode_entropy": 0.75}) == {"d3il_score": 0.25}
+    assert d3il_score(get_task("aligning"), {"success_rate": 0.5, "mode_entropy": None}) == {}
+    rates = {f"stacked_{count}_rate": rate for count, rate in ((1, 0.9), (2, 0.5), (3, 0.1))}
+    values = {"success_rate": 0.1, "mode_entropy": None, **rates}
+    assert d3il_score(get_task("stacking"), values)["d3il_score"] == pytest.approx(1.5)
+
+
+def test_divergence_from_the_prior_of_the_demonstrations():
+    prior = list(STACKING_PRIOR.values())
+    assert sum(prior) == pytest.approx(1.0)
+    assert divergence([3] * 10, prior) == pytest.approx(0.6966, abs=1e-4)  # -log6 0.287
+    assert divergence([0, 1, 2, 3, 4, 5], [1 / 6] * 6) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("unsolved", ["Zero", ""])
+def test_what_unsolved_contexts_count_must_be_known(unsolved):
+    with pytest.raises(ValueError, match="unsolved must be"):
+        conditional_entropy([[0]], 2, unsolved=unsolved)
+
+
+def test_bootstrap_interval_covers_the_mean():
+    values = [float(value) for value in range(100)]
+    low, high = bootstrap_interval(values, lambda units: sum(units) / len(units))
+    assert 40 < low < 49.5 < high < 59  # 49.5 +- 1.96 * 28.9 / 10
+    assert bootstrap_interval([1, 2], lambda units: None) is None
+
+
+def test_interval_of_an_entropy_holds_the_entropy():
+    modes = [mode % 20 for mode in range(58)]
+    low, high = bootstrap_interval(modes, lambda units: mode_entropy(units, 24))
+    assert low < mode_entropy(modes, 24) < high and 0.01 < high - low < 0.2

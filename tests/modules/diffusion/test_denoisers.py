@@ -1,0 +1,130 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Denoisers: shapes for any horizon and batch, dependence on time and condition, the released size."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_koap.modules.diffusion.denoisers import ConditionEncoder, MLPDenoiser, StepEmbedding, TransformerDenoiser
+from torchrl_koap.modules.diffusion.unet import TemporalUnet
+
+MAKERS = {
+    "unet": lambda **options: TemporalUnet(3, 6, channels=(16, 32), **options),
+    "mlp": lambda **options: MLPDenoiser(3, 6, horizon=14, width=32, **options),
+    "transformer": lambda **options: TransformerDenoiser(3, 6, width=32, depth=1, **options),
+}
+DEVICES = ["cpu"] + ["cuda"] * torch.cuda.is_available()
+
+
+@pytest.fixture(params=MAKERS)
+def denoiser(request):
+    torch.manual_seed(0)
+    return MAKERS[request.param]()
+
+
+def inputs(*batch, horizon=14, dtype=torch.float32, device="cpu"):
+    options = {"dtype": dtype, "device": device}
+    return (
+        torch.randn(*batch, horizon, 3, **options),
+        50 * torch.rand(batch, **options),
+        torch.randn(*batch, 6, **options),
+    )
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_extra_batch_dimensions_equal_flattened(denoiser, dtype, device):
+    denoiser.to(dtype).to(device)
+    x, time, condition = inputs(2, 5, dtype=dtype, device=device)
+    nested = denoiser(x, time, condition)
+    flat = denoiser(x.flatten(0, 1), time.flatten(), condition.flatten(0, 1))
+    torch.testing.assert_close(nested.flatten(0, 1), flat)
+    torch.testing.assert_close(nested[1, 3], denoiser(x[1, 3], time[1, 3], condition[1, 3]), atol=1e-5, rtol=1e-4)
+    assert nested.dtype == dtype and nested.shape == x.shape
+
+
+def test_output_depends_on_every_input_and_reaches_every_parameter(denoiser):
+    x, time, condition = (tensor.requires_grad_() for tensor in inputs(4))
+    denoiser(x, time, condition).square().sum().backward()
+    for tensor in (x, time, condition):
+        assert (tensor.grad.flatten(1 if tensor.ndim > 1 else 0).abs().amax(-1) > 0).all()
+    for name, parameter in denoiser.named_parameters():
+        assert parameter.grad is not None and parameter.grad.isfinite().all(), name
+        assert parameter.grad.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("horizon", [1, 7, 8, 13, 14, 40])
+@pytest.mark.parametrize("channels", [(16,), (16, 32), (16, 16, 32)])
+def test_unet_takes_any_horizon(horizon, channels):
+    unet = TemporalUnet(3, 6, channels=channels)
+    x, time, condition = inputs(2, horizon=horizon)
+    assert unet(x, time, condition).shape == x.shape
+
+
+def test_unet_pads_by_repeating_the_last_step():
+    unet = TemporalUnet(3, 6, channels=(16, 32))
+    x, time, condition = inputs(2)
+    padded = torch.cat([x, x[:, -1:].expand(2, 2, 3)], 1)
+    torch.testing.assert_close(unet(x, time, condition), unet(padded, time, condition)[:, :14])
+
+
+def test_released_size_is_that_of_the_first_public_code():
+    for state_dim, parameters in {4: 11_881_220, 16: 12_050_192}.items():
+        with torch.device("meta"):
+            unet = TemporalUnet.released(state_dim, 2 * state_dim)
+        assert sum(parameter.numel() for parameter in unet.parameters()) == parameters
+
+
+def test_unet_learns_a_condition_that_changes_within_centimetres():
+    torch.manual_seed(0)
+    unet = TemporalUnet(1, 1, channels=(16,), condition_width=32)
+    optimizer = torch.optim.Adam(unet.parameters(), lr=5e-3)
+    losses = []
+    for _ in range(150):
+        condition = 2 * torch.rand(128, 1) - 1
+        target = torch.sign(torch.sin(9 * condition))[:, :, None].expand(-1, 8, 1)
+        loss = (unet(torch.zeros(128, 8, 1), torch.zeros(128), condition) - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss))
+    assert sum(losses[-10:]) / 10 < 0.25 < losses[0]
+
+
+def test_embeddings_in_closed_form():
+    embedding = StepEmbedding(8)
+    embedding.network = torch.nn.Identity()
+    values = embedding(torch.tensor([0.0, 3.0]))
+    torch.testing.assert_close(values[0], torch.tensor([0.0] * 4 + [1.0] * 4))
+    torch.testing.assert_close(values[1, 0], torch.tensor(3.0).sin())
+    torch.testing.assert_close(values.square().sum(-1), torch.full((2,), 4.0))
+    encoder = ConditionEncoder(1, frequencies=2, width=4)
+    encoder.network = torch.nn.Identity()
+    torch.testing.assert_close(encoder(torch.tensor([[0.5]])), torch.tensor([[0.5, 1.0, 0.0, 0.0, -1.0]]))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"channels": (30,)}, r"channels must be multiples of groups \(8\), got \(30,\)"),
+        ({"kernel_size": 4}, "kernel_size must be odd, got 4"),
+        ({"blocks_per_level": 0}, "blocks_per_level must be at least 1"),
+        ({"multiple": 3}, "multiple must be a multiple of 2"),
+        ({"activation": "swish"}, "unknown activation 'swish'"),
+        ({"embedding_dim": 5}, "embedding_dim must be even"),
+    ],
+)
+def test_impossible_sizes_are_explained(options, message):
+    with pytest.raises(ValueError, match=message):
+        TemporalUnet(3, 6, **options)
+
+
+def test_wrong_input_is_explained(denoiser):
+    x, time, condition = inputs(2)
+    with pytest.raises(ValueError, match=r"sequence must be \[\*B, H, 3\] \(state_dim\), got \[2, 14, 2\]"):
+        denoiser(x[..., :2], time, condition)
+    with pytest.raises(ValueError, match=r"condition must be \[2, 6\] \(\[\*B, condition_dim\]\), got \[2, 5\]"):
+        denoiser(x, time, condition[:, :5])
+    with pytest.raises(ValueError, match="must have 14 steps"):
+        MAKERS["mlp"]()(x[:, :12], time, condition)

@@ -1,0 +1,310 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The inverse dynamics model: inference path, normalisers, keys, rollouts, fitting, saving, composition."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+
+from torchrl_koap.modules import (
+    KoopmanInverseDynamics,
+    KoopmanLifting,
+    KoopmanOperator,
+    LatentActionMLP,
+    LinearActionDecoder,
+    Normalizer,
+)
+
+STATE_NORMALIZER = {"offset": torch.tensor([1.0, -2.0, 0.5]), "scale": torch.tensor([2.0, 0.1, 5.0])}
+ACTION_NORMALIZER = {"offset": torch.tensor([0.3, -0.1]), "scale": torch.tensor([0.01, 3.0])}
+
+
+def make_model(*, normalizers=True, seed=0, parts=None, input_dim=None, dropout=0.0, **options):
+    torch.manual_seed(seed)
+    latent_dim = 4 if input_dim is None else input_dim
+    made = {
+        "latent_action": LatentActionMLP(3, latent_dim, hidden_dims=(8,), look_ahead=3, relative=True, dropout=dropout),
+        "action_decoder": LinearActionDecoder(latent_dim, 2),
+        "lifting": KoopmanLifting(3, 4, hidden_dims=(8,)),
+        "operator": KoopmanOperator(4, input_dim=input_dim),
+    } | (parts or {})
+    if normalizers:
+        options = {
+            "state_normalizer": Normalizer(**STATE_NORMALIZER),
+            "action_normalizer": Normalizer(**ACTION_NORMALIZER),
+        } | options
+    return KoopmanInverseDynamics(**made, **options)
+
+
+def windows(*batch, num_frames=9):
+    generator = torch.Generator().manual_seed(1)
+    return torch.randn(*batch, num_frames, 3, generator=generator).cumsum(-2)
+
+
+def test_inference_is_normalise_infer_decode_denormalise():
+    model, state = make_model(), windows(2, 5)
+    td = model(TensorDict({"state": state}, [2, 5]))
+    x = (state - STATE_NORMALIZER["offset"]) / STATE_NORMALIZER["scale"]
+    for t in range(1, 6):
+        read = torch.cat([x[..., t, :] - x[..., t - 1, :], x[..., t, :], x[..., t + 3, :] - x[..., t, :]], -1)
+        u = model.latent_action.network(read)
+        torch.testing.assert_close(td["latent_action"][..., t, :], u)
+        a = u @ model.action_decoder.linear.weight.T + model.action_decoder.linear.bias
+        a = a * ACTION_NORMALIZER["scale"] + ACTION_NORMALIZER["offset"]
+        torch.testing.assert_close(td["action"][..., t, :], a)
+    torch.testing.assert_close(model.decode(model.infer(state)), td["action"])
+    torch.testing.assert_close(model.infer(state, range(2, 4)), td["latent_action"][..., 2:4, :])
+    torch.testing.assert_close(model.lift(state), model.lifting.encode(x))
+    torch.testing.assert_close(
+        model.normalize_action(td["action"][..., 1:, :]), model.action_decoder.linear(td["latent_action"])[..., 1:, :]
+    )
+
+
+def test_without_normalisers_nothing_is_scaled():
+    model, state = make_model(normalizers=False), windows(4)
+    assert model.in_keys == ["state"] and model.out_keys == ["latent_action", "action"]
+    assert torch.equal(model.normalize_state(state), state)
+    td = model(TensorDict({"state": state}, [4]))
+    assert set(td.keys()) == {"state", "latent_action", "action"}
+    torch.testing.assert_close(td["action"], model.action_decoder.linear(td["latent_action"]))
+
+
+def renamed_parts():
+    return {
+        "latent_action": LatentActionMLP(3, 4, hidden_dims=(8,), look_ahead=3, relative=True, in_key="x", out_key="u"),
+        "action_decoder": LinearActionDecoder(4, 2, in_key="u", out_key="v"),
+    }
+
+
+@pytest.mark.parametrize("parts", [None, renamed_parts])
+@pytest.mark.parametrize("normalizers", [True, False])
+@pytest.mark.parametrize("late", [True, False])
+def test_renamed_and_nested_keys(parts, normalizers, late):
+    state = windows(4)
+    torch.manual_seed(0)
+    model = make_model(normalizers=normalizers, parts=parts and parts())
+    expected = model(TensorDict({"state": state}, [4]))["action"]
+    names = {"state": ("agent", "window"), "action": ("agent", "command")}
+    if late:
+        other = make_model(normalizers=normalizers, parts=parts and parts())
+        other.set_keys(**names)
+    else:
+        other = make_model(
+            normalizers=normalizers, parts=parts and parts(), state_key=names["state"], action_key=names["action"]
+        )
+    other.load_state_dict(model.state_dict())
+    assert other.in_keys == [names["state"]] and other.out_keys[-1] == names["action"]
+    assert (other.state_key, other.action_key) == tuple(names.values())
+    td = other(TensorDict({"agent": {"window": state}}, [4]))
+    torch.testing.assert_close(td["agent", "command"], expected)
+    extra = {"normalized_state", "normalized_action"} if normalizers else set()
+    assert set(td.keys()) == {"agent", *other.latent_action.out_keys, *extra}
+    data = TensorDict({"agent": {"window": state, "command": torch.randn(4, 9, 2)}}, [4])
+    assert other.fit_decoder(data, torch.ones(4, 9, dtype=torch.bool)).num_labels == 4 * 5
+
+
+@pytest.mark.parametrize("normalizers", [True, False])
+def test_raw_entries_are_not_written_over(normalizers):
+    model, state = make_model(normalizers=normalizers), windows(4)
+    td = TensorDict({"state": state.clone()}, [4])
+    first = model(td)["action"].clone()
+    assert torch.equal(td["state"], state)
+    assert torch.equal(model(td)["action"], first)  # a second call reads the same state
+    if normalizers:
+        torch.testing.assert_close(td["normalized_state"], model.normalize_state(state))
+        torch.testing.assert_close(model.normalize_action(first), td["normalized_action"], rtol=1e-3, atol=1e-3)
+
+
+def test_part_of_a_longer_sequence():
+    model = make_model()
+    sequence = TensorDictSequential(
+        TensorDictModule(lambda observation: observation[..., 2:], ["observation"], ["state"]),
+        model,
+        TensorDictModule(lambda action: action.clamp(-0.1, 0.1), ["action"], ["command"]),
+    )
+    assert sequence.in_keys == ["observation"] and sequence.out_keys[-2:] == ["action", "command"]
+    state = windows(4)
+    td = sequence(TensorDict({"observation": torch.cat([torch.randn(4, 9, 2), state], -1)}, [4]))
+    torch.testing.assert_close(td["command"], model.decode(model.infer(state)).clamp(-0.1, 0.1))
+    names = {id(parameter) for parameter in sequence.parameters()}
+    assert names == {id(parameter) for parameter in model.parameters()}
+    by_name = model(state=state)
+    torch.testing.assert_close(by_name[-1], td["action"])
+
+
+@pytest.mark.parametrize("input_dim", [None, 6])
+def test_rollout_is_repeated_multiplication(input_dim):
+    model = make_model(input_dim=input_dim).double()
+    if input_dim:
+        torch.nn.init.normal_(model.operator.input)
+    matrix = model.operator.matrix()
+    b = torch.eye(4).double() if input_dim is None else model.operator.input
+    lifted = torch.randn(2, 3, 4).double()
+    latent = torch.randn(2, 3, 7, input_dim or 4).double()
+    rolled = model.rollout_latent(lifted, latent)
+    assert rolled.shape == (2, 3, 7, 4)
+    for t in range(7):
+        expected = lifted @ torch.linalg.matrix_power(matrix, t + 1).T
+        for s in range(t + 1):
+            expected = expected + latent[..., s, :] @ (torch.linalg.matrix_power(matrix, t - s) @ b).T
+        torch.testing.assert_close(rolled[..., t, :], expected)
+    torch.testing.assert_close(model.predict_next(lifted, latent[..., 0, :]), rolled[..., 0, :])
+
+
+# fitting
+
+
+def labelled(*batch, share=0.5):
+    generator = torch.Generator().manual_seed(3)
+    mask = torch.rand(*batch, 9, generator=generator) < share
+    action = torch.randn(*batch, 9, 2, generator=generator)
+    action = torch.where(mask.unsqueeze(-1), action, torch.nan)
+    return TensorDict({"state": windows(*batch), "action": action}, batch), mask
+
+
+def test_decoder_is_fitted_on_the_labelled_frames_that_count():
+    model = make_model(dropout=0.5)
+    data, mask = labelled(30)
+    groups = torch.arange(30) // 3
+    result = model.fit_decoder(data, mask, groups=groups, batch_size=7)
+    rows = [(i, t) for i in range(30) for t in range(1, 6) if mask[i, t]]
+    assert result.num_labels == len(rows)
+    model.eval()
+    latent = torch.stack([model.infer(data["state"])[i, t] for i, t in rows])
+    target = torch.stack([model.normalize_action(data["action"][i, t]) for i, t in rows])
+    reference = LinearActionDecoder(4, 2)
+    expected = reference.fit_ridge(
+        latent, target, torch.ones(len(rows), dtype=torch.bool), groups=torch.tensor([i // 3 for i, _ in rows])
+    )
+    assert result.penalty == expected.penalty
+    assert list(result.errors.values()) == pytest.approx(list(expected.errors.values()), rel=1e-4)
+    for name, value in model.action_decoder.state_dict().items():
+        torch.testing.assert_close(value, reference.state_dict()[name], rtol=1e-3, atol=1e-4)
+
+
+def test_fitting_takes_any_batch_and_leaves_the_mode_alone():
+    flat, nested = make_model(), make_model()
+    data, mask = labelled(4, 6)
+    flat.fit_decoder(data.reshape(-1), mask.flatten(0, 1), groups=torch.arange(24) // 6)
+    nested.fit_decoder(data, mask, groups=(torch.arange(24) // 6).reshape(4, 6))
+    windowed = make_model()
+    windowed.fit_decoder(TensorDict(dict(data.items()), [4, 6, 9]), mask, groups=(torch.arange(24) // 6).reshape(4, 6))
+    for name, value in flat.state_dict().items():
+        assert torch.equal(value, nested.state_dict()[name]) and torch.equal(value, windowed.state_dict()[name])
+    assert nested.training and nested.latent_action.training
+    nested.eval().fit_decoder(data, mask)
+    assert not nested.latent_action.training
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), 1e38, 0.0])
+def test_actions_outside_the_mask_are_not_read(poison):
+    data, mask = labelled(20)
+    models = make_model(), make_model()
+    models[0].fit_decoder(data, mask)
+    data["action"] = torch.where(mask.unsqueeze(-1), data["action"], poison)
+    models[1].fit_decoder(data, mask)
+    for name, value in models[0].state_dict().items():
+        assert torch.equal(value, models[1].state_dict()[name]), name
+
+
+class RefusesNaN(Normalizer):
+    """A normaliser that checks what it gets."""
+
+    def forward(self, values):
+        assert values.isfinite().all()
+        return super().forward(values)
+
+
+def test_normalisers_never_see_an_action_outside_the_mask():
+    data, mask = labelled(20)
+    models = make_model(), make_model(action_normalizer=RefusesNaN(**ACTION_NORMALIZER))
+    for model in models:
+        model.fit_decoder(data, mask)
+    for name, value in models[0].state_dict().items():
+        assert torch.equal(value, models[1].state_dict()[name]), name
+
+
+def test_scales_are_fitted_in_normalised_units():
+    model, state = make_model(), windows(100)
+    model.fit_scales(state)
+    x = model.normalize_state(state)
+    expected = (x[:, 4:9] - x[:, 1:6]).square().mean((0, 1)).sqrt()
+    torch.testing.assert_close(model.latent_action.scales[-1], expected)
+
+
+def test_bad_fits_are_explained():
+    model = make_model()
+    data, mask = labelled(4)
+    with pytest.raises(ValueError, match=r"no labelled frame lies in frames 1\.\.5 of any window"):
+        model.fit_decoder(data, mask & (torch.arange(9) > 5))
+    with pytest.raises(ValueError, match=r"mask must be bool \[4, 9\] \(\[\*B, T\]\), got torch.bool \[4, 9, 1\]"):
+        model.fit_decoder(data, mask.unsqueeze(-1))
+    with pytest.raises(ValueError, match=r"mask must be bool \[4, 9\] .*, got torch.float32"):
+        model.fit_decoder(data, mask.float())
+    with pytest.raises(ValueError, match=r"groups must be \[4\] \(\[\*B\]\), got \[4, 9\]"):
+        model.fit_decoder(data, mask, groups=torch.zeros(4, 9, dtype=torch.int64))
+    with pytest.raises(ValueError, match="a window of 4 frames is too short"):
+        model.fit_decoder(data[:, :4] if data.batch_dims > 1 else data.apply(lambda x: x[:, :4]), mask[:, :4])
+
+
+# parts, saving, types
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"latent_action": LatentActionMLP(3, 5)}, "sizes of a latent action differ: {'latent_action': 5"),
+        ({"action_decoder": LinearActionDecoder(7, 2)}, "'action_decoder': 7"),
+        ({"operator": KoopmanOperator(4, input_dim=9)}, "'operator input': 9"),
+        ({"lifting": KoopmanLifting(3, 6)}, "latent_dim differs: lifting 6, operator 4"),
+        ({"lifting": KoopmanLifting(2, 4)}, "state_dim differs: latent_action 3, lifting 2"),
+        (
+            {"action_decoder": LinearActionDecoder(4, 2, in_key="w")},
+            "writes 'latent_action', but action_decoder reads 'w'",
+        ),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(parts, message):
+    with pytest.raises(ValueError, match=message):
+        make_model(parts=parts)
+
+
+def test_statistics_travel_with_the_weights():
+    model, data = make_model(), labelled(20)
+    model.fit_scales(data[0]["state"])
+    model.fit_decoder(*data)
+    state = windows(4)
+    expected = model(TensorDict({"state": state}, [4]))["action"]
+    other = make_model(seed=5, state_normalizer=Normalizer(), action_normalizer=Normalizer())
+    other.load_state_dict(model.state_dict())
+    for restored in (other, copy.deepcopy(model)):
+        assert torch.equal(restored(TensorDict({"state": state}, [4]))["action"], expected)
+        u = restored.infer(state)
+        assert torch.equal(restored.action_decoder.predictive_variance(u), model.action_decoder.predictive_variance(u))
+
+
+def test_float64_and_reset():
+    model, state = make_model(), windows(4)
+    expected = model(TensorDict({"state": state}, [4]))["action"]
+    double = copy.deepcopy(model).double()
+    action = double(TensorDict({"state": state.double()}, [4]))["action"]
+    assert action.dtype == torch.float64
+    torch.testing.assert_close(action.float(), expected, rtol=1e-4, atol=1e-4)
+    assert {p.dtype for p in double.parameters()} == {torch.float64}
+    assert len(list(double.parameters())) == len(list(model.parameters()))  # shared parts stay shared
+    model.reset_parameters_recursive()
+    again = model(TensorDict({"state": state}, [4]))["action"]
+    assert not torch.allclose(again, expected)
+    torch.testing.assert_close(again, model.decode(model.infer(state)))
+
+
+def test_the_inference_path_compiles():
+    torch._dynamo.reset()
+    model, state = make_model(), windows(4)
+    compiled = torch.compile(model, fullgraph=True, backend="aot_eager")
+    td = TensorDict({"state": state}, [4])
+    torch.testing.assert_close(compiled(td.clone())["action"], model(td)["action"])

@@ -1,0 +1,199 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Latent-action networks: what they gather, how it is scaled, and the kernel behind the Fourier observables."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.modules import LatentActionFourier, LatentActionLSTM, LatentActionMLP
+from torchrl_koap.modules.koopman.latent_action import LatentActionModule
+
+KINDS = [LatentActionMLP, LatentActionLSTM, LatentActionFourier]
+
+
+def windows(*batch, dtype=torch.float32, num_frames=16, d=2):
+    generator = torch.Generator().manual_seed(2)
+    return torch.randn(*batch, num_frames, d, generator=generator, dtype=torch.float64).cumsum(-2).to(dtype)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_batch_gives_the_same_latent_actions(kind, dtype):
+    torch.manual_seed(0)
+    network = kind(2, 6, history=2, look_ahead=(3, 5)).to(dtype)
+    state = windows(2, 3, dtype=dtype)
+    td = network(TensorDict({"state": state}, [2, 3]))
+    latent = td["latent_action"]
+    assert latent.shape == (2, 3, 16, network.latent_dim) and latent.dtype == dtype
+    for i in range(2):
+        for j in range(3):
+            single = network(TensorDict({"state": state[i, j]}))["latent_action"]
+            torch.testing.assert_close(single, latent[i, j])
+    assert network(TensorDict({"state": state[:0]}, [0, 3]))["latent_action"].shape == (0, 3, 16, network.latent_dim)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_keys_and_wrong_width(kind):
+    network = kind(2, 6, in_key=("agent", "x"), out_key=("agent", "u"))
+    assert network.in_keys == [("agent", "x")] and network.out_keys == [("agent", "u")]
+    assert network(TensorDict({"agent": {"x": windows(3)}}, [3]))["agent", "u"].shape[:2] == (3, 16)
+    with pytest.raises(ValueError, match=r"expected states with 2 columns, got shape \[3, 16, 5\]"):
+        network.gather(windows(3, d=5))
+
+
+def test_the_base_infers_nothing():
+    with pytest.raises(NotImplementedError):
+        LatentActionModule(2, 3)(TensorDict({"state": windows(1)}, [1]))
+
+
+def test_absolute_frames_are_gathered_as_they_are():
+    network = LatentActionMLP(2, 3, history=1, look_ahead=(2, 4))
+    state = windows(3)
+    read = network.gather(state, range(1, 12))
+    for t in range(1, 12):
+        expected = torch.stack([state[:, t - 1], state[:, t], state[:, t + 2], state[:, t + 4]], 1)
+        assert torch.equal(read[:, t - 1], expected)
+
+
+@pytest.mark.parametrize("kind", [LatentActionMLP, LatentActionFourier])
+def test_relative_frames_have_unit_spread_and_the_current_one_is_untouched(kind):
+    more = {} if kind is LatentActionFourier else {"relative": True}
+    network = kind(2, 3, history=2, look_ahead=(2, 4), **more)
+    state = windows(200) * torch.tensor([1e-3, 50.0]) + 7.0
+    span = network.span(16)
+    plain = network.gather(state, span)
+    for t in span:
+        x = {offset: state[:, t + offset] for offset in (-2, -1, 0, 2, 4)}
+        expected = torch.stack([x[-1] - x[-2], x[0] - x[-1], x[0], x[2] - x[0], x[4] - x[2]], 1)
+        torch.testing.assert_close(plain[:, t - span.start], expected)
+    network.fit_scales(state)
+    network.fit_scales(state.reshape(20, 10, 16, 2))  # again, with other batch dimensions: the same
+    scaled = network.gather(state, span)
+    assert torch.equal(scaled[..., 2, :], plain[..., 2, :])
+    spread = scaled.square().mean((0, 1)).sqrt()
+    torch.testing.assert_close(spread[[0, 1, 3, 4]], torch.ones(4, 2))
+    torch.testing.assert_close(network.scales[[0, 1, 3, 4]], plain.square().mean((0, 1)).sqrt()[[0, 1, 3, 4]])
+    assert "scales" in network.state_dict()
+
+
+def test_relative_latent_actions_of_a_shifted_window_differ_by_the_current_frame_alone():
+    network = LatentActionFourier(2, 8, position_scale=1e9)
+    state = windows(4)
+    moved = state + torch.tensor([3.0, -2.0])
+    torch.testing.assert_close(network.infer(network.gather(state)), network.infer(network.gather(moved)))
+    near = LatentActionFourier(2, 8, position_scale=1.0)
+    assert not torch.allclose(near.infer(near.gather(state)), near.infer(near.gather(moved)), atol=1e-3)
+
+
+def test_scales_of_a_column_that_never_moves_and_of_absolute_frames():
+    state = windows(50)
+    state[..., 1] = 4.0
+    network = LatentActionMLP(2, 3, relative=True)
+    network.fit_scales(state)
+    assert (network.scales[:, 1] == 1).all() and network.gather(state).isfinite().all()
+    absolute = LatentActionMLP(2, 3)
+    absolute.fit_scales(state)
+    assert (absolute.scales == 1).all()
+
+
+def test_a_window_too_short_leaves_the_scales_as_they_were():
+    network = LatentActionMLP(2, 3, relative=True)
+    network.fit_scales(windows(50))
+    before = network.scales.clone()
+    with pytest.raises(ValueError, match="too short"):
+        network.fit_scales(windows(50, num_frames=5))
+    assert torch.equal(network.scales, before) and not torch.equal(before, torch.ones_like(before))
+
+
+def test_the_lstm_reads_its_frames_in_order():
+    network = LatentActionLSTM(2, 3, hidden_dim=5, history=2, look_ahead=4)
+    reference = torch.nn.LSTM(2, 5, batch_first=True)
+    reference.load_state_dict(network.lstm.state_dict())
+    state = windows(1)[0]
+    latent = network.infer(network.gather(state))
+    for t in range(2, 12):
+        last = reference(state[[t - 2, t - 1, t, t + 4]][None])[0][0, -1]
+        torch.testing.assert_close(latent[t], network.readout(last))
+
+
+def test_linear_skip_is_added():
+    torch.manual_seed(0)
+    network = LatentActionMLP(2, 3, linear_skip=True, dropout=0.5)
+    frames = network.gather(windows(4))
+    assert not torch.equal(network.infer(frames), network.infer(frames))  # dropout while training
+    network.eval()
+    expected = network.network(frames.flatten(-2)) + frames.flatten(-2) @ network.skip.weight.T
+    torch.testing.assert_close(network.infer(frames), expected)
+
+
+# Fourier observables
+
+
+def fourier_parts(num_features, curvature=0.3, motion_scale=0.7, position_scale=2.0, seed=0):
+    torch.manual_seed(seed)
+    network = LatentActionFourier(
+        2,
+        num_features,
+        history=1,
+        look_ahead=(2, 4),
+        curvature=curvature,
+        motion_scale=motion_scale,
+        position_scale=position_scale,
+    ).double()
+    frames = network.gather(windows(10, dtype=torch.float64), network.span(16)).flatten(0, 1)
+    motion = frames[:, [0, 2, 3]].flatten(1)  # D = 6 relative entries
+    place = torch.cat([motion / (motion_scale * math.sqrt(6)), frames[:, 1] / position_scale], 1)
+    kernel = motion @ motion.T / 6 + curvature * torch.exp(-torch.cdist(place, place).square() / 2)
+    latent = network.infer(frames)
+    assert latent.shape[-1] == num_features + 6 == network.latent_dim
+    return (latent @ latent.T - kernel).detach(), curvature
+
+
+def test_inner_products_approach_the_kernel_as_the_features_grow():
+    errors = {}
+    for number in (64, 1024, 16384):
+        draws = [fourier_parts(number, seed=seed)[0].square().mean() for seed in range(4)]
+        errors[number] = torch.stack(draws).mean().sqrt().item()
+    assert errors[16384] < 0.02 * 0.3
+    for number in (64, 1024):  # 16 times the features, a quarter of the error
+        assert 2.5 < errors[number] / errors[16 * number] < 6.5, errors
+
+
+def test_variance_of_the_curved_part_is_the_curvature():
+    error, curvature = fourier_parts(16384)
+    assert error.diagonal().abs().max() < 0.1 * curvature  # the kernel's diagonal is |v|^2 / D + c
+
+
+def test_a_small_curvature_leaves_linear_regression():
+    network = LatentActionFourier(2, 32, curvature=0.0)
+    latent = network.infer(network.gather(windows(5)))
+    assert (latent[..., network.motion_dim :] == 0).all()
+    read = network.gather(windows(5))
+    motion = torch.cat([read[..., :1, :], read[..., 2:, :]], -2).flatten(-2)
+    torch.testing.assert_close(latent[..., : network.motion_dim], motion / math.sqrt(network.motion_dim))
+
+
+def test_frequencies_are_drawn_anew_and_trained():
+    torch.manual_seed(0)
+    network = LatentActionFourier(2, 4000, history=1, look_ahead=8)
+    before = network.frequency.detach().clone()
+    assert abs(before.mean().item()) < 0.05 and abs(before.std().item() - 1) < 0.05
+    assert 0 <= network.phase.min() and 6.2 < network.phase.max() <= 2 * math.pi
+    network.reset_parameters()
+    assert not torch.equal(before, network.frequency)
+    network.infer(network.gather(windows(3))).square().sum().backward()
+    assert network.frequency.grad.abs().max() > 0 and network.phase.grad.abs().max() > 0
+
+
+def test_steps_tells_where_a_latent_action_holds_the_steps_of_an_axis():
+    network = LatentActionFourier(3, 8, history=2, look_ahead=(2, 5))
+    state = torch.randn(40, 16, 3, generator=torch.Generator().manual_seed(0)).cumsum(1)
+    network.fit_scales(state)
+    latent = network.infer(network.gather(state, range(4, 5)))[:, 0]
+    entries, factors = network.steps((2, 0))
+    expected = torch.stack([state[:, b] - state[:, a] for a, b in ((2, 3), (3, 4), (4, 6), (6, 9))], 1)[..., [2, 0]]
+    torch.testing.assert_close(latent[:, entries] * factors, expected)

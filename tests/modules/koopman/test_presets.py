@@ -1,0 +1,174 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Presets: sizes against the released code, every preset trains, options are checked."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.modules import (
+    PRESETS,
+    LatentActionFourier,
+    LatentActionLSTM,
+    LatentActionMLP,
+    Normalizer,
+    make_koopman_inverse_dynamics,
+)
+from torchrl_koap.modules.koopman.presets import NETWORK_OPTIONS
+from torchrl_koap.objectives import KOAPLoss
+
+
+def make_batch(batch=8, d=2, num_frames=16):
+    """A double integrator in normalised units: smooth paths whose differences are the actions."""
+    generator = torch.Generator().manual_seed(0)
+    action = 0.1 * torch.randn(batch, num_frames, d, generator=generator).cumsum(1)
+    state = torch.cat([torch.zeros(batch, 1, d), action[:, :-1].cumsum(1)], 1)
+    has_action = torch.rand(batch, num_frames, 1, generator=generator) < 0.5
+    action = torch.where(has_action, action, torch.nan)
+    return TensorDict({"state": state, "action": action, "has_action": has_action}, [batch])
+
+
+def count(module):
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+@pytest.mark.parametrize(("state_dim", "expected"), [(2, 1_387_524), (14, 1_412_112), (10, 1_403_916)])
+def test_released_has_the_released_number_of_parameters(state_dim, expected):
+    assert count(make_koopman_inverse_dynamics(state_dim, 2, preset="released")) == expected
+
+
+def test_released_parts_have_the_released_sizes():
+    """koap_release_notes section 3.1 and 3: encoder, decoder, z_act, act_decoder and K in Avoiding."""
+    model = make_koopman_inverse_dynamics(2, 2, preset="released")
+    assert count(model.lifting.encoder) == 397_824 and count(model.lifting.decoder) == 788_994
+    assert count(model.latent_action) == 199_168 and count(model.action_decoder) == 1_026
+    assert model.operator.weight.shape == (512,) and model.operator.structure == "diagonal"
+    assert model.lifting.encode(torch.randn(3, 16, 2)).shape == (3, 16, 512)
+    # targets of t = 1..13: x_{min(t - 1 + 8, 15)}
+    index = model.latent_action.gather(torch.arange(16.0)[:, None].expand(16, 2))[1:14, -1, 0]
+    assert index.tolist() == [min(t + 7, 15) for t in range(1, 14)]
+    assert model.latent_action.span(16) == range(1, 14)
+
+
+def test_paper_is_the_paper():
+    model = make_koopman_inverse_dynamics(2, 2, preset="paper")
+    assert isinstance(model.latent_action, LatentActionLSTM) and model.latent_action.look_ahead == (8,)
+    assert model.operator.structure == "dense" and model.operator.input is None
+    assert isinstance(model.lifting.encoder, torch.nn.Sequential) and not model.lifting.include_state
+    assert isinstance(model.action_decoder.linear, torch.nn.Linear)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_trains(preset):
+    torch.manual_seed(0)
+    batch = make_batch()
+    model = make_koopman_inverse_dynamics(
+        2,
+        2,
+        preset=preset,
+        state_normalizer=Normalizer.fit(batch["state"]),
+        action_normalizer=Normalizer.fit(batch["action"], mask=batch["has_action"]),
+    )
+    model.fit_scales(batch["state"])
+    loss = KOAPLoss(model)
+    optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3, weight_decay=0.01)
+    first = None
+    for _ in range(20):
+        losses = loss(batch)
+        total = sum(losses.values())
+        optimizer.zero_grad()
+        total.backward()
+        assert all(p.grad is not None and p.grad.isfinite().all() for p in loss.parameters()), preset
+        optimizer.step()
+        first = first or total.item()
+    loss.eval()
+    assert sum(loss(batch).values()) < 0.9 * first
+    before = loss(batch)["loss_action"]
+    fit = model.fit_decoder(batch, batch["has_action"].squeeze(-1))
+    assert fit.num_labels > 0 and loss(batch)["loss_action"] < before
+    assert model(batch.select("state"))["action"].shape == (8, 16, 2)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(
+    ("network", "kind"), [("fourier", LatentActionFourier), ("lstm", LatentActionLSTM), ("mlp", LatentActionMLP)]
+)
+def test_every_network_fits_every_preset(preset, network, kind):
+    model = make_koopman_inverse_dynamics(4, 3, preset=preset, network=network, latent_dim=8, hidden_dim=16)
+    assert isinstance(model.latent_action, kind)
+    assert (model.operator.input is not None) == (network == "fourier")
+    td = model(TensorDict({"state": torch.randn(2, 16, 4)}, [2]))
+    assert td["action"].shape == (2, 16, 3)
+
+
+def test_options_override_the_preset_and_reach_the_parts():
+    model = make_koopman_inverse_dynamics(
+        2,
+        2,
+        preset="paper",
+        network="mlp",
+        dropout=0.3,
+        relative=True,
+        linear_skip=True,
+        structure="block_diagonal",
+        look_ahead=(2, 5),
+        history=3,
+        clamped=False,
+        include_state=True,
+        latent_dim=10,
+    )
+    f = model.latent_action
+    assert (f.history, f.look_ahead, f.relative, f.clamped, f.latent_dim) == (3, (2, 5), True, False, 10)
+    assert f.skip is not None and any(getattr(layer, "p", None) == 0.3 for layer in f.network)
+    assert model.operator.structure == "block_diagonal" and model.lifting.include_state
+    fourier = make_koopman_inverse_dynamics(
+        2, 2, network="fourier", num_features=32, curvature=0.5, motion_scale=2.0, position_scale=3.0
+    ).latent_action
+    assert fourier.amplitude == pytest.approx((2 * 0.5 / 32) ** 0.5)
+    assert (fourier.motion_scale, fourier.position_scale, fourier.phase.numel()) == (2.0, 3.0, 32)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"preset": "paperr"}, "unknown preset 'paperr'; did you mean 'paper'"),
+        ({"preset": "xyz"}, "unknown preset 'xyz'; known: default, paper, released"),
+        ({"preset": None}, "unknown preset None"),
+        ({"network": "tcn"}, "unknown network 'tcn'; known: fourier, lstm, mlp"),
+        ({"network": "lstmm"}, "unknown network 'lstmm'; did you mean 'lstm'"),
+        ({"latentdim": 3}, "option .* 'latentdim'; did you mean 'latent_dim'"),
+        ({"preset": "paper", "dropout": 0.1}, "option .* network 'lstm': 'dropout'"),
+        ({"preset": "released", "num_features": 8}, "option .* network 'mlp': 'num_features'"),
+        ({"structure": "full"}, "unknown operator structure 'full'"),
+        ({"operator_init": "zero"}, "unknown operator init 'zero'"),
+    ],
+)
+def test_unknown_names_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        make_koopman_inverse_dynamics(2, 2, **options)
+
+
+def test_presets_name_only_known_options():
+    common = None
+    for name, preset in PRESETS.items():
+        foreign = {option for options in NETWORK_OPTIONS.values() for option in options}
+        rest = set(preset) - foreign
+        common = rest if common is None else common
+        assert rest == common, (
+            name
+        )  # the same choices in every preset, so that two presets can be compared line by line
+
+
+def test_normalisers_are_used_and_their_entries_are_named():
+    scale = Normalizer(torch.zeros(2), torch.full((2,), 10.0))
+    torch.manual_seed(0)
+    plain = make_koopman_inverse_dynamics(2, 2, preset="paper")
+    scaled = make_koopman_inverse_dynamics(2, 2, preset="paper", state_normalizer=scale, action_normalizer=scale)
+    for name in ("latent_action", "action_decoder"):
+        getattr(scaled, name).load_state_dict(getattr(plain, name).state_dict())
+    state = torch.randn(3, 16, 2)
+    td = scaled(TensorDict({"state": 10 * state}, [3]))
+    torch.testing.assert_close(td["action"], 10 * plain(TensorDict({"state": state}, [3]))["action"])
+    torch.testing.assert_close(td["normalized_state"], state)
+    assert scaled.in_keys == ["state"] and scaled.out_keys[-1] == "action"

@@ -1,0 +1,175 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Statistics against closed forms; constant columns, masks, state dicts, and missing statistics."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.torch import load, save
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+
+from torchrl_koap.modules import Normalizer
+
+DTYPES = (torch.float32, torch.float64)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("shape", [(50, 3), (5, 10, 3), (1, 3)])
+def test_ranges(shape, dtype):
+    values = torch.randn(shape, dtype=dtype) * torch.tensor([1e-3, 1.0, 1e3], dtype=dtype) + 2
+    out = Normalizer.fit(values)(values)
+    assert out.dtype == dtype
+    flat = out.flatten(0, -2)
+    limit = 0.0 if len(flat) == 1 else 1.0
+    torch.testing.assert_close(flat.amax(0), torch.full((3,), limit, dtype=dtype), atol=1e-3, rtol=0)
+    torch.testing.assert_close(flat.amin(0), torch.full((3,), -limit, dtype=dtype), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_standard_and_identity(dtype):
+    values = torch.randn(400, 2, dtype=dtype) * 3 + 7
+    normalizer = Normalizer.fit(values, mode="standard")
+    torch.testing.assert_close(normalizer.offset, values.mean(0))
+    torch.testing.assert_close(normalizer.scale, values.std(0, correction=0))
+    assert torch.equal(Normalizer.fit(values, mode="identity")(values), values)
+    normalizer = Normalizer.fit(values, mode="rms")
+    assert not normalizer.offset.any()
+    torch.testing.assert_close(normalizer(values).square().mean(0), torch.ones(2, dtype=dtype))
+    assert Normalizer.fit(torch.zeros(3, 1), mode="rms").scale.item() == 1.0
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3), min_size=1, max_size=20),
+    st.sampled_from(["minmax", "standard", "rms", "identity"]),
+)
+def test_always_finite_and_invertible(rows, mode):
+    values = torch.tensor(rows, dtype=torch.float64)
+    normalizer = Normalizer.fit(values, mode=mode)
+    out = normalizer(values)
+    assert out.isfinite().all() and (normalizer.scale > 0).all()
+    torch.testing.assert_close(normalizer.inverse(out), values, atol=1e-6, rtol=1e-9)
+    differences = values[1:] - values[:-1]
+    torch.testing.assert_close(normalizer.scale_difference(differences), out[1:] - out[:-1], atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(
+        normalizer.unscale_difference(normalizer.scale_difference(differences)), differences, atol=1e-6, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize("mode", ["minmax", "standard"])
+@pytest.mark.parametrize("constant", [0.0, 0.1, 12345.678, 1e-42])
+def test_constant_columns_are_only_shifted(mode, constant):
+    values = torch.rand(101, 2)
+    values[:, 1] = constant
+    normalizer = Normalizer.fit(values, mode=mode)
+    assert normalizer.scale[1] == 1.0
+    assert normalizer(values)[:, 1].abs().max() <= 1e-7 * max(constant, 1)
+    unseen = normalizer(torch.tensor([[0.5, constant + 1.0]]))
+    assert abs(unseen[0, 1].item() - 1) < 1e-2
+
+
+@pytest.mark.parametrize("mode", ["minmax", "standard"])
+def test_columns_constant_up_to_rounding_are_only_shifted(mode):
+    values = torch.full((10, 1), 12345.678)
+    values[3] = torch.nextafter(values[3], torch.tensor([torch.inf]))
+    assert values[3] != values[0]
+    assert Normalizer.fit(values, mode=mode).scale.item() == 1.0
+
+
+def test_a_tiny_but_real_range_is_scaled():
+    values = torch.linspace(0, 1e-5, 11).unsqueeze(-1)  # ten micrometres
+    torch.testing.assert_close(Normalizer.fit(values)(values)[-1], torch.ones(1))
+
+
+@pytest.mark.parametrize("trailing", [False, True])
+def test_masks(trailing):
+    values = torch.randn(6, 5, 2)
+    mask = torch.rand(6, 5) > 0.5
+    values[~mask] = float("nan")
+    normalizer = Normalizer.fit(values, mode="standard", mask=mask.unsqueeze(-1) if trailing else mask)
+    torch.testing.assert_close(normalizer.offset, values[mask].mean(0))
+    with pytest.raises(ValueError, match="NaN or infinite, in columns"):
+        Normalizer.fit(values)
+    with pytest.raises(ValueError, match="no rows"):
+        Normalizer.fit(values, mask=torch.zeros_like(mask))
+    with pytest.raises(ValueError, match="mask must be bool"):
+        Normalizer.fit(values, mask=mask.float())
+    with pytest.raises(ValueError, match="mask must be bool"):
+        Normalizer.fit(values, mask=mask[:3])
+
+
+def test_wrong_input():
+    values = torch.zeros(4, 2)
+    values[2, 1] = float("inf")
+    with pytest.raises(ValueError, match=r"1 of 4 rows are NaN or infinite, in columns \[1\]"):
+        Normalizer.fit(values)
+    with pytest.raises(ValueError, match="did you mean 'minmax'"):
+        Normalizer.fit(torch.zeros(4, 2), mode="minmx")
+    with pytest.raises(ValueError, match="float tensor"):
+        Normalizer.fit(torch.zeros(4, 2, dtype=torch.int64))
+    with pytest.raises(ValueError, match="float tensor"):
+        Normalizer.fit(torch.zeros(4))
+    with pytest.raises(ValueError, match="wanted 2 columns, got shape"):
+        Normalizer.fit(torch.rand(4, 2))(torch.zeros(5, 3))
+    for offset, scale in ((None, torch.ones(1)), (torch.zeros(2), torch.ones(1)), (torch.zeros(1), torch.zeros(1))):
+        with pytest.raises(ValueError, match="offset"):
+            Normalizer(offset, scale)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_state_dict_round_trip(dtype):
+    normalizer = Normalizer.fit(torch.randn(30, 3, dtype=dtype), mode="standard")
+    restored = Normalizer()
+    restored.load_state_dict(load(save(normalizer.state_dict())))
+    assert restored.scale.dtype == dtype
+    assert torch.equal(restored.offset, normalizer.offset) and torch.equal(restored.scale, normalizer.scale)
+    fitted = Normalizer.fit(torch.randn(30, 3, dtype=dtype))
+    fitted.load_state_dict(normalizer.state_dict())
+    assert torch.equal(fitted.scale, normalizer.scale)
+    with pytest.raises(RuntimeError, match="size mismatch"):
+        Normalizer.fit(torch.randn(30, 4)).load_state_dict(normalizer.state_dict())
+
+
+def test_missing_statistics_are_found_out():
+    normalizer = Normalizer()
+    assert not normalizer.is_fitted
+    for method in (normalizer, normalizer.inverse, normalizer.scale_difference, normalizer.unscale_difference):
+        with pytest.raises(RuntimeError, match="no statistics"):
+            method(torch.zeros(1, 2))
+    policy = nn.Sequential(Normalizer(), nn.Linear(2, 1))
+    with pytest.raises(RuntimeError, match=r'Missing key.*"0\.offset", "0\.scale"'):
+        policy.load_state_dict({key: value for key, value in policy.state_dict().items() if "." in key})
+    trained = nn.Sequential(Normalizer.fit(torch.rand(5, 2)), nn.Linear(2, 1))
+    policy.load_state_dict(trained.state_dict())
+    x = torch.rand(7, 2)
+    assert torch.equal(policy(x), trained(x))
+
+
+def test_module_in_a_tensordict():
+    values = torch.randn(20, 3)
+    module = TensorDictModule(Normalizer.fit(values), in_keys=["state"], out_keys=[("scaled", "state")])
+    out = module(TensorDict({"state": values.reshape(4, 5, 3)}, [4, 5]))
+    assert out["scaled", "state"].shape == (4, 5, 3)
+    assert out["scaled", "state"].abs().max() <= 1 + 1e-6
+    assert not list(module.parameters())
+
+
+def test_gradients_and_types_follow_the_argument():
+    normalizer = Normalizer.fit(torch.tensor([[0.0], [4.0]]))
+    x = torch.ones(1, 1, dtype=torch.float64, requires_grad=True)
+    y = normalizer(x)
+    assert y.dtype == torch.float64
+    y.sum().backward()
+    assert x.grad.item() == 0.5
+    assert normalizer.double().offset.dtype == torch.float64
+
+
+def test_compiles_without_breaks():
+    normalizer = Normalizer.fit(torch.rand(9, 2))
+    compiled = torch.compile(normalizer, fullgraph=True, backend="eager")
+    x = torch.rand(4, 2)
+    assert torch.equal(compiled(x), normalizer(x))

@@ -1,0 +1,381 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The Koopman losses: closed forms in plain loops, masks, labels that must not leak, and the shared base."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from loss_test_base import LossTestBase
+from tensordict import TensorDict
+
+from torchrl_koap.modules import (
+    KoopmanInverseDynamics,
+    KoopmanLifting,
+    KoopmanOperator,
+    LatentActionFourier,
+    LatentActionLSTM,
+    LatentActionMLP,
+    LinearActionDecoder,
+    Normalizer,
+)
+from torchrl_koap.objectives import KOAPLoss, KoopmanDynamicsLoss, KoopmanReconstructionLoss, LatentActionLoss
+
+T, K, HISTORY = 9, 3, 1
+LOSSES = (KoopmanReconstructionLoss, KoopmanDynamicsLoss, LatentActionLoss, KOAPLoss)
+NETWORKS = ("mlp", "lstm", "fourier")
+
+
+def make_network(kind="mlp", *, clamped=False, normalizers=True, dropout=0.0, seed=0):
+    torch.manual_seed(seed)
+    frames = {"history": HISTORY, "look_ahead": K, "clamped": clamped}
+    if kind == "mlp":
+        latent_action = LatentActionMLP(3, 4, hidden_dims=(16,), dropout=dropout, **frames)
+    elif kind == "lstm":
+        latent_action = LatentActionLSTM(3, 4, hidden_dim=8, **frames)
+    else:
+        latent_action = LatentActionFourier(3, 16, **frames)
+    operator = KoopmanOperator(4, input_dim=latent_action.latent_dim if kind == "fourier" else None)
+    if kind == "fourier":
+        torch.nn.init.normal_(operator.input, std=0.1)
+    network = KoopmanInverseDynamics(
+        latent_action,
+        LinearActionDecoder(latent_action.latent_dim, 2),
+        lifting=KoopmanLifting(3, 4, hidden_dims=(16,), include_state=kind == "fourier"),
+        operator=operator,
+        state_normalizer=Normalizer(torch.tensor([0.1, -0.2, 0.0]), torch.tensor([2.0, 1.0, 3.0]))
+        if normalizers
+        else None,
+        action_normalizer=Normalizer(torch.tensor([0.3, 0.0]), torch.tensor([0.5, 2.0])) if normalizers else None,
+    )
+    return network
+
+
+def make_batch(*batch, dtype=torch.float32, share=0.5, num_frames=T):
+    generator = torch.Generator().manual_seed(4)
+    state = torch.randn(*batch, num_frames, 3, generator=generator, dtype=torch.float64).cumsum(-2)
+    action = torch.randn(*batch, num_frames, 2, generator=generator, dtype=torch.float64)
+    has_action = torch.rand(*batch, num_frames, 1, generator=generator) < share
+    action = torch.where(has_action, action, torch.nan)
+    return TensorDict({"state": state.to(dtype), "action": action.to(dtype), "has_action": has_action}, batch)
+
+
+def span(clamped):
+    return range(HISTORY, T - 2 if clamped else T - K)
+
+
+class KoopmanLossTests(LossTestBase):
+    default_keys = {"state": "state", "action": "action", "has_action": "has_action", "padded": "padded"}
+    learning_rate = 1e-2
+    loss_class: type
+
+    def make_loss(self, seed=0, **options):
+        kind = options.pop("kind", "fourier")
+        return self.loss_class(make_network(kind, seed=seed), **options)
+
+    def make_batch(self, *batch):
+        data = make_batch(*batch)
+        padded = torch.zeros(*batch, T, dtype=torch.bool)
+        padded[..., :2] = torch.rand(*batch, 1, generator=torch.Generator().manual_seed(1)) < 0.4
+        return data.set("padded", padded)
+
+    def counted(self, batch, key, elements):
+        if key == "loss_reconstruction":
+            return elements.numel()
+        frames = slice(span(False).start, span(False).stop)
+        count = ~(batch["padded"][..., frames] | batch["padded"][..., frames.start + 1 : frames.stop + 1])
+        if key == "loss_action":
+            count &= batch["has_action"][..., frames, 0]
+        assert (elements[~count] == 0).all() and (elements[count] > 0).all()
+        return count.sum()
+
+
+class TestReconstruction(KoopmanLossTests):
+    loss_class = KoopmanReconstructionLoss
+    in_names, out_keys = ("state",), ("loss_reconstruction",)
+    test_compiled_equals_eager = None  # TestKOAP compiles the same terms
+
+
+class TestDynamics(KoopmanLossTests):
+    loss_class = KoopmanDynamicsLoss
+    in_names, out_keys = ("state",), ("loss_koopman",)
+    test_compiled_equals_eager = None  # TestKOAP compiles the same terms
+
+
+class TestLatentAction(KoopmanLossTests):
+    loss_class = LatentActionLoss
+    in_names, out_keys = ("state", "action", "has_action"), ("loss_action",)
+    decrease = 0.8
+    test_compiled_equals_eager = None
+
+
+class TestKOAP(KoopmanLossTests):
+    loss_class = KOAPLoss
+    in_names = ("state", "action", "has_action")
+    out_keys = ("loss_reconstruction", "loss_koopman", "loss_action")
+    coefficients = {"koopman_coeff": "loss_koopman", "action_coeff": "loss_action"}
+
+
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+def test_compiled_equals_eager_for_the_other_networks(kind):
+    torch._dynamo.reset()
+    loss, batch = KOAPLoss(make_network(kind)), make_batch(3)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch)
+    for key, value in loss(batch).items():
+        torch.testing.assert_close(compiled[key], value)
+
+
+# values
+
+
+def in_plain_loops(network, batch, clamped):
+    """All three losses, element by element, from the weights and the definition."""
+    g, decoder, f = network.lifting, network.action_decoder.linear, network.latent_action
+    offset, scale = network.state_normalizer.offset, network.state_normalizer.scale
+    a_offset, a_scale = network.action_normalizer.offset, network.action_normalizer.scale
+    reconstruction, dynamics, action = [], [], []
+    for window in range(len(batch)):
+        x = [(row - offset) / scale for row in batch["state"][window]]
+        z = [g.encoder(row) for row in x]
+        if g.include_state:
+            z = [torch.cat([row, lifted]) for row, lifted in zip(x, z, strict=True)]
+        reconstruction += [((g.decoder(z[t]) - x[t]) ** 2).mean() for t in range(T)]
+        for t in span(clamped):
+            read = [x[t - 1], x[t], x[min(t + K, T - 1)]]
+            if isinstance(f, LatentActionMLP):
+                u = f.network(torch.cat(read))
+            elif isinstance(f, LatentActionLSTM):
+                lstm = torch.nn.LSTM(3, 8, batch_first=True)
+                weights = dict(f.lstm.named_parameters())
+                u = f.readout(torch.func.functional_call(lstm, weights, torch.stack(read)[None])[0][0, -1])
+            else:
+                motion = torch.cat([x[t] - read[0], read[2] - x[t]]) / 6**0.5
+                phase = torch.cat([motion, x[t] / 4]) @ f.frequency + f.phase
+                u = torch.cat([motion, (2 * 0.1 / 16) ** 0.5 * torch.cos(phase)])
+            step = u if network.operator.input is None else network.operator.input @ u
+            predicted = network.operator.weight @ z[t] + step
+            dynamics.append(((predicted - z[t + 1]) ** 2).mean())
+            if batch["has_action"][window, t]:
+                target = (batch["action"][window, t] - a_offset) / a_scale
+                action.append(((decoder.weight @ u + decoder.bias - target) ** 2).mean())
+    return {
+        "loss_reconstruction": torch.stack(reconstruction),
+        "loss_koopman": torch.stack(dynamics),
+        "loss_action": torch.stack(action),
+    }
+
+
+@pytest.mark.parametrize("clamped", [False, True])
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_values_in_plain_loops(kind, clamped):
+    network, batch = make_network(kind, clamped=clamped), make_batch(4)
+    expected = in_plain_loops(network, batch, clamped)
+    losses = KOAPLoss(network, koopman_coeff=0.5, action_coeff=3.0)(batch)
+    for key, factor in (("loss_reconstruction", 1.0), ("loss_koopman", 0.5), ("loss_action", 3.0)):
+        torch.testing.assert_close(losses[key], factor * expected[key].mean())
+    elements = KOAPLoss(network, reduction="none")(batch)
+    torch.testing.assert_close(elements["loss_koopman"].flatten(), expected["loss_koopman"])
+    assert elements["loss_koopman"].shape == elements["loss_action"].shape == (4, len(span(clamped)))
+    labelled = batch["has_action"][:, span(clamped).start : span(clamped).stop, 0]
+    torch.testing.assert_close(elements["loss_action"][labelled], expected["loss_action"])
+    assert (elements["loss_action"][~labelled] == 0).all()
+
+
+def test_single_losses_are_the_terms_of_the_sum():
+    network, batch = make_network(), make_batch(4)
+    together = KOAPLoss(network)(batch)
+    for loss_class in LOSSES[:3]:
+        for key, value in loss_class(network)(batch).items():
+            assert torch.equal(value, together[key])
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_gradients_in_plain_loops(kind):
+    """Also of the target g(x_{t+1}), which is not detached (koap_release_notes 3.1)."""
+    network, batch = make_network(kind), make_batch(3)
+    parameters = dict(network.named_parameters())
+    expected = in_plain_loops(network, batch, False)
+    for key, value in KOAPLoss(network)(batch).items():
+        left = torch.autograd.grad(value, parameters.values(), retain_graph=True, allow_unused=True)
+        right = torch.autograd.grad(expected[key].mean(), parameters.values(), retain_graph=True, allow_unused=True)
+        for name, one, other in zip(parameters, left, right, strict=True):
+            zeros = torch.zeros_like(parameters[name])
+            one, other = (zeros if gradient is None else gradient for gradient in (one, other))
+            assert torch.allclose(one, other, rtol=1e-3, atol=1e-5), (key, name)
+
+
+# labels
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_without_labels_the_action_loss_and_its_gradients_are_exactly_zero(kind):
+    network, batch = make_network(kind), make_batch(4, share=0.0)
+    assert batch["action"].isnan().all()
+    value = LatentActionLoss(network)(batch)["loss_action"]
+    assert value == 0.0
+    value.backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is None or (parameter.grad == 0).all(), name
+    assert network.action_decoder.linear.weight.grad is not None  # in the graph: distributed training needs that
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+@pytest.mark.parametrize("poison", [float("nan"), float("inf"), 1e38, -1.0])
+def test_labels_outside_the_budget_change_nothing_bit_for_bit(kind, poison):
+    batch = make_batch(4)
+    zeroed, poisoned = batch.clone(), batch.clone()
+    zeroed["action"] = torch.where(batch["has_action"], batch["action"], 0.0)
+    poisoned["action"] = torch.where(batch["has_action"], batch["action"], poison)
+    results = []
+    for data in (zeroed, poisoned):
+        network = make_network(kind)
+        losses = KOAPLoss(network)(data)
+        sum(losses.values()).backward()
+        fit = network.fit_decoder(data, data["has_action"].squeeze(-1), groups=torch.arange(4))
+        gradients = {name: parameter.grad for name, parameter in network.named_parameters()}
+        results.append((dict(losses.items()), gradients, network.state_dict(), fit))
+    for left, right in zip(results[0][:3], results[1][:3], strict=True):
+        assert left.keys() == right.keys()
+        for name, value in left.items():
+            assert value.isfinite().all() and torch.equal(value, right[name]), name
+    assert results[0][3].errors == results[1][3].errors and results[0][3].penalty == results[1][3].penalty
+
+
+def test_labels_on_frames_that_do_not_count_change_nothing():
+    batch = make_batch(4, share=1.0)
+    other = batch.clone()
+    other["action"][:, 0] = 1e6
+    other["action"][:, T - K :] = -1e6
+    networks = make_network(), make_network()
+    values = [KOAPLoss(network)(data)["loss_action"] for network, data in zip(networks, (batch, other), strict=True)]
+    assert torch.equal(*values)
+    for network, data in zip(networks, (batch, other), strict=True):
+        network.fit_decoder(data, data["has_action"].squeeze(-1))
+    assert torch.equal(networks[0].action_decoder.linear.weight, networks[1].action_decoder.linear.weight)
+    batch["action"][:, T - K - 1] += 1
+    assert KOAPLoss(networks[0])(batch)["loss_action"] != KOAPLoss(networks[1])(other)["loss_action"]
+
+
+def test_a_labelled_action_that_is_nan_is_loud():
+    batch = make_batch(4, share=1.0)
+    batch["action"][0, 2] = torch.nan
+    assert LatentActionLoss(make_network())(batch)["loss_action"].isnan()
+
+
+def test_all_frames_of_a_mean_weigh_alike():
+    """A window with one label must not weigh as much as one with five."""
+    network, batch = make_network(), make_batch(2, share=1.0)
+    batch["has_action"][0] = False
+    batch["has_action"][0, 2] = True
+    elements = LatentActionLoss(network, reduction="none")(batch)["loss_action"]
+    expected = (elements[0, 1] + elements[1].sum()) / (1 + len(span(False)))
+    torch.testing.assert_close(LatentActionLoss(network)(batch)["loss_action"], expected)
+
+
+# padding
+
+
+@pytest.mark.parametrize("trailing", [False, True])
+def test_transitions_of_padded_frames_count_in_no_loss(trailing):
+    network, batch = make_network(), make_batch(2, share=1.0)
+    padded = torch.zeros(2, T, dtype=torch.bool)
+    padded[0, :3] = True  # transitions 0, 1 inside, 2 out of the padding: frames 1 and 2 do not count
+    padded[1, 5:] = True  # transition 4 into it and 5 inside: frames 4 and 5 do not count
+    data = batch.clone().set("padded", padded.unsqueeze(-1) if trailing else padded)
+    plain = KOAPLoss(network, reduction="none")(batch)
+    masked = KOAPLoss(network, reduction="none")(data)
+    keep = torch.tensor([[0, 0, 1, 1, 1], [1, 1, 1, 0, 0]], dtype=torch.bool)  # of frames 1..5
+    for key in ("loss_koopman", "loss_action"):
+        assert torch.equal(masked[key], torch.where(keep, plain[key], 0.0))
+        torch.testing.assert_close(KOAPLoss(network)(data)[key], plain[key][keep].mean())
+    assert torch.equal(masked["loss_reconstruction"], plain["loss_reconstruction"])
+    data["action"][0, :3] = data["action"][1, 4:] = 1e30
+    assert torch.equal(KOAPLoss(network, reduction="none")(data)["loss_action"], masked["loss_action"])
+    assert torch.equal(LatentActionLoss(network, reduction="none")(data)["loss_action"], masked["loss_action"])
+
+
+# keys, modes, sharing
+
+
+def test_keys_of_the_network_are_taken_over_and_renaming_reaches_it():
+    network = make_network()
+    network.set_keys(state="window", action=("robot", "velocity"))
+    loss, batch = KOAPLoss(network), make_batch(3)
+    assert loss.in_keys == ["window", ("robot", "velocity"), "has_action"]
+    expected = KOAPLoss(make_network())(batch)
+    renamed = batch.rename_key_("state", "window").rename_key_("action", ("robot", "velocity"))
+    for key, value in loss(renamed).items():
+        assert torch.equal(value, expected[key])
+    loss.set_keys(state="x", action="a", has_action="labelled")
+    assert network.in_keys == ["x"] and network.out_keys[-1] == "a"
+    assert network(TensorDict({"x": renamed["window"]}, [3]))["a"].shape == (3, T, 2)
+    loss.set_keys(state=None)
+    assert network.in_keys == ["state"] and network.state_key == "state"
+
+
+@pytest.mark.parametrize("entry", ["has_action", "padded"])
+@pytest.mark.parametrize("bad", [torch.ones(3, T - 1, 1, dtype=torch.bool), torch.ones(3, T, 1)])
+def test_a_mask_of_another_shape_or_type_is_refused(entry, bad):
+    with pytest.raises(ValueError, match=f"'{entry}' must be bool"):
+        KOAPLoss(make_network())(TensorDict({**make_batch(3), entry: bad}, [3]))
+
+
+def test_a_window_too_short_is_explained():
+    batch = make_batch(3, num_frames=HISTORY + K)
+    message = f"a window of {HISTORY + K} frames is too short .* at least {HISTORY + K + 1} frames are needed"
+    for loss_class in LOSSES[1:]:
+        with pytest.raises(ValueError, match=message):
+            loss_class(make_network())(batch)
+    assert KoopmanReconstructionLoss(make_network())(batch)["loss_reconstruction"] > 0
+    assert KOAPLoss(make_network())(make_batch(3, num_frames=HISTORY + K + 1))["loss_koopman"] > 0
+
+
+def test_eval_switches_dropout_off():
+    loss, batch = KOAPLoss(make_network(dropout=0.5)), make_batch(3)
+    assert loss(batch)["loss_koopman"] != loss(batch)["loss_koopman"]
+    loss.eval()
+    assert loss(batch)["loss_koopman"] == loss(batch)["loss_koopman"]
+    loss.train()
+    assert loss(batch)["loss_koopman"] != loss(batch)["loss_koopman"]
+
+
+def test_training_moves_the_network_that_was_handed_in_and_its_inference_path():
+    """The sequence and the attributes hold the same parts: what is trained through one is used by the other."""
+    network, batch = make_network("fourier"), make_batch(8)
+    before = network(batch.select("state"))["action"].detach()
+    loss = KOAPLoss(network)
+    assert {id(p) for p in loss.parameters()} == {id(p) for p in network.parameters()}
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2)
+    sum(loss(batch).values()).backward()
+    optimizer.step()
+    after = network(batch.select("state"))["action"]
+    assert not torch.allclose(after, before)
+    torch.testing.assert_close(after, network.decode(network.infer(batch["state"])))
+
+
+def test_what_is_fitted_after_the_loss_was_built_reaches_it():
+    network, batch = make_network("fourier"), make_batch(64)
+    loss = KOAPLoss(network)
+    before = loss(batch)
+    network.fit_scales(batch["state"])
+    scaled = loss(batch)
+    assert scaled["loss_koopman"] != before["loss_koopman"]
+    network.fit_decoder(batch, batch["has_action"].squeeze(-1))
+    assert loss(batch)["loss_action"] < 0.95 * scaled["loss_action"]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_cuda_equals_cpu(kind):
+    batch = make_batch(8)
+    expected = KOAPLoss(make_network(kind))(batch)
+    network = make_network(kind).cuda()
+    for key, value in KOAPLoss(network)(batch.cuda()).items():
+        assert value.device.type == "cuda"
+        torch.testing.assert_close(value.cpu(), expected[key], rtol=1e-3, atol=1e-5)
+    on_cpu = make_network(kind)
+    errors = on_cpu.fit_decoder(batch, batch["has_action"].squeeze(-1)).errors
+    batch = batch.cuda()
+    fit = network.fit_decoder(batch, batch["has_action"].squeeze(-1), groups=torch.arange(8, device="cuda") // 2)
+    assert fit.noise_variance.device.type == "cuda" and fit.errors.keys() == errors.keys()
+    fit = network.fit_decoder(batch, batch["has_action"].squeeze(-1))
+    assert list(fit.errors.values()) == pytest.approx(list(errors.values()), rel=1e-2)

@@ -1,0 +1,98 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The loss of supervised inverse dynamics: a plain loop, hidden labels, padding, and the shared base."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from loss_test_base import LossTestBase
+from tensordict import TensorDict
+
+from torchrl_koap.modules import Normalizer, RecurrentInverseDynamics
+from torchrl_koap.objectives import InverseDynamicsLoss
+
+T = 7
+
+
+def make_loss(seed=0, **options):
+    torch.manual_seed(seed)
+    network = RecurrentInverseDynamics(
+        3,
+        2,
+        hidden_dim=16,
+        state_normalizer=Normalizer(torch.tensor([0.1, -0.2, 0.0]), torch.tensor([2.0, 1.0, 3.0])),
+        action_normalizer=Normalizer(torch.tensor([0.3, 0.0]), torch.tensor([0.5, 2.0])),
+    )
+    return InverseDynamicsLoss(network, **options)
+
+
+def make_batch(*batch, share=0.5):
+    generator = torch.Generator().manual_seed(4)
+    has_action = torch.rand(*batch, T, 1, generator=generator) < share
+    action = torch.where(has_action, torch.randn(*batch, T, 2, generator=generator), torch.nan)
+    state = torch.randn(*batch, T, 3, generator=generator)
+    return TensorDict({"state": state, "action": action, "has_action": has_action}, batch)
+
+
+class TestInverseDynamicsLoss(LossTestBase):
+    default_keys = {"state": "state", "action": "action", "has_action": "has_action", "padded": "padded"}
+    in_names, out_keys = ("state", "action", "has_action"), ("loss_action",)
+    learning_rate = 1e-2
+
+    def make_loss(self, seed=0, **options):
+        return make_loss(seed, **options)
+
+    def make_batch(self, *batch):
+        return make_batch(*batch)
+
+    def counted(self, batch, key, elements):
+        return int(batch["has_action"][..., 1:-1, :].sum())
+
+
+@pytest.mark.parametrize("trailing", [True, False])
+def test_equals_a_plain_loop(trailing):
+    loss, batch = make_loss(), make_batch(4)
+    padded = torch.zeros(4, T, 1, dtype=torch.bool)
+    padded[0, :3], padded[1, -2:] = True, True
+    prediction = loss.network(batch.clone())["action"]
+    scale = torch.tensor([0.5, 2.0])
+    errors = []
+    for row in range(4):
+        for frame in range(1, T - 1):
+            if batch["has_action"][row, frame] and not (padded[row, frame] or padded[row, frame + 1]):
+                errors.append((((prediction - batch["action"])[row, frame] / scale) ** 2).mean())
+    batch["padded"] = padded if trailing else padded.squeeze(-1)
+    assert 5 < len(errors) < batch["has_action"].sum()
+    torch.testing.assert_close(loss(batch)["loss_action"], torch.stack(errors).mean())
+
+
+def test_hidden_actions_reach_neither_value_nor_gradient():
+    loss, batch = make_loss(), make_batch(4)
+    loss(batch)["loss_action"].backward()
+    gradients = {name: value.grad.clone() for name, value in loss.named_parameters()}
+    assert any(gradient.abs().max() > 0 for gradient in gradients.values())
+    loss.zero_grad()
+    for poison in (1e30, torch.inf):
+        poisoned = batch.clone()
+        poisoned["action"] = torch.where(batch["has_action"], batch["action"], poison)
+        result = loss(poisoned)["loss_action"]
+        assert torch.equal(result, loss(batch)["loss_action"])
+        loss.zero_grad()
+        result.backward()
+        for name, value in loss.named_parameters():
+            assert torch.equal(value.grad, gradients[name]) and value.grad.isfinite().all()
+
+
+def test_without_labels_loss_and_gradients_are_exactly_zero():
+    loss, batch = make_loss(), make_batch(4, share=0.0)
+    result = loss(batch)["loss_action"]
+    result.backward()
+    assert result == 0
+    assert all((value.grad == 0).all() for value in loss.parameters())
+
+
+def test_a_mask_of_another_shape_is_refused():
+    batch = make_batch(4)
+    batch["has_action"] = batch["has_action"][:, 1:].clone().float().expand(4, T - 1, 1)
+    with pytest.raises(ValueError, match=r"'has_action' must be bool \[4, 7, 1\], got torch.float32 \[4, 6, 1\]"):
+        make_loss()(batch)

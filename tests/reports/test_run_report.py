@@ -1,0 +1,277 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The report: right numbers, nothing dropped, everything escaped, absent and damaged files said."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+from run_files import make_demonstrations, make_object_rollouts, make_rollouts, write_run
+from safetensors.torch import save_file
+
+from torchrl_koap.reports import pictures
+from torchrl_koap.reports.html import definition, interval_bar
+from torchrl_koap.reports.mode_plots import even_entropy
+from torchrl_koap.reports.pictures import PICTURES, draw_pictures
+from torchrl_koap.reports.run_report import CAPTIONS, write_report
+from torchrl_koap.tasks import get_task
+
+_VOID = {"meta", "img", "rect", "br"}
+
+
+class Page(HTMLParser):
+    """Text, tags and links of a page; fails on tags that do not close."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.source = path.read_text()
+        self.open, self.tags, self.links, self.words = [], [], [], []
+        self.feed(self.source)
+        assert not self.open, f"not closed: {self.open}"
+        self.text = re.sub(r"\s+", " ", " ".join(self.words))
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.links += [value for name, value in attributes if name in ("src", "href")]
+        if tag not in _VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in _VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = write_run(tmp_path_factory.mktemp("run"))
+    write_report(folder)
+    return folder
+
+
+def test_headline_has_intervals_and_n(run):
+    text = Page(run / "index.html").text
+    for wanted in (
+        "50.0 % interval 95 % interval 15.0 to 85.0 %, 2 of 4 rollouts",
+        f"0.22 2 of 24 modes; an even choice averages {even_entropy(2, 24):.2f}, n = 2",
+        "action error, koap 0.91 mm ridge 1.04 mm, n = 20 unlabelled steps",
+        "action labels 20 50.00 % of 40 transitions, in 1 of 2 demonstrations",
+        "400 Hz 8.5 ms per plan, 0.5 ms per control step",
+        "1 min 25 s planner 1 min 5 s, controller 20.0 s",
+        "Outside the budget, for analysis only: 20 labels",
+    ):
+        assert wanted in text
+
+
+def test_order_headline_labels_pictures_commands(run):
+    text = Page(run / "index.html").text
+    places = [text.index(word) for word in ("Result", "Labels", "Executed rollouts", "All numbers", "Do it again")]
+    assert places == sorted(places)
+    assert "koap train --out 'a folder'" in text
+    solver = "--episodes 4 --seed 100 --execution feedback --solver flow_euler --solver-steps 8"
+    assert f"koap eval {run} {solver}" in text
+
+
+def test_pictures_are_there_with_captions_and_no_outside_resource(run):
+    page = Page(run / "index.html")
+    expected = [picture for picture in PICTURES if picture.name != "film.gif"]  # this run has kept no actions
+    assert {f"plots/{picture.name}" for picture in expected} <= set(page.links)
+    for link in page.links:
+        assert (run / link).is_file()
+    for picture in expected:
+        assert CAPTIONS[picture.name][0] in page.text
+    assert "http" not in page.source and "script" not in page.tags
+    assert "Not drawn" not in page.text and 'class="warning"' not in page.source
+
+
+def test_no_key_is_dropped(tmp_path):
+    write_run(tmp_path)
+    for name in ("config", "summary", "eval"):
+        path = tmp_path / f"{name}.json"
+        content = json.loads(path.read_text())
+        content[f"odd_{name}"] = {"deep": {"list": [{"a": 1.25}, {"b_mm": None}], "flag": True}, "text": f"only {name}"}
+        path.write_text(json.dumps(content))
+    page = Page(write_report(tmp_path, draw=False))
+    for name in ("config", "summary", "eval"):
+        assert f"odd {name} deep list a b (mm) 1.25 – – – flag yes text only {name}" in page.text
+    assert "planner 32, 64" in page.text and "812,345" in page.text
+
+
+def test_everything_from_files_is_escaped(tmp_path):
+    evil = "<script>alert('1')</script>&\""
+    content = {evil: evil, "command": evil, "task": evil, "method": evil, "seed": evil, "versions": {evil: evil}}
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    labels = {evil: evil, "labelled_transitions": 1, "total_transitions": 2}
+    summary = {"labels": labels, "action_error_mm": {evil: 1.0, "ridge": 2.0}, "train_seconds": {evil: 1.0}}
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    evaluation = {"success_rate": 0.5, "execution": evil, "distinct_modes": evil, "mode_entropy": 0.1}
+    evaluation["episode"] = [{"seed": evil, evil: evil}]
+    (tmp_path / "eval.json").write_text(json.dumps(evaluation))
+    page = Page(write_report(tmp_path))
+    assert "script" not in page.tags and "<script" not in page.source
+    assert page.source.count("&lt;script&gt;") > 12
+
+
+def test_empty_run_says_which_commands_make_the_sections(tmp_path):
+    folder = tmp_path / "my run"
+    folder.mkdir()
+    page = Page(write_report(folder))
+    assert f"koap eval '{folder}' --episodes 60 --seed 100" in page.text
+    assert f"koap train --out '{folder}'" in page.text
+    assert "img" not in page.tags and not (folder / "plots").exists()
+
+
+@pytest.mark.parametrize("name", ["config.json", "summary.json", "eval.json"])
+@pytest.mark.parametrize("content", ['{"task": ', "[1, 2]", ""])
+def test_damaged_json_is_named_and_the_rest_is_shown(name, content, tmp_path):
+    write_run(tmp_path)
+    (tmp_path / name).write_text(content)
+    page = Page(write_report(tmp_path, draw=False))
+    assert page.source.count('class="warning"') == 1 and str(tmp_path / name) in page.text
+    assert ("success rate" in page.text) == (name != "eval.json")
+
+
+@pytest.mark.parametrize("name", ["rollouts.safetensors", "actions.safetensors", "metrics.csv"])
+def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path):
+    write_run(tmp_path)
+    draw_pictures(tmp_path, animation=False)
+    data = tmp_path / name
+    data.write_bytes(data.read_bytes()[: -len(data.read_bytes()) // 2] if name != "metrics.csv" else b"phase,step\n")
+    problems = draw_pictures(tmp_path, animation=False)
+    wanted = {p.name for p in PICTURES if p.source == name and not p.name.endswith(".gif")}
+    assert set(problems) == wanted and all(message.startswith(f"{name}: ") for message in problems.values())
+    page = Page(write_report(tmp_path, animation=False))
+    assert page.source.count('class="warning"') == len(wanted)
+    assert not {f"plots/{picture}" for picture in wanted} & set(page.links)
+    assert "plots/eigenvalues.png" in page.links
+
+
+def test_odd_values_do_not_stop_the_report(tmp_path):
+    odd = {"success_rate": None, "episodes": "many", "mode_entropy": float("nan"), "control_hz": [], "episode": "none"}
+    (tmp_path / "eval.json").write_text(json.dumps(odd | {"plan_ms": "x"}))
+    (tmp_path / "summary.json").write_text(json.dumps({"labels": 3, "action_error_mm": 1.0, "train_seconds": 12.0}))
+    page = Page(write_report(tmp_path))
+    assert "not a number" in page.text and "training time 12.0 s" in page.text
+
+
+def test_camera_film_is_shown_if_there(tmp_path):
+    (tmp_path / "plots").mkdir()
+    (tmp_path / "plots" / "film.mp4").write_bytes(b"")
+    page = Page(write_report(tmp_path))
+    assert "video" in page.tags and "plots/film.mp4" in page.links
+
+
+def write_object_run(folder, task="stacking", **evaluation):
+    """A run of a task with objects, with what an evaluation in contexts leaves."""
+    write_run(folder)
+    rollouts = make_object_rollouts(task)
+    if not get_task(task).plans_position:
+        rollouts |= {"plan": torch.zeros(4, 0, 1, 2), "plan_step": torch.zeros(4, 0, dtype=torch.long)}
+    save_file(rollouts, folder / "rollouts.safetensors")
+    demonstrations = {"position": torch.rand(40, 2), "objects": torch.rand(40, len(get_task(task).objects), 2)}
+    data = make_demonstrations() | demonstrations
+    save_file(data, folder / "demonstrations.safetensors")
+    actions = torch.rand(20, get_task(task).action_dim)
+    save_file({"predicted": actions, "true": actions + 0.001}, folder / "actions.safetensors")
+    for name, change in (("config", {"task": task}), ("eval", {"contexts": 2} | evaluation)):
+        path = folder / f"{name}.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    return folder
+
+
+def test_tiles_of_a_task_with_contexts(tmp_path):
+    rates = {"stacked_1_rate": 0.75, "stacked_1_low": 0.3, "stacked_1_high": 0.954, "stacked_3_rate": 0.5}
+    pooled = {"mode_entropy": None, "pooled_mode_entropy": 0.387, "pooled_mode_entropy_low": 0.0}
+    write_object_run(tmp_path, **rates, **pooled, pooled_mode_entropy_high=0.5)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary["action_error_mrad"] = summary.pop("action_error_mm")
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    text = Page(write_report(tmp_path, draw=False)).text
+    even = f"an even choice averages {even_entropy(2, 6):.2f}, n = 2"
+    for wanted in (
+        "50.0 % interval 95 % interval 15.0 to 85.0 %, 2 of 4 rollouts in 2 contexts",
+        "one box stacked 75.0 % interval 95 % interval 30.0 to 95.4 %, 3 of 4 rollouts",
+        "three boxes stacked 50.0 % 2 of 4 rollouts",
+        f"mode entropy, all contexts together, base 6 0.39 95 % interval 0.00 to 0.50; 2 of 6 modes; {even}",
+        "action error, koap 0.91 mrad ridge 1.04 mrad, n = 20 unlabelled steps",
+        "Outside the budget, for analysis only: 20 labels",
+    ):
+        assert wanted in text
+    assert "two boxes" not in text
+
+
+def test_entropy_within_contexts(tmp_path):
+    write_object_run(tmp_path, "aligning", mode_entropy=0.5, pooled_mode_entropy=0.9)
+    text = Page(write_report(tmp_path, draw=False)).text
+    assert "mode entropy, base 2 0.50 2 of 2 modes; mean over contexts, 2 rollouts each" in text
+
+
+@pytest.mark.parametrize("task", ["aligning", "sorting", "stacking"])
+def test_report_of_a_task_with_objects(task, tmp_path, monkeypatch):
+    """Every picture that the task has, no word of Avoiding, and one line where no film can be made."""
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    (tmp_path / "plots").mkdir()
+    (tmp_path / "plots" / "plans.png").write_bytes(b"of an earlier evaluation")
+    page = Page(write_report(write_object_run(tmp_path, task)))
+    plans = get_task(task).plans_position
+    expected = {picture.name for picture in PICTURES} - {"film.gif"} - (set() if plans else {"plans.png"})
+    assert {link.removeprefix("plots/") for link in page.links} == expected
+    assert (tmp_path / "plots" / "plans.png").exists() is plans
+    assert ("the rollouts hold no plans of positions" in page.text) is not plans
+    assert page.source.count('class="warning"') == 1
+    assert "film.gif was not made: rendering is switched off by the environment variable MUJOCO_GL=off" in page.text
+    assert "cylinder" not in page.text and "gap taken" not in page.text
+    word = {"aligning": "thick far side", "sorting": "frames are the bins", "stacking": "still in the gripper"}[task]
+    assert word in page.text and "Squares are the objects" in page.text
+
+
+@pytest.mark.parametrize("task", ["avoiding", "stacking_1"])
+def test_film_of_the_first_success(task, tmp_path, monkeypatch):
+    made = []
+
+    def render(actions, path, **options):
+        made.append((actions, options))
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"GIF89a")
+        return path
+
+    monkeypatch.setattr(pictures, "render_rollout", render)
+    monkeypatch.setattr(pictures, "PICTURES", [picture for picture in PICTURES if picture.name == "film.gif"])
+    if task == "avoiding":
+        write_run(tmp_path)
+        rollouts = make_rollouts() | {"action": torch.rand(4, 20, 2)}
+    else:
+        write_object_run(tmp_path, task)
+        rollouts = make_object_rollouts(task)
+    rollouts["outcome"] = torch.tensor([0, 0, 1, 1])
+    save_file(rollouts, tmp_path / "rollouts.safetensors")
+    assert draw_pictures(tmp_path) == {}
+    ((actions, options),) = made
+    np.testing.assert_array_equal(actions, rollouts["action"][2])
+    assert options["task"] == task
+    assert (options["context"] is None) if task == "avoiding" else options["context"].dtype == np.float64
+    made.clear()
+    assert draw_pictures(tmp_path, animation=False) == {} and not made
+
+
+def test_no_such_directory(tmp_path):
+    for function in (write_report, draw_pictures):
+        with pytest.raises(FileNotFoundError, match="no run directory"):
+            function(tmp_path / "none")
+
+
+def test_interval_bar_is_to_scale():
+    bar = interval_bar(0.9, 0.75, 0.96)
+    assert 'x="75.0" y="2" width="21.0"' in bar and 'x="89.8"' in bar
+    assert 'width="0.4"' in interval_bar(1.0, 1.0, 1.0)
+
+
+def test_long_lists_are_cut_and_counted():
+    assert definition("a", list(range(100))).endswith("39 … (100 in all)")

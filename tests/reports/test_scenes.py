@@ -1,0 +1,133 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Scenes and bodies are drawn to scale and where the environments have them."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from torchrl_koap.reports import objects, scenes
+from torchrl_koap.tasks import TASKS
+
+
+@pytest.fixture(scope="module")
+def models():
+    """Compiled scenes of the environments."""
+    registry = pytest.importorskip("torchrl_koap.envs.registry")
+    return {name: registry.ENVIRONMENTS[name](1).sims.model for name in scenes.SCENES}
+
+
+def test_avoiding_is_that_of_the_environment():
+    avoiding = pytest.importorskip("torchrl_koap.envs.avoiding")
+    assert [(x, y, radius) for _, x, y, radius, _ in avoiding.OBSTACLES] == list(scenes.AVOIDING_CYLINDERS)
+    assert avoiding.FINISH_Y == scenes.AVOIDING_FINISH
+
+
+def test_scene_has_true_radii():
+    axes = scenes.draw_scene(Figure().add_subplot(), "avoiding")
+    sizes = sorted(round(patch.get_radius(), 3) for patch in axes.patches)
+    assert sizes == [0.025] * 5 + [0.03] + [0.035] * 5 + [0.04]
+    assert axes.get_aspect() == 1
+
+
+def test_unknown_scene_suggests_the_nearest():
+    with pytest.raises(ValueError, match="did you mean 'avoiding'"):
+        scenes.draw_scene(Figure().add_subplot(), "avoidin")
+
+
+@pytest.mark.parametrize("task", ["sorting", "sorting_2", "sorting_6", "po_sorting"])
+def test_sorting_is_that_of_the_environment(task, models):
+    model = models[task]
+    platform = model.body("platform")
+    centre, half = platform.pos[:2], model.geom_size[platform.geomadr[0]][:2]
+    np.testing.assert_allclose(np.transpose(scenes.SORTING_PLATFORM), [centre - half, centre + half])
+    for (color, *place), name in zip(scenes.SORTING_BINS, ("red", "blue"), strict=True):
+        body = model.body(f"{name}_bin")
+        np.testing.assert_allclose(body.pos[:2], place)
+        geoms = range(int(body.geomadr[0]), int(body.geomadr[0] + body.geomnum[0]))
+        walls = [(*model.geom_pos[geom][:2], *model.geom_size[geom][:2]) for geom in geoms]
+        np.testing.assert_allclose(sorted(walls), sorted(scenes.SORTING_WALLS), atol=1e-12)
+        assert to_rgb(color)[0 if name == "red" else 2] == max(to_rgb(color))
+
+
+def test_stacking_is_that_of_the_environment(models):
+    stacking = pytest.importorskip("torchrl_koap.envs.stacking")
+    site = models["stacking"].site("target")
+    np.testing.assert_allclose(site.pos[:2], scenes.STACKING_TARGET)
+    np.testing.assert_allclose(site.size[:2], scenes.STACKING_HALF)
+    assert (stacking.TARGET, stacking.ZONE_RADIUS) == (scenes.STACKING_TARGET, scenes.STACKING_RADIUS)
+
+
+def test_regions_of_aligning_are_those_of_the_contexts():
+    contexts = pytest.importorskip("torchrl_koap.envs.contexts").draw_contexts("aligning", 4000, 0)
+    regions = np.array(scenes.ALIGNING_REGIONS)  # [objects, axes, ends]
+    np.testing.assert_allclose(contexts[..., :2].min(0), regions[..., 0], atol=1e-3)
+    np.testing.assert_allclose(contexts[..., :2].max(0), regions[..., 1], atol=1e-3)
+
+
+@pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].objects])
+def test_bodies_have_the_sizes_and_colours_of_the_environment(task, models):
+    model, looks = models[task], objects.object_looks(task, len(TASKS[task].objects))
+    assert len(looks) == len(TASKS[task].objects) == len(TASKS[task].drawn)
+    for name, look in zip(TASKS[task].objects, looks, strict=True):
+        if name == "target":
+            assert look.still
+            np.testing.assert_allclose(model.site("target_base").size[:2], look.half)
+            continue
+        geom = int(model.body(name).geomadr[0])
+        assert not look.still and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
+        np.testing.assert_allclose(model.geom_size[geom][:2], look.half)
+        if task != "aligning":
+            assert np.argmax(to_rgb(look.color)) == np.argmax(model.geom_rgba[geom][:3])
+
+
+@pytest.mark.parametrize("task", scenes.SCENES)
+def test_every_start_lies_inside_the_picture(task):
+    axes = scenes.draw_scene(Figure().add_subplot(), task)
+    if TASKS[task].objects:
+        contexts = pytest.importorskip("torchrl_koap.envs.contexts").draw_contexts(task, 200, 0)
+        low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+        assert ((contexts[..., :2] > low + 0.04) & (contexts[..., :2] < high - 0.04)).all()
+
+
+def test_outlines_turn_with_the_body():
+    from torchrl_koap.envs.contexts import yaw_quaternions
+
+    poses, half = np.array([[0.4, -0.2, 0.7], [0.5, 0.1, -1.2]]), (0.03, 0.05)
+    for pose, outline in zip(poses, objects.outlines(poses, half), strict=True):
+        np.testing.assert_allclose(outline[0], outline[4])
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, yaw_quaternions(pose[2]))
+        corners = np.array([[-0.03, -0.05, 0], [0.03, -0.05, 0], [0.03, 0.05, 0], [-0.03, 0.05, 0]])
+        wanted = corners @ matrix.reshape(3, 3).T + [*pose[:2], 0]
+        np.testing.assert_allclose(outline[:4], wanted[:, :2])
+
+
+@pytest.mark.parametrize("number", [3, 21])
+def test_orientation_is_drawn(number):
+    """Outlines with a thick far side, of many the centre and a line to the far side."""
+    axes, looks = Figure().add_subplot(), objects.OBJECTS["aligning"]
+    contexts = np.tile([[0.5, -0.2, 0.0], [0.5, 0.3, np.pi / 2]], (number, 1, 1))
+    objects.draw_starts(axes, contexts, looks)
+    lines = [line for item in axes.collections if hasattr(item, "get_segments") for line in item.get_segments()]
+    if number == 3:
+        assert [len(line) for line in lines] == [5] * 3 + [2] * 3 + [5] * 3 + [2] * 3
+        np.testing.assert_allclose(lines[3], [[0.55, -0.15], [0.45, -0.15]])
+    else:
+        assert len(lines) == 42
+        np.testing.assert_allclose(lines[0], [[0.5, -0.2], [0.5, -0.15]])
+        np.testing.assert_allclose(lines[21], [[0.5, 0.3], [0.45, 0.3]], atol=1e-12)
+
+
+def test_objects_of_an_unknown_task_are_grey():
+    looks = objects.object_looks(None, 5)
+    assert len(looks) == 5 and {look.color for look in looks} == {scenes.MUTED}
+    assert objects.object_looks("stacking", 2) == looks[:2]
+
+
+def test_bad_contexts():
+    with pytest.raises(ValueError, match=r"'context' must have shape \[any, 2, 3\], got \[4, 2\]"):
+        objects.draw_starts(Figure().add_subplot(), np.zeros((4, 2)), objects.OBJECTS["aligning"])

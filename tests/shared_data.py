@@ -1,0 +1,10 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Where recordings and human demonstrations lie that the package never ships; tests that need them skip without."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+SHARED = Path(os.environ.get("KOAP_SHARED", Path(__file__).parents[2] / "shared"))
+HUMAN = SHARED / "d3il_avoiding_human"

@@ -1,0 +1,131 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Paired comparison: exact cases by hand, coverage of a known difference, unequal pairs, correction, damaged files."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+from torchrl_koap.studies.paired_comparison import compare, holm, read_outcomes, sign_flip_p
+
+
+def outcomes(rates, seed, *, seeds=3, contexts=60):
+    """Random successes, independent of everything else."""
+    generator = np.random.default_rng(seed)
+    return {
+        number: {(context, context): bool(generator.random() < rates) for context in range(contexts)}
+        for number in range(seeds)
+    }
+
+
+def test_p_value_by_hand():
+    # |sum| of +-3 +-1 +-1 is 5, 3, 3, 1 and mirrored: 6 of 8 are at least 3
+    assert sign_flip_p([3, -1, 1]) == pytest.approx(6 / 8)
+    assert sign_flip_p([3, 1, 1]) == pytest.approx(2 / 8)
+    values = [1 / 3, 2 / 3, -1 / 3, 1.0, 0.0]
+    sums = [
+        sum(s * v for s, v in zip(signs, values[:4], strict=True)) for signs in itertools.product((-1, 1), repeat=4)
+    ]
+    assert sign_flip_p(values) == np.mean([abs(total) >= abs(sum(values)) - 1e-9 for total in sums])
+
+
+def test_exact_and_drawn_p_values_agree():
+    values = [1.0] * 12 + [-1.0] * 5  # 17: drawn
+    exact = (
+        sum(  # 17 coins, at least 12 alike
+            np.prod([(17 - i) / (i + 1) for i in range(k)]) for k in [*range(6), *range(12, 18)]
+        )
+        / 2.0**17
+    )
+    assert sign_flip_p(values) == pytest.approx(exact, abs=0.01)
+    assert sign_flip_p(values) == sign_flip_p(values)
+    assert sign_flip_p([1.0] * 40) == pytest.approx(1 / 10_001)
+
+
+def test_identical_outcomes_differ_by_nothing():
+    same = outcomes(0.5, 0)
+    result = compare(same, same)
+    assert (result.difference, result.p) == (0.0, 1.0)
+    # without any spread the rule of three says what contexts not seen could hide
+    reach = 3 / result.contexts
+    assert (result.low, result.high) == (pytest.approx(-reach), pytest.approx(reach))
+    assert (result.contexts, result.seeds, result.pairs) == (60, 3, 180)
+
+
+def test_swapping_the_methods_swaps_the_signs():
+    first, second = outcomes(0.8, 0), outcomes(0.4, 1)
+    forth, back = compare(first, second), compare(second, first)
+    assert forth.difference == pytest.approx(-back.difference)
+    assert (forth.low, forth.high) == pytest.approx((-back.high, -back.low), abs=0.02)
+    assert forth.p == back.p < 0.01
+    assert forth == compare(first, second)
+
+
+def test_interval_covers_the_known_difference():
+    results = [compare(outcomes(0.7, 2 * n), outcomes(0.5, 2 * n + 1)) for n in range(60)]
+    assert all(result.low <= result.difference <= result.high for result in results)
+    assert np.mean([result.low <= 0.2 <= result.high for result in results]) >= 0.9
+    assert np.mean([result.difference for result in results]) == pytest.approx(0.2, abs=0.02)
+
+
+def test_seeds_that_disagree_widen_the_interval():
+    # seed 0 always wins by everything, seed 1 never: contexts alone would call 0.5 certain
+    always = {(context, 0): True for context in range(40)}
+    never = {(context, 0): False for context in range(40)}
+    result = compare({0: always, 1: never}, {0: never, 1: never})
+    assert result.difference == 0.5
+    assert (result.low, result.high) == (0.0, 1.0)
+
+
+def test_rollouts_of_one_context_are_one_unit():
+    first = {0: {(context, 10 * context + k): True for context in range(4) for k in range(5)}}
+    second = {0: {(context, 10 * context + k): k == 0 for context in range(4) for k in range(5)}}
+    result = compare(first, second)
+    assert (result.contexts, result.pairs) == (4, 20)
+    assert result.difference == pytest.approx(0.8)
+    assert result.p == 2 / 2**4  # four units, not twenty
+
+
+def test_only_shared_pairs_count():
+    first = {0: {(0, 0): True, (1, 1): True}, 1: {(0, 0): True}, 5: {(0, 0): True}}
+    second = {0: {(1, 1): False, (2, 2): True}, 1: {(0, 0): True}, 6: {(0, 0): False}}
+    result = compare(first, second)
+    assert (result.contexts, result.seeds, result.pairs) == (2, 2, 2)
+    assert result.difference == 0.5
+    assert compare({0: {(0, 0): True}}, {1: {(0, 0): True}}) is None
+    assert compare({0: {(0, 0): True}}, {0: {(1, 1): True}}) is None
+    assert compare({}, {}) is None
+
+
+def test_holm_is_monotone_and_keeps_order():
+    assert holm([0.02, 0.5, 0.001, None]) == [0.04, 0.5, 0.003, None]
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_outcomes_are_read_with_and_without_contexts(tmp_path):
+    path = tmp_path / "eval.json"
+    rows = [{"seed": 100, "outcome": "success", "context": 3}, {"seed": 101, "outcome": "timeout"}]
+    path.write_text(json.dumps({"episode": rows}))
+    assert read_outcomes(path) == {(3, 100): True, (101, 101): False}
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        ("{", "damaged"),
+        ("{}", "'episode'"),
+        ('{"episode": [{"seed": 1}]}', "episode 0"),
+        ('{"episode": [3]}', "episode 0"),
+        ('{"episode": [{"seed": 1, "outcome": "success"}, {"seed": 1, "outcome": "success"}]}', "twice"),
+    ],
+)
+def test_damaged_evaluations_are_named(tmp_path, content, word):
+    path = tmp_path / "eval.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=word) as error:
+        read_outcomes(path)
+    assert str(path) in str(error.value)

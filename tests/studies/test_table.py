@@ -1,0 +1,161 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Cells as a file, pooled and as a table: nothing dropped, types kept, damage named."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.studies.summary import summarise
+from torchrl_koap.studies.table import CELL_COLUMNS, markdown_table, read_cells, table_rows, write_cells
+
+
+def cell(method="koap", fraction=0.02, seed=0, *, successes=20, episodes=30, **more):
+    return {
+        "task": "avoiding",
+        "method": method,
+        "fraction": fraction,
+        "observations": 1.0,
+        "seed": seed,
+        "label_unit": "trajectory",
+        "status": "done",
+        "reason": "",
+        "labelled_units": 4,
+        "labelled_transitions": 320 + seed,
+        "trajectories_touched": 4,
+        "episodes": episodes,
+        "successes": successes,
+        "success_rate": successes / episodes,
+        "success_low": 0.1,
+        "success_high": 0.9,
+        "mode_entropy": 0.5 + 0.1 * seed,
+        "collisions": 2,
+        "mean_steps": 80.5,
+        "action_error": 1.0 + seed,
+        "controller_updates": 500,
+        "train_seconds": 12.25,
+        "eval_seconds": 3.5,
+        "run": f"{method}/{fraction}/{seed}",
+    } | more
+
+
+def failed(**more):
+    empty = dict.fromkeys(("episodes", "successes", "success_rate", "mode_entropy", "action_error", "train_seconds"))
+    return (
+        cell(**{key: value for key, value in more.items() if key != "reason"})
+        | empty
+        | {
+            "status": "failed",
+            "reason": more.get("reason", "RuntimeError: loss | not finite"),
+        }
+    )
+
+
+def test_columns_are_those_agreed_on():
+    assert CELL_COLUMNS[:7] == ("task", "method", "fraction", "observations", "seed", "label_unit", "status")
+    assert CELL_COLUMNS[-1] == "run"
+    assert tuple(cell()) == CELL_COLUMNS
+
+
+def test_cells_survive_the_file(tmp_path):
+    rows = [cell(), failed(seed=1), cell("vae", 1 / 3, 7, mode_entropy=None)]
+    assert read_cells(write_cells(tmp_path / "cells.csv", rows)) == rows
+    assert [path.name for path in tmp_path.iterdir()] == ["cells.csv"]
+
+
+def test_reasons_become_one_line_and_nan_becomes_empty(tmp_path):
+    rows = [failed(reason='first "line"\n  second, line'), cell(seed=1, action_error=math.nan)]
+    read = read_cells(write_cells(tmp_path / "cells.csv", rows))
+    assert read[0]["reason"] == 'first "line" second, line'
+    assert read[1]["action_error"] is None
+
+
+def test_rows_that_cannot_be_written_leave_the_file(tmp_path):
+    path = write_cells(tmp_path / "cells.csv", [cell()])
+    with pytest.raises(ValueError, match="unknown column of a cell 'sucesses'; did you mean 'successes'"):
+        write_cells(path, [cell() | {"sucesses": 3}])
+    with pytest.raises(ValueError, match="unknown status of a cell 'dune'; did you mean 'done'"):
+        write_cells(path, [cell(status="dune")])
+    assert read_cells(path) == [cell()]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("avoiding,koap,0.02", "avoiding,koap,many", ("line 2", "'fraction'", "'many'")),
+        ("avoiding,koap,0.02", "avoiding,koap,nan", ("line 2", "'fraction'", "finite")),
+        (",1.0,0,", ",1.0,0.5,", ("line 2", "'seed'", "whole number")),
+        (",done,", ",dome,", ("line 2", "'status'", "'dome'")),
+        ("avoiding,koap", "avoiding,", ("line 2", "'method'", "empty")),
+        (",30,20,", ",30,,", ("line 2", "'successes'", "empty")),
+        (",12.25,3.5,koap/0.02/0", "", ("line 2", "'train_seconds'", "ends")),
+        ("koap/0.02/0", "koap/0.02/0,5", ("line 2", "more values")),
+        ("mode_entropy,", "", ("lacks the column 'mode_entropy'",)),
+        ("avoiding", "\udcff", ("damaged",)),
+    ],
+)
+def test_damage_is_named(tmp_path, old, new, words):
+    path = write_cells(tmp_path / "cells.csv", [cell()])
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8", errors="surrogateescape")
+    with pytest.raises(ValueError) as error:
+        read_cells(path)
+    for word in (str(path), *words):
+        assert word in str(error.value)
+
+
+def test_seeds_are_pooled():
+    item = summarise([cell(seed=0, successes=30), cell(seed=1, successes=15), failed(seed=2)])[0]
+    assert (item.successes, item.episodes, item.success) == (45, 60, 0.75)
+    assert (item.low, item.high) == wilson_interval(45, 60)
+    assert (item.lowest, item.highest) == (0.5, 1.0)
+    assert (item.done, item.failed, item.missing) == ((0, 1), (2,), ())
+    assert item.entropy == pytest.approx(0.55)
+    assert (item.action_error, item.action_error_low, item.action_error_high) == (1.5, 1.0, 2.0)
+    assert item.labelled_transitions == 320.5
+
+
+def test_nothing_is_pooled_that_differs():
+    rows = [cell(), cell(fraction=0.1), cell("vae"), cell(observations=0.5), cell(label_unit="window")]
+    items = summarise(rows + [row | {"task": "sorting"} for row in rows])
+    assert len(items) == 10
+    assert all(item.episodes == 30 for item in items)
+    assert [item.task for item in items] == ["avoiding"] * 5 + ["sorting"] * 5
+
+
+def test_a_method_without_any_done_cell_stays():
+    item = summarise([failed(seed=0), failed(seed=1)])[0]
+    assert (item.success, item.low, item.episodes, item.failed) == (None, None, 0, (0, 1))
+    assert table_rows([item])[0]["success (95 %)"] == "no cell done"
+
+
+def test_wrong_cells_are_refused():
+    with pytest.raises(ValueError, match="avoiding, koap, 2 % labels, seed 0 occurs twice"):
+        summarise([cell(), cell()])
+    with pytest.raises(ValueError, match="seed 0 is done but has no 'episodes'"):
+        summarise([cell() | {"episodes": None}])
+
+
+def test_table_counts_failures_and_says_why():
+    rows = [cell(), failed(seed=1), cell("vae", successes=30), cell("vae", seed=1, status="missing")]
+    text = markdown_table(rows)
+    lines = text.splitlines()
+    assert lines[0].startswith("| labels (trajectories) | method | success (95 %) | n | seeds |")
+    assert lines[2].startswith("| 2 % | koap | 66.7 % (48.8-80.8) | 30 | 1 of 2 | failed: seed 1 |")
+    assert "| 1 of 2 | missing: seed 1 |" in lines[3]
+    assert len({line.replace("\\|", "").count("|") for line in lines[:4]}) == 1
+    assert "2 of 4 cells are not done:" in text
+    assert "- avoiding, koap, 2 % labels, seed 1: failed: RuntimeError: loss | not finite" in text
+    assert "- avoiding, vae, 2 % labels, seed 1: missing" in text
+    assert "not done" not in markdown_table([cell()])
+
+
+def test_columns_that_say_nothing_are_left_out():
+    one, two = (list(table_rows(summarise(rows))[0]) for rows in ([cell()], [cell(), cell(observations=0.5)]))
+    assert "trajectories used" not in one
+    assert "trajectories used" in two
+    assert "task" not in one
+    assert "task" in table_rows(summarise([cell(), cell(task="sorting")]))[0]

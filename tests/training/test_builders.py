@@ -1,0 +1,179 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""From plain options to data, planners and controllers."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tiny_runs import demonstration, write_demonstrations
+
+from torchrl_koap.data import LabelBudget, save_ted
+from torchrl_koap.keys import validate
+from torchrl_koap.modules import PRESETS
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training.builders import (
+    DENOISERS,
+    NORMALIZATION,
+    build_controller,
+    build_planner,
+    load_demonstrations,
+    make_env_of,
+    mode_index_of,
+    set_up_torch,
+)
+from torchrl_koap.training.methods import METHODS
+
+TASK = get_task("avoiding")
+PLANNER = {
+    "denoiser": "unet",
+    "channels": [8, 16],
+    "schedule": "squared_cosine",
+    "prediction": "sample",
+    "history": 2,
+    "horizon": 14,
+    "relative": False,
+    "solver": "dpm++2m",
+    "solver_steps": 3,
+    "clip": 1.2,
+}
+
+
+@pytest.fixture(scope="module")
+def data(demonstrations):
+    return load_demonstrations(str(demonstrations), TASK)
+
+
+def test_raw_folders_become_states_and_actions(data):
+    validate(data)
+    commanded, measured = demonstration(2, 32)
+    third = data[data["episode"] == 2]
+    assert len(third) == 31
+    np.testing.assert_allclose(third["state"].numpy(), measured[:-1], atol=1e-7)
+    np.testing.assert_allclose(third["action"].numpy(), np.diff(commanded, axis=0), atol=1e-9)
+    assert data["has_action"].all()
+
+
+def test_recorded_folders_give_the_same(tmp_path, data):
+    save_ted(data, tmp_path / "ted", task="avoiding")
+    again = load_demonstrations(str(tmp_path), TASK)
+    for key in ("state", "action", "episode", "observation"):
+        assert torch.equal(again[key], data[key])
+    again["action"][0] = 7.0  # in memory: the file stays as it is
+    assert torch.equal(load_demonstrations(str(tmp_path), TASK)["action"], data["action"])
+
+
+def test_scripted_demonstrations_are_recorded():
+    seen = []
+    data = load_demonstrations("scripted", TASK, episodes=2, seed=3, progress=lambda *done: seen.append(done))
+    assert data["episode"].unique().tolist() == [0, 1] and seen[-1] == (2, 2)
+    assert torch.equal(data["state"], data["observation"][:, [2, 3]])
+
+
+def test_missing_and_empty_folders_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="'nowhere' is neither 'scripted' nor a folder"):
+        load_demonstrations("nowhere", TASK)
+    with pytest.raises(FileNotFoundError, match=f"no demonstrations .* in {tmp_path}"):
+        load_demonstrations(str(tmp_path), TASK)
+
+
+def test_reading_raw_folders_leaves_them_alone(tmp_path):
+    write_demonstrations(tmp_path, episodes=2)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    load_demonstrations(str(tmp_path), TASK)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+    assert pickle.loads(before["env_000_00.pkl"])["robot"]["c_pos"].shape == (30, 3)
+
+
+@pytest.mark.parametrize("denoiser", ["unet", "mlp", "transformer"])
+@pytest.mark.parametrize("relative", [True, False])
+def test_every_denoiser_plans(denoiser, relative):
+    planner = build_planner(PLANNER | {"denoiser": denoiser, "relative": relative}, 2)
+    assert planner.plan(torch.zeros(3, 2, 2)).shape == (3, 14, 2)
+    assert (planner.solver, planner.num_steps, planner.clip, planner.relative) == ("dpm++2m", 3, 1.2, relative)
+    assert planner.schedule.prediction == "sample"
+
+
+def test_the_released_denoiser_has_the_published_size():
+    planner = build_planner(PLANNER | {"denoiser": "released"}, 2)
+    assert sum(p.numel() for p in planner.parameters()) == pytest.approx(11.9e6, rel=0.01)
+    assert set(DENOISERS) == {"unet", "mlp", "transformer", "released"}
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("denoiser", "unnet", "unknown denoiser 'unnet'; did you mean 'unet'"),
+        ("schedule", "cosine", "unknown schedule 'cosine'; did you mean 'squared_cosine'"),
+        ("prediction", "eps", "unknown prediction 'eps'; did you mean 'epsilon'"),
+        ("solver", "dpm++", r"unknown solver 'dpm\+\+'; did you mean 'dpm\+\+2m'"),
+        ("solver", "heun", "solver 'heun' walks a flow path"),
+        ("solver_steps", 0, "num_steps must lie in"),
+    ],
+)
+def test_unknown_planner_options_suggest_the_nearest(option, value, message):
+    with pytest.raises(ValueError, match=message):
+        build_planner(PLANNER | {option: value}, 2)
+
+
+@pytest.mark.parametrize(
+    ("preset", "method"),
+    [(preset, name) for name, method in METHODS.items() if not method.acts for preset in method.presets],
+)
+def test_every_controller_acts_and_takes_over_weights(method, preset, data):
+    labelled, _ = LabelBudget(2).apply(data)
+    options = {"method": method, "preset": preset}
+    torch.manual_seed(0)
+    controller = build_controller(options, 2, 2, labelled).eval()
+    restored = build_controller(options, 2, 2).eval()
+    restored.load_state_dict(controller.state_dict())
+    states = data["state"][:32].reshape(2, 16, 2)
+    expected = controller(TensorDict({"state": states}, [2]))["action"]
+    assert expected.shape == (2, 16, 2)
+    torch.testing.assert_close(restored(TensorDict({"state": states}, [2]))["action"], expected, rtol=0, atol=0)
+
+
+def test_statistics_are_those_of_all_states_and_of_the_labelled_actions(data):
+    labelled, _ = LabelBudget(2).apply(data)
+    shown = data["action"][labelled["has_action"].squeeze(-1)]
+    default = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
+    torch.testing.assert_close(default.action_normalizer.scale, shown.square().mean(0).sqrt())
+    assert (default.action_normalizer.offset == 0).all()
+    torch.testing.assert_close(default.state_normalizer.offset, data["state"].mean(0))
+    paper = build_controller({"method": "dd", "preset": "paper"}, 2, 2, labelled)
+    torch.testing.assert_close(paper.action_normalizer.inverse(torch.ones(1, 2))[0], shown.amax(0))
+    torch.testing.assert_close(paper.state_normalizer.inverse(-torch.ones(1, 2))[0], data["state"].amin(0))
+    assert set(NORMALIZATION) == set(PRESETS)
+
+
+def test_unknown_controllers_and_tasks_suggest_the_nearest():
+    with pytest.raises(ValueError, match="unknown method 'kaop'; did you mean 'koap'"):
+        build_controller({"method": "kaop", "preset": "default"}, 2, 2)
+    with pytest.raises(ValueError, match="unknown preset 'papper'; did you mean 'paper'"):
+        build_controller({"method": "koap", "preset": "papper"}, 2, 2)
+
+
+def test_environments_and_modes_of_a_task():
+    env = make_env_of(TASK, num_threads=2)(3)
+    assert env.batch_size == (3,)
+    env.close()
+    flags = torch.tensor([[0, 1, 0, 0, 1, 0, 0, 0, 1], [0] * 9], dtype=torch.bool)
+    assert mode_index_of(TASK)(flags).tolist() == [23, -1]
+
+
+@pytest.mark.parametrize(
+    ("threads", "device", "message"),
+    [(0, "cpu", "threads must be >= 1, got 0"), (1, "gpu", "device must be 'cpu' or 'cuda', got 'gpu'")],
+)
+def test_threads_and_device_are_checked(threads, device, message):
+    with pytest.raises(ValueError, match=message):
+        set_up_torch(threads, device)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_missing_gpu_is_said():
+    with pytest.raises(ValueError, match="'cuda:1' was asked for, but torch finds no CUDA here"):
+        set_up_torch(1, "cuda:1")

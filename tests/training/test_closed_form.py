@@ -1,0 +1,87 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The closed-form fit of a finished controller: which labels it sees, and how often."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+from torchrl_koap.modules import LinearActionDecoder
+from torchrl_koap.training.builders import build_controller
+from torchrl_koap.training.closed_form import DEFAULT_PENALTY, fit_closed_form
+
+LENGTHS = (25, 18, 31, 40, 22)
+CONTROLLERS = [("koap", "default"), ("koap", "paper"), ("koap", "released"), ("linear", "default")]
+
+
+def numbered(lengths=LENGTHS):
+    """Actions count the steps of all trajectories; states wander."""
+    generator = torch.Generator().manual_seed(0)
+    frames = [torch.randn(n + 1, 4, generator=generator).cumsum(0) * 0.01 for n in lengths]
+    counts = torch.arange(1.0, sum(lengths) + 1).split(list(lengths))
+    data = flatten_trajectories(frames, [torch.stack([count, -count], 1) for count in counts])
+    return select_state(data, (2, 3))
+
+
+@pytest.mark.parametrize(("method", "preset"), CONTROLLERS)
+@pytest.mark.parametrize(
+    ("amount", "unit"), [(2, "trajectory"), (3, "window"), (0.3, "transition"), (1.0, "trajectory")]
+)
+def test_every_label_with_full_look_ahead_is_used_exactly_once(monkeypatch, method, preset, amount, unit):
+    data = numbered()
+    labelled, _ = LabelBudget(amount, unit=unit).apply(data)
+    torch.manual_seed(0)
+    controller = build_controller({"method": method, "preset": preset}, 2, 2, labelled)
+    seen = []
+    fit_ridge = LinearActionDecoder.fit_ridge
+
+    def spy(self, latent, action, mask, **options):
+        normalizer = getattr(controller, "action_normalizer", None)
+        actions = action if normalizer is None else normalizer.inverse(action)
+        seen.append((actions[mask], options["groups"][mask]))
+        return fit_ridge(self, latent, action, mask, **options)
+
+    monkeypatch.setattr(LinearActionDecoder, "fit_ridge", spy)
+    report = fit_closed_form(controller, labelled)
+    ((actions, groups),) = seen
+    look_ahead = controller.num_window_frames - 1 - controller.history
+    left = torch.cat([torch.arange(n, 0, -1) for n in LENGTHS])  # steps that are left in the trajectory, this included
+    wanted = labelled["has_action"].squeeze(-1) & (left > look_ahead)
+    assert actions[:, 0].round().int().sort().values.tolist() == (wanted.nonzero().flatten() + 1).tolist()
+    assert torch.equal(groups, data["episode"][actions[:, 0].round().long() - 1])
+    assert report["labels_used"] == wanted.sum() > 0
+
+
+def test_few_trajectories_take_the_default_penalty_many_choose():
+    data = numbered()
+    reports = []
+    for count in (1, 2, 3, 5):
+        labelled, _ = LabelBudget(count).apply(data)
+        torch.manual_seed(0)
+        controller = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
+        reports.append(fit_closed_form(controller, labelled))
+    assert [report["penalty"] == DEFAULT_PENALTY for report in reports] == [True, True, False, False]
+    assert all(report["held_out_error"] > 0 for report in reports)
+
+
+@pytest.mark.parametrize(("preset", "through_zero"), [("default", True), ("paper", False)])
+def test_no_motion_decodes_to_no_action_only_where_zero_is_zero(preset, through_zero):
+    """With actions normalised by their root mean square, a bias would be an action out of nothing."""
+    labelled, _ = LabelBudget(5).apply(numbered())
+    torch.manual_seed(0)
+    controller = build_controller({"method": "koap", "preset": preset}, 2, 2, labelled)
+    fit_closed_form(controller, labelled)
+    bias = controller.action_decoder.linear.bias
+    assert (bias == 0).all() == through_zero
+
+
+def test_labels_that_see_no_look_ahead_are_an_error():
+    data = numbered((20,))
+    labelled, _ = LabelBudget(1, unit="transition", seed=1).apply(data)
+    labelled["has_action"] = torch.zeros_like(labelled["has_action"])
+    labelled["has_action"][-1] = True
+    labelled["action"] = torch.where(labelled["has_action"], data["action"], torch.nan)
+    controller = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
+    with pytest.raises(ValueError, match="no labelled frame"):
+        fit_closed_form(controller, labelled)

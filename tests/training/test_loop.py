@@ -1,0 +1,242 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The training loop: what one update is, what is logged, and that an interrupted run ends like an uninterrupted one."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.objectives import SoftUpdate
+
+from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner, make_koopman_inverse_dynamics
+from torchrl_koap.objectives import KOAPLoss, PlannerLoss
+from torchrl_koap.training.checkpoints import CheckpointError, load_tensors
+from torchrl_koap.training.loop import DivergedError, phase_finished, train, warmup_cosine
+from torchrl_koap.training.run_directory import RunDirectory
+
+
+class Interrupt(KeyboardInterrupt):
+    pass
+
+
+def interrupt_at(step):
+    def progress(done, values):
+        if done == step:
+            raise Interrupt
+
+    return progress
+
+
+class Quadratic(nn.Module):
+    """Two losses and a diagnostic that is not to be minimised."""
+
+    def __init__(self, value=3.0):
+        super().__init__()
+        self.x = nn.Parameter(torch.tensor([value], dtype=torch.float64))
+
+    def forward(self, td):
+        x = self.x * td["gain"]
+        return TensorDict({"loss_a": x.sum(), "loss_b": 2 * x.sum(), "diagnostic": -1e6 * self.x.sum()})
+
+
+def constant(gain=1.0):
+    return lambda: TensorDict({"gain": torch.tensor([gain], dtype=torch.float64)}, [1])
+
+
+def test_shape_of_the_learning_rate():
+    rates = [warmup_cosine(step, 200, 20) for step in range(200)]
+    assert rates[0] == pytest.approx(1 / 20) and max(rates) == rates[19]
+    assert rates[100] == pytest.approx(0.5)
+    assert rates[150] == pytest.approx(0.5 * (1 + math.cos(0.75 * math.pi)))
+    assert all(later < earlier for earlier, later in zip(rates[19:], rates[20:], strict=False))
+    assert 0 < rates[-1] < 1e-3
+    assert warmup_cosine(0, 10, 0) == 1.0
+
+
+def test_first_update_is_that_of_adamw_on_the_sum_of_the_losses():
+    """After one step Adam's moments cancel: x - lr wd x - lr sign(gradient), with lr after one step of warm-up."""
+    loss = Quadratic()
+    values = train("x", loss, constant(), num_steps=1, learning_rate=0.4, weight_decay=0.1, warmup=4)
+    rate = 0.4 / 4
+    assert loss.x.item() == pytest.approx(3 - rate * 0.1 * 3 - rate, abs=1e-6)
+    assert values["loss_a"] == 3 and values["loss_b"] == 6 and values["learning_rate"] == pytest.approx(rate)
+    assert "diagnostic" not in values and values["iterations_per_second"] > 0
+
+
+def test_logger_and_progress_hear_of_every_logged_step():
+    class Logger(list):
+        def log_scalar(self, name, value, step):
+            self.append((name, value, step))
+
+    logger, seen = Logger(), []
+    train(
+        "phase",
+        Quadratic(),
+        constant(),
+        num_steps=7,
+        learning_rate=0.0,
+        log_every=3,
+        logger=logger,
+        progress=lambda done, values: seen.append((done, values.get("loss_a"))),
+    )
+    assert [(n, v, s) for n, v, s in logger if n == "phase/loss_b"] == [
+        ("phase/loss_b", 6.0, step) for step in (3, 6, 7)
+    ]
+    assert {name for name, _, _ in logger} == {
+        f"phase/{name}" for name in ("loss_a", "loss_b", "learning_rate", "iterations_per_second")
+    }
+    assert seen == [(1, None), (2, None), (3, 3.0), (4, 3.0), (5, 3.0), (6, 3.0), (7, 3.0)]
+
+
+@pytest.mark.parametrize("name", ["num_steps", "log_every", "checkpoint_every"])
+def test_numbers_of_steps_are_checked(name):
+    with pytest.raises(ValueError, match=f"{name} must be >= 1, got 0"):
+        train("x", Quadratic(), constant(), **{"num_steps": 5, "learning_rate": 0.1, name: 0})
+
+
+class Planner:
+    """Everything of a run with a small planner, its moving average included."""
+
+    phase = "planner"
+
+    def __init__(self, seed=0):
+        torch.manual_seed(seed)
+        planner = StatePlanner(MLPDenoiser(2, 4, horizon=6, width=16, depth=1), NoiseSchedule(), state_dim=2, horizon=6)
+        planner.fit_normalizers(self.windows(64))
+        self.loss = PlannerLoss(planner)
+        self.average = SoftUpdate(self.loss, eps=0.8)
+
+    @staticmethod
+    def windows(number):
+        return torch.randn(number, 8, 2).cumsum(1)
+
+    def sample(self):
+        return TensorDict({"state": self.windows(4)}, [4])
+
+
+class Controller(Planner):
+    phase = "controller"
+
+    def __init__(self, seed=0):
+        torch.manual_seed(seed)
+        model = make_koopman_inverse_dynamics(2, 2, preset="paper", latent_dim=8, hidden_dim=8)
+        self.loss, self.average = KOAPLoss(model), None
+
+    def sample(self):
+        state, labelled = torch.randn(4, 12, 2).cumsum(1), torch.rand(4, 12, 1) < 0.5
+        action = torch.where(labelled, torch.randn(4, 12, 2), torch.nan)
+        return TensorDict({"state": state, "action": action, "has_action": labelled}, [4])
+
+
+def run_training(kind, path, **options):
+    parts = kind()
+    torch.manual_seed(1)
+    run = RunDirectory(path)
+    values = train(
+        parts.phase,
+        parts.loss,
+        parts.sample,
+        target_update=parts.average,
+        run=run,
+        **{"num_steps": 40, "learning_rate": 1e-2, "warmup": 10, "log_every": 5, "checkpoint_every": 10, **options},
+    )
+    return parts.loss, run, values
+
+
+def rows_without_speed(run):
+    return [{key: value for key, value in row.items() if key != "iterations_per_second"} for row in run.read_metrics()]
+
+
+@pytest.fixture(scope="module", params=[Planner, Controller])
+def uninterrupted(request, tmp_path_factory):
+    return request.param, *run_training(request.param, tmp_path_factory.mktemp("whole"))
+
+
+@pytest.mark.parametrize("stops", [[3], [20, 21], [21], [10, 11, 27, 39], [40]], ids=str)
+def test_an_interrupted_training_ends_bit_for_bit_like_an_uninterrupted_one(uninterrupted, tmp_path, stops):
+    """Killed before the first checkpoint, beside checkpoints, several times, and after the last update."""
+    kind, loss, run, values = uninterrupted
+    for stop in stops:
+        with pytest.raises(Interrupt):
+            run_training(kind, tmp_path, resume=True, progress=interrupt_at(stop))
+    resumed, resumed_run, resumed_values = run_training(kind, tmp_path, resume=True)
+    state = loss.state_dict()
+    assert state.keys() == resumed.state_dict().keys()
+    assert kind is Controller or any("target" in name for name in state)
+    for name, value in resumed.state_dict().items():
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(value, state[name], rtol=0, atol=0, equal_nan=True)
+    assert rows_without_speed(resumed_run) == rows_without_speed(run)
+    assert len(run.read_metrics()) == 8
+    assert {**resumed_values, "iterations_per_second": 0} == {**values, "iterations_per_second": 0}
+    whole, about = load_tensors(run.path / "checkpoints" / f"{kind.phase}.safetensors")
+    again, same = load_tensors(tmp_path / "checkpoints" / f"{kind.phase}.safetensors")
+    assert about == same and about["step"] == 40
+    for name, value in whole.items():
+        torch.testing.assert_close(again[name], value, rtol=0, atol=0, equal_nan=True)
+
+
+def test_a_finished_training_is_not_repeated(uninterrupted, tmp_path):
+    kind, _, run, values = uninterrupted
+    before = {file.name: file.read_bytes() for file in run.path.rglob("*") if file.is_file()}
+
+    def fail(done, values):
+        raise AssertionError("no update is left")
+
+    _, _, again = run_training(kind, run.path, resume=True, progress=fail)
+    assert {key: again[key] for key in values if "loss" in key} == {k: v for k, v in values.items() if "loss" in k}
+    assert {file.name: file.read_bytes() for file in run.path.rglob("*") if file.is_file()} == before
+
+
+def test_without_resume_the_checkpoint_is_ignored(tmp_path):
+    run_training(Planner, tmp_path, num_steps=10)
+    seen = []
+    run_training(Planner, tmp_path, num_steps=10, progress=lambda done, values: seen.append(done))
+    assert seen == list(range(1, 11))
+
+
+def test_a_checkpoint_of_another_model_is_refused(tmp_path):
+    run_training(Planner, tmp_path, num_steps=10)
+    (tmp_path / "checkpoints" / "planner.safetensors").rename(tmp_path / "checkpoints" / "controller.safetensors")
+    with pytest.raises(CheckpointError, match="controller.safetensors holds the state of another model"):
+        run_training(Controller, tmp_path, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("log_every", "message"),
+    [(5, "loss_a, loss_b is not finite at step 10"), (500, "parameters are not finite at step 10")],
+)
+def test_divergence_is_found_and_the_last_good_checkpoint_kept(tmp_path, log_every, message):
+    calls = []
+
+    def sample():
+        calls.append(1)
+        return constant(math.nan if len(calls) == 8 else 1.0)()
+
+    with pytest.raises(DivergedError, match=f"phase: {message}; lower the learning rate"):
+        train(
+            "phase",
+            Quadratic(),
+            sample,
+            num_steps=20,
+            learning_rate=0.1,
+            log_every=log_every,
+            checkpoint_every=5,
+            run=_Anything(tmp_path),
+        )
+    tensors, about = load_tensors(tmp_path / "checkpoints" / "phase.safetensors")
+    assert about["step"] == 5 and tensors["loss.x"].isfinite().all()
+
+
+class _Anything(RunDirectory):
+    COLUMNS = (*RunDirectory.COLUMNS, "loss_a", "loss_b")
+
+
+def test_a_phase_is_finished_when_its_weights_are_there(tmp_path):
+    run = RunDirectory(tmp_path)
+    assert not phase_finished(run, "planner")
+    (tmp_path / "planner.safetensors").touch()
+    assert phase_finished(run, "planner") and not phase_finished(run, "controller")

@@ -1,0 +1,107 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The table of methods: every entry can be built, its losses train it, and unknown names are answered."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
+from torchrl_koap.tasks import WINDOW
+from torchrl_koap.training.builders import build_controller
+from torchrl_koap.training.methods import METHODS, get_method
+
+CONTROLLERS = [name for name, method in METHODS.items() if not method.acts]
+
+
+@pytest.fixture(scope="module")
+def data():
+    generator = torch.Generator().manual_seed(0)
+    states = [torch.randn(41, 3, generator=generator).cumsum(0) for _ in range(4)]
+    data = flatten_trajectories(states, [state.diff(dim=0)[:, :2] for state in states])
+    return LabelBudget(2).apply(select_state(data, (0, 1, 2)))[0]
+
+
+def make(name, data):
+    torch.manual_seed(0)
+    return build_controller({"method": name, "preset": "default"}, 3, 2, data)
+
+
+def same(first, second):
+    """Equal, where a decoder that was not fitted yet is NaN too."""
+    return torch.allclose(first, second, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_an_entry_holds_together(name):
+    method = METHODS[name]
+    assert method.title and len({other.title for other in METHODS.values()}) == len(METHODS)
+    assert method.acts == (method.build is None)
+    assert not (method.acts and (method.phases or method.closed_form or method.labelled_only))
+    assert not method.teacher or not METHODS[method.teacher].acts
+    if not method.acts:
+        # every method has at most one controller's budget of updates, whatever it does with it
+        assert sum(phase.share for phase in method.phases) == (1 if method.phases else 0)
+        assert bool(method.phases) or method.closed_form
+        assert len({phase.name for phase in method.phases}) == len(method.phases)
+    assert {phase.windows for phase in method.phases} <= {"all", "mixed", "labelled"}
+    if method.labelled_only:
+        assert {phase.windows for phase in method.phases} == {"labelled"}
+    if method.other_decoder:
+        other = METHODS[method.other_decoder]
+        assert other.closed_form != method.closed_form and METHODS[other.other_decoder] is method
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_every_phase_trains_what_acts_on_windows_with_and_without_labels(name, data):
+    controller = make(name, data)
+    for phase in METHODS[name].phases:
+        loss = phase.loss(controller)
+        window = max(WINDOW, controller.num_window_frames)
+        share = {"all": None, "mixed": 0.25, "labelled": 1.0}[phase.windows]
+        keys = ["state", "action", "has_action"]
+        buffer = make_window_buffer(data, window, 8, select=keys, pad_before=controller.history, labelled_share=share)
+        batch = buffer.sample()
+        if phase.windows == "labelled":
+            assert batch["has_action"].any((1, 2)).all()
+        losses = loss(batch)
+        total = sum(losses[key] for key in losses.keys() if key.startswith("loss_"))
+        total.backward()
+        gradients = [parameter.grad for parameter in loss.parameters() if parameter.grad is not None]
+        assert total.isfinite() and gradients and all(gradient.isfinite().all() for gradient in gradients)
+        assert any(gradient.abs().sum() > 0 for gradient in gradients)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_statistics_are_those_of_what_a_method_may_see(name, data):
+    """Action statistics never depend on hidden labels; those of states depend on unlabelled ones where they may."""
+    hidden = ~data["has_action"]
+    other = data.clone()
+    other["action"] = torch.where(hidden, 1e9, other["action"])
+    moved = data.clone()
+    moved["state"] = torch.where(hidden, moved["state"] * 3 + 1, moved["state"])
+    clean, poisoned, shifted = (make(name, variant).state_dict() for variant in (data, other, moved))
+    assert all(same(clean[key], poisoned[key]) for key in clean)
+    changed = [key for key in clean if not same(clean[key], shifted[key])]
+    assert not any(key.startswith("action_normalizer") for key in changed)
+    if METHODS[name].labelled_only:
+        assert not changed
+    elif "state_normalizer.offset" in clean:
+        assert "state_normalizer.offset" in changed
+
+
+def test_unknown_methods_and_decoders_are_answered():
+    with pytest.raises(ValueError, match="unknown method 'linaer'; did you mean 'linear'?"):
+        get_method("linaer")
+    with pytest.raises(ValueError, match="unknown decoder 'rigde'; did you mean 'ridge'?"):
+        get_method("koap", "rigde")
+    with pytest.raises(ValueError, match="the decoder of method 'linear' is a closed form: it has no decoder 'sgd'"):
+        get_method("linear", "sgd")
+    with pytest.raises(ValueError, match="the decoder of method 'dd' is trained by gradients: it has no decoder"):
+        get_method("dd", "ridge")
+
+
+def test_the_other_decoder_is_another_entry():
+    assert get_method("koap", "ridge") is METHODS["koap"]
+    assert get_method("koap", "sgd") is get_method("koap_sgd") is METHODS["koap_sgd"]
+    assert get_method("koap_sgd", "ridge") is METHODS["koap"]

@@ -1,0 +1,125 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Plain files of a run: read back as written, rewound exactly, never half-written."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+
+from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+
+
+@pytest.fixture
+def run(tmp_path):
+    run = RunDirectory(tmp_path / "deep" / "run")
+    for phase, steps in (("planner", (50, 100, 150)), ("controller", (50, 100))):
+        for step in steps:
+            run.log(phase, step, {f"loss_{'planner' if phase == 'planner' else 'action'}": step / 1000})
+    return run
+
+
+def steps_of(run):
+    return [(row["phase"], int(row["step"])) for row in run.read_metrics()]
+
+
+ALL = [("planner", 50), ("planner", 100), ("planner", 150), ("controller", 50), ("controller", 100)]
+
+
+def test_rows_are_read_back(run):
+    assert steps_of(run) == ALL
+    rows = run.read_metrics()
+    assert tuple(rows[0]) == RunDirectory.COLUMNS
+    assert rows[1]["loss_planner"] == "0.1" and rows[1]["loss_action"] == ""
+    assert run.last_metrics("planner") == {"loss_planner": 0.15}
+    assert run.last_metrics("controller") == {"loss_action": 0.1}
+    assert run.last_metrics("other") == {}
+
+
+@pytest.mark.parametrize(
+    ("phase", "step", "kept"),
+    [
+        ("planner", 0, 0),
+        ("planner", 99, 1),
+        ("planner", 100, 2),
+        ("controller", 0, 3),
+        ("controller", 50, 4),
+        ("controller", 500, 5),
+    ],
+)
+def test_rewinding_drops_later_rows_and_later_phases(run, phase, step, kept):
+    run.rewind_metrics(phase, step)
+    assert steps_of(run) == ALL[:kept]
+    run.log(phase, step + 1, {})
+    assert steps_of(run) == [*ALL[:kept], (phase, step + 1)]
+
+
+def test_a_row_cut_off_by_a_kill_is_left_out_and_cleaned_up(run):
+    path = run.path / "metrics.csv"
+    whole = path.read_bytes()
+    for cut in range(1, 12):
+        path.write_bytes(whole[:-cut])
+        assert steps_of(run) == ALL[:-1]
+    run.rewind_metrics("controller", 50)
+    run.log("controller", 51, {})
+    assert steps_of(run) == [*ALL[:-1], ("controller", 51)]
+
+
+def test_without_metrics_there_is_nothing_to_read_or_rewind(tmp_path):
+    run = RunDirectory(tmp_path / "new")
+    assert run.read_metrics() == [] and run.last_metrics("planner") == {}
+    run.rewind_metrics("planner", 0)
+    assert not run.path.exists()
+
+
+def test_json_round_trip_and_entries(run):
+    content = {"task": "avoiding", "planner": {"channels": [8, 16]}, "count": None}
+    run.write_json("config.json", content)
+    assert run.read_json("config.json") == content
+    assert run.read_entry("config.json", "planner") == {"channels": [8, 16]}
+    with pytest.raises(RunDirectoryError, match="config.json has no entry 'controller'"):
+        run.read_entry("config.json", "controller")
+
+
+def test_numbers_that_json_does_not_know_become_null(run):
+    run.write_json("summary.json", {"error": float("inf"), "rows": [{"x": float("nan")}, (1.5, -float("inf"))]})
+    assert run.read_json("summary.json") == {"error": None, "rows": [{"x": None}, [1.5, None]]}
+    assert "Infinity" not in (run.path / "summary.json").read_text()
+
+
+@pytest.mark.parametrize("text", ["", '{"task": "avo', "[1, 2]", "\x00\x01"])
+def test_damaged_json_is_named(run, text):
+    (run.path / "config.json").write_text(text)
+    with pytest.raises(RunDirectoryError, match="config.json is damaged"):
+        run.read_json("config.json")
+
+
+def test_missing_json_says_what_was_wanted(tmp_path):
+    with pytest.raises(RunDirectoryError, match="config.json is missing: is .* the folder of a finished `koap train`"):
+        RunDirectory(tmp_path).read_json("config.json")
+
+
+@pytest.mark.parametrize("what", ["json", "metrics"])
+def test_a_full_disk_leaves_what_was_there(run, monkeypatch, what):
+    run.write_json("config.json", {"task": "avoiding"})
+    before = {file.name: file.read_bytes() for file in run.path.iterdir()}
+
+    def full(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        if what == "json":
+            run.write_json("config.json", {"task": "other"})
+        else:
+            run.rewind_metrics("planner", 0)
+    assert {file.name: file.read_bytes() for file in run.path.iterdir()} == before
+
+
+def test_content_that_json_cannot_hold_leaves_what_was_there(run):
+    run.write_json("config.json", {"task": "avoiding"})
+    with pytest.raises(TypeError):
+        run.write_json("config.json", {"task": object()})
+    assert run.read_json("config.json") == {"task": "avoiding"}
+    assert sorted(file.name for file in run.path.iterdir()) == ["config.json", "metrics.csv"]

@@ -1,0 +1,224 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Every method through ``koap train``: hidden labels reach no weight, and a killed run ends as if it was not."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_runs import TINY as TINY_CALL
+from tiny_runs import koap, write_demonstrations
+
+from torchrl_koap.data import LabelBudget
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training import loop
+from torchrl_koap.training.builders import load_demonstrations
+from torchrl_koap.training.checkpoints import load_tensors
+from torchrl_koap.training.config import Train
+from torchrl_koap.training.methods import METHODS
+from torchrl_koap.training.run import run_train
+from torchrl_koap.training.run_directory import RunDirectory
+
+TASK = get_task("avoiding")
+TINY = {"steps": 4, "controller_steps": 4, "batch_size": 8, "controller_batch_size": 8, "channels": (8, 16)}
+POISON = 1e9
+
+
+@pytest.fixture(scope="module")
+def planner(tmp_path_factory, demonstrations):
+    """A run whose planner is taken over by all others."""
+    folder = tmp_path_factory.mktemp("planner") / "run"
+    run_train(Train(out=folder, dataset=str(demonstrations), method="linear", label_count=2, analysis=False, **TINY))
+    return folder
+
+
+def train_tiny(out, demonstrations, planner, method, **options):
+    options = {**TINY, "label_count": 2, "analysis": False, **options}
+    if not METHODS[method].acts:
+        options["planner_from"] = planner
+    return run_train(Train(out=out, dataset=str(demonstrations), method=method, **options))
+
+
+def poisoned(data, budget, *, inside=False):
+    """Fully labelled data whose actions and commands outside the budget are senseless; or whose labels are others.
+
+    Of a trajectory with a hidden action all commands are: their differences are its actions.
+    """
+    labelled = budget.apply(data, command=TASK.observation[TASK.command])[0]
+    data = data.clone()
+    if inside:
+        data["action"] = torch.where(labelled["has_action"], data["action"] * 1.5, data["action"])
+        return data
+    data["action"] = torch.where(labelled["has_action"], data["action"], POISON)
+    for key in ("observation", ("next", "observation")):
+        data[key] = torch.where(labelled[key].isnan(), POISON, data[key])
+    return data
+
+
+def weights(folder: Path) -> bytes:
+    return (folder / "controller.safetensors").read_bytes()
+
+
+CASES = [(method, unit, {}) for method in METHODS for unit in ("trajectory", "window")]
+CASES += [(method, "window", {"released_settings": True, "epochs": 1}) for method in ("koap", "pretrain", "dd")]
+
+
+@pytest.mark.parametrize(("method", "unit", "options"), CASES)
+def test_no_weight_of_any_method_depends_on_a_hidden_label(
+    method, unit, options, demonstrations, planner, tmp_path, monkeypatch
+):
+    budget = LabelBudget(2, unit=unit, seed=0, window=16, history=2)
+    real = load_demonstrations(str(demonstrations), TASK)
+    variants = {"clean": real, "outside": poisoned(real, budget), "inside": poisoned(real, budget, inside=True)}
+    kept = budget.apply(real)[0]["has_action"].squeeze(-1)
+    assert (variants["outside"]["action"][~kept] == POISON).all() and 0 < kept.sum() < len(kept)
+    assert torch.equal(variants["outside"]["action"][kept], real["action"][kept])
+    assert (variants["outside"]["observation"] > POISON / 2).any()
+    for name, data in variants.items():
+        monkeypatch.setattr("torchrl_koap.training.run.load_demonstrations", lambda *a, data=data, **o: data.clone())
+        train_tiny(tmp_path / name, demonstrations, planner, method, label_unit=unit, **options)
+    assert weights(tmp_path / "outside") == weights(tmp_path / "clean")
+    assert weights(tmp_path / "inside") != weights(tmp_path / "clean")  # else the test could not fail
+    reports = [json.loads((tmp_path / name / "summary.json").read_text()) for name in ("clean", "outside")]
+    assert settled(reports[0]) == settled(reports[1])
+
+
+def test_no_weight_of_a_planner_depends_on_any_label(demonstrations, planner, tmp_path, monkeypatch):
+    budget = LabelBudget(2)
+    data = poisoned(poisoned(load_demonstrations(str(demonstrations), TASK), budget), budget, inside=True)
+    monkeypatch.setattr("torchrl_koap.training.run.load_demonstrations", lambda *a, **o: data.clone())
+    options = {"method": "linear", "label_count": 2, "analysis": False}
+    run_train(Train(out=tmp_path / "run", dataset=str(demonstrations), **options, **TINY))
+    name = "planner.safetensors"
+    assert (tmp_path / "run" / name).read_bytes() == (planner / name).read_bytes()
+    assert weights(tmp_path / "run") != weights(planner)
+
+
+def settled(summary):
+    summary.pop("train_seconds")
+    for phase in ("planner", "controller"):
+        summary[phase].pop("iterations_per_second", None)
+    return summary
+
+
+# killed and resumed
+
+
+LONGER = {"steps": 12, "controller_steps": 12}
+KILLED = {
+    "koap": ["controller"],
+    "pretrain": ["controller", "finetune"],
+    "vae": ["controller", "decoder"],
+    "lapo": ["controller", "decoder"],
+    "nonlinear": ["controller"],
+    "dp": ["policy"],
+    "relabel": ["teacher_controller", "policy"],
+}
+
+
+@pytest.fixture(scope="module")
+def whole_run(tmp_path_factory, demonstrations, planner):
+    """Runs that nobody interrupts, one per method, trained when first asked for."""
+    folders = {}
+
+    def get(method):
+        if method not in folders:
+            folders[method] = tmp_path_factory.mktemp("whole") / "run"
+            train_tiny(folders[method], demonstrations, planner, method, **LONGER)
+        return folders[method]
+
+    return get
+
+
+@pytest.mark.parametrize("when", ["in its middle", "at its end"])
+@pytest.mark.parametrize(("method", "phase"), [(method, phase) for method in KILLED for phase in KILLED[method]])
+def test_a_method_killed_in_a_phase_or_behind_it_ends_bit_for_bit_like_one_that_was_not(
+    method, phase, when, whole_run, demonstrations, planner, tmp_path, monkeypatch
+):
+    """In the middle: two updates behind the last checkpoint; at the end: the phase is saved, the next not begun."""
+    save, saved = loop.save_training_state, []
+
+    def killed(path, loss, optimizer, about):
+        if about["phase"] == phase and when == "in its middle" and saved.count(phase) == 1:
+            raise KeyboardInterrupt
+        save(path, loss, optimizer, about)
+        saved.append(about["phase"])
+        if about["phase"] == phase and when == "at its end" and about["step"] == steps_of(whole_run(method), phase):
+            raise KeyboardInterrupt
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        steps_of(whole_run(method), phase)  # trained before anything is killed
+        patch.setattr(loop, "save_training_state", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train_tiny(out, demonstrations, planner, method, checkpoint_every=2, **LONGER)
+    assert not (out / "summary.json").exists()
+    run_train(Train(out=out, resume=True))
+    assert weights(out) == weights(whole_run(method))
+    mine, its = (settled(RunDirectory(folder).read_json("summary.json")) for folder in (out, whole_run(method)))
+    assert mine == its
+    rows = [RunDirectory(folder).read_metrics() for folder in (out, whole_run(method))]
+    speed = "iterations_per_second"
+    assert [{**row, speed: 0} for row in rows[0]] == [{**row, speed: 0} for row in rows[1]]
+
+
+def steps_of(run, phase):
+    return load_tensors(run / "checkpoints" / f"{phase}.safetensors")[1]["step"]
+
+
+# policies of their own
+
+
+@pytest.fixture(scope="module", params=["dp", "relabel"])
+def policy_run(request, tmp_path_factory, demonstrations, planner):
+    folder = tmp_path_factory.mktemp(request.param) / "run"
+    train_tiny(folder, demonstrations, planner, request.param)
+    return folder
+
+
+def test_a_policy_is_evaluated_without_a_planner(policy_run, tmp_path, capsys):
+    out = tmp_path / "run"
+    shutil.copytree(policy_run, out)
+    assert not (out / "planner.safetensors").exists()
+    assert koap("eval", out, "--episodes", 2, "--threads", 1, "--no-report", "--solver-steps", 2) == 0
+    result = json.loads((out / "eval.json").read_text())
+    assert result["execution"] == "chunks" and result["solver_steps"] == 2
+    assert [row["seed"] for row in result["episode"]] == [100, 101]
+    assert result["success_rate"] == sum(row["outcome"] == "success" for row in result["episode"]) / 2
+    rollouts = load_tensors(out / "rollouts.safetensors")[0]
+    assert rollouts["length"].tolist() == [row["steps"] for row in result["episode"]]
+    assert "success_rate" in capsys.readouterr().out
+
+
+def test_a_policy_spends_the_labels_it_was_given(policy_run):
+    summary = RunDirectory(policy_run).read_json("summary.json")
+    assert summary["labels"]["selected_units"] == 2 and summary["planner_parameters"] == 0
+    teacher = METHODS[RunDirectory(policy_run).read_entry("config.json", "method")].teacher
+    assert summary["controller_updates"] == (8 if teacher else 4)
+
+
+@pytest.mark.parametrize("method", ["dp", "relabel"])
+def test_a_policy_takes_no_planner_over(method, planner, demonstrations, tmp_path, capsys):
+    command = ("train", "--out", tmp_path / "run", "--dataset", demonstrations, "--method", method)
+    assert koap(*command, "--planner-from", planner) == 1
+    err = capsys.readouterr().err
+    assert err == f"koap: method '{method}' is a policy of its own and has no planner to take over\n"
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_goes_on_after_it_was_moved_together_with_what_it_builds_on(tmp_path):
+    """As when the folder of a curve moves to another machine with cells half done."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    data = write_demonstrations(here / "raw")
+    assert koap("train", "--dataset", data, "--out", here / "planner", *TINY_CALL) == 0
+    call = ("--method", "linear", *TINY_CALL)
+    assert koap("train", "--dataset", data, "--out", here / "run", "--planner-from", here / "planner", *call) == 0
+    weights = (here / "run" / "controller.safetensors").read_bytes()
+    (here / "run" / "controller.safetensors").unlink()
+    here.rename(there)
+    again = ("--dataset", there / "raw", "--out", there / "run", "--planner-from", there / "planner", *call, "--resume")
+    assert koap("train", *again) == 0
+    assert (there / "run" / "controller.safetensors").read_bytes() == weights

@@ -1,0 +1,110 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Relabelling: a controller's actions in place of the labels that the budget hides."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_koap.data.augmentation import extrapolate_ends
+from torchrl_koap.data.window_table import WindowTable
+from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
+
+RELABELLED = "relabelled"
+
+
+@torch.no_grad()
+def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_size: int = 4096) -> TensorDict:
+    """Gives every unlabelled step the action that an inverse dynamics reads off the recorded states.
+
+    Afterwards a method that knows labelled steps only, such as the
+    :class:`~torchrl_koap.modules.DiffusionPolicy`, learns from all demonstrations. Only states are read: what is stored
+    as the action of an unlabelled step cannot reach the outcome.
+
+    An action is read at frame ``controller.history`` of a window, where the controller sees its whole past and
+    look-ahead. Over the ends of a trajectory the first state is repeated, as at the start of an episode, and the last
+    ones go on at their velocity (:func:`~torchrl_koap.data.extrapolate_ends`)::
+
+        frame            0      1      2      ...    window - 1         (history = 1)
+        action of step 0 x_0    x_0    x_1    ...
+        action of step t x_t-1  x_t    x_t+1  ...
+
+    Args:
+        controller (nn.Module): reads a window of raw states ``[B, T, d]``, its first in-key, and writes actions
+            ``[B, T, act]``, its last out-key; has ``history`` and ``num_window_frames``. It runs in evaluation mode.
+        data (TensorDictBase): flat data ``[N]`` with ``state``, as the controller sees it, ``action``, ``has_action``
+            and ``episode``; not changed.
+
+    Keyword Args:
+        window (int): frames per window.
+        batch_size (int): windows per forward pass. Defaults to 4096.
+
+    Returns:
+        TensorDict: a shallow copy of ``data`` in which every step has an action and ``has_action``; labelled steps keep
+        theirs bit for bit. The new entry ``relabelled`` ``[N, 1]`` tells them apart: True where the action is the
+        controller's.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if the window is too short for the controller, the batch size is below 1, or the controller's
+            actions are not finite or of another width than the data's.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+        >>> from torchrl_koap.modules import LinearInverseDynamics
+        >>> from torchrl_koap.data.pseudo_labels import relabel
+        >>> data = flatten_trajectories([torch.rand(21, 2)] * 4, [torch.rand(20, 3)] * 4)
+        >>> data, _ = LabelBudget(1).apply(select_state(data, (0, 1)))
+        >>> relabelled = relabel(LinearInverseDynamics(2, 3), data, window=10)
+        >>> int(relabelled["has_action"].sum()), int(relabelled["relabelled"].sum())
+        (80, 60)
+    """
+    for key in (STATE, ACTION, HAS_ACTION, EPISODE):
+        if data.get(key, None) is None:
+            raise KeyError(f"relabelling needs the entry {key!r}; there are {sorted(map(str, data.keys()))}")
+    if window < controller.num_window_frames:
+        raise ValueError(f"the controller needs windows of {controller.num_window_frames} frames, got {window}")
+    if batch_size < 1:
+        raise ValueError(f"batch_size must be >= 1, got {batch_size}")
+    hidden = ~data.get(HAS_ACTION).reshape(-1)
+    action = data.get(ACTION).clone()
+    if hidden.any():
+        predicted = _predict(controller, data, hidden, window, batch_size)
+        if predicted.shape[-1] != action.shape[-1]:
+            raise ValueError(
+                f"the controller's actions have {predicted.shape[-1]} columns, those of the data {action.shape[-1]}"
+            )
+        bad = ~predicted.isfinite().all(-1)
+        if bad.any():
+            raise ValueError(f"the controller's actions are not finite in {int(bad.sum())} of {len(bad)} steps")
+        action[hidden] = predicted.to(action)
+    result = data.copy()
+    result.set(ACTION, action)
+    result.set(HAS_ACTION, torch.ones_like(data.get(HAS_ACTION)))
+    return result.set(RELABELLED, hidden.reshape(data.get(HAS_ACTION).shape))
+
+
+def _predict(controller: nn.Module, data: TensorDictBase, hidden: Tensor, window: int, batch_size: int) -> Tensor:
+    """The controller's actions ``[hidden steps, act]``."""
+    now = controller.history
+    continued = extrapolate_ends(data, window - 1 - now)
+    # one window per step of the data, in their order: those that have the step at frame `now`
+    table = WindowTable.build(continued, window, history=now + 1, pad_before=now)
+    starts, first = table.starts[hidden, None], table.first[hidden, None]
+    offsets = torch.arange(window, device=starts.device)
+    example = next(itertools.chain(controller.parameters(), controller.buffers()), continued.get(STATE))
+    was_training = controller.training
+    controller.eval()  # dropout would make labels of noise
+    try:
+        actions = []
+        for start, low in zip(starts.split(batch_size), first.split(batch_size), strict=True):
+            states = continued.get(STATE)[(start + offsets).clamp_min(low)].to(example.device)  # [B, T, d]
+            windows = TensorDict({controller.in_keys[0]: states}, batch_size=states.shape[:-1])
+            actions.append(controller(windows).get(controller.out_keys[-1])[:, now].to(starts.device))
+    finally:
+        controller.train(was_training)
+    return torch.cat(actions)

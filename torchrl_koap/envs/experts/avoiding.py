@@ -1,0 +1,272 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A simulated joystick player for Avoiding that takes any of the 24 ways to the finish line.
+
+The player is modelled after the human demonstrations, who held a stick per axis: pauses, pushes that are held and let
+go, saturation at full deflection, and a dead zone below which nothing moves. In one control step it
+
+    1. looks       at the measured position of a moment ago, adds what it has pushed since, and errs by some millimetres
+    2. decides     sideways: push towards the gap of the next row, hold, let go when there;
+                   forwards: at cruising speed, slower or not at all while the gap would come too early;
+                   and takes back whatever would run into a cylinder
+    3. moves the   stick, whose deflection follows the decision over about five control steps, with a slowly
+       stick       drifting hand
+
+All randomness of an episode is drawn when the player is made, from its own seed: an episode does not depend on the
+others in the batch, and nothing touches a global generator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES, ROW_Y
+from torchrl_koap.envs.experts.noise import drift
+
+FULL_PUSH = 0.0124  # m per control step at full deflection
+LEAST_PUSH = 0.0053  # smaller deflections fall into the dead zone
+ROD_RADIUS = 0.01
+# x of the gaps that humans take, low and high end, from small to large x (m)
+GAPS = (
+    ((0.414, 0.446), (0.556, 0.597)),
+    ((0.345, 0.376), (0.485, 0.515), (0.626, 0.670)),
+    ((0.262, 0.304), (0.412, 0.440), (0.552, 0.588), (0.700, 0.735)),
+)
+_ROBOT_LAG = 3  # control steps by which the measured position follows the command
+_GLANCE = 4  # control steps between an event and the player's picture of it
+_MEMORY = 12
+_HORIZON = 300  # control steps for which hand noise is drawn
+
+
+def _hand_response() -> np.ndarray:
+    """Weights [13] by which the deflection follows the decisions of the last steps; rings a little, like a hand."""
+    time = np.arange(-6, 7)
+    weights = np.sinc(time / 3.6) * np.hanning(17)[2:-2]
+    return weights / weights.sum()
+
+
+_HAND = _hand_response()
+_HAND_REST = 1 - np.cumsum(_HAND)  # share of a decision that is still to come after so many steps
+
+
+def mode_gaps(mode: int) -> tuple[int, int, int]:
+    """Which gap of each row a mode takes, counted from small x.
+
+    Args:
+        mode (int): 0 to 23, see :func:`~torchrl_koap.envs.mode_index`.
+
+    Raises:
+        ValueError: if there is no such mode.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.avoiding import mode_gaps
+        >>> mode_gaps(0), mode_gaps(23)
+        ((0, 0, 0), (1, 2, 3))
+    """
+    if not 0 <= mode < 24:
+        raise ValueError(f"mode must be 0 to 23, got {mode}")
+    return mode // 12, mode % 12 // 4, mode % 4
+
+
+class AvoidingExpert:
+    """Players of a batch of episodes, one mode and one seed each.
+
+    Args:
+        modes (sequence of int): the mode each episode shall take, ``n`` numbers of 0 to 23.
+        seeds (sequence): for each episode an integer or a sequence of integers, as for ``numpy.random.default_rng``.
+
+    Raises:
+        ValueError: if a mode does not exist or the numbers of modes and seeds differ.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.envs import AvoidingEnv, mode_index
+        >>> from torchrl_koap.envs.experts.avoiding import AvoidingExpert
+        >>> env, expert = AvoidingEnv(2, dtype=torch.float64), AvoidingExpert([0, 22], seeds=[1, 2])
+        >>> def policy(td):
+        ...     return td.set("action", torch.from_numpy(expert.act(td["observation"].numpy())))
+        >>> last = env.rollout(150, policy, break_when_any_done=False, break_when_all_done=True)["next"][:, -1]
+        >>> last["success"].squeeze(-1).tolist(), mode_index(last["mode"]).tolist()
+        ([True, True], [0, 22])
+    """
+
+    def __init__(self, modes: Sequence[int], seeds: Sequence):
+        modes, seeds = list(modes), list(seeds)
+        if not modes or len(modes) != len(seeds):
+            raise ValueError(f"as many seeds as modes are needed, at least one, got {len(modes)} and {len(seeds)}")
+        drawn = [_draw(mode, np.random.default_rng(seed)) for mode, seed in zip(modes, seeds, strict=True)]
+        for name in drawn[0]:
+            setattr(self, f"_{name}", np.stack([habits[name] for habits in drawn]))
+        count = len(modes)
+        self._time = 0
+        self._row = np.zeros(count, dtype=np.int64)  # the row whose gap is aimed at; 3 behind the last one
+        self._forward = self._cruise[:, 0].copy()  # forwards push that is held
+        self._blocked = np.zeros(count, dtype=bool)  # a cylinder was straight ahead
+        self._side = np.zeros(count)  # sideways push that is held, m per step
+        self._crossed = np.full(count, -1)  # time at which the finish line was seen crossed
+        self._decisions = np.zeros((count, len(_HAND), 2))  # latest first
+        self._commanded = None
+        self._measured = None
+
+    @property
+    def finished(self) -> np.ndarray:
+        """Which players have let go after the finish line and would stop recording, bool [n]."""
+        return (self._crossed >= 0) & (self._time >= self._crossed + self._linger)
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Decides the next control step of every episode.
+
+        Args:
+            observation (array): commanded and measured xy [n, 4] (m), as :class:`~torchrl_koap.envs.AvoidingEnv` gives.
+
+        Returns:
+            np.ndarray: change of the commanded xy [n, 2] (m), float64.
+
+        Raises:
+            ValueError: if the shape is wrong.
+        """
+        observation = np.asarray(observation, dtype=np.float64)
+        if observation.shape != (len(self._row), 4):
+            raise ValueError(f"observation must have shape [{len(self._row)}, 4], got {list(observation.shape)}")
+        seen = self._look(observation)
+        decision = self._decide(seen, observation[:, 3])
+        self._decisions = np.concatenate([decision[:, None], self._decisions[:, :-1]], axis=1)
+        if self._time == 0:  # some had begun to push before the recording started
+            begun = np.arange(len(_HAND)) <= self._head_start[:, None]
+            self._decisions = np.where(begun[..., None], decision[:, None], 0.0)
+        push = np.einsum("nkd,k->nd", self._decisions, _HAND) + self._tremor[:, self._time % _HORIZON]
+        self._time += 1
+        return push
+
+    def _look(self, observation: np.ndarray) -> np.ndarray:
+        """Where the player believes the command would come to rest if the stick were let go now, [n, 2]."""
+        commanded, measured = observation[:, :2], observation[:, 2:]
+        if self._commanded is None:
+            self._commanded = np.repeat(commanded[:, None], _MEMORY, axis=1)
+            self._measured = np.repeat(measured[:, None], _MEMORY, axis=1)
+        self._commanded = np.concatenate([commanded[:, None], self._commanded[:, :-1]], axis=1)
+        self._measured = np.concatenate([measured[:, None], self._measured[:, :-1]], axis=1)
+        pushed_since = commanded - self._commanded[:, _GLANCE + _ROBOT_LAG]
+        surprise = self._measured[:, _GLANCE] + pushed_since - commanded
+        to_come = np.einsum("nkd,k->nd", self._decisions, _HAND_REST)
+        slip = self._misjudgement[:, self._time % _HORIZON]
+        return commanded + to_come + self._attention[:, None] * surprise + slip
+
+    def _decide(self, seen: np.ndarray, height: np.ndarray) -> np.ndarray:
+        count = np.arange(len(seen))
+        passed = np.array([*ROW_Y, np.inf])[self._row] + self._release[count, self._row]
+        self._row += ((seen[:, 1] > passed) | self._may_go_on(seen[:, 0])) & (self._row < 3)
+        newly = (height > FINISH_Y) & (self._crossed < 0)
+        self._crossed[newly] = self._time
+
+        way = self._gap_x[count, self._row] - seen[:, 0]
+        gate = np.array([*ROW_Y, FINISH_Y])[self._row] - self._gate[count, self._row]
+        room = np.maximum(gate - seen[:, 1], 0.0)
+        cruise = self._cruise[:, self._time % _HORIZON]
+        self._push_sideways(way, room / cruise, count)
+
+        steps_sideways = np.abs(way) / FULL_PUSH
+        off = np.abs(way) > 2 * self._tolerance[count, self._row]
+        late = off & (steps_sideways > room / cruise + self._patience) & (self._row < 3)
+        forward = np.where(late, room / np.maximum(steps_sideways, 1e-9), cruise)
+        forward = np.where(forward < LEAST_PUSH * self._creep, 0.0, forward)
+        self._forward += self._ease * (forward - self._forward)
+        forward = np.where(self._forward < 0.3 * LEAST_PUSH, 0.0, self._forward)
+        decision = np.stack([self._side * self._grip[:, self._time % _HORIZON], forward], axis=1)
+        decision[:, 0] = np.clip(decision[:, 0], -FULL_PUSH, FULL_PUSH)
+        decision = self._avoid(seen, decision, cruise)
+        behind = (self._crossed >= 0)[:, None]
+        decision = np.where(behind, np.stack([self._last_side, self._last_forward * cruise], axis=1), decision)
+        return np.where((self._time < self._pause)[:, None], 0.0, decision)
+
+    def _may_go_on(self, x: np.ndarray) -> np.ndarray:
+        """Whether the gap is reached with a push that may go on: it is the open side, and the next gap lies there."""
+        count = np.arange(len(x))
+        following = self._gap_x[count, np.minimum(self._row + 1, 3)] - x
+        direction = np.sign(self._side)
+        reached = (self._gap_x[count, self._row] - x) * direction < 0
+        open_side = self._open[count, self._row] == direction
+        return reached & open_side & (direction != 0) & (following * direction > 0.02) & (self._row < 2)
+
+    def _push_sideways(self, way: np.ndarray, steps: np.ndarray, count: np.ndarray) -> None:
+        """Begins, hardens and ends the sideways push, given the way to the gap and the steps left until its row."""
+        holding = self._side != 0
+        there = way * np.sign(self._side) < self._tolerance[count, self._row] * 0.3
+        self._side[holding & there] = 0.0
+        begin = (self._side == 0) & (np.abs(way) > np.where(self._blocked, 0.003, self._tolerance[count, self._row]))
+        needed = np.abs(way) / np.maximum(steps, 1.0)
+        push = np.clip(needed * self._haste[count, self._row], LEAST_PUSH * 1.06, FULL_PUSH)
+        push = np.where(push > 0.92 * FULL_PUSH, FULL_PUSH, push)
+        harder = holding & ~there & (needed > 1.35 * np.abs(self._side))
+        change = begin | harder
+        self._side[change] = (np.sign(way) * push)[change]
+        self._side[self._time < self._side_pause] = 0.0
+
+    def _avoid(self, seen: np.ndarray, decision: np.ndarray, cruise: np.ndarray) -> np.ndarray:
+        """Takes back the part of a decision that would run into a cylinder within the next steps."""
+        margin = self._margin + self._caution * np.abs(decision[:, 0]) / FULL_PUSH
+        self._blocked[:] = False
+        ahead = np.arange(1, 5)[None, :, None] * decision[:, None] + seen[:, None]  # [n, 4, 2]
+        decision = decision.copy()
+        for _, x, y, radius, _ in OBSTACLES:
+            near = np.linalg.norm(ahead - (x, y), axis=-1).min(1) < radius + ROD_RADIUS + margin
+            towards = decision[:, 0] * (x - seen[:, 0]) > 0
+            in_front = seen[:, 1] < y - 0.6 * radius
+            beside = near & ~in_front & towards
+            decision[beside, 0] = 0.0
+            decision[beside, 1] = cruise[beside]
+            decision[near & in_front, 1] = 0.0
+            self._blocked |= near & in_front
+            cramped = near & in_front & (self._side == 0)  # aims too near to the cylinder: more room on the next try
+            rows = self._row[cramped]
+            self._gap_x[cramped, rows] += 0.0015 * np.sign(self._gap_x[cramped, rows] - x)
+        return decision
+
+
+def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
+    """Habits and slips of one episode: everything that is random about it (m and control steps).
+
+    ``gap_x`` is aimed at in each row (entry 3: behind the last one), reached ``gate`` before the row; the next gap
+    counts once the row is ``release`` behind. ``tolerance``, ``haste``, ``patience``, ``creep`` and ``ease`` shape the
+    pushes; ``margin`` (``+ caution`` at full sideways push) is the distance kept from cylinders; ``attention`` is the
+    weight of what is seen of the robot against what was pushed; series over time are drifting noise.
+    """
+    uniform, normal = generator.uniform, generator.normal
+    gaps = [GAPS[row][gap] for row, gap in enumerate(mode_gaps(mode))]
+    gap_x = [uniform(low, high) for low, high in gaps]
+    long_pause = generator.random() < 0.13
+    row1, row2, _ = mode_gaps(mode)
+    pause = generator.integers(7, 19) if long_pause else generator.integers(-3, 4)
+    brisk = generator.random() < 0.6
+    start = uniform(0.88, 1.02) if brisk else uniform(0.66, 0.88)
+    warm_up = np.clip(np.arange(_HORIZON) / uniform(10, 45), 0, 1)
+    cruise = (start + (uniform(0.98, 1.06) - start) * warm_up) + drift(generator, 15, 0.05, _HORIZON)
+    lets_go = generator.random() < 0.35
+    turns = generator.random() < 0.5
+    return {
+        "gap_x": np.array([*gap_x, gap_x[-1] + normal(0, 0.012)]),
+        "gate": np.append(uniform(-0.005, 0.040, 3), 0.0),
+        "release": np.append(uniform(0.010, 0.042, 3), 0.0),
+        "tolerance": np.append(uniform(0.008, 0.014, 3), 0.02),
+        "haste": np.append(uniform(0.9, 1.15, 3), 1.0),
+        "attention": np.array(uniform(0.1, 0.4)),
+        "caution": np.array(uniform(0.005, 0.011)),
+        "ease": np.array(uniform(0.3, 0.8)),
+        "patience": np.array(uniform(1.0, 5.0)),
+        "creep": np.array(uniform(0.6, 1.1)),
+        "margin": np.array(uniform(0.010, 0.014)),
+        "open": np.array([2 * row1 - 1, row2 - 1, 0, 0]),  # sign of the side without further cylinders
+        "pause": np.array(max(pause, 0)),
+        "head_start": np.array(max(-pause, 0)),
+        "side_pause": np.array(max(pause, 0) + (generator.integers(2, 8) if generator.random() < 0.5 else 0)),
+        "linger": np.array(4 + generator.geometric(0.3)),
+        "last_side": np.array(uniform(-0.008, 0.008) if turns else 0.0),
+        "last_forward": np.array(uniform(-0.1, 0.2) if lets_go else 1.0),
+        "cruise": np.clip(cruise, 0.4, uniform(1.0, 1.05)) * FULL_PUSH,
+        "grip": 1 + drift(generator, 8, 0.06, _HORIZON),
+        "misjudgement": np.stack(
+            [drift(generator, 12, 0.003, _HORIZON), drift(generator, 12, 0.003, _HORIZON)], axis=1
+        ),
+        "tremor": np.stack([drift(generator, 2, 0.0002, _HORIZON), drift(generator, 2, 0.0002, _HORIZON)], axis=1),
+    }

@@ -1,0 +1,302 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A simulated person at the gripper who stacks the three boxes of Stacking in a wanted order.
+
+What it does next follows from what it sees now, so similar situations give similar motions. For every box::
+
+    reach     fingers open, over the box at a safe height, turned as the box is turned, down once above it
+    grasp     fingers close until they stop
+    carry     up, over to the stack, turned back, down once above it
+    release   fingers open; then up and on to the next box
+
+A box that slipped or fell is fetched again. Poses of the tool centre point (TCP) are decided here; joint commands come
+from the controller's inverse kinematics. All randomness of an episode is drawn when the expert is made, from its own
+seed: an episode does not depend on the others in the batch, and nothing touches a global generator.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchrl_koap.envs.experts.noise import drift
+from torchrl_koap.envs.mujoco.inverse_kinematics import follow_pose, tcp_pose
+from torchrl_koap.envs.stacking import BOXES, TARGET
+from torchrl_koap.tasks import get_task
+
+ORDERS = tuple(itertools.permutations(range(3)))
+GRIPPER_OPEN, GRIPPER_CLOSED = 0.08, 0.06  # gripper numbers: the distances of the fingers that will result (m)
+HALF_SIZES = np.array([size[:2] for _, size, _ in BOXES])
+BOX_HEIGHT = 0.06
+ON_TABLE = 0.011  # height of the centre of a box that lies on the table (m)
+
+_SPEED, _PUSH = 0.0125, 0.0012  # sideways: m per control step, and its change per control step
+_SINK, _RISE, _LIFT = 0.0075, 0.01, 0.001  # down, up: m per control step, and their change
+_TURN, _TURN_PUSH = 0.028, 0.004  # rad per control step, and its change
+_EAGERNESS = np.array([0.15, 0.15, 0.12])  # share of the remaining way that is wanted in the next control step
+_HOLD = 0.004  # the TCP grasps that much above the centre of a box (m)
+_FINGER_AT, _FINGER_HALF = 0.051, (0.015, 0.011)  # an open finger: distance from the TCP, half sizes (m)
+_CLEAR = 0.003  # room that a finger needs beside it (m)
+_HORIZON = 1500  # control steps for which the wobble of the hand is drawn
+_REACH, _GRASP, _CARRY, _RELEASE, _RETREAT = range(5)
+
+
+class StackingExpert:
+    """People of a batch of episodes, one order and one seed each.
+
+    Args:
+        modes (sequence of int): order of the boxes of each episode, 0 to 5, see
+            :func:`~torchrl_koap.envs.stacking.mode_index`.
+        contexts (array): contexts [n, 3, 3] of the episodes. The expert looks at the observed boxes only.
+        seeds (sequence): for each episode an integer or a sequence of integers, as for ``numpy.random.default_rng``.
+
+    Raises:
+        ValueError: if a mode does not exist or the numbers of modes, contexts and seeds differ.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.envs import StackingEnv
+        >>> from torchrl_koap.envs.contexts import evaluation_contexts
+        >>> from torchrl_koap.envs.experts.stacking import StackingExpert
+        >>> contexts = evaluation_contexts("stacking", 1)
+        >>> env, expert = StackingEnv(1, contexts=contexts, dtype=torch.float64), StackingExpert([3], contexts, [0])
+        >>> def policy(td):
+        ...     return td.set("action", torch.from_numpy(expert.act(td["observation"].numpy())))
+        >>> last = env.rollout(700, policy)["next"][:, -1]
+        >>> last["success"].item(), last["mode"].tolist()
+        (True, [[1, 2, 0]])
+    """
+
+    def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
+        modes, seeds, shape = list(modes), list(seeds), np.shape(contexts)
+        if not modes or len(modes) != len(seeds) or shape != (len(modes), 3, 3):
+            raise ValueError(
+                "as many contexts [n, 3, 3] and seeds as modes are needed, at least one, got"
+                f" {len(modes)} modes, {len(seeds)} seeds and contexts of shape {list(shape)}"
+            )
+        for mode in modes:
+            if mode not in range(6):
+                raise ValueError(f"mode must be 0 to 5, got {mode}")
+        self._people = [
+            _Person(ORDERS[mode], np.random.default_rng(seed)) for mode, seed in zip(modes, seeds, strict=True)
+        ]
+        self._parts = get_task("stacking").observation
+
+    @property
+    def finished(self) -> np.ndarray:
+        """Who has let go of the third box and drawn back, bool [n]."""
+        return np.array([person.finished for person in self._people])
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Decides the next control step of every episode.
+
+        Args:
+            observation (array): [n, 31] as :class:`~torchrl_koap.envs.StackingEnv` gives it.
+
+        Returns:
+            np.ndarray: change of the commanded joints (rad) and gripper number (m) [n, 8], float64.
+
+        Raises:
+            ValueError: if the shape is wrong.
+        """
+        observation = np.asarray(observation, dtype=np.float64)
+        if observation.shape != (len(self._people), 31):
+            raise ValueError(f"observation must be [{len(self._people)}, 31], got {list(observation.shape)}")
+        seen = {name: observation[:, columns] for name, columns in self._parts.items()}
+        commanded = seen["desired_joints_and_gripper"][:, :7]
+        _, turned = tcp_pose(seen["measured_joints"])
+        start, _ = tcp_pose(commanded)
+        boxes = np.stack(
+            [np.c_[seen[f"{name}_position"], np.arctan(seen[f"{name}_tan_yaw"])] for name, _, _ in BOXES], axis=1
+        )
+        poses, gripper = np.empty((len(self._people), 7)), np.empty((len(self._people), 1))
+        for i, person in enumerate(self._people):
+            yaw = 2 * math.atan2(turned[i, 2], turned[i, 1])
+            tcp, width = seen["tcp_position"][i], seen["gripper_width"][i, 0]
+            if person.position is None:
+                person.position, person.yaw = start[i].copy(), yaw
+            gripper[i] = person.decide(tcp, math.remainder(yaw, 2 * math.pi), width, boxes[i])
+            half = person.yaw / 2
+            poses[i] = (*person.position, 0.0, math.cos(half), math.sin(half), 0.0)
+        return np.concatenate([follow_pose(commanded, poses) - commanded, gripper], axis=1)
+
+
+class _Person:
+    """One episode: commanded TCP position (m) and yaw (rad), stage, and habits drawn from the generator."""
+
+    def __init__(self, order: tuple[int, ...], generator: np.random.Generator):
+        self.order, self.position, self.yaw = order, None, 0.0
+        self.finished = False
+        self._pace = generator.uniform(0.85, 1.05)
+        self._centre = np.array(TARGET) + generator.uniform(-0.004, 0.004, 2)
+        self._wobble = np.stack([drift(generator, 12, 0.0012, _HORIZON) for _ in range(3)], axis=1)
+        self._hesitation = generator.integers(0, 4, 16)
+        self._velocity, self._spin = np.zeros(3), 0.0
+        self._time, self._placed, self._grasp, self._grip_width = 0, 0, None, 0.0
+        self._speed, self._seen = 0.0, np.zeros(3)
+        self._enter(_REACH)
+
+    def decide(self, tcp: np.ndarray, yaw: float, width: float, boxes: np.ndarray) -> float:
+        """Moves the command by one control step, given what is seen; returns the gripper number."""
+        self._time += 1
+        self._since += 1
+        self._speed, self._seen = np.linalg.norm(tcp - self._seen), tcp.copy()
+        stage = (self._reach, self._close, self._carry, self._open, self._retreat)[self._stage]
+        return stage(tcp, yaw, width, boxes)
+
+    def _enter(self, stage: int) -> None:
+        self._stage, self._since, self._down = stage, 0, False
+
+    def _reach(self, tcp, yaw, width, boxes) -> float:
+        self._recount(tcp, boxes)
+        box = boxes[self.order[self._placed]]
+        far = np.linalg.norm(box[:2] - tcp[:2])
+        if self._grasp is None or far > 0.06:
+            self._grasp = _choose_grasp(self.order[self._placed], boxes)
+        turn, shift = self._grasp
+        goal = box[:2] + shift * np.array([math.cos(turn), math.sin(turn)])
+        error, tilt = np.linalg.norm(goal - tcp[:2]), abs(turn - yaw)
+        low, off = box[2] + _HOLD, error + 0.08 * max(tilt - 0.03, 0.0)
+        if off < 0.008:
+            self._down = True
+        elif off > 0.012 and tcp[2] > box[2] + 0.025:  # the fingers would come down on the box
+            self._down = False
+        height = low if self._down else box[2] + 0.05 + _funnel(off, 0.0, 0.02, 0.009, 0.03)
+        self._move(goal, max(height, self._above_stack(tcp)), turn, tcp)
+        there = error < 0.007 and tilt < 0.05 and abs(tcp[2] - low) < 0.008
+        if (there and width > 0.07 and self._since > 8) or (tcp[2] - low < 0.03 and self._since > 250):
+            self._enter(_GRASP)
+        return GRIPPER_OPEN
+
+    def _close(self, tcp, yaw, width, boxes) -> float:
+        self._velocity[:], self._spin = 0.5 * self._velocity, 0.5 * self._spin
+        wait = 5 + self._hesitation[self._time % 16]
+        if self._since > wait and (abs(width - self._grip_width) < 0.0005 or self._since > 25):
+            if width < 0.05:
+                self._grasp = None
+                self._enter(_REACH)
+            else:
+                self._enter(_CARRY)
+        self._grip_width = width
+        return GRIPPER_CLOSED
+
+    def _carry(self, tcp, yaw, width, boxes) -> float:
+        index = self.order[self._placed]
+        box = boxes[index]
+        offset = tcp - box[:3]
+        if np.linalg.norm(offset) > 0.05 or width < 0.05:  # lost
+            self._grasp = None
+            self._enter(_REACH)
+            return GRIPPER_OPEN
+        goal, height = self._place(boxes)
+        error, tilt = np.linalg.norm(goal - box[:2]), abs(yaw)
+        low = height + offset[2]
+        near = _funnel(error + 0.08 * max(tilt - 0.03, 0.0), low, low + 0.045, 0.008, 0.035)
+        far = min(max(near, _funnel(0.25 - error, 0.105, low + 0.045, 0.0, 0.12)), max(low + 0.045, 0.105))
+        self._move(goal + offset[:2], near if error < 0.06 else far, 0.0, tcp)
+        down = box[2] < height + 0.003 and abs(self.position[2] - low) < 0.004
+        if down and error < 0.009 and tilt < 0.06 and self._speed < 0.001:
+            self._enter(_RELEASE)
+        return GRIPPER_CLOSED
+
+    def _open(self, tcp, yaw, width, boxes) -> float:
+        self._velocity[:], self._spin = 0.5 * self._velocity, 0.5 * self._spin
+        wait = 4 + self._hesitation[self._time % 16]
+        if self._since > wait and width > 0.077:
+            self._placed += 1
+            self._grasp = None
+            self._enter(_RETREAT if self._placed == 3 else _REACH)
+        return GRIPPER_OPEN
+
+    def _retreat(self, tcp, yaw, width, boxes) -> float:
+        self._move(tcp[:2], ON_TABLE + 3 * BOX_HEIGHT, 0.0, tcp)
+        self.finished |= self._since > 12
+        return GRIPPER_OPEN
+
+    def _place(self, boxes: np.ndarray) -> tuple[np.ndarray, float]:
+        """Where the centre of the box in hand shall come to rest: xy and height."""
+        if not self._placed:
+            return self._centre, ON_TABLE
+        below = boxes[self.order[self._placed - 1]]
+        return below[:2], below[2] + BOX_HEIGHT
+
+    def _recount(self, tcp: np.ndarray, boxes: np.ndarray) -> None:
+        """Boxes that no longer lie where they were put have to be fetched again."""
+        if np.linalg.norm(tcp[:2] - self._centre) < 0.12:
+            return
+        for place in range(self._placed):
+            box = boxes[self.order[place]]
+            if np.linalg.norm(box[:2] - TARGET) > 0.055 or abs(box[2] - ON_TABLE - place * BOX_HEIGHT) > 0.02:
+                self._placed, self._grasp = place, None
+                return
+
+    def _above_stack(self, tcp: np.ndarray) -> float:
+        """Height that open fingers need where they are to pass the stack."""
+        if not self._placed:
+            return 0.0
+        top = ON_TABLE + (self._placed - 0.5) * BOX_HEIGHT
+        return _funnel(0.17 - np.linalg.norm(tcp[:2] - self._centre), 0.0, top + 0.035, 0.0, 0.08)
+
+    def _move(self, goal: np.ndarray, height: float, turn: float, tcp: np.ndarray) -> None:
+        """Speeds up, slows down and steers towards a place; sideways only as far up as the height there asks for."""
+        freedom = np.clip((0.02 - (height - tcp[2])) / 0.015, 0.0, 1.0)
+        wobble = self._wobble[self._time % _HORIZON]
+        far = np.linalg.norm(goal - tcp[:2]) > 0.03
+        way = np.append(goal, height) + (wobble if far else 0.0) - self.position
+        wanted = _EAGERNESS * way
+        wanted[:2] = _limited(wanted[:2], _SPEED * self._pace * freedom)
+        wanted[2] = np.clip(wanted[2], -_SINK * self._pace, _RISE * self._pace)
+        change = wanted - self._velocity
+        self._velocity += np.append(_limited(change[:2], _PUSH), np.clip(change[2], -_LIFT, _LIFT))
+        self.position += self._velocity
+        spin = np.clip(0.2 * (turn - self.yaw), -_TURN, _TURN) * self._pace
+        self._spin += np.clip(spin - self._spin, -_TURN_PUSH, _TURN_PUSH)
+        self.yaw += self._spin
+
+
+def _choose_grasp(index: int, boxes: np.ndarray) -> tuple[float, float]:
+    """How to grasp a box: yaw of the gripper and shift along its width (rad, m).
+
+    Of the equivalent yaws the one nearest to the neutral seventh joint is taken, unless another box is in the way.
+    """
+    box, others = boxes[index], [other for other in range(3) if other != index]
+    long = HALF_SIZES[index, 1] > 0.04
+    neutral = math.atan2(box[1], box[0])
+    period = math.pi if long else math.pi / 2
+    nearest = neutral + math.remainder(box[3] + (math.pi / 2 if long else 0.0) - neutral, period)
+    turns = [nearest] if long else [nearest, nearest - math.copysign(period, nearest - neutral)]
+    shifts = (0.0, 0.008, -0.008, 0.014, -0.014, 0.022, -0.022, 0.03, -0.03)[: 9 if long else 5]
+    best, most = None, -math.inf
+    for shift, turn in itertools.product(shifts, turns):
+        room = min(_room(box[:2], turn, shift, boxes[other], HALF_SIZES[other]) for other in others)
+        if room > _CLEAR:
+            return turn, shift
+        if room > most:
+            best, most = (turn, shift), room
+    return best
+
+
+def _room(place: np.ndarray, turn: float, shift: float, other: np.ndarray, half: np.ndarray) -> float:
+    """Least distance (m; negative inside) of the open fingers from another box, measured along its sides."""
+    across, along = np.array([math.sin(turn), -math.cos(turn)]), np.array([math.cos(turn), math.sin(turn)])
+    grid = np.array(list(itertools.product((-1, 0, 1), (-1, 0, 1))))
+    room = math.inf
+    for side in (-1, 1):
+        centre = place + shift * along + side * _FINGER_AT * across
+        points = centre + grid[:, :1] * _FINGER_HALF[0] * across + grid[:, 1:] * _FINGER_HALF[1] * along
+        c, s = math.cos(other[3]), math.sin(other[3])
+        inside = np.abs((points - other[:2]) @ np.array([[c, -s], [s, c]])) - half
+        room = min(room, inside.max(1).min())
+    return room
+
+
+def _funnel(error: float, low: float, high: float, tight: float, wide: float) -> float:
+    """``low`` for errors below ``tight``, ``high`` above ``wide``, in between in proportion."""
+    return low + (high - low) * min(max((error - tight) / (wide - tight), 0.0), 1.0)
+
+
+def _limited(vector: np.ndarray, length: float) -> np.ndarray:
+    """The vector, shortened to ``length`` if it is longer."""
+    return vector * min(1.0, length / max(np.linalg.norm(vector), 1e-12))

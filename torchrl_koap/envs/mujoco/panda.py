@@ -1,0 +1,243 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The Franka Panda arm of the D3IL benchmark as a `dm_control.mjcf` model (spec section 2).
+
+The numbers are D3IL's, not those of the Panda that ships with ``gymnasium-robotics``: only the ten meshes are taken
+from that package. Lengths in m, masses in kg, inertias in kg m^2, angles in rad, quaternions (w, x, y, z).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+
+from torchrl_koap.envs.mujoco.mjcf import mjcf
+
+NUM_ARM_JOINTS = 7
+NUM_FINGERS = 2
+TCP_OFFSET = 0.105  # tool centre point along the hand's z axis
+FLANGE_OFFSET = 0.107  # link8 along the z axis of link7
+HAND_QUAT = (0.92388, 0.0, 0.0, -0.382683)  # D3IL's rounded -45 deg about z
+REST_POSTURE = (0.0, 0.17453, 0.0, -0.87266, 0.0, 1.22173, 0.78540)
+
+_TURN = 0.5**0.5
+_TO_X = (_TURN, _TURN, 0.0, 0.0)  # +90 deg about x
+_FROM_X = (_TURN, -_TURN, 0.0, 0.0)  # -90 deg about x
+_NONE = (1.0, 0.0, 0.0, 0.0)
+
+# offset, rotation, mass, centre of mass, principal inertia, inertia frame
+_LINKS = (
+    (
+        (0.0, 0.0, 0.0),
+        _NONE,
+        3.01399,
+        (-0.0291898, -0.000879465, 0.0566032),
+        (0.0126801, 0.0117603, 0.00856656),
+        (0.00411744, 0.564916, 0.0132875, 0.825031),
+    ),
+    (
+        (0.0, 0.0, 0.333),
+        _NONE,
+        2.77281,
+        (1.1399e-5, -0.0312655, -0.0693733),
+        (0.0164224, 0.0153969, 0.00546286),
+        (0.98466, 0.174481, -0.000101815, 0.000347662),
+    ),
+    (
+        (0.0, 0.0, 0.0),
+        _FROM_X,
+        2.7996,
+        (-1.31766e-5, -0.0703216, 0.0311782),
+        (0.016787, 0.0157415, 0.00553027),
+        (0.57484, 0.818266, -6.05764e-5, -6.61626e-5),
+    ),
+    (
+        (0.0, -0.316, 0.0),
+        _TO_X,
+        2.14603,
+        (0.0443483, 0.0249283, -0.03813),
+        (0.00915257, 0.00896477, 0.00384742),
+        (0.0615263, 0.349824, 0.234291, 0.904956),
+    ),
+    (
+        (0.0825, 0.0, 0.0),
+        _TO_X,
+        2.18807,
+        (-0.0385503, 0.0395256, 0.0247162),
+        (0.00946899, 0.00928491, 0.00396694),
+        (0.813566, 0.465041, 0.309792, 0.160858),
+    ),
+    (
+        (-0.0825, 0.384, 0.0),
+        _FROM_X,
+        3.19545,
+        (-6.36776e-5, 0.0384124, -0.10997),
+        (0.0278873, 0.0268823, 0.00569569),
+        (0.990767, -0.135571, 0.000963106, 0.000694406),
+    ),
+    (
+        (0.0, 0.0, 0.0),
+        _TO_X,
+        1.35761,
+        (0.0510023, 0.00693267, 0.00616899),
+        (0.00412168, 0.0033698, 0.00213304),
+        (-0.0460841, 0.754362, 0.044494, 0.653325),
+    ),
+    (
+        (0.088, 0.0, 0.0),
+        _TO_X,
+        0.417345,
+        (0.0103614, 0.0103596, 0.0791078),
+        (0.000637671, 0.000528056, 0.000279577),
+        (0.63547, 0.278021, -0.670462, 0.263369),
+    ),
+)
+_JOINT_RANGES = (
+    (-2.9671, 2.9671),
+    (-1.8326, 1.8326),
+    (-2.9671, 2.9671),
+    (-3.1416, 0.0873),
+    (-2.9671, 2.9671),
+    (-0.0873, 3.8223),
+    (-2.9671, 2.9671),
+)
+_MOTOR_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+_FINGER_LIMIT = 70.0
+
+
+def mesh_folder() -> Path:
+    """Folder with the ten detailed Panda meshes of the installed ``gymnasium-robotics`` package.
+
+    Raises:
+        ImportError: if the package is not installed.
+        FileNotFoundError: if this version of the package has no such meshes.
+
+    Examples:
+        >>> from torchrl_koap.envs.mujoco.panda import mesh_folder
+        >>> (mesh_folder() / "hand.stl").exists()
+        True
+    """
+    spec = importlib.util.find_spec("gymnasium_robotics")
+    if spec is None or spec.origin is None:
+        raise ImportError(
+            "the Panda meshes come from the package 'gymnasium-robotics', which is not installed:"
+            " pip install 'gymnasium-robotics>=1.4'"
+        )
+    folder = Path(spec.origin).parent / "envs" / "assets" / "kitchen_franka" / "franka_assets" / "meshes" / "visual"
+    missing = [name for name in (*(f"link{i}" for i in range(8)), "hand", "finger") if not _mesh(folder, name).exists()]
+    if missing:
+        raise FileNotFoundError(
+            f"the installed 'gymnasium-robotics' has no Panda mesh {missing[0]}.stl in {folder} (version 1.4.2 does)"
+        )
+    return folder
+
+
+def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0) -> mjcf.RootElement:
+    """Builds the arm: 7 hinge joints, 2 finger slides, 9 motors, TCP body, wrist camera, optionally a rod in the hand.
+
+    What can touch something always collides: rod, fingers, finger pads and the hand (which comes down on a cylinder
+    when the rod is pressed against it). Links 0-7 are drawn only, unless ``link_collisions`` is set: commands all over
+    the table never brought one into contact, and leaving them out saves time.
+
+    Names: joints ``joint1`` ... ``joint7``, ``finger_left``, ``finger_right`` (motors alike), bodies ``link0`` ...
+    ``link8``, ``hand``, ``tcp``, geom ``rod``, camera ``wrist``.
+
+    Args:
+        rod (bool): the hand holds a rod (Avoiding, Aligning, Sorting) or nothing (Stacking).
+        link_collisions (bool): the convex hulls of links 0-7 collide with objects and table too. The original lets
+            them collide with each other as well, which joint limits and tasks keep them from; testing takes time.
+        alpha (float): opacity of the arm when drawn.
+
+    Raises:
+        ImportError: if ``gymnasium-robotics``, which holds the meshes, is not installed.
+
+    Examples:
+        >>> from torchrl_koap.envs.mujoco.panda import panda
+        >>> arm = panda(rod=True)
+        >>> len(arm.find_all("joint")), len(arm.find_all("actuator"))
+        (9, 9)
+    """
+    folder = mesh_folder()
+    root = mjcf.RootElement(model="panda")
+    root.compiler.angle = "radian"
+    for name in (*(f"link{i}" for i in range(8)), "hand", "finger"):
+        root.asset.add("mesh", name=name, file=str(_mesh(folder, name)))
+    colour, dark = (0.95, 0.95, 0.95, alpha), (0.25, 0.25, 0.28, alpha)
+    hull = {"contype": int(link_collisions), "conaffinity": 0}  # a conaffinity would let links meet each other
+
+    body = root.worldbody
+    for index, (offset, quat, mass, com, inertia, frame) in enumerate(_LINKS):
+        body = body.add("body", name=f"link{index}", pos=offset, quat=quat)
+        body.add("inertial", mass=mass, pos=com, diaginertia=inertia, quat=frame)
+        if index:
+            joint = {"type": "hinge", "axis": (0, 0, 1), "limited": True, "range": _JOINT_RANGES[index - 1]}
+            body.add("joint", name=f"joint{index}", **joint)
+        wrist = {"solimp": (1.998, 1.999, 0.0)} if index == 7 else {}
+        body.add("geom", name=f"link{index}", type="mesh", mesh=f"link{index}", rgba=colour, **hull, **wrist)
+
+    flange = body.add("body", name="link8", pos=(0, 0, FLANGE_OFFSET))
+    flange.add("inertial", mass=0.1, pos=(0, 0, 0), diaginertia=(0.1, 0.1, 0.1))
+    hand = flange.add("body", name="hand", quat=HAND_QUAT)
+    hand.add(
+        "inertial",
+        mass=0.670782,
+        pos=(-2.76618e-6, -0.00061547, 0.0239295),
+        diaginertia=(0.00227632, 0.00206087, 0.000456542),
+        quat=(0.697945, 0.716151, -0.000242485, 8.47563e-5),
+    )
+    hand.add("geom", name="hand", type="mesh", mesh="hand", rgba=colour, solimp=(1.998, 1.999, 0.0))
+    hand.add("camera", name="wrist", pos=(0.1, 0, 0), euler=(0, 3.14, 1.57), fovy=60)
+    hand.add("body", name="tcp", pos=(0, 0, TCP_OFFSET))
+    if rod:
+        _add_rod(hand)
+    for side, name in ((1.0, "left"), (-1.0, "right")):
+        _add_finger(hand, side, name, dark)
+
+    chain = [f"link{i}" for i in range(9)] + ["hand"]
+    for first, second in zip(chain, chain[1:], strict=False):
+        root.contact.add("exclude", body1=first, body2=second)
+    motors = [(f"joint{i + 1}", limit) for i, limit in enumerate(_MOTOR_LIMITS)]
+    motors += [("finger_left", _FINGER_LIMIT), ("finger_right", _FINGER_LIMIT)]
+    for joint, limit in motors:
+        root.actuator.add("motor", name=joint, joint=joint, gear=(1,), forcelimited=True, forcerange=(-limit, limit))
+    return root
+
+
+def _mesh(folder: Path, name: str) -> Path:
+    return folder / f"{name}.stl"
+
+
+def _add_rod(hand: mjcf.Element) -> None:
+    # D3IL leaves the inertia of rod and tip to their shapes, at the density of water
+    radius, length, density = 0.01, 0.3, 1000.0
+    mass = density * math.pi * radius**2 * length
+    across, along = mass * (3 * radius**2 + length**2) / 12, mass * radius**2 / 2
+    rod = hand.add("body", name="rod")
+    rod.add("inertial", mass=mass, pos=(0, 0, 0.075), diaginertia=(across, across, along))
+    rod.add("geom", name="rod", type="cylinder", size=(0.01, 0.15), pos=(0, 0, 0.075), rgba=(0.2, 0.4, 0.8, 1))
+    tip = rod.add("body", name="rod_tip")
+    mass = density * 4 / 3 * math.pi * radius**3
+    tip.add("inertial", mass=mass, pos=(0, 0, 0.225), diaginertia=(0.4 * mass * radius**2,) * 3)
+    drawn = {"contype": 0, "conaffinity": 0, "rgba": (0.2, 0.4, 0.8, 1)}
+    tip.add("geom", name="rod_tip", type="sphere", size=(0.01,), pos=(0, 0, 0.225), **drawn)
+
+
+def _add_finger(hand: mjcf.Element, side: float, name: str, colour: tuple) -> None:
+    finger = hand.add("body", name=f"finger_{name}", pos=(0, 0, 0.0584))
+    finger.add(
+        "inertial",
+        mass=0.0218754,
+        pos=(-2.42335e-5 * side, 0.0119585 * side, 0.0237816),
+        diaginertia=(5.69661e-6, 5.56035e-6, 1.55183e-6),
+        quat=(0.996177, 0.0868631 * side, -2.77937e-5 * side, -0.00926642),
+    )
+    slide = {"type": "slide", "axis": (0, side, 0), "limited": True, "range": (0, 0.04), "damping": 10}
+    finger.add("joint", name=f"finger_{name}", **slide)
+    firm = {"condim": 4, "margin": 0.001, "solimp": (0.998, 0.999, 0.001)}
+    turned = {} if side > 0 else {"quat": (0, 0, 0, 1)}
+    shape = {"type": "mesh", "mesh": "finger", "friction": (1, 0.005, 0.0001), "solref": (0.02, 1), "rgba": colour}
+    finger.add("geom", name=f"finger_{name}", **shape, **firm, **turned)
+    tip = finger.add("body", name=f"finger_tip_{name}", pos=(0, 0.0085 * side, 0.056))
+    tip.add("inertial", mass=0.01, pos=(0, 0, 0), diaginertia=(0.01, 0.01, 0.01), quat=(0, 0, 0, 1))
+    pad = {"type": "box", "size": (0.008, 0.004, 0.008), "pos": (0, -0.005 * side, -0.012), "rgba": colour}
+    tip.add("geom", name=f"pad_{name}", **pad, friction=(2, 0.05, 0.0001), solref=(0.01, 0.5), **firm)

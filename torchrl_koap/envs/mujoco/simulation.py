@@ -1,0 +1,259 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A batch of simulations of one scene: one shared model, one state per simulation, threads that advance them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import mujoco
+import numpy as np
+
+from torchrl_koap.envs.mujoco import controller
+from torchrl_koap.envs.mujoco.scene import PANDA
+
+_NUM_JOINTS = 9  # seven of the arm, two fingers
+_CHUNKS_PER_THREAD = 4  # smaller pieces even out simulations that take longer
+
+
+class SimulationBatch:
+    """Simulations that share a model and are advanced together, in one or several threads.
+
+    The result for one simulation depends neither on the others nor on the number of threads.
+
+    Args:
+        model (mujoco.MjModel): a compiled scene that holds the arm, see :func:`~torchrl_koap.envs.mujoco.scene.scene`.
+        num_sims (int): number of simulations.
+        num_threads (int): number of threads that advance them; 1 stays in the caller's thread.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.envs.mujoco.scene import compile_scene, scene
+        >>> from torchrl_koap.envs.mujoco.simulation import SimulationBatch
+        >>> sims = SimulationBatch(compile_scene(scene()), num_sims=2)
+        >>> start = np.array([0, 0.17, 0, -0.87, 0, 1.22, 0.785])
+        >>> sims.reset(np.arange(2), start)
+        >>> sims.tcp_position.shape, round(sims.data[0].time, 6)
+        ((2, 3), 0.001)
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_sims: int, num_threads: int = 1):
+        self.model = model
+        self.data = [mujoco.MjData(model) for _ in range(num_sims)]
+        self.num_threads = num_threads
+        self.joint_targets = np.zeros((num_sims, 7))
+        self.joint_speeds = np.zeros((num_sims, 7))
+        self.started = np.zeros(num_sims, dtype=bool)
+        self.widths = np.full(num_sims, controller.FINGER_RESET)
+        self.grasping = np.zeros(num_sims, dtype=bool)
+        self.log = np.zeros((num_sims, controller.LOG_WIDTH + model.nq - _NUM_JOINTS))
+        self.log_time = np.zeros(num_sims)
+
+        joint = model.joint(f"{PANDA}joint1")
+        self._qpos_start, self._qvel_start = int(joint.qposadr[0]), int(joint.dofadr[0])
+        if (self._qpos_start, self._qvel_start) != (model.nq - _NUM_JOINTS, model.nv - _NUM_JOINTS):
+            raise ValueError("the arm's nine joints must come last in the state, after the free bodies of the task")
+        self._tcp = model.body(f"{PANDA}tcp").id
+        self._joint = joint.id
+        self._step = controller.step_address()
+        self._data_addresses = np.array([data._address for data in self.data], dtype=np.int64)
+        self._pointers = np.array([self._arrays(data) for data in self.data], dtype=np.int64)
+        self._tcp_views = [data.xpos[self._tcp] for data in self.data]
+        self._arm_views = [data.qpos[self._qpos_start :] for data in self.data]
+        self._object_views = [data.qpos[: self._qpos_start] for data in self.data]
+        self._executor = None
+        self._executor_pid = None
+
+    def _arrays(self, data: mujoco.MjData) -> list[int]:
+        arrays = [None] * controller.NUM_POINTERS
+        arrays[controller.QPOS] = data.qpos[self._qpos_start :]
+        arrays[controller.QVEL] = data.qvel[self._qvel_start :]
+        arrays[controller.CTRL] = data.ctrl
+        arrays[controller.BIAS] = data.qfrc_bias[self._qvel_start :]
+        arrays[controller.TCP_POS] = data.xpos[self._tcp]
+        arrays[controller.TCP_QUAT] = data.xquat[self._tcp]
+        arrays[controller.ANCHORS] = data.xanchor[self._joint :]
+        arrays[controller.JOINT_AXES] = data.xaxis[self._joint :]
+        arrays[controller.OBJECTS] = data.qpos
+        return [array.ctypes.data for array in arrays]
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    @property
+    def tcp_position(self) -> np.ndarray:
+        """TCP positions [n, 3] (m) as the original reads them: one substep (1 ms) older than the joints."""
+        return np.stack(self._tcp_views)
+
+    @property
+    def joint_positions(self) -> np.ndarray:
+        """Measured joints [n, 7] (rad)."""
+        return np.stack(self._arm_views)[:, :7]
+
+    @property
+    def gripper_width(self) -> np.ndarray:
+        """Distance of the fingers [n] (m)."""
+        return np.stack(self._arm_views)[:, 7:].sum(1)
+
+    @property
+    def object_poses(self) -> np.ndarray:
+        """Poses of the free bodies [n, objects, 7]: position (m) and quaternion, in the order of the state."""
+        return np.stack(self._object_views).reshape(len(self), -1, 7)
+
+    def reset(
+        self,
+        rows: np.ndarray,
+        start_joints: np.ndarray,
+        object_poses: np.ndarray | None = None,
+        *,
+        width: float = controller.FINGER_RESET,
+    ) -> None:
+        """Puts simulations into their start state (spec section 4), one substep included.
+
+        Args:
+            rows (np.ndarray): indices of the simulations.
+            start_joints (np.ndarray): arm joints [7] (rad).
+            object_poses (np.ndarray, optional): poses of the free bodies [len(rows), objects, 7].
+            width (float): finger target (m) during that substep.
+        """
+        commands = np.zeros((len(self), 7))
+        for index, row in enumerate(rows):
+            data = self.data[row]
+            mujoco.mj_resetData(self.model, data)
+            if object_poses is not None:
+                data.qpos[: self._qpos_start] = object_poses[index].ravel()
+            data.qpos[self._qpos_start : self._qpos_start + 7] = start_joints
+            data.qpos[self._qpos_start + 7 :] = 0.0
+            mujoco.mj_forward(self.model, data)
+            commands[row] = start_joints
+        self.started[rows] = False
+        self.widths[rows] = width
+        self.grasping[rows] = False
+        self.track_joints(rows, commands, substeps=1)
+
+    def track_pose(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
+        """Advances simulations by ``substeps`` while the TCP follows ``commands`` (spec section 3.1).
+
+        Args:
+            rows (np.ndarray): indices of the simulations.
+            commands (np.ndarray): TCP positions (m) and quaternions [n, 7]; rows not advanced are ignored.
+            substeps (int): physics steps.
+        """
+        commands = np.ascontiguousarray(commands, dtype=np.float64)
+        state = (self.joint_targets, self.joint_speeds, self.started, self.log)
+        self._run(controller.track_pose, rows, (commands, self.widths, self.grasping, substeps, *state))
+
+    def track_joints(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
+        """Advances simulations by ``substeps`` while the joints are held at ``commands`` [n, 7] (spec section 3.2)."""
+        commands = np.ascontiguousarray(commands, dtype=np.float64)
+        self._run(controller.track_joints, rows, (commands, self.widths, self.grasping, substeps, self.log))
+
+    def _run(self, kernel, rows: np.ndarray, arguments: tuple) -> None:
+        rows = np.ascontiguousarray(rows, dtype=np.int64)
+        if not len(rows):
+            return
+        for row in rows:
+            self.log_time[row] = self.data[row].time + controller.TIMESTEP
+        due = [self.data[row].time + arguments[3] * controller.TIMESTEP for row in rows]
+        self._dispatch(kernel, rows, arguments)
+        for row, time in zip(rows, due, strict=True):
+            if abs(self.data[row].time - time) > 0.5 * controller.TIMESTEP:  # MuJoCo resets a state that blows up
+                raise RuntimeError(f"the simulation of environment {row} became unstable")
+
+    def _dispatch(self, kernel, rows: np.ndarray, arguments: tuple) -> None:
+        fixed = (self._step, self.model._address, self._data_addresses, self._pointers)
+        if self.num_threads == 1 or len(rows) == 1:
+            kernel(*fixed, rows, *arguments)
+            return
+        if self._executor is None or self._executor_pid != os.getpid():  # threads do not survive a fork
+            self._executor = ThreadPoolExecutor(self.num_threads, thread_name_prefix="koap-simulation")
+            self._executor_pid = os.getpid()
+        pieces = np.array_split(rows, min(len(rows), self.num_threads * _CHUNKS_PER_THREAD))
+        for future in [self._executor.submit(kernel, *fixed, piece, *arguments) for piece in pieces]:
+            future.result()
+
+    def close(self) -> None:
+        """Ends the threads; they start again when needed."""
+        if self._executor is not None:
+            self._executor.shutdown()
+            self._executor = None
+
+    def get_state(self, row: int) -> dict[str, np.ndarray]:
+        """Everything that decides the future of one simulation, controller included.
+
+        Args:
+            row (int): index of the simulation.
+
+        Returns:
+            dict: physics state (``mjSTATE_INTEGRATION``), force bias, TCP pose, joint targets, finger targets.
+        """
+        data, spec = self.data[row], mujoco.mjtState.mjSTATE_INTEGRATION.value
+        physics = np.empty(mujoco.mj_stateSize(self.model, spec))
+        mujoco.mj_getState(self.model, data, physics, spec)
+        return {
+            "physics": physics,
+            "bias": data.qfrc_bias.copy(),
+            "tcp_position": data.xpos[self._tcp].copy(),
+            "tcp_quaternion": data.xquat[self._tcp].copy(),
+            "joint_targets": self.joint_targets[row].copy(),
+            "joint_speeds": self.joint_speeds[row].copy(),
+            "started": self.started[row].copy(),
+            "width": self.widths[row].copy(),
+            "grasping": self.grasping[row].copy(),
+        }
+
+    def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
+        """Restores what :meth:`get_state` returned; the simulation then continues bit for bit."""
+        data = self.data[row]
+        mujoco.mj_resetData(self.model, data)
+        spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
+        mujoco.mj_setState(self.model, data, state["physics"], spec)
+        mujoco.mj_forward(self.model, data)  # poses for pictures, contacts; what it changes is put back below
+        mujoco.mj_setState(self.model, data, state["physics"], spec)
+        data.qfrc_bias[:] = state["bias"]
+        data.xpos[self._tcp] = state["tcp_position"]
+        data.xquat[self._tcp] = state["tcp_quaternion"]
+        self.joint_targets[row] = state["joint_targets"]
+        self.joint_speeds[row] = state["joint_speeds"]
+        self.started[row] = state["started"]
+        self.widths[row], self.grasping[row] = state["width"], state["grasping"]
+
+    def set_physics(self, row: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
+        """Puts one simulation into a physics state and forgets the controller's past.
+
+        Args:
+            row (int): index of the simulation.
+            qpos (array): positions [nq] (m, rad).
+            qvel (array, optional): velocities [nv].
+            qacc_warmstart (array, optional): warm start of the solver [nv].
+            ctrl (array, optional): motor commands [nu] (N m, N).
+            time (float): clock (s).
+
+        Raises:
+            ValueError: if a size is wrong or a number is not finite.
+        """
+        data = self.data[row]
+        mujoco.mj_resetData(self.model, data)
+        given = {"qpos": qpos, "qvel": qvel, "ctrl": ctrl, "qacc_warmstart": qacc_warmstart}
+        for name, value in given.items():
+            if value is None:
+                continue
+            array, value = getattr(data, name), np.asarray(value, dtype=np.float64)
+            if value.shape != array.shape or not np.isfinite(value).all():
+                raise ValueError(f"{name!r} must be {array.shape[0]} finite numbers, got shape {list(value.shape)}")
+            array[:] = value
+        data.time = time
+        mujoco.mj_forward(self.model, data)
+        if qacc_warmstart is not None:  # the forward pass has replaced it
+            data.qacc_warmstart[:] = qacc_warmstart
+        self.started[row] = False
+
+    def contacts(self, row: int, geom: int, others: Sequence[int]) -> np.ndarray:
+        """Which geoms of ``others`` touched ``geom`` in the last substep, bool [len(others)]."""
+        data = self.data[row]
+        if not data.ncon:
+            return np.zeros(len(others), dtype=bool)
+        pairs = data.contact.geom
+        touching = np.concatenate([pairs[pairs[:, 0] == geom, 1], pairs[pairs[:, 1] == geom, 0]])
+        return np.isin(others, touching)

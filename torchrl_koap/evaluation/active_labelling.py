@@ -1,0 +1,154 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+r"""Which demonstrations to label next, from the latent actions alone.
+
+A linear decoder under a ridge penalty knows how uncertain it is without knowing a single action: its covariance
+:math:`C = (\sum u u^T + \lambda)^{-1}`, over the labelled steps, holds no label, so neither do choices made with it.
+That is also why several demonstrations can be chosen at once: what the first choice will teach about the others is
+known before it is labelled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchrl_koap.lookup import lookup
+
+_MEAN_SPREAD = 30.0  # prior deviation of a fitted mean against that of what the latent actions explain: nearly free
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """A demonstration to label.
+
+    Args:
+        episode (int): its number.
+        score (float, optional): what the criterion gives it when its turn comes, in units of the noise variance.
+    """
+
+    episode: int
+    score: float | None
+
+
+def _variance(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
+    """Mean leverage of the steps of a demonstration."""
+    return ((latent @ covariance) * latent).sum(-1).mean().item()
+
+
+def _gain(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
+    """By how much the mean leverage over all steps falls if these steps are labelled."""
+    part = _explained_part(latent, covariance)
+    return ((part @ moment) * part).sum().item()
+
+
+def _explained_part(latent: Tensor, covariance: Tensor) -> Tensor:
+    """``P [T, m]`` such that labelling the steps ``latent [T, m]`` takes ``P^T P`` off the covariance (Woodbury)."""
+    projected = latent @ covariance
+    inner = torch.eye(len(latent), dtype=latent.dtype, device=latent.device) + projected @ latent.mT
+    return torch.linalg.solve_triangular(torch.linalg.cholesky(inner), projected, upper=False)
+
+
+CRITERIA = {"gain": _gain, "variance": _variance, "random": None}
+
+
+@torch.no_grad()
+def rank_trajectories(
+    latent: Tensor,
+    episode: Tensor,
+    labelled: Tensor,
+    *,
+    penalty: float,
+    criterion: str = "gain",
+    count: int = 5,
+    bias: bool = False,
+    seed: int = 0,
+) -> list[Suggestion]:
+    r"""Chooses trajectories to label, one after the other, each as if those before it were labelled already.
+
+    * ``"gain"``: the one whose labels lower the mean predictive variance over *all* steps the most (I-optimal design,
+      greedy). It prefers long demonstrations that resemble many others.
+    * ``"variance"``: the one along which the decoder is least certain on average. It prefers outliers.
+    * ``"random"``: any.
+
+    The covariance is that of the plain ridge, also where the decoder is shrunk towards a prior of its own: what it is
+    shrunk towards has no part in it.
+
+    Args:
+        latent (Tensor): latent actions ``[N, m]``.
+        episode (Tensor): trajectory of every step ``[N]``.
+        labelled (Tensor): labelled steps, bool ``[N]``. Trajectories with unlabelled steps can be chosen, and only
+            those steps count for the choice.
+
+    Keyword Args:
+        penalty (float): the ridge, in units of the mean square norm of the labelled latent actions (of all, where none
+            is labelled), as in :class:`~torchrl_koap.modules.koopman.action_decoder.RidgeFit`.
+        criterion (str): ``"gain"``, ``"variance"`` or ``"random"``.
+        count (int): trajectories to choose.
+        bias (bool): the decoder has a fitted mean.
+        seed (int): seed of ``"random"``.
+
+    Returns:
+        list of Suggestion: in the order of choice.
+
+    Raises:
+        ValueError: for an unknown criterion, shapes that disagree, latent actions that are not finite, a penalty that
+            is not positive, a count out of range, or if every step is labelled.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.evaluation.active_labelling import rank_trajectories
+        >>> latent = torch.tensor([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # the last direction is unknown as yet
+        >>> known = torch.tensor([True, False, False])
+        >>> [choice.episode for choice in rank_trajectories(latent, torch.arange(3), known, penalty=0.1, count=2)]
+        [2, 1]
+    """
+    lookup(CRITERIA, criterion, "criterion")
+    if latent.ndim != 2 or episode.shape != latent.shape[:1] or labelled.shape != latent.shape[:1]:
+        raise ValueError(
+            "wanted latent [N, m], episode [N] and labelled [N],"
+            f" got {list(latent.shape)}, {list(episode.shape)} and {list(labelled.shape)}"
+        )
+    if labelled.dtype != torch.bool:
+        raise ValueError(f"labelled must be bool, got {labelled.dtype}")
+    if not 0 < penalty < float("inf"):
+        raise ValueError(f"penalty must be positive and finite, got {penalty}")
+    if not latent.isfinite().all():
+        raise ValueError("latent actions must be finite")
+    names = episode[~labelled].unique().tolist()
+    if not names:
+        raise ValueError("nothing is left to suggest: every step is labelled")
+    if not 1 <= count <= len(names):
+        raise ValueError(f"count must be in 1..{len(names)}, the trajectories that are not labelled yet, got {count}")
+    score = CRITERIA[criterion]
+    if score is None:
+        drawn = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))[:count].tolist()
+        return [Suggestion(names[index], None) for index in drawn]
+
+    rows, scale = _rows(latent.double(), labelled, penalty, bias)
+    known = rows[labelled]
+    precision = known.mT @ known + scale * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
+    covariance = torch.cholesky_inverse(torch.linalg.cholesky(precision))
+    moment = rows.mT @ rows / len(rows)
+    left = {name: rows[(episode == name) & ~labelled] for name in names}
+    chosen = []
+    for _ in range(count):
+        scores = {name: score(part, covariance, moment) for name, part in left.items()}
+        best = max(scores, key=scores.__getitem__)
+        part = _explained_part(left.pop(best), covariance)
+        covariance = covariance - part.mT @ part
+        chosen.append(Suggestion(best, scores[best]))
+    return chosen
+
+
+def _rows(latent: Tensor, labelled: Tensor, penalty: float, bias: bool) -> tuple[Tensor, Tensor]:
+    """Latent actions, with a column for a fitted mean, and the ridge in their squared units."""
+    reference = latent[labelled] if labelled.any() else latent
+    if bias:
+        latent, reference = latent - reference.mean(0), reference - reference.mean(0)
+    unit = reference.square().sum(-1).mean()
+    unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # constant latent actions: any scale will do
+    if bias:
+        latent = torch.cat([latent, (_MEAN_SPREAD * unit.sqrt()).expand(len(latent), 1)], -1)
+    return latent, penalty * unit

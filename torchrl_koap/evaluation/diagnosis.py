@@ -1,0 +1,181 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Which part of a policy fails: planner, controller, or the data.
+
+Three success rates tell them apart. The planner *imagines* episodes on its own: every plan's executed part becomes the
+next history, nothing is simulated. The controller follows the *recorded* states of demonstrations in their own
+contexts, as if the planner were perfect. Both together are the closed loop. Beside them: how far the executed states
+leave the plans, and how far they leave the demonstrations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_koap.data import trajectory_lengths
+from torchrl_koap.evaluation.rollouts import make_policy, roll_out
+from torchrl_koap.evaluation.scores import outcome_of
+from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.keys import OBSERVATION
+from torchrl_koap.modules import StatePlanner
+from torchrl_koap.modules.policies.plan_then_control import RecordedPlanner
+from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.goals import goal_reached
+
+
+@torch.no_grad()
+def imagine(planner: StatePlanner, start: Tensor, *, interval: int, max_steps: int, seed: int = 0) -> Tensor:
+    """Lets a planner continue its own plans.
+
+    Args:
+        planner (StatePlanner): the planner.
+        start (Tensor): first states ``[E, d]``.
+
+    Keyword Args:
+        interval (int): planned states that are taken over before the next plan.
+        max_steps (int): states to imagine.
+        seed (int): seed of the planner's noise.
+
+    Returns:
+        Tensor: imagined states ``[E, max_steps, d]`` (or a few more), the first one the start.
+    """
+    generator = torch.Generator(start.device).manual_seed(seed)
+    states = [start] * planner.history
+    while len(states) - planner.history < max_steps - 1:
+        history = torch.stack(states[-planner.history :], -2)
+        plan = planner.plan(history, generator=generator)
+        states += plan[:, :interval].unbind(1)
+    return torch.stack(states[planner.history - 1 :], 1)
+
+
+def contexts_of(task: Task, observation: Tensor) -> Tensor:
+    """Contexts ``[E, objects, 3]`` (x, y in m, yaw in rad) that first observations ``[E, obs]`` show.
+
+    ``tan(yaw)`` gives the yaw of a box up to half a turn, which looks the same.
+    """
+    rows = []
+    for name in task.objects:
+        xy = observation[:, task.observation[task.drawn[name]]][:, :2]
+        if f"{name}_quaternion" in task.observation:
+            w, _, _, z = observation[:, task.observation[f"{name}_quaternion"]].unbind(-1)
+            yaw = 2 * torch.atan2(z * w.sign(), w.abs())
+        else:
+            yaw = observation[:, task.observation[f"{name}_tan_yaw"]].squeeze(-1).atan()
+        rows.append(torch.cat([xy, yaw[:, None]], -1))
+    return torch.stack(rows, 1)
+
+
+def recorded_futures(states: Sequence[Tensor], horizon: int) -> Tensor:
+    """For every step of recorded trajectories ``[T_i, d]`` the states that follow, ``[E, max T, H, d]``.
+
+    The last state of a trajectory is repeated.
+    """
+    longest = max(len(path) for path in states)
+    ahead = torch.arange(longest)[:, None] + torch.arange(1, horizon + 1)
+    return torch.stack([path[ahead.clamp_max(len(path) - 1)] for path in states])
+
+
+def follow_recordings(
+    planner: StatePlanner,
+    controller,
+    task: Task,
+    data: TensorDictBase,
+    make_env: Callable[[int], Any],
+    *,
+    episodes: int,
+    **options,
+) -> list[TensorDict]:
+    """Closed-loop episodes in which recorded states take the place of plans.
+
+    Args:
+        planner (StatePlanner): for its history and horizon alone.
+        controller (nn.Module): the controller under test.
+        task (Task): the task.
+        data (TensorDictBase): flat demonstrations with ``state``.
+        make_env (callable): makes an environment of a number of episodes.
+
+    Keyword Args:
+        episodes (int): demonstrations to follow, spread evenly over the data.
+        **options: of :func:`~torchrl_koap.evaluation.rollouts.make_policy`.
+    """
+    lengths = trajectory_lengths(data).tolist()
+    chosen = torch.linspace(0, len(lengths) - 1, min(episodes, len(lengths))).long().unique().tolist()
+    paths = data["state"].split(lengths)
+    starts = torch.stack([data[OBSERVATION].split(lengths)[index][0] for index in chosen])
+    policy = make_policy(RecordedPlanner(planner), controller, state_columns=task.state_of, **options)
+    return roll_out(
+        policy,
+        make_env,
+        list(range(len(chosen))),
+        max_steps=task.max_steps,
+        contexts=contexts_of(task, starts.double()).numpy() if task.objects else None,
+        futures=recorded_futures([paths[index] for index in chosen], planner.horizon),
+    )
+
+
+def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -> dict[str, list[float]]:
+    """How far executed states lie from the plan in force, per part of the state.
+
+    Returns:
+        dict: root mean square distance per step ``1 .. interval`` after a plan, in the units of the part.
+    """
+    errors: dict[str, list[Tensor]] = {name: [] for name in task.state_slices}
+    for episode in episodes:
+        chunk = episode.get("remaining_plan_chunk", None)
+        if chunk is None:
+            return {}
+        states = task.state_of(torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]))
+        made = torch.arange(0, len(episode) - interval + 1, interval)
+        steps = torch.arange(1, interval + 1)
+        gap = states[made[:, None] + steps] - chunk[made, 0, :interval]
+        for name, columns in task.state_slices.items():
+            errors[name].append(gap[..., columns].square().sum(-1))
+    return {name: torch.cat(parts).mean(0).sqrt().tolist() for name, parts in errors.items() if parts}
+
+
+def nearest_distances(states: Tensor, others: Tensor, scale: Tensor) -> Tensor:
+    """Distance of states ``[N, d]`` to the nearest of others ``[M, d]``, columns divided by ``scale``."""
+    found = [torch.cdist(part / scale, others / scale).amin(1) for part in states.split(2048)]
+    return torch.cat(found)
+
+
+def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase, *, most: int = 4000) -> dict[str, float]:
+    """Distance of visited states to the nearest demonstrated one, and that among demonstrations, in spreads.
+
+    Every second demonstration is compared with the others, so that both figures are distances to strangers.
+    """
+    every = data["episode"] % 2 == 0
+    known, held_out = data["state"][every], data["state"][~every]
+    if not len(held_out):
+        return {}
+    scale = known.std(0).clamp_min(1e-6) * task.state_dim**0.5
+    visited = torch.cat([task.state_of(episode[OBSERVATION]) for episode in episodes])
+    known = known[:: max(1, len(known) // 20000)]
+    sample = [states[:: max(1, len(states) // most)] for states in (visited, held_out)]
+    figures = [nearest_distances(states, known, scale) for states in sample]
+    return {
+        "visited_median": figures[0].median().item(),
+        "visited_95": figures[0].quantile(0.95).item(),
+        "demonstrated_median": figures[1].median().item(),
+        "demonstrated_95": figures[1].quantile(0.95).item(),
+    }
+
+
+def rate(good: Sequence[bool]) -> Mapping[str, float]:
+    """Success rate with its 95 % Wilson interval and n."""
+    low, high = wilson_interval(sum(good), len(good))
+    return {"rate": sum(good) / len(good), "low": low, "high": high, "episodes": len(good)}
+
+
+def imagined_success(task: Task, imagined: Tensor) -> list[bool]:
+    """Which imagined episodes ``[E, T, d]`` reach the goal at any time."""
+    return goal_reached(task, imagined).any(-1).tolist()
+
+
+def executed_success(episodes: Sequence[TensorDict]) -> list[bool]:
+    """Which executed episodes succeed."""
+    return [outcome_of(episode) == "success" for episode in episodes]

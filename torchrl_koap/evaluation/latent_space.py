@@ -1,0 +1,284 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a trained Koopman model has learned: its spectrum, its multi-step errors, and what its latent actions hold.
+
+Spectrum and multi-step errors need no label. The linear probe asks whether the true actions lie linearly in the latent
+actions at all; it reads every label, in the budget or not, so it may inform a reader and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from torchrl_koap.data import cut_windows, trajectory_lengths
+from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
+from torchrl_koap.modules import KoopmanInverseDynamics, LinearActionDecoder
+
+OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"
+MODELS = ("koopman", "reconstruction", "linear", "copy_last")
+_MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
+
+
+def spectrum(eigenvalues: Tensor, *, tolerance: float = 1e-3, slowest: int = 5) -> dict[str, Any]:
+    r"""Where the eigenvalues of an operator lie, and in how many steps its slowest parts fade to 1/e.
+
+    Args:
+        eigenvalues (Tensor): complex ``[m]``.
+
+    Keyword Args:
+        tolerance (float): distance to the unit circle below which an eigenvalue lies on it. Defaults to ``1e-3``.
+        slowest (int): decay times :math:`-1 / \ln |\lambda|` to list, of those inside. Defaults to ``5``.
+
+    Examples:
+        >>> import math
+        >>> import torch
+        >>> from torchrl_koap.evaluation.latent_space import spectrum
+        >>> spectrum(torch.tensor([1.0, 1.25, 1j / math.e], dtype=torch.complex128))
+        {'spectral_radius': 1.25, 'inside': 1, 'on': 1, 'outside': 1, 'slowest_decay_steps': [1.0]}
+    """
+    size = eigenvalues.detach().abs().double().sort(descending=True).values
+    inside = size[size < 1 - tolerance]
+    outside = int((size > 1 + tolerance).sum())
+    return {
+        "spectral_radius": size[0].item(),
+        "inside": len(inside),
+        "on": len(size) - len(inside) - outside,
+        "outside": outside,
+        "slowest_decay_steps": (-1 / inside[:slowest].log()).tolist(),
+    }
+
+
+@torch.no_grad()
+def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> TensorDict:
+    """Latent actions of all steps that see their whole look-ahead, each once: those a decoder is fitted on.
+
+    Args:
+        controller (KoopmanInverseDynamics): the model, in evaluation mode.
+        data (TensorDictBase): flat ``[N]`` with ``state``, ``action``, ``has_action`` and ``episode``.
+
+    Returns:
+        TensorDict: ``[M]`` with ``latent_action [M, m]``, ``action``, ``has_action [M]`` and ``episode [M]``.
+    """
+    keys = [STATE, ACTION, HAS_ACTION, EPISODE]
+    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.history)
+    now = controller.history
+    parts = windows[STATE].split(4096)
+    latent = torch.cat([controller.infer(part, range(now, now + 1)).squeeze(-2) for part in parts])
+    here = windows[:, now]
+    entries = {"latent_action": latent, ACTION: here[ACTION], EPISODE: here[EPISODE]}
+    return TensorDict(entries | {HAS_ACTION: here[HAS_ACTION].squeeze(-1)}, [len(latent)])
+
+
+def split_trajectories(episode: Tensor, labelled: Tensor, *, seed: int = 0) -> Tensor:
+    """Half of the trajectories to fit on, drawn at random, those with a label in the budget first.
+
+    The other half is then new to a decoder fitted within the budget too, as far as the budget leaves so many.
+
+    Args:
+        episode (Tensor): trajectory of every step ``[N]``.
+        labelled (Tensor): steps labelled in the budget, bool ``[N]``.
+
+    Keyword Args:
+        seed (int): seed of the draw.
+
+    Returns:
+        Tensor: numbers of the trajectories to fit on.
+
+    Raises:
+        ValueError: if there is only one trajectory.
+    """
+    names = episode.unique()
+    if len(names) < 2:
+        raise ValueError("to fit on half of the trajectories takes at least two, got 1")
+    order = names[torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))]
+    touched = torch.isin(order, episode[labelled].unique())
+    return torch.cat([order[touched], order[~touched]])[: len(names) // 2]
+
+
+@torch.no_grad()
+def prediction_errors(
+    controller: KoopmanInverseDynamics,
+    data: TensorDictBase,
+    fit_on: Tensor,
+    parts: Mapping[str, Sequence[int]],
+    *,
+    horizon: int = 10,
+) -> dict[str, dict[str, list[float]]]:
+    r"""How far predicted states are from recorded ones, ``1 .. horizon`` steps ahead, for three models.
+
+    * ``koopman``: :math:`z_{t+1} = K z_t + B u_t` from :math:`z_t = g_\theta(x_t)`, mapped back by :math:`g_\psi`;
+    * ``linear``: :math:`x_{t+1} = A x_t + C v_t + c` by least squares, with ``v_t`` the frames that ``u_t`` is made of:
+      the same inputs, no lifting;
+    * ``copy_last``: :math:`x_{t+h} = x_t`.
+
+    Beside them ``reconstruction``: :math:`g_\psi(g_\theta(x_{t+h}))`, what the first one cannot do better than.
+
+    Both ``u`` and ``v`` read recorded states around and *ahead* of every step (``x_{t+k}``), so this tests the models;
+    it is no forecast. The linear model is fitted on the trajectories ``fit_on``, and all three are judged on the
+    others. The Koopman model was trained on the states of all of them (that takes no label). Where ``v_t`` holds
+    ``x_{t+2}``, as by default, the linear model interpolates and owes little to what it predicted before.
+
+    Args:
+        controller (KoopmanInverseDynamics): the model, in evaluation mode.
+        data (TensorDictBase): flat ``[N]`` with raw ``state`` ``[N, d]`` and ``episode``.
+        fit_on (Tensor): numbers of the trajectories to fit the linear model on.
+        parts (mapping): columns of the state by name.
+
+    Keyword Args:
+        horizon (int): steps to predict. Defaults to ``10``.
+
+    Returns:
+        dict: by model and part the root mean square distance after ``1 .. horizon`` steps, in raw units.
+
+    Raises:
+        ValueError: if the horizon is below 1, or a trajectory is too short for it.
+    """
+    if horizon < 1:
+        raise ValueError(f"horizon must be >= 1 step, got {horizon}")
+    now, length = controller.history, controller.num_window_frames + horizon - 1
+    windows = cut_windows(data, length, select=[STATE, EPISODE], pad_before=now)
+    fitted = torch.isin(windows[EPISODE][:, -1], fit_on)
+    known, new = (windows[STATE][rows] for rows in (fitted, ~fitted))
+    if not len(known) or not len(new):
+        raise ValueError("fit_on must hold some of the trajectories and leave some out")
+    linear = _fit_linear(controller, known)
+    new = new[:: -(-len(new) // _MOST_WINDOWS)]
+    sums = {model: torch.zeros(horizon, new.shape[-1], dtype=torch.float64) for model in MODELS}
+    frames = range(now, now + horizon)
+    for states in new.split(1024):
+        true = states[:, now + 1 : now + 1 + horizon]
+        lifted = controller.lift(states[:, : now + 1 + horizon])
+        past = lifted[:, : now + 1]  # a recurrent decoder needs it as well
+        rolled = controller.rollout_latent(past[:, -1], controller.infer(states, frames))
+        decoded = [controller.lifting.decode(path)[:, now + 1 :] for path in (torch.cat([past, rolled], 1), lifted)]
+        predicted = {
+            "koopman": _raw(controller, decoded[0]),
+            "reconstruction": _raw(controller, decoded[1]),
+            "linear": _raw(controller, _roll_linear(controller, linear, states, frames)),
+            "copy_last": states[:, now : now + 1].expand_as(true),
+        }
+        for model, states_of in predicted.items():
+            sums[model] += (states_of - true).double().square().sum(0)
+    return {
+        model: {name: (total[:, list(columns)].sum(-1) / len(new)).sqrt().tolist() for name, columns in parts.items()}
+        for model, total in sums.items()
+    }
+
+
+def _raw(controller: KoopmanInverseDynamics, state: Tensor) -> Tensor:
+    return state if controller.state_normalizer is None else controller.state_normalizer.inverse(state)
+
+
+def _frames_read(controller: KoopmanInverseDynamics, states: Tensor, frames: range) -> Tensor:
+    """What the latent actions of some frames read, flat and with a constant: ``[B, len(frames), .]``."""
+    read = controller.latent_action.gather(controller.normalize_state(states), frames).flatten(-2).double()
+    return torch.cat([read, torch.ones_like(read[..., :1])], -1)
+
+
+def _fit_linear(controller: KoopmanInverseDynamics, states: Tensor) -> Tensor:
+    now = controller.history
+    normalized = controller.normalize_state(states).double()
+    inputs = torch.cat([normalized[:, now], _frames_read(controller, states, range(now, now + 1))[:, 0]], -1)
+    # x_t is among the frames read: only an SVD finds the smallest of the many best answers
+    return torch.linalg.lstsq(inputs, normalized[:, now + 1], driver="gelsd").solution
+
+
+def _roll_linear(controller: KoopmanInverseDynamics, weight: Tensor, states: Tensor, frames: range) -> Tensor:
+    state = controller.normalize_state(states)[:, frames.start].double()
+    rolled = []
+    for read in _frames_read(controller, states, frames).unbind(1):
+        state = torch.cat([state, read], -1) @ weight
+        rolled.append(state)
+    return torch.stack(rolled, 1)
+
+
+def explained(predicted: Tensor, true: Tensor) -> list[float]:
+    """Share ``R^2`` of the variance of every column of ``true [N, a]`` that predictions explain; NaN if it has none.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.evaluation.latent_space import explained
+        >>> true = torch.tensor([[0.0], [2.0]])
+        >>> explained(true, true), explained(torch.ones(2, 1), true)
+        ([1.0], [0.0])
+    """
+    left = (predicted - true).double().square().sum(0)
+    spread = (true - true.mean(0)).double().square().sum(0)
+    return torch.where(spread > 0, 1 - left / spread, torch.nan).tolist()
+
+
+def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[float]:
+    """``R^2`` of a linear map from latent to true actions, fitted on some steps and judged on the others.
+
+    Args:
+        latent (Tensor): latent actions ``[N, m]``.
+        action (Tensor): true actions ``[N, act]``; all of them are read.
+        groups (Tensor): trajectory of every step ``[N]``, by which the ridge is chosen.
+        fit (Tensor): steps to fit on, bool ``[N]``.
+
+    Returns:
+        list of float: per action dimension.
+
+    Raises:
+        ValueError: if nothing is left to fit on or to judge on.
+    """
+    if fit.all() or not fit.any():
+        raise ValueError(f"a probe is fitted on some steps and judged on others, got {int(fit.sum())} of {len(fit)}")
+    decoder = LinearActionDecoder(latent.shape[-1], action.shape[-1]).to(latent)
+    decoder.fit_ridge(latent, action, fit, groups=groups)
+    with torch.no_grad():
+        return explained(decoder.linear(latent[~fit]), action[~fit])
+
+
+def analyse_latent(
+    controller: KoopmanInverseDynamics,
+    data: TensorDictBase,
+    labelled: Tensor,
+    parts: Mapping[str, Sequence[int]],
+    *,
+    horizon: int = 10,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Everything this file measures.
+
+    Args:
+        controller (KoopmanInverseDynamics): the model, in evaluation mode, on the device of the data.
+        data (TensorDictBase): flat ``[N]``, fully labelled, as the controller sees them.
+        labelled (Tensor): steps labelled in the budget, bool ``[N]``.
+        parts (mapping): columns of the state by name.
+
+    Keyword Args:
+        horizon (int): steps to predict; fewer where trajectories are shorter. Defaults to ``10``.
+        seed (int): seed of the half of the trajectories that is fitted on.
+
+    Returns:
+        dict: ``eigenvalues`` (where the operator is a matrix), ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET`
+        the probe, the number of labels it read and the ``R^2`` of the model's own decoder on the same steps.
+    """
+    result: dict[str, Any] = {}
+    if hasattr(controller.operator, "eigenvalues"):
+        result["eigenvalues"] = spectrum(controller.operator.eigenvalues())
+    fit_on = split_trajectories(data[EPISODE], labelled, seed=seed)
+    reach = controller.num_window_frames - 1 - controller.history
+    horizon = min(horizon, max(1, int(trajectory_lengths(data).min()) - reach))
+    held_out = int(len(data[EPISODE].unique()) - len(fit_on))
+    errors = prediction_errors(controller, data, fit_on, parts, horizon=horizon)
+    sizes = {"steps": horizon, "fitted_trajectories": len(fit_on), "judged_trajectories": held_out}
+    result["multi_step"] = sizes | errors
+    steps = infer_steps(controller, data)
+    latent, action, fit = steps["latent_action"], steps[ACTION], torch.isin(steps[EPISODE], fit_on)
+    budget = data[EPISODE][labelled].unique()
+    with torch.no_grad():
+        own = explained(controller.decode(latent[~fit]), action[~fit])
+    result[OUTSIDE_THE_BUDGET] = {
+        "labels_read": len(steps),
+        "steps_judged": int((~fit).sum()),
+        "judged_trajectories_in_budget": int((~torch.isin(budget, fit_on)).sum()),
+        "probe_r2": probe(latent, action, steps[EPISODE], fit),
+        "decoder_r2": own,
+    }
+    return result

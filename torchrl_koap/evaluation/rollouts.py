@@ -1,0 +1,217 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Closed-loop evaluation: one episode per environment, a seed per episode, results independent of the batch size."""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_koap.evaluation.scores import OUTCOMES, outcome_of
+from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
+from torchrl_koap.modules.diffusion.planner import StatePlanner
+from torchrl_koap.modules.diffusion.schedule import SOLVERS
+from torchrl_koap.modules.policies.plan_then_control import (
+    NOISE,
+    OBSERVATION_HISTORY,
+    EpisodeNoise,
+    PlanThenControl,
+    RecordedFutures,
+    policy_transforms,
+)
+
+
+def make_policy(
+    planner: StatePlanner,
+    controller: TensorDictModuleBase,
+    *,
+    state_columns: Sequence[int] | Callable[[Tensor], Tensor],
+    execution: str = "feedback",
+    replan_interval: int = 4,
+    joining: float = 0.8,
+    controller_columns: Sequence[int] | None = None,
+    gripper: tuple[int, int] | None = None,
+) -> PlanThenControl:
+    """Planner and controller as a policy that observes as many frames as the longer-sighted of the two."""
+    return PlanThenControl(
+        planner,
+        controller,
+        state_columns=state_columns,
+        history=max(planner.history, controller.history + 1),
+        execution=execution,
+        replan_interval=replan_interval,
+        joining=joining,
+        controller_columns=controller_columns,
+        gripper=gripper,
+    )
+
+
+@torch.no_grad()
+def roll_out(
+    policy: PlanThenControl,
+    make_env: Callable[[int], EnvBase],
+    seeds: Sequence[int],
+    *,
+    max_steps: int,
+    batch_size: int | None = None,
+    contexts: Any = None,
+    futures: Tensor | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> list[TensorDict]:
+    """Runs one episode per seed.
+
+    Args:
+        policy (PlanThenControl): the policy.
+        make_env (callable): makes an environment of a given number of parallel episodes.
+        seeds (sequence of int): one per episode; the planner's noise depends on nothing else.
+
+    Keyword Args:
+        max_steps (int): control steps at most.
+        batch_size (int, optional): episodes at a time. Default: all. Outcomes do not depend on it.
+        contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
+        futures (Tensor, optional): recorded futures ``[E, steps, H, d]`` for a policy whose planner is a
+            :class:`~torchrl_koap.modules.policies.plan_then_control.RecordedPlanner`.
+        progress (callable, optional): called with the number of episodes finished.
+
+    Returns:
+        list of TensorDict: one per episode, ``[steps]``, cut at its end.
+
+    Raises:
+        ValueError: if there are no seeds, the batch size is below 1, or contexts and seeds differ in number.
+    """
+    if not len(seeds) or (batch_size is not None and batch_size < 1):
+        raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
+    if contexts is not None and len(contexts) != len(seeds):
+        raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
+    planner, device = policy.planner, _device_of(policy)
+    size, episodes = batch_size or len(seeds), []
+    for begin in range(0, len(seeds), size):
+        part = seeds[begin : begin + size]
+        env = make_env(len(part))
+        _seed_noise(env, part)
+        transforms = policy_transforms(policy.history)
+        env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
+        if futures is not None:
+            noise = RecordedFutures(futures[begin : begin + size])
+        else:
+            draws = (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
+            noise = EpisodeNoise(part, (*draws, *planner.sample_shape), num_steps=max_steps)
+        start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
+        try:
+            rollout = env.rollout(
+                max_steps,
+                TensorDictSequential(noise.to(device), policy),
+                auto_reset=False,
+                tensordict=env.reset(**start),
+                break_when_any_done=False,
+                break_when_all_done=True,
+            )
+        finally:
+            env.close()
+        rollout = rollout.exclude(NOISE, OBSERVATION_HISTORY, ("next", OBSERVATION_HISTORY), "remaining_plan")
+        done = rollout["next", "done"].squeeze(-1)
+        lengths = torch.where(done.any(-1), done.int().argmax(-1) + 1, done.shape[-1])
+        episodes += [rollout[index, :length] for index, length in enumerate(lengths.tolist())]
+        if progress is not None:
+            progress(len(episodes))
+    return episodes
+
+
+def _device_of(policy: PlanThenControl) -> torch.device:
+    return next(itertools.chain(policy.parameters(), policy.buffers()), torch.empty(0)).device
+
+
+def _seed_noise(env: EnvBase, seeds: Sequence[int]) -> None:
+    """Observation noise that an episode meets depends on its own seed alone."""
+    transforms = env.transform if isinstance(env, TransformedEnv) else ()
+    for transform in transforms if isinstance(transforms, Iterable) else (transforms,):
+        if hasattr(transform, "seed_episodes"):
+            transform.seed_episodes(seeds)
+
+
+@torch.no_grad()
+def measure_latency(policy: PlanThenControl, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
+    """Median time of a plan and of a control step between plans, at batch 1, in ms, and the control rate in Hz."""
+    device = _device_of(policy)
+    observed = torch.zeros(1, policy.history, observation_dim, device=device)
+    td = TensorDict({OBSERVATION_HISTORY: observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1], device=device)
+    between, with_plan = [], []
+    for repeat in range(repeats + 3):
+        td["is_init"] = torch.ones(1, 1, dtype=torch.bool, device=device)
+        for kind in (with_plan, between):
+            _wait(device)
+            began = time.perf_counter()
+            td = policy(td)
+            td[ACTION].sum().item()
+            if repeat >= 3:  # the first calls warm caches up
+                kind.append((time.perf_counter() - began) * 1e3)
+            td["is_init"] = torch.zeros(1, 1, dtype=torch.bool, device=device)
+    control = statistics.median(between)
+    plan = max(statistics.median(with_plan) - control, 0.0)
+    rate = 1e3 / (control + plan / policy.replan_interval)
+    return {"plan_ms": plan, "control_ms": control, "control_hz": rate}
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def rollouts_to_tensors(
+    episodes: Sequence[TensorDict],
+    *,
+    position: slice,
+    mode_index: Callable[[Tensor], Tensor],
+    interval: int,
+    objects: Sequence[slice] = (),
+    plans_position: bool = True,
+) -> dict[str, Tensor]:
+    """What the pictures need, padded to the longest episode.
+
+    Args:
+        episodes (sequence of TensorDict): from :func:`roll_out`.
+        position (slice): columns of the observation that are drawn; the first two count.
+        mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
+        interval (int): steps per plan.
+        objects (sequence of slice): columns of the objects that are drawn, likewise.
+        plans_position (bool): the first two columns of a plan are that position; otherwise plans are left out.
+
+    Returns:
+        dict: ``position`` ``[E, T, 2]`` (NaN behind the end), ``length``, ``mode``, ``outcome`` ``[E]``, ``action``
+        ``[E, T, act]``, ``plan`` ``[E, P, H, 2]`` and ``plan_step`` ``[E, P]`` (NaN and -1 padding; empty for open-loop
+        execution, whose cache holds actions); for a task with objects ``object_position`` ``[E, T, objects, 2]`` and
+        ``context`` ``[E, objects, 3]``.
+    """
+    longest, last = max(len(episode) for episode in episodes), [episode[-1]["next"] for episode in episodes]
+    columns = [slice(part.start, part.start + 2) for part in (position, *objects)]
+    paths = torch.full((len(episodes), longest + 1, len(columns), 2), torch.nan)
+    plans, plan_steps, actions = [], [], []
+    for index, episode in enumerate(episodes):
+        frames = torch.cat([episode[OBSERVATION], last[index][OBSERVATION][None]])
+        paths[index, : len(frames)] = torch.stack([frames[:, part] for part in columns], 1).float()
+        chunks = episode.get("remaining_plan_chunk", None)
+        plans.append(torch.zeros(0, 1, 2) if chunks is None or not plans_position else chunks[::interval, 0, :, :2])
+        plan_steps.append(torch.arange(len(plans[-1])) * interval)
+        actions.append(episode[ACTION])
+    pad = torch.nn.utils.rnn.pad_sequence
+    tensors = {
+        "position": paths[:, :, 0].contiguous(),
+        "length": torch.tensor([len(episode) for episode in episodes]),
+        "mode": torch.stack([mode_index(end[MODE]).reshape(()) for end in last]).long(),
+        "outcome": torch.tensor([OUTCOMES.index(outcome_of(episode)) for episode in episodes]),
+        "plan": pad(plans, batch_first=True, padding_value=torch.nan),
+        "plan_step": pad(plan_steps, batch_first=True, padding_value=-1),
+        "action": pad(actions, batch_first=True, padding_value=torch.nan),
+    }
+    if objects:
+        tensors["object_position"] = paths[:, :, 1:].contiguous()
+        tensors["context"] = torch.stack([end[CONTEXT] for end in last])
+    return tensors

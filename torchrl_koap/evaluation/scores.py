@@ -1,0 +1,185 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""From rollouts to the numbers that D3IL reports per task (spec sections 6 and 8), each with its interval.
+
+Success rates get Wilson intervals. Entropies get percentile intervals of a bootstrap over what is independent: episodes
+where every episode starts alike, else contexts with all their rollouts.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, mode_entropy, wilson_interval
+from torchrl_koap.keys import COLLISION, MODE, SUCCESS
+from torchrl_koap.tasks import Task
+
+OUTCOMES = ("timeout", "success", "collision")
+# share of each order in D3IL's demonstrations of Stacking (spec section 6.4); letters 0 red, 1 green, 2 blue
+STACKING_PRIOR = {
+    (0, 1, 2): 0.152,
+    (0, 2, 1): 0.127,
+    (1, 0, 2): 0.106,
+    (1, 2, 0): 0.287,
+    (2, 0, 1): 0.235,
+    (2, 1, 0): 0.093,
+}
+
+
+def outcome_of(episode: TensorDict) -> str:
+    """``"success"``, ``"collision"`` or ``"timeout"``, from the last frame of an episode."""
+    last = episode[-1]["next"]
+    if last[SUCCESS].item():
+        return "success"
+    return "collision" if COLLISION in last.keys() and last[COLLISION].item() else "timeout"
+
+
+def score(
+    episodes: Sequence[TensorDict],
+    seeds: Sequence[int],
+    *,
+    num_modes: int,
+    mode_index: Callable[[Tensor], Tensor],
+    contexts: Sequence[int] | None = None,
+    unsolved: str = "skip",
+) -> dict[str, Any]:
+    """Success with its 95 % Wilson interval, entropy of the modes of successful episodes, and a row per episode.
+
+    Args:
+        episodes (sequence of TensorDict): from :func:`~torchrl_koap.evaluation.rollouts.roll_out`.
+        seeds (sequence of int): one per episode.
+
+    Keyword Args:
+        num_modes (int): base of the logarithm of the entropy.
+        mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
+        contexts (sequence of int, optional): number of the context of every episode. With it ``mode_entropy`` is the
+            mean over contexts, None below two rollouts per context, and ``pooled_mode_entropy`` is that of all
+            successful episodes together.
+        unsolved (str): what contexts without success count, see
+            :func:`~torchrl_koap.evaluation.statistics.conditional_entropy`.
+
+    Raises:
+        ValueError: if the numbers of episodes, seeds or contexts differ.
+    """
+    rows = []
+    for seed, episode in zip(seeds, episodes, strict=True):
+        mode = int(mode_index(episode[-1]["next", MODE]))
+        rows.append({"seed": seed, "outcome": outcome_of(episode), "mode": mode, "steps": len(episode)})
+    won = [row for row in rows if row["outcome"] == "success"]
+    modes = [row["mode"] for row in won if row["mode"] >= 0]
+    result = _rate("success", len(won), len(rows), {"episodes": len(rows)})
+
+    def pooled(sample: Sequence[int]) -> float:
+        return mode_entropy(sample, num_modes)
+
+    if contexts is None:
+        result |= _entropy("mode_entropy", modes, pooled)
+    else:
+        for row, context in zip(rows, contexts, strict=True):
+            row["context"] = int(context)
+        groups: dict[int, list[int]] = {row["context"]: [] for row in rows}
+        for row in won:
+            if row["mode"] >= 0:
+                groups[row["context"]].append(row["mode"])
+
+        def conditional(sample: Sequence[Sequence[int]]) -> float | None:
+            return conditional_entropy(sample, num_modes, unsolved=unsolved)
+
+        result["contexts"] = len(groups)
+        if len(rows) >= 2 * len(groups):
+            result |= _entropy("mode_entropy", list(groups.values()), conditional)
+        else:
+            result["mode_entropy"] = None
+        result |= _entropy("pooled_mode_entropy", modes, pooled)
+    return result | {
+        "distinct_modes": len(set(modes)),
+        "collisions": sum(row["outcome"] == "collision" for row in rows),
+        "mean_steps": statistics.fmean(row["steps"] for row in rows),
+        "episode": rows,
+    }
+
+
+def _rate(name: str, good: int, total: int, first: dict[str, Any]) -> dict[str, Any]:
+    low, high = wilson_interval(good, total)
+    return first | {f"{name}_rate": good / total, f"{name}_low": low, f"{name}_high": high}
+
+
+def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:
+    interval = (bootstrap_interval(units, statistic) if len(units) else None) or (None, None)
+    low, high = (None if end is None else min(max(end, 0.0), 1.0) for end in interval)
+    return {name: statistic(units), f"{name}_low": low, f"{name}_high": high}
+
+
+def stacking_scores(episodes: Sequence[TensorDict], contexts: Sequence[int], *, complete: bool = True) -> dict:
+    """How many boxes were brought to the zone, and in how many orders (spec section 6.4).
+
+    Args:
+        episodes (sequence of TensorDict): rollouts of :class:`~torchrl_koap.envs.stacking.StackingEnv`.
+        contexts (sequence of int): number of the context of every episode.
+
+    Keyword Args:
+        complete (bool): the criterion was the whole stack; otherwise episodes end with the first box.
+
+    Returns:
+        dict: ``stacked_1_rate`` and, if complete, ``stacked_2_rate``, ``stacked_3_rate`` with intervals, and entropies
+        of the first one, two and three letters (bases 3, 6, 6) over contexts.
+    """
+    letters = [tuple(int(letter) for letter in episode[-1]["next", MODE] if letter >= 0) for episode in episodes]
+    result: dict[str, Any] = {}
+    for count, base in ((1, 3), (2, 6), (3, 6))[: 3 if complete else 1]:
+        good = [len(order) >= count for order in letters]
+        if count == 3:  # three letters are not yet a stack
+            good = [episode[-1]["next", SUCCESS].item() for episode in episodes]
+        result |= _rate(f"stacked_{count}", sum(good), len(good), {})
+        orders = {order: index for index, order in enumerate(itertools.permutations(range(3), count))}
+        groups: dict[int, list[int]] = {context: [] for context in contexts}
+        for order, fine, context in zip(letters, good, contexts, strict=True):
+            if fine and len(order) >= count:
+                groups[context].append(orders[order[:count]])
+        if len(episodes) >= 2 * len(groups):
+            result[f"stacked_{count}_entropy"] = conditional_entropy(list(groups.values()), base)
+    return result
+
+
+def divergence(modes: Sequence[int], prior: Sequence[float]) -> float:
+    """Kullback-Leibler divergence of the modes seen from a prior, logarithm base ``len(prior)``.
+
+    Raises:
+        ValueError: for a mode out of range.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.scores import divergence
+        >>> round(divergence([0, 0], [0.5, 0.5]), 6), round(divergence([0, 1], [0.5, 0.5]), 6)
+        (1.0, 0.0)
+    """
+    base = len(prior)
+    entropy = mode_entropy(modes, base)
+    cross = sum(math.log(prior[mode], base) for mode in modes) / len(modes)
+    return -entropy - cross
+
+
+def d3il_score(task: Task, result: dict[str, Any]) -> dict[str, float]:
+    """The single figure D3IL ranks methods by, where it is defined.
+
+    Avoiding: 0.8 success + 0.2 entropy. Aligning: the mean of success and entropy. Sorting: success minus the
+    divergence of the modes from equally frequent ones, which our demonstrations have. Stacking: the sum of the three
+    success rates. The tasks with contexts need two rollouts per context at least.
+    """
+    success, entropy = result["success_rate"], result["mode_entropy"]
+    if task.name == "stacking":
+        return {"d3il_score": sum(result[f"stacked_{count}_rate"] for count in (1, 2, 3))}
+    if entropy is None:
+        return {}
+    if task.name == "avoiding":
+        return {"d3il_score": 0.8 * success + 0.2 * entropy}
+    if task.name == "aligning":
+        return {"d3il_score": 0.5 * (success + entropy)}
+    if "sorting" in task.name:
+        return {"d3il_score": success - (1 - entropy)}
+    return {}

@@ -1,0 +1,113 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Numbers that evaluations report: success, entropy of the modes over all episodes or per context, intervals."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+
+
+def wilson_interval(successes: int, trials: int, *, z: float = 1.959963984540054) -> tuple[float, float]:
+    """Wilson score interval of a success rate (95 % by default).
+
+    Raises:
+        ValueError: if there are no trials, or more successes than trials.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.statistics import wilson_interval
+        >>> [round(bound, 3) for bound in wilson_interval(60, 60)]
+        [0.94, 1.0]
+    """
+    if trials < 1 or not 0 <= successes <= trials:
+        raise ValueError(f"expected 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
+    rate, weight = successes / trials, z * z / trials
+    centre = (rate + weight / 2) / (1 + weight)
+    spread = z / (1 + weight) * math.sqrt(rate * (1 - rate) / trials + weight / (4 * trials))
+    low = 0.0 if successes == 0 else centre - spread
+    high = 1.0 if successes == trials else centre + spread
+    return low, high
+
+
+def mode_entropy(modes: Sequence[int], num_modes: int) -> float:
+    """Entropy of the modes seen, logarithm base ``num_modes``: 1 if all are equally frequent, 0 for a single one.
+
+    Args:
+        modes (sequence of int): one mode ``0 .. num_modes - 1`` per successful episode (D3IL counts no others).
+        num_modes (int): number of possible modes.
+
+    Raises:
+        ValueError: for a mode out of range.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.statistics import mode_entropy
+        >>> mode_entropy([0, 1, 2, 3], 4), mode_entropy([2, 2, 2], 4), mode_entropy([], 4)
+        (1.0, 0.0, 0.0)
+    """
+    counts = [0] * num_modes
+    for mode in modes:
+        if not 0 <= mode < num_modes:
+            raise ValueError(f"mode {mode} is not in 0..{num_modes - 1}")
+        counts[mode] += 1
+    total = sum(counts)
+    return sum(-n / total * math.log(n / total, num_modes) for n in counts if n) + 0.0
+
+
+def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsolved: str = "skip") -> float | None:
+    """Mean over contexts of the entropy of the modes seen in each, logarithm base ``num_modes``.
+
+    A single rollout per context always gives 0: the figure says something from two on.
+
+    Args:
+        modes (sequence): for each context the modes of its successful rollouts.
+        num_modes (int): number of possible modes.
+        unsolved (str): ``"skip"`` leaves contexts without success out (Sorting, Stacking), ``"zero"`` counts them as 0
+            (Aligning).
+
+    Returns:
+        float or None: None if there is nothing to average.
+
+    Raises:
+        ValueError: for a mode out of range, or another ``unsolved``.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.statistics import conditional_entropy
+        >>> conditional_entropy([[0, 1], [1, 1], []], 2), conditional_entropy([[0, 1], []], 2, unsolved="zero")
+        (0.5, 0.5)
+    """
+    if unsolved not in ("skip", "zero"):
+        raise ValueError(f"unsolved must be 'skip' or 'zero', got {unsolved!r}")
+    values = [mode_entropy(seen, num_modes) for seen in modes if len(seen) or unsolved == "zero"]
+    return sum(values) / len(values) if values else None
+
+
+def bootstrap_interval(
+    units: Sequence, statistic: Callable[[Sequence], float | None], *, draws: int = 500, level: float = 0.95
+) -> tuple[float, float] | None:
+    """Percentile interval of a statistic under resampling of independent units, shifted by the bias.
+
+    Resamples hold fewer distinct units than the sample; an entropy is lower on them. The interval is moved by as much
+    as their mean lies beside the statistic of the sample.
+
+    Args:
+        units (sequence): what was sampled independently: episodes, or contexts with all their episodes.
+        statistic (callable): from a list of units to a number, or None where it is not defined.
+        draws (int): number of resamples; the same ones in every call.
+        level (float): probability that the interval holds.
+
+    Returns:
+        tuple or None: low and high end; None if the statistic is never defined.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.statistics import bootstrap_interval
+        >>> bootstrap_interval([1.0] * 9, lambda units: sum(units) / len(units))
+        (1.0, 1.0)
+    """
+    generator = random.Random(0)
+    values = [statistic(generator.choices(units, k=len(units))) for _ in range(draws)]
+    values = sorted(value for value in values if value is not None)
+    if not values:
+        return None
+    tail, estimate = (1 - level) / 2, statistic(units)
+    shift = 0.0 if estimate is None else estimate - sum(values) / len(values)
+    return values[int(tail * (len(values) - 1))] + shift, values[round((1 - tail) * (len(values) - 1))] + shift

@@ -1,0 +1,138 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Saving that never damages an earlier result: write aside, then rename.
+
+A full disk or an interrupt in the middle of a save leaves what was there before, and no half-written rest.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replacing_file(path: str | Path) -> Iterator[Path]:
+    """Gives a path to write to; the file takes the place of ``path`` when the block ends without an error.
+
+    Args:
+        path (str or Path): the file to create or replace. Missing parent folders are created.
+
+    Yields:
+        Path: a new, empty file in the same folder.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from torchrl_koap.files import replacing_file
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "report.txt"
+        ...     with replacing_file(path) as aside:
+        ...         _ = aside.write_text("complete")
+        ...     path.read_text(), len(list(Path(folder).iterdir()))
+        ('complete', 1)
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, aside = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    os.close(handle)
+    aside = Path(aside)
+    try:
+        yield aside
+        aside.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
+        os.replace(aside, path)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
+
+
+@contextlib.contextmanager
+def replacing_folder(path: str | Path) -> Iterator[Path]:
+    """Gives a folder to write into; it takes the place of ``path`` when the block ends without an error.
+
+    Args:
+        path (str or Path): the folder to create or replace. Missing parent folders are created.
+
+    Yields:
+        Path: a new, empty folder beside it.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from torchrl_koap.files import replacing_folder
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "result"
+        ...     with replacing_folder(path) as aside:
+        ...         _ = (aside / "part").write_text("complete")
+        ...     [entry.name for entry in path.iterdir()]
+        ['part']
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
+    try:
+        yield aside
+        aside.chmod(0o777 & ~_umask())
+        _exchange(aside, path)
+    except BaseException:
+        shutil.rmtree(aside, ignore_errors=True)
+        raise
+
+
+@contextlib.contextmanager
+def one_at_a_time(path: str | Path) -> Iterator[None]:
+    """Lets one process, or thread, at a time into the block; the others wait.
+
+    Where the system has no ``fcntl`` (Windows) nobody waits.
+
+    Args:
+        path (str or Path): the lock file; it stays.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_koap.files import one_at_a_time
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with one_at_a_time(f"{folder}/.lock"):
+        ...         "alone"
+        'alone'
+    """
+    if importlib.util.find_spec("fcntl") is None:
+        yield
+        return
+    import fcntl
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a") as file:  # closing the file gives the lock back
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _exchange(new: Path, path: Path) -> None:
+    """Renames ``new`` to ``path``; a folder cannot be renamed onto a full one, so the old one steps aside first."""
+    try:
+        os.replace(new, path)
+        return
+    except OSError:
+        if not path.is_dir():
+            raise
+    old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
+    try:
+        os.replace(path, old)
+        os.replace(new, path)
+    except BaseException:
+        if any(old.iterdir()) and not path.exists():
+            os.replace(old, path)
+        raise
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

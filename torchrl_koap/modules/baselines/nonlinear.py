@@ -1,0 +1,89 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""KOAP with both of its linear maps replaced by networks: what is the linearity worth?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
+from torchrl_koap.modules.koopman.latent_action import LatentActionMLP
+from torchrl_koap.modules.koopman.lifting import KoopmanLifting
+from torchrl_koap.modules.networks import mlp
+
+
+class NonlinearInverseDynamics(LatentInverseDynamics):
+    r"""As KOAP, but with nonlinear latent dynamics and a nonlinear action decoder.
+
+    .. math::
+        z_t = g_\theta(x_t), \qquad u_t = f_\theta(x_{t-n}, \dots, x_t, x_{t+k}), \qquad
+        \hat z_{t+1} = h_\theta(z_t, u_t), \qquad \hat a_t = d_\phi(u_t)
+
+    All parts are perceptrons and trained together by :class:`~torchrl_koap.objectives.NonlinearLoss`. As in KOAP,
+    ``f`` reads steps at unit scale and never ``x_{t+1}``, which the dynamics have to predict.
+
+    The first public code (``koap_release_notes`` 3.3) has LSTMs in place of ``g``, ``h`` and ``d``.
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        action_dim (int): size of an action.
+
+    Keyword Args:
+        latent_dim (int): size ``m`` of a lifted state and of a latent action. Defaults to ``32``.
+        hidden_dims (sequence of int): widths of ``f``, ``h`` and ``d``. Defaults to ``(128, 128)``.
+        lifting_dims (sequence of int): widths of ``g`` and its inverse. Defaults to ``(64, 64)``, as KOAP's default.
+        history (int): number ``n`` of frames before the current one. Defaults to ``4``.
+        look_ahead (int or sequence of int): offsets ``k >= 2``. Defaults to ``(2, 3, 4, 5)``.
+        state_normalizer (nn.Module, optional): maps raw states to the networks' units.
+        action_normalizer (nn.Module, optional): its ``inverse`` maps decoded actions to raw units.
+        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
+        out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
+
+    Raises:
+        ValueError: for a negative history or an offset below 2; at the call for states of another size.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import NonlinearInverseDynamics
+        >>> model = NonlinearInverseDynamics(2, 2)
+        >>> td = model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))
+        >>> td["action"].shape, td["latent_action"].shape
+        (torch.Size([3, 16, 2]), torch.Size([3, 16, 32]))
+    """
+
+    reader: LatentActionMLP
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        latent_dim: int = 32,
+        hidden_dims: Sequence[int] = (128, 128),
+        lifting_dims: Sequence[int] = (64, 64),
+        history: int = 4,
+        look_ahead: int | Sequence[int] = (2, 3, 4, 5),
+        **kwargs,
+    ):
+        reader = LatentActionMLP(
+            state_dim, latent_dim, hidden_dims=hidden_dims, history=history, look_ahead=look_ahead, relative=True
+        )
+        super().__init__(reader, mlp(latent_dim, hidden_dims, action_dim), **kwargs)
+        self.latent_dim = latent_dim
+        self.lifting = KoopmanLifting(state_dim, latent_dim, hidden_dims=lifting_dims)
+        self.dynamics = mlp(2 * latent_dim, hidden_dims, latent_dim)
+
+    def lift(self, state: Tensor) -> Tensor:
+        """Lifted states ``[*B, T, m]`` of raw states ``[*B, T, d]``."""
+        return self.lifting.encode(self.normalize_state(state))
+
+    def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
+        """The prediction of ``z_{t+1}``, ``[*B, T, m]``."""
+        return self.dynamics(torch.cat([lifted, latent_action], -1))
+
+    def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Latent actions ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
+        return self.reader.infer(self.reader.gather(self.normalize_state(state), frames))

@@ -1,0 +1,134 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Inverse dynamics networks that labels alone teach. A window of states in, an action per frame out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_koap.modules.inverse_dynamics import WindowController
+from torchrl_koap.modules.networks import SequenceLSTM, mlp
+from torchrl_koap.modules.transition_frames import TransitionFrames
+
+
+class _Supervised(WindowController):
+    """States to actions in one step; what is predicted is the subclass's."""
+
+    def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Normalised actions ``[*B, T, act]`` of raw states ``[*B, T, d]``, or of some of the window's ``frames``."""
+        raise NotImplementedError
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action of every frame."""
+        return tensordict.set(self.out_keys[0], self.raw_action(self.predict(tensordict.get(self.in_keys[0]))))
+
+
+class SupervisedInverseDynamics(_Supervised):
+    r"""A perceptron from the frames around a step to its action, trained on labels.
+
+    .. math::
+        a_t = f(x_{t-n}, \dots, x_t, x_{t+k_1}, x_{t+k_2}, \dots)
+
+    With ``look_ahead=1`` this is the inverse dynamics of Decision Diffuser, which is told the next state and nothing
+    further ahead. KOAP's first public code trains an LSTM instead (:class:`RecurrentInverseDynamics`), whose first
+    outputs, those that are executed, are its worst (``koap_release_notes`` section 8).
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        action_dim (int): size of an action.
+
+    Keyword Args:
+        hidden_dims (sequence of int): widths. Defaults to ``(128, 128)``.
+        history (int): frames ``n`` before the current one. Defaults to ``4``.
+        look_ahead (int or sequence of int): offsets ``k >= 1``. Defaults to ``1``.
+        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.WindowController`.
+
+    Raises:
+        ValueError: for a negative history or an offset below 1.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import SupervisedInverseDynamics
+        >>> model = SupervisedInverseDynamics(2, 2, look_ahead=(1, 4))
+        >>> model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))["action"].shape
+        torch.Size([3, 16, 2])
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        hidden_dims: Sequence[int] = (128, 128),
+        history: int = 4,
+        look_ahead: int | Sequence[int] = 1,
+        **kwargs,
+    ):
+        super().__init__(TransitionFrames(state_dim, history=history, look_ahead=look_ahead), **kwargs)
+        self.network = mlp(self.reader.num_features, hidden_dims, action_dim)
+
+    def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Normalised actions ``[*B, T, act]``; frames near the ends read a clamped window."""
+        return self.network(self.reader(self.normalize_state(state), frames))
+
+
+class RecurrentInverseDynamics(_Supervised):
+    """An LSTM that reads ``a_t`` off ``x_0, ..., x_{t+1}``: the supervised controller of KOAP's first public code.
+
+    ``koap_release_notes`` section 3.4: outputs at frames ``1 .. T-1`` are the actions of frames ``0 .. T-2``; that of
+    the last frame repeats the one before.
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        action_dim (int): size of an action.
+
+    Keyword Args:
+        hidden_dim (int): width of the LSTM. Defaults to ``256``.
+        history (int): frames before the current one that a policy hands over. Defaults to ``1``.
+        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.WindowController`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import RecurrentInverseDynamics
+        >>> model = RecurrentInverseDynamics(2, 2, hidden_dim=16)
+        >>> model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))["action"].shape
+        torch.Size([3, 16, 2])
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        hidden_dim: int = 256,
+        history: int = 1,
+        **kwargs,
+    ):
+        super().__init__(**kwargs)
+        self._history = history
+        self.network = SequenceLSTM(state_dim, hidden_dim, action_dim)
+
+    @property
+    def history(self) -> int:
+        """Frames before the current one that a policy hands over."""
+        return self._history
+
+    @property
+    def num_window_frames(self) -> int:
+        """Frames of the shortest complete window."""
+        return self.history + 2
+
+    def span(self, num_frames: int) -> range:
+        """Frames of a window that count in the loss: all but the first and the last."""
+        return range(1, num_frames - 1)
+
+    def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Normalised actions ``[*B, T, act]``."""
+        action = self.network(self.normalize_state(state))[..., 1:, :]
+        action = torch.cat([action, action[..., -1:, :]], -2)
+        return action if frames is None else action[..., frames.start : frames.stop, :]

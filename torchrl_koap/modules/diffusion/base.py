@@ -1,0 +1,210 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What the planner and the Diffusion Policy share: a sequence sampled given the last observed states."""
+
+from __future__ import annotations
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from tensordict.nn.probabilistic import InteractionType, interaction_type
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_koap.modules.diffusion.schedule import SOLVERS, NoiseSchedule
+from torchrl_koap.modules.normalizer import Normalizer
+
+Tensor = torch.Tensor
+
+
+class ConditionedDiffusion(TensorDictModuleBase):
+    """Base of the generative models: condition, start noise and solver; subclasses say what the sequence is.
+
+    A subclass encodes and decodes the diffused sequence ``[*B, H, width]`` in units of its own, and samples it by
+    :meth:`solve`.
+
+    Args:
+        denoiser (nn.Module): ``denoiser(sequence [*B, H, width], time [*B], condition [*B, h * d + f])``, of the shape
+            of the sequence.
+        schedule (NoiseSchedule, optional): noise schedule and prediction type. Defaults to ``NoiseSchedule()``.
+
+    Keyword Args:
+        state_dim (int): number ``d`` of state columns.
+        width (int): columns of the diffused sequence.
+        history (int): number ``h`` of observed frames, the current one included.
+        horizon (int): number ``H`` of frames of the sequence.
+        relative (bool): the condition holds the older frames as displacements from the current one.
+        features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with ``num_features``.
+        solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
+            flow path.
+        num_steps (int): solver steps.
+        clip (float, optional): bound of the normalised sequence at every solver step.
+        in_keys (list of NestedKey): the entry of the history.
+        out_keys (list of NestedKey): the entry of the sequence.
+        noise_key (NestedKey, optional): entry of the start noise.
+
+    Raises:
+        ValueError: for sizes below 1, several in- or out-keys, an unknown or unfit solver.
+    """
+
+    width_name = "state_dim"
+
+    def __init__(
+        self,
+        denoiser: nn.Module,
+        schedule: NoiseSchedule | None,
+        *,
+        state_dim: int,
+        width: int,
+        history: int,
+        horizon: int,
+        relative: bool,
+        features: nn.Module | None,
+        solver: str | None,
+        num_steps: int,
+        clip: float | None,
+        in_keys: list[NestedKey],
+        out_keys: list[NestedKey],
+        noise_key: NestedKey | None,
+    ):
+        super().__init__()
+        sizes = {"state_dim": state_dim, self.width_name: width, "history": history, "horizon": horizon}
+        for name, value in sizes.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
+        if len(self.in_keys) != 1 or len(self.out_keys) != 1:
+            raise ValueError(f"one in_key and one out_key are needed, got {self.in_keys} and {self.out_keys}")
+        self.denoiser = denoiser
+        self.schedule = NoiseSchedule() if schedule is None else schedule
+        self.state_dim, self.history, self.horizon, self.relative = state_dim, history, horizon, relative
+        self.clip, self.noise_key = clip, noise_key
+        self.features = features
+        self.condition_normalizer = identity_normalizer(
+            history * state_dim + (0 if features is None else features.num_features)
+        )
+        self._width = width
+        default = "heun" if self.schedule.path == "flow" else "dpm++2m"
+        self.solver = default if solver is None else solver
+        self.num_steps = num_steps
+
+    @property
+    def solver(self) -> str:
+        """Name of the solver; may be set at any time."""
+        return self._solver
+
+    @solver.setter
+    def solver(self, name: str) -> None:
+        self.schedule.check_solver(name)
+        self._solver = name
+
+    @property
+    def num_steps(self) -> int:
+        """Number of solver steps; may be set at any time."""
+        return self._num_steps
+
+    @num_steps.setter
+    def num_steps(self, number: int) -> None:
+        self.schedule.nodes(number)
+        self._num_steps = number
+
+    @property
+    def sample_shape(self) -> tuple[int, int]:
+        """Shape ``(H, width)`` of one diffused sequence, and so of its start noise."""
+        return self.horizon, self._width
+
+    def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
+        """Cuts windows of states ``[*B, history + horizon, d]`` into history and future."""
+        length = self.history + self.horizon
+        if window.ndim < 2 or window.shape[-2] != length or window.shape[-1] != self.state_dim:
+            raise ValueError(
+                f"windows must be [*B, {length}, {self.state_dim}] (history + horizon, state_dim),"
+                f" got {list(window.shape)}"
+            )
+        return window[..., : self.history, :], window[..., self.history :, :]
+
+    def encode_history(self, history: Tensor) -> Tensor:
+        """Raw history ``[*B, h, d]`` to the denoiser's condition ``[*B, h * d + f]``."""
+        if history.ndim < 2 or history.shape[-2:] != (self.history, self.state_dim):
+            raise ValueError(
+                f"{self.in_keys[0]!r} must be [*B, {self.history}, {self.state_dim}] (history, state_dim),"
+                f" got {list(history.shape)}"
+            )
+        return self.condition_normalizer(self.condition(history))
+
+    def condition(self, history: Tensor) -> Tensor:
+        """The condition ``[*B, h * d + f]`` in raw units."""
+        if self.relative:
+            now = history[..., -1:, :]
+            displaced = torch.cat([history[..., :-1, :] - now, now], -2)
+        else:
+            displaced = history
+        condition = displaced.flatten(-2)
+        return condition if self.features is None else torch.cat([condition, self.features(history)], -1)
+
+    def draw_noise(self, history: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Start noise ``[*B, H, width]`` for histories ``[*B, h, d]``."""
+        shape = (*history.shape[:-2], *self.sample_shape)
+        return torch.randn(shape, dtype=history.dtype, device=history.device, generator=generator)
+
+    def denoising_error(
+        self, condition: Tensor, sample: Tensor, noise: Tensor | None = None, time: Tensor | None = None
+    ) -> Tensor:
+        """Squared error ``[*B, H, width]`` of the denoiser on noised sequences: what training minimises.
+
+        Args:
+            condition (Tensor): of :meth:`encode_history`, ``[*B, h * d + f]``.
+            sample (Tensor): clean normalised sequences ``[*B, H, width]``.
+            noise (Tensor, optional): of the same shape. Default: random.
+            time (Tensor, optional): ``[*B]`` in training steps. Default: random.
+        """
+        with torch.no_grad():
+            noise = torch.randn_like(sample) if noise is None else noise
+            time = self.schedule.sample_time(sample) if time is None else time.to(sample.dtype)
+            noisy, target = self.schedule.add_noise(sample, noise, time), self.schedule.target(sample, noise, time)
+        return (self.denoiser(noisy, time, condition) - target).square()
+
+    def solve(self, history: Tensor, noise: Tensor | None, generator: torch.Generator | None) -> Tensor:
+        """Samples normalised sequences ``[*B, H, width]`` for raw histories ``[*B, h, d]``.
+
+        Args:
+            history (Tensor): raw history.
+            noise (Tensor, optional): start noise ``[*B, H, width]``, or ``[*B, 1 + num_steps, H, width]`` where the
+                rest are the draws of a stochastic solver. Default: drawn.
+            generator (torch.Generator, optional): source of what is drawn.
+
+        Raises:
+            ValueError: for a history or noise of another shape.
+        """
+        condition = self.encode_history(history)
+        step_noise = None
+        if noise is None:
+            noise = self.draw_noise(history, generator)
+        elif noise.ndim == history.ndim + 1:
+            step_noise = noise[..., 1:, :, :].movedim(-3, 0)
+            noise = noise[..., 0, :, :]
+        expected = (*history.shape[:-2], *self.sample_shape)
+        if noise.shape != expected or (step_noise is not None and step_noise.shape[0] < self.num_steps):
+            raise ValueError(
+                f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, {self.width_name}]), or hold at least"
+                f" {1 + self.num_steps} (1 + num_steps) of these on axis -3, got start noise {list(noise.shape)}"
+                + ("" if step_noise is None else f" and {step_noise.shape[0]} further draws")
+            )
+        return self.schedule.solve(
+            lambda x, time: self.denoiser(x, time, condition),
+            noise,
+            self.num_steps,
+            self._solver_now(explicit=step_noise is not None),
+            clip=self.clip,
+            step_noise=step_noise,
+            generator=generator,
+        )
+
+    def _solver_now(self, explicit: bool) -> str:
+        """A stochastic solver stays if the exploration type asks for samples, or if its draws are given."""
+        if explicit or not SOLVERS[self.solver].stochastic or interaction_type() in (None, InteractionType.RANDOM):
+            return self.solver
+        return "ddim"
+
+
+def identity_normalizer(width: int) -> Normalizer:
+    """A normaliser of that many columns that changes nothing until statistics are loaded or fitted."""
+    return Normalizer.fit(torch.zeros(1, width), mode="identity")

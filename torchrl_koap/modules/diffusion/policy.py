@@ -1,0 +1,165 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Diffusion Policy: a generative model of the next actions given the last observed states, without a plan between."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import nn
+
+from torchrl_koap import keys
+from torchrl_koap.modules.diffusion.base import ConditionedDiffusion, identity_normalizer
+from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
+from torchrl_koap.modules.normalizer import Normalizer
+
+Tensor = torch.Tensor
+ACTION_CHUNK = "action_chunk"
+
+
+class DiffusionPolicy(ConditionedDiffusion):
+    """Samples the next ``horizon`` actions given the last ``history`` states (Chi et al. 2023).
+
+    What the planner is for states, this is for actions: same denoiser, noise, solvers and condition. It learns from
+    labelled steps alone. The first action of a chunk is the one to take *now*, in the last frame of the history::
+
+        frame        0      1      2      3      ...  14          (history = 2, horizon = 14)
+                     x_0    x_1
+        chunk               a_1    a_2    a_3    ...  a_14        a_t moves x_t to x_{t+1}
+        entry               0      1      2      ...  13
+
+    KOAP's first public code diffuses ``a_2, a_3, ...`` here and begins to execute them in frame 1, one step too early
+    (and fixes the width of the condition to that of a single task).
+
+    The condition is the planner's: states as they are, or with ``relative=True`` older frames as displacements from
+    the current one. Sampling starts from random noise, also under ``ExplorationType.DETERMINISTIC``
+    (:class:`~torchrl_koap.modules.diffusion.planner.StatePlanner`).
+
+    Args:
+        denoiser (nn.Module): ``denoiser(sequence [*B, H, act], time [*B], condition [*B, h * d + f]) -> [*B, H, act]``.
+        schedule (NoiseSchedule, optional): noise schedule and prediction type. Defaults to ``NoiseSchedule()``.
+
+    Keyword Args:
+        state_dim (int): number ``d`` of state columns.
+        action_dim (int): number ``act`` of action entries.
+        history (int): number ``h`` of observed frames, the current one included. Defaults to 2.
+        horizon (int): number ``H`` of actions in a chunk. Defaults to 14.
+        relative (bool): the condition holds displacements from the current state. Defaults to False.
+        features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
+            further numbers that the condition holds.
+        solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
+            flow path.
+        num_steps (int): solver steps. Defaults to 10.
+        clip (float, optional): bound of the normalised actions at every solver step. Defaults to no bound; ``1.0``
+            suits ``"minmax"`` statistics.
+        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]`` in raw units. Defaults to ``["history"]``.
+        out_keys (list of NestedKey): the entry of the actions ``[*B, H, act]`` in raw units. Defaults to
+            ``["action_chunk"]``.
+        noise_key (NestedKey, optional): entry read if present: start noise ``[*B, H, act]``, or ``[*B, 1 + num_steps,
+            H, act]`` where the rest are the draws of a stochastic solver. Defaults to ``"noise"``.
+
+    Raises:
+        ValueError: for a history of another length or width, noise of another shape, an unknown or unfit solver.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import DiffusionPolicy, NoiseSchedule, TemporalUnet
+        >>> policy = DiffusionPolicy(TemporalUnet(3, 4), NoiseSchedule("flow"), state_dim=2, action_dim=3, num_steps=4)
+        >>> policy.fit_normalizers(torch.randn(100, 16, 2), torch.randn(500, 3))
+        >>> policy(TensorDict({"history": torch.randn(5, 2, 2)}, [5]))["action_chunk"].shape
+        torch.Size([5, 14, 3])
+    """
+
+    width_name = "action_dim"
+
+    def __init__(
+        self,
+        denoiser: nn.Module,
+        schedule: NoiseSchedule | None = None,
+        *,
+        state_dim: int,
+        action_dim: int,
+        history: int = 2,
+        horizon: int = 14,
+        relative: bool = False,
+        features: nn.Module | None = None,
+        solver: str | None = None,
+        num_steps: int = 10,
+        clip: float | None = None,
+        in_keys: list[NestedKey] | None = None,
+        out_keys: list[NestedKey] | None = None,
+        noise_key: NestedKey | None = "noise",
+    ):
+        super().__init__(
+            denoiser,
+            schedule,
+            state_dim=state_dim,
+            width=action_dim,
+            history=history,
+            horizon=horizon,
+            relative=relative,
+            features=features,
+            solver=solver,
+            num_steps=num_steps,
+            clip=clip,
+            in_keys=[keys.HISTORY] if in_keys is None else in_keys,
+            out_keys=[ACTION_CHUNK] if out_keys is None else out_keys,
+            noise_key=noise_key,
+        )
+        self.action_dim = action_dim
+        self.action_normalizer = identity_normalizer(action_dim)
+
+    def set_keys(self, *, history: NestedKey | None = None, action_chunk: NestedKey | None = None) -> None:
+        """Renames the entries read and written."""
+        if history is not None:
+            self.in_keys = [history]
+        if action_chunk is not None:
+            self.out_keys = [action_chunk]
+
+    def fit_normalizers(self, windows: Tensor, actions: Tensor, *, mode: str = "minmax") -> None:
+        """Takes the statistics of condition and actions from data; call it before a loss is built on the policy.
+
+        Args:
+            windows (Tensor): states in raw units, ``[*N, history + horizon, d]``; no label is needed for them.
+            actions (Tensor): labelled actions in raw units, ``[*M, act]``. All steps of a chunk share their statistics.
+
+        Keyword Args:
+            mode (str): ``"minmax"``, ``"standard"``, ``"rms"`` or ``"identity"`` (see
+                :class:`~torchrl_koap.modules.normalizer.Normalizer`).
+
+        Raises:
+            ValueError: for windows or actions of another shape, no actions, or actions that are not finite: they
+                must be those of the label budget.
+        """
+        if actions.ndim < 2 or actions.shape[-1] != self.action_dim:
+            raise ValueError(f"actions must be [*M, {self.action_dim}] (action_dim), got {list(actions.shape)}")
+        history, _ = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
+        example = self.action_normalizer.scale
+        condition = Normalizer.fit(self.condition(history), mode=mode)
+        self.action_normalizer = Normalizer.fit(actions, mode=mode).to(example)
+        self.condition_normalizer = condition.to(example)
+
+    def encode_actions(self, actions: Tensor) -> Tensor:
+        """Raw actions ``[*B, H, act]`` to the normalised sequence that noise is added to."""
+        if actions.shape[-2:] != self.sample_shape:
+            raise ValueError(
+                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self.action_dim}] (horizon, action_dim),"
+                f" got {list(actions.shape)}"
+            )
+        return self.action_normalizer(actions)
+
+    def decode_actions(self, sequence: Tensor) -> Tensor:
+        """Inverse of :meth:`encode_actions`."""
+        return self.action_normalizer.inverse(sequence)
+
+    def sample(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
+        """Samples actions ``[*B, H, act]`` for histories ``[*B, h, d]``, raw units; see the class for ``noise``."""
+        return self.decode_actions(self.solve(history, noise, generator))
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the actions into the tensordict."""
+        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        return tensordict.set(self.out_keys[0], self.sample(tensordict.get(self.in_keys[0]), noise))

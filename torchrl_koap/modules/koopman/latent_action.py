@@ -1,0 +1,269 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Latent actions ("action proxies"), inferred from short state sequences alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.modules import LSTM
+
+from torchrl_koap.keys import LATENT_ACTION, STATE
+from torchrl_koap.modules.networks import mlp
+from torchrl_koap.modules.time_alignment import check_offsets, frame_index, frame_span
+
+
+class LatentActionModule(TensorDictModuleBase):
+    r"""Base of the latent-action networks: gathers the frames of every step and asks :meth:`infer` for ``u``.
+
+    .. math::
+        u_t = f_\theta(x_{t-n}, \dots, x_t, x_{t+k}), \qquad x_{t+1} \text{ is never an input}
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        latent_dim (int): size ``m`` of a latent action.
+
+    Keyword Args:
+        history (int): number ``n`` of frames before the current one.
+        look_ahead (int or sequence of int): offset ``k``, or several.
+        relative (bool): read, beside the current frame itself, the steps between neighbouring frames, each divided by
+            its own spread (:meth:`fit_scales`): ``x_{t-n+1} - x_{t-n}, ..., x_t, x_{t+k_1} - x_t,
+            x_{t+k_2} - x_{t+k_1}, ...``. Steps of a few millimetres then reach the network at unit scale, not as
+            differences of numbers of order one, and a decoder that weighs them all alike is a local mean velocity.
+        clamped (bool): let frames whose look-ahead is cut at the window's end count in the losses, as the released
+            code does (:func:`~torchrl_koap.modules.time_alignment.frame_span`).
+        in_key (NestedKey): window of states ``[*B, T, d]``. Defaults to ``"state"``.
+        out_key (NestedKey): latent actions ``[*B, T, m]``. Defaults to ``"latent_action"``.
+    """
+
+    scales: Tensor
+
+    def __init__(
+        self,
+        state_dim: int,
+        latent_dim: int,
+        *,
+        history: int = 1,
+        look_ahead: int | Sequence[int] = 8,
+        relative: bool = False,
+        clamped: bool = False,
+        in_key: NestedKey = STATE,
+        out_key: NestedKey = LATENT_ACTION,
+    ):
+        super().__init__()
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        self.state_dim, self.latent_dim = state_dim, latent_dim
+        self.history, self.look_ahead = history, check_offsets(history, look_ahead)
+        self.relative, self.clamped = relative, clamped
+        self.num_frames = history + 1 + len(self.look_ahead)
+        self.register_buffer("scales", torch.ones(self.num_frames, state_dim))
+
+    def span(self, num_frames: int) -> range:
+        """Frames of a window of ``num_frames`` that count in the losses.
+
+        Raises:
+            ValueError: if the window is too short to hold one.
+        """
+        return frame_span(num_frames, self.history, self.look_ahead, clamped=self.clamped)
+
+    @property
+    def num_window_frames(self) -> int:
+        """Frames of the shortest window in which a frame (``history``) has all it reads and its successor."""
+        return self.history + 1 + self.look_ahead[-1]
+
+    def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """What each latent action reads.
+
+        Args:
+            state (Tensor): states ``[*B, T, d]`` in the networks' units.
+            frames (range, optional): frames of the window to gather for. Default: all ``T``.
+
+        Returns:
+            Tensor: ``[*B, len(frames), F, d]`` with ``F = history + 1 + len(look_ahead)``.
+
+        Raises:
+            ValueError: if the states have another number of columns.
+        """
+        if state.shape[-1] != self.state_dim:
+            raise ValueError(f"expected states with {self.state_dim} columns, got shape {list(state.shape)}")
+        num_frames = state.shape[-2]
+        frames = range(num_frames) if frames is None else frames
+        index = frame_index(frames, num_frames, self.history, self.look_ahead, state.device)
+        read = state[..., index, :]
+        if not self.relative:
+            return read
+        steps, n = read[..., 1:, :] - read[..., :-1, :], self.history
+        return torch.cat([steps[..., :n, :], read[..., n : n + 1, :], steps[..., n:, :]], -2) / self.scales
+
+    @torch.no_grad()
+    def fit_scales(self, windows: Tensor) -> None:
+        """Sets the spread (root mean square) of every step from windows ``[*B, T, d]``; no label is read."""
+        if not self.relative:
+            return
+        read = self.gather(windows, self.span(windows.shape[-2])).flatten(0, -3)
+        spread = read.square().mean(0).sqrt() * self.scales
+        spread[self.history] = 1.0  # the current frame stays in the normaliser's units
+        self.scales.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
+
+    def infer(self, frames: Tensor) -> Tensor:
+        """Latent actions ``[*B, T, m]`` from frames ``[*B, T, F, d]``."""
+        raise NotImplementedError
+
+    def forward(self, tensordict):
+        """Writes the latent action of every frame of the window."""
+        return tensordict.set(self.out_keys[0], self.infer(self.gather(tensordict.get(self.in_keys[0]))))
+
+
+class LatentActionLSTM(LatentActionModule):
+    """Latent actions by an LSTM over the short sequence ``x_{t-n}, ..., x_t, x_{t+k}`` (the paper's ``f``).
+
+    Args and keys as in :class:`LatentActionModule`.
+
+    Keyword Args:
+        hidden_dim (int): width of the LSTM. Defaults to ``128``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import LatentActionLSTM
+        >>> infer = LatentActionLSTM(2, 8, hidden_dim=16)
+        >>> infer(TensorDict({"state": torch.randn(5, 16, 2)}, [5]))["latent_action"].shape
+        torch.Size([5, 16, 8])
+    """
+
+    def __init__(self, state_dim: int, latent_dim: int, *, hidden_dim: int = 128, **kwargs):
+        super().__init__(state_dim, latent_dim, **kwargs)
+        self.lstm = LSTM(state_dim, hidden_dim, batch_first=True)
+        self.readout = nn.Linear(hidden_dim, latent_dim)
+
+    def infer(self, frames: Tensor) -> Tensor:
+        """Runs the LSTM from a zero state and reads its last output."""
+        flat = frames.reshape(-1, *frames.shape[-2:])  # [B * T, F, d]
+        zeros = flat.new_zeros(1, flat.shape[0], self.lstm.hidden_size)
+        out, _ = self.lstm(flat, (zeros, zeros))
+        return self.readout(out[:, -1]).reshape(*frames.shape[:-2], self.latent_dim)
+
+
+class LatentActionMLP(LatentActionModule):
+    """Latent actions by a perceptron on the concatenated frames (the released code's ``f``).
+
+    Args and keys as in :class:`LatentActionModule`.
+
+    Keyword Args:
+        hidden_dims (sequence of int): widths. Defaults to ``(128, 128)``.
+        dropout (float): dropout behind every hidden layer; the released code uses 0.1. Defaults to ``0``.
+        linear_skip (bool): add a linear map of the frames, so that an inverse map which is almost linear costs the
+            network nothing. Defaults to ``False``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import LatentActionMLP
+        >>> infer = LatentActionMLP(2, 8, history=4, look_ahead=(2, 4, 8), relative=True, linear_skip=True)
+        >>> infer(TensorDict({"state": torch.randn(16, 2)}, []))["latent_action"].shape
+        torch.Size([16, 8])
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        latent_dim: int,
+        *,
+        hidden_dims: Sequence[int] = (128, 128),
+        dropout: float = 0.0,
+        linear_skip: bool = False,
+        **kwargs,
+    ):
+        super().__init__(state_dim, latent_dim, **kwargs)
+        inputs = self.num_frames * state_dim
+        self.network = mlp(inputs, hidden_dims, latent_dim, dropout=dropout)
+        self.skip = nn.Linear(inputs, latent_dim, bias=False) if linear_skip else None
+
+    def infer(self, frames: Tensor) -> Tensor:
+        """Applies the perceptron (and the linear map) to the flattened frames."""
+        flat = frames.flatten(-2)
+        latent = self.network(flat)
+        return latent if self.skip is None else latent + self.skip(flat)
+
+
+class LatentActionFourier(LatentActionModule):
+    r"""Latent actions that are themselves observables of the window: a linear and a trainable Fourier part.
+
+    .. math::
+        u_t = \big(v_t / \sqrt{D},\; \sqrt{2 c / p}\, \cos(\Omega [v_t / (\ell_v \sqrt{D}), x_t / \ell_x] + \beta)\big)
+
+    with ``v_t`` the ``D`` entries of the steps between neighbouring frames. A linear decoder under a ridge penalty is
+    then Gaussian process regression with a linear plus ``c`` times a squared-exponential kernel (random Fourier
+    features): linear where labels are few, curved where they are many. The frequencies and phases are trained by the
+    Koopman loss, so the operator needs an input matrix (``KoopmanOperator(input_dim=...)``).
+
+    Args and keys as in :class:`LatentActionModule`, with ``relative`` always on.
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        num_features (int): number ``p`` of Fourier features; ``latent_dim`` becomes ``p + D``. With 0 only the linear
+            part is left.
+
+    Keyword Args:
+        curvature (float): prior variance ``c`` of the curved part against the linear one. Defaults to ``0.1``.
+        motion_scale (float): length ``l_v``, in spreads of the steps. Defaults to ``1``.
+        position_scale (float): length ``l_x``, in units of the normalised state. Defaults to ``4``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import LatentActionFourier
+        >>> infer = LatentActionFourier(2, 64, history=4, look_ahead=(2, 3, 4, 6, 8))
+        >>> infer(TensorDict({"state": torch.randn(16, 2)}, []))["latent_action"].shape
+        torch.Size([16, 82])
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        num_features: int,
+        *,
+        curvature: float = 0.1,
+        motion_scale: float = 1.0,
+        position_scale: float = 4.0,
+        **kwargs,
+    ):
+        history, look_ahead = kwargs.get("history", 1), kwargs.get("look_ahead", 8)
+        motion_dim = (history + len(check_offsets(history, look_ahead))) * state_dim
+        super().__init__(state_dim, num_features + motion_dim, relative=True, **kwargs)
+        self.motion_dim = motion_dim
+        self.amplitude = math.sqrt(2 * curvature / max(num_features, 1))
+        self.motion_scale, self.position_scale = motion_scale, position_scale
+        self.frequency = nn.Parameter(torch.empty(motion_dim + state_dim, num_features))
+        self.phase = nn.Parameter(torch.empty(num_features))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Draws frequencies and phases of the squared-exponential kernel anew."""
+        nn.init.normal_(self.frequency)
+        nn.init.uniform_(self.phase, 0.0, 2 * math.pi)
+
+    def infer(self, frames: Tensor) -> Tensor:
+        """Evaluates the observables."""
+        n = self.history
+        motion = torch.cat([frames[..., :n, :], frames[..., n + 1 :, :]], -2).flatten(-2) / math.sqrt(self.motion_dim)
+        where = torch.cat([motion / self.motion_scale, frames[..., n, :] / self.position_scale], -1)
+        return torch.cat([motion, self.amplitude * torch.cos(where @ self.frequency + self.phase)], -1)
+
+    def steps(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Where a latent action holds the steps along some state columns, and their size per unit of it.
+
+        Args:
+            axes (sequence of int): state columns.
+
+        Returns:
+            tuple of Tensor: entries of the latent action, int64 ``[S, len(axes)]``, and factors ``[S, len(axes)]`` that
+            turn them into steps in the networks' units; ``S = history + len(look_ahead)``.
+        """
+        scales = torch.cat([self.scales[: self.history], self.scales[self.history + 1 :]])[:, list(axes)]
+        first = torch.arange(len(scales), device=scales.device)[:, None] * self.state_dim
+        return first + torch.tensor(list(axes), device=scales.device), scales * math.sqrt(self.motion_dim)

@@ -1,0 +1,142 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Named combinations of lifting, operator, latent-action network and decoder: one line of keywords per choice."""
+
+from __future__ import annotations
+
+from torch import nn
+
+from torchrl_koap.keys import STATE
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
+from torchrl_koap.modules.koopman.inverse_dynamics import NORMALIZED_STATE, KoopmanInverseDynamics
+from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionLSTM, LatentActionMLP
+from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
+
+PRESETS = {
+    # best measured (benchmarks/RESULTS.md): observables of the frames relative to the current one, an input matrix
+    # B, no clamped look-ahead, a decoder in closed form
+    "default": {
+        "latent_dim": 32,
+        "hidden_dim": 64,
+        "recurrent_lifting": False,
+        "include_state": True,
+        "structure": "dense",
+        "operator_init": "identity",
+        "network": "fourier",
+        "num_features": 512,
+        "history": 4,
+        "look_ahead": (2, 3, 4, 5),
+        "clamped": False,
+    },
+    # design section 2: g MLP, f LSTM, dense K, look-ahead k = 8
+    "paper": {
+        "latent_dim": 64,
+        "hidden_dim": 128,
+        "recurrent_lifting": False,
+        "include_state": False,
+        "structure": "dense",
+        "operator_init": "identity",
+        "network": "lstm",
+        "history": 1,
+        "look_ahead": 8,
+        "relative": False,
+        "clamped": True,
+        "linear_skip": False,
+        "dropout": 0.0,
+    },
+    # koap_release_notes section 3.1: recurrent g, feed-forward f on raw states, diagonal K, k = 7 steps ahead in effect
+    "released": {
+        "latent_dim": 512,
+        "hidden_dim": 256,
+        "recurrent_lifting": True,
+        "include_state": False,
+        "structure": "diagonal",
+        "operator_init": "normal",
+        "network": "mlp",
+        "history": 1,
+        "look_ahead": 7,
+        "relative": False,
+        "clamped": True,
+        "linear_skip": False,
+        "dropout": 0.1,
+    },
+}
+
+# what only one kind of latent-action network takes, and its value where a preset does not name it
+NETWORK_OPTIONS = {
+    "fourier": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0},
+    "lstm": {"relative": False},
+    "mlp": {"relative": False, "linear_skip": False, "dropout": 0.0},
+}
+
+
+def make_koopman_inverse_dynamics(
+    state_dim: int,
+    action_dim: int,
+    *,
+    preset: str = "default",
+    state_normalizer: nn.Module | None = None,
+    action_normalizer: nn.Module | None = None,
+    **overrides,
+) -> KoopmanInverseDynamics:
+    """Builds a :class:`KoopmanInverseDynamics` from a preset; keywords override single choices.
+
+    Args:
+        state_dim (int): size of a state.
+        action_dim (int): size of an action.
+
+    Keyword Args:
+        preset (str): ``"default"``, ``"paper"`` or ``"released"``.
+        state_normalizer (nn.Module, optional): see :class:`KoopmanInverseDynamics`.
+        action_normalizer (nn.Module, optional): see :class:`KoopmanInverseDynamics`.
+        **overrides: any entry of ``PRESETS[preset]``, and of ``NETWORK_OPTIONS`` for the network chosen.
+
+    Raises:
+        ValueError: for an unknown preset or option; the message suggests the nearest.
+
+    Examples:
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> model = make_koopman_inverse_dynamics(2, 2, preset="released")
+        >>> sum(p.numel() for p in model.parameters())
+        1387524
+    """
+    choice = lookup(PRESETS, preset, "preset")
+    network = overrides.get("network", choice["network"])
+    options = lookup(NETWORK_OPTIONS, network, "network")
+    foreign = {name for others in NETWORK_OPTIONS.values() for name in others} - set(options)
+    choice = {**options, **{name: value for name, value in choice.items() if name not in foreign}}
+    for name in overrides:
+        lookup(choice, name, f"option of the inverse dynamics with network {network!r}:")
+    choice.update(overrides)
+
+    latent_dim, hidden = choice["latent_dim"], choice["hidden_dim"]
+    frames = {key: choice[key] for key in ("history", "look_ahead", "clamped", *options)}
+    if network == "fourier":
+        latent_action = LatentActionFourier(state_dim, **frames)
+    elif network == "lstm":
+        latent_action = LatentActionLSTM(state_dim, latent_dim, hidden_dim=hidden, **frames)
+    else:
+        latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=(hidden, hidden), **frames)
+    lifting = KoopmanLifting(
+        state_dim,
+        latent_dim,
+        hidden_dims=(hidden, hidden),
+        include_state=choice["include_state"],
+        recurrent=choice["recurrent_lifting"],
+        in_key=NORMALIZED_STATE if state_normalizer is not None else STATE,
+    )
+    operator = KoopmanOperator(
+        latent_dim,
+        input_dim=latent_action.latent_dim if network == "fourier" else None,
+        structure=choice["structure"],
+        init=choice["operator_init"],
+    )
+    decoder = LinearActionDecoder(latent_action.latent_dim, action_dim)
+    return KoopmanInverseDynamics(
+        latent_action,
+        decoder,
+        lifting=lifting,
+        operator=operator,
+        state_normalizer=state_normalizer,
+        action_normalizer=action_normalizer,
+    )

@@ -1,0 +1,344 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Pictures of paths over the scene from above: rollouts, plans against execution, demonstrations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from torchrl_koap.reports.mode_plots import draw_mode_table
+from torchrl_koap.reports.objects import draw_object_paths, draw_starts, legend_handles, object_looks, object_paths
+from torchrl_koap.reports.scenes import BLUE, INK, draw_scene, set_title
+from torchrl_koap.reports.training_plots import as_array, save_figure
+from torchrl_koap.tasks.modes import mode_choices, mode_colors, mode_name
+
+TIMEOUT, SUCCESS, COLLISION = 0, 1, 2
+OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision"}
+FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X"}
+NO_MODE = "#8a919c"
+
+
+def executed_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
+    """Positions of each episode, without the padding.
+
+    Args:
+        rollouts (mapping): ``position`` [E, T, 2] (m) and ``length`` [E].
+
+    Returns:
+        list: an array [length, 2] per episode.
+
+    Raises:
+        ValueError: if an entry is missing or has a wrong shape.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.reports.rollout_plots import executed_paths
+        >>> [len(path) for path in executed_paths({"position": torch.zeros(2, 9, 2), "length": torch.tensor([4, 9])})]
+        [4, 9]
+    """
+    position = as_array("position", _entry(rollouts, "position"), [None, None, 2])
+    length = as_array("length", _entry(rollouts, "length"), [len(position)])
+    paths = [row[: max(int(number), 0)] for row, number in zip(position, length, strict=True)]
+    return [path[np.isfinite(path).all(1)] for path in paths]
+
+
+def plot_rollouts(
+    rollouts: Mapping[str, Any], path: str | Path, *, task: str | None = "avoiding", num_modes: int | None = None
+) -> Path:
+    """Executed paths over the scene, coloured by mode; failures are black and marked where they end.
+
+    A second panel shows the bodies of tasks that have them: where they start, their paths, where they end.
+
+    Args:
+        rollouts (mapping): ``position`` [E, T, 2] (m, NaN after the end), ``length`` [E], ``mode`` [E] (-1 none),
+            ``outcome`` [E] (0 out of time, 1 success, 2 collision); optionally ``object_position`` [E, T, objects, 2]
+            (m) and ``context`` [E, objects, 3] (x, y in m, yaw in rad).
+        path (str or Path): png to write.
+        task (str, optional): task whose scene and modes are drawn.
+        num_modes (int, optional): number of modes, needed where the task names no choices.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from torchrl_koap.reports.rollout_plots import plot_rollouts
+        >>> one = {"position": torch.rand(1, 9, 2), "length": [9], "mode": [3], "outcome": [1]}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_rollouts(one, f"{folder}/rollouts.png").name
+        'rollouts.png'
+    """
+    paths, mode, outcome = _read(rollouts)
+    choices, colors = mode_choices(task, num_modes), mode_colors(task, num_modes)
+    bodies = object_paths(rollouts)
+    good, crowded = outcome == SUCCESS, sum(map(len, paths)) > 8000
+    if bodies is None:
+        figure = Figure(figsize=(8.4, 5.9), layout="constrained")
+        axes, side = figure.subplots(1, 2, width_ratios=(2.15, 1))
+        draw_scene(axes, task)
+    else:
+        figure = Figure(layout="constrained")
+        axes, beside, side = figure.subplots(1, 3)
+        share = abs(np.ptp(draw_scene(axes, task).get_xlim()) / np.ptp(axes.get_ylim()))
+        figure.set_size_inches(10 * share + 4.4, 5.6)
+        axes.get_gridspec().set_width_ratios((5 * share, 5 * share, 3.2))
+        draw_scene(beside, task).label_outer()
+        draw_bodies(beside, bodies, rollouts.get("context"), task, good)
+        set_title(beside, "objects: starts (pale), paths, ends")
+    axes.add_collection(
+        LineCollection(
+            [paths[index] for index in np.flatnonzero(good)],
+            colors=[_color(mode[index], colors) for index in np.flatnonzero(good)],
+            linewidths=0.6 if crowded else 1.1,
+            alpha=0.55 if crowded else 0.85,
+            zorder=2,
+        )
+    )
+    for index in np.flatnonzero(~good):
+        _draw_failure(axes, paths[index], outcome[index])
+    if task is None:
+        axes.autoscale()
+    counts = [f"{int(good.sum())} of {len(good)} rollouts succeed"]
+    counts += [f"{OUTCOMES[kind]}: {int((outcome == kind).sum())}" for kind in FAILURE_MARKS if (outcome == kind).any()]
+    set_title(axes, ", ".join(counts))
+    draw_mode_table(side, mode[good], choices, colors)
+    marks = [
+        Line2D([], [], color=INK, linewidth=1.2, marker=mark, markersize=7, label=OUTCOMES[kind])
+        for kind, mark in FAILURE_MARKS.items()
+        if (outcome == kind).any()
+    ]
+    if bodies:
+        marks += legend_handles(object_looks(task, bodies[0].shape[1]), good)
+    if marks:
+        below = {"bbox_to_anchor": (side.get_xlim()[0], side.dataLim.y0 - 0.2), "bbox_transform": side.transData}
+        side.legend(handles=marks, frameon=False, fontsize=8.5, loc="upper left", **below)
+    return save_figure(figure, path)
+
+
+def plot_plans(
+    rollouts: Mapping[str, Any],
+    path: str | Path,
+    *,
+    task: str | None = "avoiding",
+    num_modes: int | None = None,
+    episodes: Sequence[int] | None = None,
+    count: int = 6,
+) -> Path:
+    """Every plan of a few episodes over the path that was executed.
+
+    Args:
+        rollouts (mapping): the entries of :func:`plot_rollouts`, ``plan`` [E, P, H, 2] (m, NaN padded) and
+            ``plan_step`` [E, P], the control step at which each plan was made (-1 padding).
+        path (str or Path): png to write.
+        task (str, optional): task whose scene and modes are drawn.
+        num_modes (int, optional): number of modes, needed where the task names no choices.
+        episodes (sequence of int, optional): episodes to draw. Default: up to two failures, then successes of as many
+            different modes as possible.
+        count (int): number of episodes drawn by default.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from torchrl_koap.reports.rollout_plots import plot_plans
+        >>> one = {"position": torch.rand(1, 9, 2), "length": [9], "mode": [3], "outcome": [1]}
+        >>> one |= {"plan": torch.rand(1, 2, 14, 2), "plan_step": torch.tensor([[0, 4]])}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_plans(one, f"{folder}/plans.png").name
+        'plans.png'
+    """
+    paths, mode, outcome = _read(rollouts)
+    plan = as_array("plan", _entry(rollouts, "plan"), [len(paths), None, None, 2])
+    plan_step = as_array("plan_step", _entry(rollouts, "plan_step"), plan.shape[:2])
+    colors, bodies = mode_colors(task, num_modes), object_paths(rollouts)
+    if episodes is None:
+        episodes = choose_episodes(mode, outcome, count)
+    wrong = [index for index in episodes if not 0 <= index < len(paths)]
+    if wrong:
+        raise ValueError(f"episodes must be 0 to {len(paths) - 1}, got {wrong[0]}")
+    across = min(len(episodes), 3)
+    down = math.ceil(len(episodes) / max(across, 1))
+    figure = Figure(figsize=(3.8 * across + 0.3, 4.25 * down + 0.3), layout="constrained")
+    for place, index in enumerate(episodes):
+        axes = draw_scene(figure.add_subplot(down, across, place + 1), task)
+        color = INK if outcome[index] != SUCCESS else _color(mode[index], colors)
+        if bodies is not None:
+            context = rollouts["context"][index : index + 1] if "context" in rollouts else None
+            draw_bodies(axes, bodies[index : index + 1], context, task, outcome[index : index + 1] == SUCCESS)
+        axes.plot(*paths[index].T, color=color, linewidth=5, alpha=0.4, zorder=2, solid_capstyle="round")
+        made = [(plan[index, row], int(plan_step[index, row])) for row in np.flatnonzero(plan_step[index] >= 0)]
+        lines = [points[np.isfinite(points).all(1)] for points, _ in made]
+        axes.add_collection(LineCollection(lines, colors=[INK], linewidths=0.6, zorder=3))
+        starts = np.array([paths[index][step] for _, step in made if step < len(paths[index])]).reshape(-1, 2)
+        axes.scatter(*starts.T, s=5, color=INK, linewidths=0, zorder=4)
+        if outcome[index] in FAILURE_MARKS and len(paths[index]):
+            mark = FAILURE_MARKS[outcome[index]]
+            axes.scatter(*paths[index][-1], s=70, marker=mark, color=INK, edgecolors="white", linewidths=0.8, zorder=6)
+        if task is None:
+            axes.autoscale()
+        stray = plan_deviation(paths[index], lines)
+        what = mode_name(int(mode[index]), task, num_modes) if outcome[index] == SUCCESS else OUTCOMES[outcome[index]]
+        note = "no plan within the path"
+        if len(stray):
+            middle, most = 1e3 * np.quantile(stray, [0.5, 0.95])
+            note = f"off the path: median {middle:.1f}, 95 % within {most:.1f} mm"
+        set_title(axes, f"episode {index}: {what}\n{note}")
+        axes.label_outer()
+    return save_figure(figure, path)
+
+
+def choose_episodes(mode: Any, outcome: Any, count: int) -> list[int]:
+    """Up to two failures, then successes, a new mode each as long as there are any, then what is left.
+
+    Examples:
+        >>> from torchrl_koap.reports.rollout_plots import choose_episodes
+        >>> choose_episodes([0, 0, 5, 9, -1], [1, 1, 1, 1, 2], 4)
+        [4, 0, 2, 3]
+    """
+    mode, outcome = as_array("mode", mode, [None]), as_array("outcome", outcome, [None])
+    bad = np.flatnonzero(outcome != SUCCESS).tolist()
+    chosen, spare = bad[: min(2, count)], bad[2:]
+    good = np.flatnonzero(outcome == SUCCESS)
+    firsts = [int(good[mode[good] == value][0]) for value in np.unique(mode[good])]
+    room = count - len(chosen)
+    if len(firsts) > room:
+        firsts = [firsts[int(index)] for index in np.linspace(0, len(firsts) - 1, max(room, 0)).round()]
+    rest = [int(index) for index in good if index not in firsts]
+    return chosen + (firsts + rest + spare)[: max(room, 0)]
+
+
+def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:
+    """Distance of every planned point from the nearest point of the executed path, whatever the time (m).
+
+    Points planned beyond the path's end are left out: nothing was executed there.
+
+    Args:
+        path (np.ndarray): executed positions [L, 2].
+        plans (sequence): planned positions [H, 2] each.
+
+    Returns:
+        np.ndarray: distances, one per planned point that was reached.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.reports.rollout_plots import plan_deviation
+        >>> path = np.stack([np.arange(5.0), np.zeros(5)], axis=1)
+        >>> plan_deviation(path, [np.array([[1.5, 0.25], [6.0, 0.0]])]).tolist()
+        [0.25]
+    """
+    points = np.concatenate([np.zeros((0, 2)), *plans])
+    if len(path) < 2 or not len(points):
+        return np.zeros(0)
+    start, along = path[:-1], np.diff(path, axis=0)
+    square = np.maximum(np.square(along).sum(1), 1e-18)
+    offset = points[:, None] - start  # [points, L-1, 2]
+    share = (offset * along).sum(-1) / square
+    distance = np.linalg.norm(offset - np.clip(share, 0, 1)[..., None] * along, axis=-1)
+    nearest = distance.argmin(1)
+    beyond = (nearest == len(along) - 1) & (share[:, -1] > 1)
+    return distance.min(1)[~beyond]
+
+
+def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, task: str | None = "avoiding") -> Path:
+    """Paths of the demonstrations; transitions with an action label are emphasised, the others grey.
+
+    Args:
+        demonstrations (mapping): ``episode`` [N], ``labelled`` [N] and ``position`` [N, 2] (m) or, in files that have
+            none, ``state`` [N, d], whose first two columns are the position; optionally ``objects`` [N, objects, 2]
+            (m), which get a panel of their own.
+        path (str or Path): png to write.
+        task (str, optional): task whose scene is drawn.
+
+    Examples:
+        >>> import tempfile
+        >>> import torch
+        >>> from torchrl_koap.reports.rollout_plots import plot_demonstrations
+        >>> data = {"position": torch.rand(6, 2), "episode": [0, 0, 0, 1, 1, 1], "labelled": [True] * 3 + [False] * 3}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     plot_demonstrations(data, f"{folder}/demonstrations.png").name
+        'demonstrations.png'
+    """
+    if "position" in demonstrations:
+        position = as_array("position", demonstrations["position"], [None, 2])
+    else:
+        position = as_array("state", _entry(demonstrations, "state"), [None, None])[:, :2]
+    episode = as_array("episode", _entry(demonstrations, "episode"), [len(position)])
+    labelled = as_array("labelled", _entry(demonstrations, "labelled"), [len(position)]).astype(bool)
+    borders = np.flatnonzero(np.diff(episode) != 0) + 1
+    paths = np.split(position, borders)
+    if "objects" in demonstrations:
+        bodies = as_array("objects", demonstrations["objects"], [len(position), None, 2])
+        figure = Figure(figsize=(10.9, 6.2), layout="constrained")
+        axes, beside = figure.subplots(1, 2)
+        draw_scene(beside, task).label_outer()
+        draw_bodies(beside, np.split(bodies, borders), None, task, [True] * len(paths))
+        entries = legend_handles([look for look in object_looks(task, bodies.shape[1]) if not look.still], [True])
+        beside.legend(handles=entries, frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(1, 1))
+        set_title(beside, "objects: paths and where they end\n")
+    else:
+        figure = Figure(figsize=(5.9, 6.4), layout="constrained")
+        axes = figure.add_subplot()
+    draw_scene(axes, task)
+    axes.add_collection(LineCollection(paths, colors="#9aa1ab", linewidths=0.7, alpha=0.8, zorder=2))
+    same = np.flatnonzero(labelled[:-1] & (episode[1:] == episode[:-1]))
+    segments = np.stack([position[same], position[same + 1]], axis=1)
+    axes.add_collection(LineCollection(segments, colors=BLUE, linewidths=1.7, capstyle="round", zorder=3))
+    if task is None:
+        axes.autoscale()
+    touched = len(np.unique(episode[labelled]))
+    share = f"{labelled.mean():.1%}" if len(labelled) else "none"
+    head = f"{len(paths)} demonstrations; labels on {int(labelled.sum()):,} of {len(labelled):,} transitions ({share})"
+    set_title(axes, f"{head}\nin {touched} of {len(paths)} demonstrations")
+    handles = [
+        Line2D([], [], color=BLUE, linewidth=1.7, label="with action label"),
+        Line2D([], [], color="#9aa1ab", linewidth=0.9, label="states only"),
+    ]
+    axes.legend(handles=handles, fontsize=8.5, loc="lower right", frameon=False)
+    return save_figure(figure, path)
+
+
+def draw_bodies(axes: Axes, paths: Sequence[np.ndarray], contexts: Any, task: str | None, good: Sequence[bool]) -> None:
+    """Start outlines (if there are contexts), paths and ends of a task's bodies.
+
+    Args:
+        axes (Axes): where to draw.
+        paths (sequence): positions [frames, objects, 2] (m) of each episode.
+        contexts (array, optional): ``[E, objects, 3]``.
+        task (str, optional): the task.
+        good (sequence of bool): whether each episode succeeded.
+    """
+    looks = object_looks(task, paths[0].shape[1] if len(paths) else 0)
+    if contexts is not None:
+        draw_starts(axes, contexts, looks)
+    draw_object_paths(axes, paths, looks, good)
+    if task is None:
+        axes.autoscale()
+
+
+def _draw_failure(axes: Axes, path: np.ndarray, outcome: int) -> None:
+    axes.plot(*path.T, color=INK, linewidth=1.2, zorder=4)
+    if len(path):
+        mark = FAILURE_MARKS.get(int(outcome), "D")
+        axes.scatter(*path[-1], s=75, marker=mark, color=INK, edgecolors="white", linewidths=0.9, zorder=5)
+
+
+def _read(rollouts: Mapping[str, Any]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    paths = executed_paths(rollouts)
+    mode = as_array("mode", _entry(rollouts, "mode"), [len(paths)]).astype(int)
+    outcome = as_array("outcome", _entry(rollouts, "outcome"), [len(paths)]).astype(int)
+    return paths, mode, outcome
+
+
+def _entry(data: Mapping[str, Any], key: str) -> Any:
+    if key not in data:
+        raise ValueError(f"missing entry {key!r}; got {', '.join(sorted(map(str, data))) or 'nothing'}")
+    return data[key]
+
+
+def _color(mode: int, colors: np.ndarray) -> Any:
+    return colors[mode] if 0 <= mode < len(colors) else NO_MODE

@@ -1,0 +1,218 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The work of a label-efficiency curve: shared planners and cells, each in a folder that says when it is finished.
+
+A cell is one method, one budget of labels, one seed. Its folder is an ordinary run directory; ``cell.json``, written
+last and in one go, marks it as done, so a process may be killed at any moment.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_koap.data import limit_observations
+from torchrl_koap.evaluation.run import Eval, run_eval
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training.builders import load_demonstrations, set_up_torch
+from torchrl_koap.training.config import Train, configure, with_task_defaults
+from torchrl_koap.training.methods import METHODS
+from torchrl_koap.training.planner import train_planner
+from torchrl_koap.training.run import run_train
+from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+
+DONE = "cell.json"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a curve.
+
+    Args:
+        method (str): name in :data:`~torchrl_koap.training.methods.METHODS`.
+        fraction (float): share of the units that keep their labels.
+        observations (float): share of the trajectories that are used at all.
+        seed (int): of label choice, initialisation and batches.
+    """
+
+    method: str
+    fraction: float
+    observations: float
+    seed: int
+
+    @property
+    def folder(self) -> str:
+        """Its run directory, relative to the curve's."""
+        return f"cells/{self.method}-{self.fraction:.15g}-{self.observations:.15g}-seed{self.seed}"
+
+    @property
+    def planner(self) -> str | None:
+        """The folder of the planner that it shares, None for a method without one."""
+        return None if METHODS[self.method].acts else planner_folder(self.observations)
+
+
+def planner_folder(observations: float) -> str:
+    """Folder of the planner that all cells with this share of the trajectories have in common."""
+    return f"planner-{observations:.15g}"
+
+
+def is_trained(folder: Path) -> bool:
+    """Whether a planner was finished."""
+    return _is_readable(RunDirectory(folder), DONE) and (folder / "planner.safetensors").is_file()
+
+
+def is_done(folder: Path) -> bool:
+    """Whether a cell was finished and all its results can be read; if not, it is to be done (again)."""
+    try:
+        _results(RunDirectory(folder))
+    except RunDirectoryError:
+        return False
+    return True
+
+
+def _is_readable(run: RunDirectory, name: str) -> bool:
+    try:
+        run.read_json(name)
+    except RunDirectoryError:
+        return False
+    return True
+
+
+def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) -> None:
+    """Trains a planner on states alone: all actions are hidden before anything looks at the data.
+
+    Args:
+        folder (str): where to.
+        observations (float): share of the trajectories to use.
+        settings (dict): options of :class:`~torchrl_koap.training.config.Train`.
+    """
+    began = time.perf_counter()
+    resume = (Path(folder) / "config.json").exists()
+    options = Train(out=Path(folder), observation_fraction=observations, resume=resume, **settings)
+    task = get_task(options.task)
+    options = with_task_defaults(options, task)
+    set_up_torch(options.threads, options.device)
+    run = RunDirectory(options.out)
+    data = load_demonstrations(options.dataset, task)
+    data["action"] = torch.full_like(data["action"], math.nan)
+    data["has_action"] = torch.zeros_like(data["has_action"])
+    data = limit_observations(data, observations).to(options.device)
+    config = configure(run, options)
+    run.write_json("config.json", config)
+    torch.manual_seed(options.seed)
+    _, values = train_planner(run, options, config, task, data, None)
+    run.write_json(DONE, {"train_seconds": time.perf_counter() - began} | values)
+
+
+def do_cell(
+    *, folder: str, cell: dict[str, Any], planner: str | None, settings: dict[str, Any], evaluation: dict[str, Any]
+) -> None:
+    """Trains and evaluates a cell, from where it was left.
+
+    Args:
+        folder (str): its run directory.
+        cell (dict): fields of :class:`Cell`.
+        planner (str, optional): folder of the planner to share.
+        settings (dict): options of :class:`~torchrl_koap.training.config.Train`.
+        evaluation (dict): options of :class:`~torchrl_koap.evaluation.run.Eval`.
+    """
+    path, this = Path(folder), Cell(**cell)
+    began = time.perf_counter()
+    if not _is_readable(RunDirectory(path), "summary.json"):
+        run_train(
+            Train(
+                out=path,
+                method=this.method,
+                label_fraction=this.fraction,
+                observation_fraction=this.observations,
+                seed=this.seed,
+                planner_from=None if planner is None else Path(planner),
+                resume=(path / "config.json").exists(),
+                **settings,
+            )
+        )
+    trained = time.perf_counter()
+    result = run_eval(Eval(run=path, animate=False, report=False, **evaluation))
+    run = RunDirectory(path)
+    run.write_json(
+        DONE,
+        asdict(this)
+        | {
+            "labels": run.read_entry("summary.json", "labels"),
+            "train_seconds": trained - began,
+            "eval_seconds": time.perf_counter() - trained,
+            "episodes": result["episodes"],
+            "successes": _successes(result),
+        },
+    )
+
+
+def cell_row(root: Path, cell: Cell, *, task: str, label_unit: str, reason: str | None = None) -> dict[str, Any]:
+    """A cell as a row of ``cells.csv`` (:data:`~torchrl_koap.studies.table.CELL_COLUMNS`).
+
+    Args:
+        root (Path): folder of the curve.
+        cell (Cell): the cell.
+
+    Keyword Args:
+        task (str): name of the task.
+        label_unit (str): what the fraction is a share of.
+        reason (str, optional): why it failed.
+    """
+    row: dict[str, Any] = {"task": task, **asdict(cell), "label_unit": label_unit, "run": cell.folder}
+    run = RunDirectory(root / cell.folder)
+    try:
+        return row | {"status": "done"} | _results(run)
+    except RunDirectoryError as error:
+        if reason is None and (run.path / DONE).exists():  # it was done once
+            reason = str(error)
+    return row | ({"status": "missing"} if reason is None else {"status": "failed", "reason": reason})
+
+
+def _results(run: RunDirectory) -> dict[str, Any]:
+    """What a finished cell found.
+
+    Raises:
+        RunDirectoryError: if a file is not there, damaged or lacks something, or somebody evaluated the cell otherwise.
+    """
+    done, summary, result = (run.read_json(name) for name in (DONE, "summary.json", "eval.json"))
+    try:
+        columns = _columns(done, summary, result)
+        episodes = done.get("episodes", result["episodes"])  # a cell of before says nothing of them
+        same = (done["successes"], episodes) == (_successes(result), result["episodes"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise RunDirectoryError(f"{run.path}: its results are damaged ({type(error).__name__}: {error})") from error
+    if not same:
+        raise RunDirectoryError(f"{run.path / 'eval.json'} is another evaluation than the curve's")
+    return columns
+
+
+def _successes(result: dict[str, Any]) -> int:
+    return round(result["success_rate"] * result["episodes"])
+
+
+def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
+    labels = done["labels"]
+    errors = next((value for name, value in summary.items() if name.startswith("action_error_")), {})
+    entropy = result["mode_entropy"]
+    return {
+        "labelled_units": labels["selected_units"],
+        "labelled_transitions": labels["labelled_transitions"],
+        "trajectories_touched": labels["trajectories_touched"],
+        "episodes": result["episodes"],
+        "successes": done["successes"],
+        "success_rate": result["success_rate"],
+        "success_low": result["success_low"],
+        "success_high": result["success_high"],
+        "mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy,
+        "collisions": result["collisions"],
+        "mean_steps": result["mean_steps"],
+        "action_error": errors.get("controller"),
+        "controller_updates": summary["controller_updates"],
+        "train_seconds": done["train_seconds"],
+        "eval_seconds": done["eval_seconds"],
+    }

@@ -1,0 +1,234 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The cells of a label-efficiency curve as a file and as a table.
+
+A cell is one method trained with one seed on one budget of labels, and evaluated.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchrl_koap.lookup import lookup
+from torchrl_koap.studies.summary import STATUSES, Summary, cell_name, percent, plural, summarise
+
+_KINDS = {
+    "task": str,
+    "method": str,
+    "fraction": float,
+    "observations": float,
+    "seed": int,
+    "label_unit": str,
+    "status": str,
+    "reason": str,
+    "labelled_units": int,
+    "labelled_transitions": int,
+    "trajectories_touched": int,
+    "episodes": int,
+    "successes": int,
+    "success_rate": float,
+    "success_low": float,
+    "success_high": float,
+    "mode_entropy": float,
+    "collisions": int,
+    "mean_steps": float,
+    "action_error": float,
+    "controller_updates": int,
+    "train_seconds": float,
+    "eval_seconds": float,
+    "run": str,
+}
+CELL_COLUMNS = tuple(_KINDS)
+_ALWAYS = ("task", "method", "fraction", "observations", "seed", "status")
+_WHEN_DONE = ("episodes", "successes")
+_WORDS = {int: "a whole number", float: "a finite number"}
+
+
+def write_cells(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Writes cells as csv, aside first; what a row lacks, and what is not a finite number, stays empty.
+
+    Args:
+        path (str or Path): the file.
+        rows (sequence of mapping): columns of :data:`CELL_COLUMNS`.
+
+    Raises:
+        ValueError: for another column, or an unknown status.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl_koap.studies.table import read_cells, write_cells
+        >>> row = {"task": "avoiding", "method": "koap", "fraction": 0.02, "observations": 1.0, "seed": 0}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = write_cells(f"{folder}/cells.csv", [row | {"status": "failed", "reason": "no memory"}])
+        ...     read_cells(path)[0]["fraction"], read_cells(path)[0]["episodes"]
+        (0.02, None)
+    """
+    from torchrl_koap.files import replacing_file  # imports torch: only when something is written
+
+    path = Path(path)
+    for row in rows:
+        for name in row:
+            lookup(CELL_COLUMNS, name, "column of a cell")
+        lookup(STATUSES, row.get("status"), "status of a cell")
+    with replacing_file(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, CELL_COLUMNS)
+        writer.writeheader()
+        writer.writerows({name: _written(row.get(name)) for name in CELL_COLUMNS} for row in rows)
+    return path
+
+
+def _written(value: Any) -> Any:
+    if isinstance(value, str):
+        return " ".join(value.split())  # a reason of several lines becomes one
+    return "" if value is None or (isinstance(value, float) and not math.isfinite(value)) else value
+
+
+def read_cells(path: str | Path) -> list[dict[str, Any]]:
+    """Reads cells with their types; empty numbers are None, empty texts are empty.
+
+    Args:
+        path (str or Path): a file of :func:`write_cells`. Columns may be in another order.
+
+    Raises:
+        ValueError: if the file is damaged; the message names it, the line and the column.
+        FileNotFoundError: if it is not there.
+    """
+    path = Path(path)
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, restkey="", strict=True)
+            lines = [(reader.line_num, line) for line in reader]
+            names = reader.fieldnames or []
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    for name in CELL_COLUMNS:
+        if name not in names:
+            raise ValueError(f"{path} lacks the column {name!r}")
+    rows = []
+    for number, line in lines:
+        where = f"{path}, line {number}"
+        if line.get("") is not None:
+            raise ValueError(f"{where}: more values than the {len(names)} columns")
+        row = {name: _read(line[name], name, where) for name in CELL_COLUMNS}
+        for name in _ALWAYS + (_WHEN_DONE if row["status"] == "done" else ()):
+            if row[name] in (None, ""):
+                raise ValueError(f"{where}, column {name!r}: empty")
+        rows.append(row)
+    return rows
+
+
+def _read(text: str | None, name: str, where: str) -> Any:
+    kind = _KINDS[name]
+    if text is None:
+        raise ValueError(f"{where}, column {name!r}: the line ends before it")
+    if kind is str:
+        if name == "status" and text not in STATUSES:
+            raise ValueError(f"{where}, column 'status': expected one of {', '.join(STATUSES)}, got {text!r}")
+        return text
+    if not text:
+        return None
+    try:
+        value = kind(text)
+        if not math.isfinite(value):
+            raise ValueError
+    except ValueError:
+        raise ValueError(f"{where}, column {name!r}: expected {_WORDS[kind]}, got {text!r}") from None
+    return value
+
+
+def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
+    """The table as text, a mapping from heading to cell per method and budget; columns without any value are left out.
+
+    Args:
+        summaries (sequence of Summary): of :func:`summarise`.
+    """
+    units = {item.label_unit for item in summaries}
+    labels = f"labels ({plural(*units)})" if len(units) == 1 and "" not in units else "labels"
+    rows = []
+    for item in summaries:
+        rows.append(
+            {
+                "task": item.task,
+                labels: percent(item.fraction) + (f" of {plural(item.label_unit)}" if len(units) > 1 else ""),
+                "trajectories used": percent(item.observations),
+                "method": item.method,
+                "success (95 %)": _interval(item),
+                "n": str(item.episodes),
+                "seeds": f"{len(item.done)} of {len(item.done) + len(item.failed) + len(item.missing)}",
+                "not done": _not_done(item),
+                "range of seeds": _range(item.lowest, item.highest, len(item.done)),
+                "mode entropy": _number(item.entropy, ".2f"),
+                "action error (mm, mrad)": _number(item.action_error, ".3g"),
+                "labelled transitions": _number(item.labelled_transitions, ",.0f"),
+                "in trajectories": _number(item.trajectories_touched, ".4g"),
+            }
+        )
+    empty = {name for name in (rows[0] if rows else ()) if all(row[name] in ("", "–") for row in rows)}
+    for name, usual in (("task", None), ("trajectories used", "100 %")):
+        values = {row[name] for row in rows}
+        if len(values) == 1 and (usual is None or values == {usual}):
+            empty.add(name)
+    return [{name: text for name, text in row.items() if name not in empty} for row in rows]
+
+
+def _interval(item: Summary) -> str:
+    if item.success is None:
+        return "no cell done"
+    return f"{percent(item.success, 1)} ({100 * item.low:.1f}-{100 * item.high:.1f})"
+
+
+def _range(low: float | None, high: float | None, seeds: int) -> str:
+    return "–" if low is None or seeds < 2 else f"{100 * low:.0f}-{100 * high:.0f} %"
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def _not_done(item: Summary) -> str:
+    parts = [("failed", item.failed), ("missing", item.missing)]
+    return "; ".join(f"{word}: seed {', '.join(map(str, seeds))}" for word, seeds in parts if seeds)
+
+
+def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The pooled table of all cells in markdown, and below it every cell that is not done with its reason.
+
+    Args:
+        rows (sequence of mapping): cells.
+
+    Examples:
+        >>> from torchrl_koap.studies.table import markdown_table
+        >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.02, "seed": 0, "status": "missing"}
+        >>> print(markdown_table([cell]))
+        | labels | method | success (95 %) | n | seeds | not done |
+        |---|---|---|---|---|---|
+        | 2 % | koap | no cell done | 0 | 0 of 1 | missing: seed 0 |
+        <BLANKLINE>
+        1 of 1 cells is not done:
+        <BLANKLINE>
+        - avoiding, koap, 2 % labels, seed 0: missing
+        <BLANKLINE>
+    """
+    table = table_rows(summarise(rows))
+    if not table:
+        return "no cells\n"
+    lines = [
+        "| " + " | ".join(part.replace("|", "\\|") for part in line) + " |"
+        for line in [table[0], *map(dict.values, table)]
+    ]
+    text = "\n".join([lines[0], "|---" * len(table[0]) + "|", *lines[1:], ""])
+    open_cells = [row for row in rows if row["status"] != "done"]
+    if open_cells:
+        verb = "is" if len(open_cells) == 1 else "are"
+        text += f"\n{len(open_cells)} of {len(rows)} cells {verb} not done:\n\n"
+        text += "".join(f"- {cell_name(row)}: {why_not_done(row)}\n" for row in open_cells)
+    return text
+
+
+def why_not_done(row: Mapping[str, Any]) -> str:
+    """Status of a cell and the reason of its failure, in one line."""
+    reason = " ".join((row.get("reason") or "").split())
+    return f"{row['status']}: {reason}" if reason else row["status"]

@@ -1,0 +1,50 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Forward kinematics of the Panda in torch (spec section 2): joints to the position of the tool."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# offset along the parent's axes (m) and the fixed quarter turns about x that follow it, for joints 1 to 7
+_LINKS = (
+    ((0.0, 0.0, 0.333), 0),
+    ((0.0, 0.0, 0.0), -1),
+    ((0.0, -0.316, 0.0), 1),
+    ((0.0825, 0.0, 0.0), 1),
+    ((-0.0825, 0.384, 0.0), -1),
+    ((0.0, 0.0, 0.0), 1),
+    ((0.088, 0.0, 0.0), 1),
+)
+_FLANGE_TO_TOOL = 0.212  # m along the last joint's axis
+
+
+def tool_position(joints: Tensor) -> Tensor:
+    """Position of the tool centre point.
+
+    Args:
+        joints (Tensor): arm joints ``[*B, 7]`` (rad).
+
+    Returns:
+        Tensor: ``[*B, 3]`` (m), robot base at the origin.
+
+    Raises:
+        ValueError: if there are not seven joints on the last axis.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.tasks.panda_kinematics import tool_position
+        >>> tool_position(torch.zeros(7))
+        tensor([0.0880, 0.0000, 0.8210])
+    """
+    if joints.shape[-1] != 7:
+        raise ValueError(f"seven joints are needed on the last axis, got shape {list(joints.shape)}")
+    x, y, z = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(*joints.shape[:-1], 3, 3).unbind(-1)
+    position = torch.zeros_like(x)
+    for index, ((along_x, along_y, along_z), turn) in enumerate(_LINKS):
+        position = position + along_x * x + along_y * y + along_z * z
+        if turn:
+            y, z = turn * z, -turn * y
+        cosine, sine = joints[..., index : index + 1].cos(), joints[..., index : index + 1].sin()
+        x, y = cosine * x + sine * y, cosine * y - sine * x
+    return position + _FLANGE_TO_TOOL * z

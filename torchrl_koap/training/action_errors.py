@@ -1,0 +1,93 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What is measured about a finished controller with labels outside its budget: for analysis only, and counted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from torchrl_koap.data import controller_view, cut_windows
+from torchrl_koap.modules import LinearInverseDynamics
+from torchrl_koap.tasks import Task
+from torchrl_koap.training.checkpoints import save_tensors
+from torchrl_koap.training.closed_form import fit_closed_form
+from torchrl_koap.training.run_directory import RunDirectory
+
+# frames of the evaluation windows: enough history and look-ahead for every controller compared
+BEFORE, AFTER = 4, 11
+UNITS = {"m": "mm", "rad": "mrad"}  # unit of the actions to the unit of their errors
+
+
+@torch.no_grad()
+def hidden_action_errors(
+    controller: nn.Module, data: TensorDictBase, labelled: TensorDictBase
+) -> tuple[Tensor, Tensor]:
+    """Predicted and true actions on the trajectories of which no label was in the budget.
+
+    The first action decoded from a window of recorded states, ``BEFORE`` frames of history (the first frame of a
+    trajectory repeated where there is none) and ``AFTER`` frames of future: the same steps for every controller.
+
+    Args:
+        controller (nn.Module): writes actions ``[*B, T, act]`` for windows of states ``[*B, T, d]``.
+        data (TensorDictBase): flat, fully labelled.
+        labelled (TensorDictBase): the same after the budget was applied.
+
+    Returns:
+        tuple of Tensor: both ``[N, act]``, raw units; ``N = 0`` if every trajectory has a label.
+    """
+    touched = labelled["episode"][labelled["has_action"].squeeze(-1)].unique()
+    windows = cut_windows(data, BEFORE + 1 + AFTER, select=["state", "action", "episode"], pad_before=BEFORE)
+    windows = windows[~torch.isin(windows["episode"][:, -1], touched.to(windows["episode"].device))]
+    device = next(iter(controller.state_dict().values())).device
+    states = windows["state"][:, BEFORE - min(controller.history, BEFORE) :].to(device)
+    predicted = controller(TensorDict({"state": states}, batch_size=[len(states)]))["action"]
+    return predicted[:, min(controller.history, BEFORE)].cpu(), windows["action"][:, BEFORE]
+
+
+def rmse_mm(predicted: Tensor, true: Tensor) -> float:
+    """Root of the mean squared error over steps and axes, m to mm (rad to mrad)."""
+    return (predicted - true).square().mean().sqrt().item() * 1e3
+
+
+def _drawn(task: Task, observation: Tensor) -> dict[str, Tensor]:
+    """Positions of the tool ``[N, 2]`` and, where there are any, of the objects ``[N, objects, 2]`` for pictures."""
+    starts = [task.observation[part].start for part in (task.position, *task.drawn.values())]
+    tool, *objects = (observation[:, start : start + 2] for start in starts)
+    return {"position": tool.contiguous()} | ({"objects": torch.stack(objects, 1)} if objects else {})
+
+
+def write_analysis(
+    run: RunDirectory,
+    task: Task,
+    data: TensorDictBase,
+    labelled: TensorDictBase,
+    controller: nn.Module,
+    columns: Sequence[int],
+) -> dict[str, Any]:
+    """Action error of the controller, and of a ridge on the same raw columns and labels, on hidden trajectories.
+
+    ``columns`` are the state columns that the controller reads. Writes ``actions.safetensors`` and
+    ``demonstrations.safetensors`` for the report.
+    """
+    labelled = controller_view(labelled.cpu(), columns)
+    viewed = controller_view(data, columns)
+    predicted, true = hidden_action_errors(controller, viewed, labelled)
+    has_action = labelled["has_action"].squeeze(-1)
+    shown = {"state": data["state"], "episode": data["episode"], "labelled": has_action}
+    save_tensors(run.path / "demonstrations.safetensors", shown | _drawn(task, data["observation"]))
+    if not len(true):
+        return {"note": "every trajectory has a label in the budget: there is nothing to measure on"}
+    save_tensors(run.path / "actions.safetensors", {"predicted": predicted, "true": true})
+    ridge = LinearInverseDynamics(len(columns), task.action_dim).to(data["state"].dtype)
+    fit_closed_form(ridge, labelled)
+    same = slice(task.same_unit)
+    by_ridge, _ = hidden_action_errors(ridge, viewed, labelled)
+    return {
+        "controller": rmse_mm(predicted[:, same], true[:, same]),
+        "ridge": rmse_mm(by_ridge[:, same], true[:, same]),
+        "analysis_labels_read": len(true),
+    }

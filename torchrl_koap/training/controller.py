@@ -1,0 +1,201 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The part of ``koap train`` that spends labels: a controller, or a diffusion policy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+
+from torchrl_koap.data import WindowTable, controller_view, cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.data.pseudo_labels import relabel
+from torchrl_koap.modules import DiffusionPolicy, KoopmanInverseDynamics
+from torchrl_koap.objectives import DiffusionPolicyLoss
+from torchrl_koap.tasks import HORIZON, WINDOW, Task
+from torchrl_koap.training import released_settings
+from torchrl_koap.training.builders import build_controller, build_diffusion_policy
+from torchrl_koap.training.checkpoints import save_tensors, save_weights
+from torchrl_koap.training.closed_form import fit_closed_form
+from torchrl_koap.training.config import Train, method_of
+from torchrl_koap.training.loop import moving_average, train
+from torchrl_koap.training.methods import METHODS, Method, Phase
+from torchrl_koap.training.progress import progress_bar, show_progress
+from torchrl_koap.training.released_settings import epochs_of, get_released
+from torchrl_koap.training.run_directory import RunDirectory
+
+_KEYS = ["state", "action", "has_action"]
+# share of every batch that has labels; None: as it comes
+_LABELLED_SHARE = {"all": None, "mixed": 0.25, "labelled": 1.0}
+
+
+def train_controller(
+    run: RunDirectory, options: Train, config: dict[str, Any], task: Task, data: TensorDictBase, logger
+) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
+    """Trains what turns states into actions and writes its weights.
+
+    Args:
+        run (RunDirectory): where weights, metrics and checkpoints go.
+        options (Train): all options.
+        config (dict): the run's ``config.json``.
+        task (Task): the task.
+        data (TensorDictBase): flat data after the label budget was applied, with the whole ``state``.
+        logger: a TorchRL logger, or None.
+
+    Returns:
+        tuple: the module, what was found by a closed form (empty if there is none), and the last losses.
+    """
+    method = method_of(options)
+    train_one = _Training(run, options, logger, task)
+    if method.acts:
+        fit: dict[str, Any] = {}
+        if method.teacher:
+            data = _relabelled(train_one, method, config, task, data)
+        controller, values = _train_policy(train_one, config, task, data)
+    else:
+        view = controller_view(data, task.controller_columns(options.controller_state))
+        controller, fit, values = _train_network(train_one, method, config["controller"], task, view)
+    values["updates"] = train_one.updates
+    save_weights(run.path / "controller.safetensors", controller, {"task": task.name, "kind": "controller"})
+    if isinstance(controller, KoopmanInverseDynamics):
+        eigenvalues = controller.operator.eigenvalues()
+        save_tensors(run.path / "eigenvalues.safetensors", {"real": eigenvalues.real, "imag": eigenvalues.imag})
+    return controller, fit, values
+
+
+class _Training:
+    """Runs phases with the options of a run."""
+
+    def __init__(self, run: RunDirectory, options: Train, logger, task: Task):
+        self.run, self.options, self.logger = run, options, logger
+        self.released = get_released(options.method) if options.released_settings else None
+        self.epochs = epochs_of(task.name)
+        self.updates = 0
+
+    def batch_size(self, own: int) -> int:
+        """Windows per update."""
+        return own if self.released is None else released_settings.BATCH_SIZE
+
+    def budget(self, phase: Phase, own: int, table: WindowTable, epochs: int | None = None) -> int:
+        """Updates of a phase: its share of what every method has, or the epochs of the first public code."""
+        if self.released is None:
+            return max(round(own * phase.share), 1)
+        epochs = self.options.epochs or epochs or self.epochs
+        return self.released.updates(phase, table, epochs)
+
+    def __call__(self, name: str, loss: nn.Module, sample: Callable, *, num_steps: int, **settings) -> dict[str, float]:
+        if self.released is not None:
+            settings |= {
+                "learning_rate": self.released.learning_rate,
+                "weight_decay": released_settings.WEIGHT_DECAY,
+                "warmup": released_settings.WARMUP,
+                "decay": False,
+            }
+        self.updates += num_steps
+        with progress_bar(num_steps, name) as bar:
+            return train(
+                name,
+                loss,
+                sample,
+                num_steps=num_steps,
+                run=self.run,
+                logger=self.logger,
+                checkpoint_every=self.options.checkpoint_every,
+                resume=self.options.resume,
+                progress=show_progress(bar),
+                **settings,
+            )
+
+
+def _train_network(
+    train_one: _Training, method: Method, entry: dict[str, Any], task: Task, data: TensorDictBase
+) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
+    """A controller's phases, and its closed form if it has one."""
+    options = train_one.options
+    controller = build_controller(entry, data["state"].shape[-1], task.action_dim, data).to(options.device)
+    history = controller.history
+    window = max(WINDOW, controller.num_window_frames)
+    if hasattr(controller, "fit_scales"):
+        windows = cut_windows(data, window, select=["state", "has_action"], pad_before=history)
+        if method.labelled_only:
+            windows = windows[windows["has_action"].squeeze(-1).any(-1)]
+        controller.fit_scales(windows["state"])
+    values: dict[str, float] = {}
+    budget = min(options.controller_steps, options.steps)
+    table = WindowTable.build(data, window, pad_before=history)
+    for phase in method.phases if budget else ():
+        buffer = make_window_buffer(
+            data,
+            window,
+            train_one.batch_size(options.controller_batch_size),
+            select=_KEYS,
+            pad_before=history,
+            labelled_share=_LABELLED_SHARE[phase.windows],
+        )
+        values |= train_one(
+            phase.name,
+            phase.loss(controller),
+            buffer.sample,
+            num_steps=train_one.budget(phase, budget, table),
+            learning_rate=options.controller_learning_rate,
+            weight_decay=1e-3,
+        )
+    controller.eval()
+    fit = fit_closed_form(controller, data, shared_axes=task.actuated) if method.closed_form else {}
+    return controller, fit, values
+
+
+def _train_policy(
+    train_one: _Training, config: dict[str, Any], task: Task, data: TensorDictBase
+) -> tuple[DiffusionPolicy, dict[str, float]]:
+    """A diffusion policy on labelled windows, with the updates that a planner would have."""
+    options = train_one.options
+    policy = build_diffusion_policy(
+        config["planner"], data["state"].shape[-1], task.action_dim, task.planner_features()
+    )
+    has_action = data["has_action"].squeeze(-1)
+    seen = data[torch.isin(data["episode"], data["episode"][has_action])]
+    states = cut_windows(extrapolate_ends(seen, HORIZON - 1), WINDOW, select=["state"], pad_before=1)["state"]
+    policy.fit_normalizers(states, data["action"][has_action])
+    policy.to(options.device)
+    # at the end of a demonstration only the steps that were recorded count
+    buffer = make_window_buffer(
+        data,
+        WINDOW,
+        train_one.batch_size(options.batch_size),
+        select=_KEYS,
+        pad_before=1,
+        pad_after=HORIZON - 1,
+        labelled_share=_LABELLED_SHARE["labelled"],
+    )
+    loss = DiffusionPolicyLoss(policy)
+    table = WindowTable.build(data, WINDOW, pad_before=1, pad_after=HORIZON - 1)
+    phase = Phase("policy", DiffusionPolicyLoss, "labelled")
+    num_steps = train_one.budget(phase, options.steps, table, released_settings.POLICY_EPOCHS)
+    values = train_one(
+        phase.name,
+        loss,
+        buffer.sample,
+        num_steps=num_steps,
+        learning_rate=options.planner_learning_rate,
+        weight_decay=1e-4,
+        target_update=moving_average(loss, num_steps),
+    )
+    loss.target_policy_params.to_module(policy)
+    return policy, values
+
+
+def _relabelled(
+    train_one: _Training, method: Method, config: dict[str, Any], task: Task, data: TensorDictBase
+) -> TensorDictBase:
+    """The data with the teacher's actions where there is no label."""
+    teacher = METHODS[method.teacher]
+    phases = tuple(replace(phase, name=f"teacher_{phase.name}") for phase in teacher.phases)
+    entry = {"method": method.teacher, "preset": config["controller"]["preset"]}
+    view = controller_view(data, task.controller_columns(train_one.options.controller_state))
+    controller, _, _ = _train_network(train_one, replace(teacher, phases=phases), entry, task, view)
+    labelled = relabel(controller, view, window=max(WINDOW, controller.num_window_frames))
+    return data.copy().update(labelled.select("action", "has_action"))

@@ -1,0 +1,143 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""One loop that trains planner and controllers: logged, checkpointed, resumable bit for bit."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl.objectives import SoftUpdate
+
+from torchrl_koap.training.checkpoints import load_training_state, save_training_state
+from torchrl_koap.training.run_directory import RunDirectory
+
+
+def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
+    """Share of the peak learning rate at ``step``: linear warm-up, then half a cosine to 0.
+
+    Examples:
+        >>> from torchrl_koap.training.loop import warmup_cosine
+        >>> [round(warmup_cosine(step, 100, 10), 2) for step in (0, 9, 50, 99)]
+        [0.1, 0.98, 0.5, 0.0]
+    """
+    return min(1.0, (step + 1) / max(warmup, 1)) * 0.5 * (1 + math.cos(math.pi * step / num_steps))
+
+
+def moving_average(loss_module: nn.Module, num_steps: int) -> SoftUpdate:
+    """The average of a loss's parameters that is used after training; its memory is a share of a short training."""
+    return SoftUpdate(loss_module, eps=min(0.998, 1 - 10 / (num_steps + 10)))
+
+
+class DivergedError(RuntimeError):
+    """A loss that became NaN or infinite."""
+
+
+def train(
+    phase: str,
+    loss_module: nn.Module,
+    sample: Callable[[], TensorDictBase],
+    *,
+    num_steps: int,
+    learning_rate: float,
+    weight_decay: float = 0.0,
+    warmup: int = 100,
+    decay: bool = True,
+    target_update: SoftUpdate | None = None,
+    run: RunDirectory | None = None,
+    logger: Any = None,
+    log_every: int = 50,
+    checkpoint_every: int = 500,
+    resume: bool = False,
+    progress: Callable[[int, dict[str, float]], None] | None = None,
+) -> dict[str, float]:
+    """Minimises the sum of all ``loss_*`` entries with AdamW.
+
+    Args:
+        phase (str): name in the log and of the checkpoint, ``"planner"`` or ``"controller"``.
+        loss_module (nn.Module): a TorchRL ``LossModule``.
+        sample (callable): returns a batch; draws from torch's global generator.
+
+    Keyword Args:
+        num_steps (int): updates.
+        learning_rate (float): peak of :func:`warmup_cosine`.
+        weight_decay (float): decoupled weight decay.
+        warmup (int): updates of warm-up.
+        decay (bool): let the learning rate fall to 0 after the warm-up; otherwise it stays. Defaults to True.
+        target_update (SoftUpdate, optional): moving average of the parameters, stepped after every update.
+        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
+        logger (optional): a TorchRL logger; scalars are named ``phase/term``.
+        log_every (int): updates per row of the log.
+        checkpoint_every (int): updates per checkpoint.
+        resume (bool): go on from the checkpoint of this phase, if there is one. On a CPU the outcome equals that of an
+            uninterrupted run bit for bit.
+        progress (callable, optional): called with the number of updates done and the last logged values.
+
+    Returns:
+        dict: the last logged values, ``iterations_per_second`` of the whole phase among them.
+
+    Raises:
+        DivergedError: if a loss is not finite where it is logged, or a parameter is not where a checkpoint is due;
+            the message names step and term. The last checkpoint is kept.
+        CheckpointError: if the checkpoint is damaged or that of another model.
+        ValueError: if a number of steps is below 1.
+    """
+    for name, value in {"num_steps": num_steps, "log_every": log_every, "checkpoint_every": checkpoint_every}.items():
+        if value < 1:
+            raise ValueError(f"{name} must be >= 1, got {value}")
+    # fused AdamW is the quickest on CPU and on CUDA, and its state is plain tensors
+    optimizer = torch.optim.AdamW(loss_module.parameters(), learning_rate, weight_decay=weight_decay, fused=True)
+    checkpoint = None if run is None else run.path / "checkpoints" / f"{phase}.safetensors"
+    start = 0
+    if resume and checkpoint is not None:
+        if checkpoint.exists():
+            start = load_training_state(checkpoint, loss_module, optimizer)["step"]
+        run.rewind_metrics(phase, start)
+    values: dict[str, float] = run.last_metrics(phase) if start else {}
+    began, mark, marked = time.perf_counter(), time.perf_counter(), start
+    for step in range(start, num_steps):
+        rate = learning_rate * (warmup_cosine(step, num_steps, warmup) if decay else min(1.0, (step + 1) / warmup))
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        losses = loss_module(sample())
+        terms = {key: losses.get(key) for key in losses.keys() if key.startswith("loss_")}
+        sum(terms.values()).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        if target_update is not None:
+            target_update.step()
+
+        done = step + 1
+        if done % log_every == 0 or done == num_steps:
+            values = {key: value.item() for key, value in terms.items()}
+            bad = [key for key, value in values.items() if not math.isfinite(value)]
+            if bad:
+                raise DivergedError(f"{phase}: {', '.join(bad)} is not finite at step {done}; lower the learning rate")
+            now = time.perf_counter()
+            values |= {"learning_rate": rate, "iterations_per_second": (done - marked) / max(now - mark, 1e-9)}
+            mark, marked = now, done
+            if run is not None:
+                run.log(phase, done, values)
+            if logger is not None:
+                for key, value in values.items():
+                    logger.log_scalar(f"{phase}/{key}", value, step=done)
+        if progress is not None:
+            progress(done, values)
+        if checkpoint is not None and (done % checkpoint_every == 0 or done == num_steps):
+            if not all(parameter.isfinite().all() for parameter in loss_module.parameters()):
+                raise DivergedError(f"{phase}: parameters are not finite at step {done}; lower the learning rate")
+            save_training_state(checkpoint, loss_module, optimizer, {"phase": phase, "step": done})
+    elapsed = time.perf_counter() - began
+    if num_steps > start:
+        values["iterations_per_second"] = (num_steps - start) / elapsed
+    return values
+
+
+def phase_finished(run: RunDirectory, phase: str) -> bool:
+    """Whether the weights of a phase were written, which happens once, at its end."""
+    return Path(run.path / f"{phase}.safetensors").exists()

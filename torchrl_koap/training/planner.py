@@ -1,0 +1,80 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The planner's part of ``koap train``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
+
+from torchrl_koap.data import (
+    ExchangeAugmentation,
+    RecoveryAugmentation,
+    SceneAugmentation,
+    cut_windows,
+    extrapolate_ends,
+    make_window_buffer,
+)
+from torchrl_koap.modules import StatePlanner
+from torchrl_koap.objectives import PlannerLoss
+from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
+from torchrl_koap.training.builders import build_planner
+from torchrl_koap.training.checkpoints import load_weights, save_weights
+from torchrl_koap.training.config import Train
+from torchrl_koap.training.loop import moving_average, phase_finished, train
+from torchrl_koap.training.progress import progress_bar, show_progress
+from torchrl_koap.training.run_directory import RunDirectory
+
+
+def train_planner(
+    run: RunDirectory, options: Train, config: dict[str, Any], task: Task, data: TensorDictBase, logger
+) -> tuple[StatePlanner, dict[str, float]]:
+    """Trains the planner, takes it over from another run, or loads it where that is done; returns it and its losses."""
+    planner = build_planner(config["planner"], data["state"].shape[-1], task.planner_features()).to(options.device)
+    source = run.path if options.planner_from is None else Path(options.planner_from)
+    if options.planner_from is not None or (options.resume and phase_finished(run, "planner")):
+        load_weights(source / "planner.safetensors", planner, task=task.name)
+        if options.planner_from is not None:
+            save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
+        return planner, run.last_metrics("planner")
+    # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
+    extended = extrapolate_ends(data, HORIZON - 1)
+    planner.fit_normalizers(cut_windows(extended, WINDOW, select=["state"], pad_before=1)["state"])
+    planner.to(options.device)
+    buffer = make_window_buffer(extended, WINDOW, options.batch_size, select=["state"], pad_before=1)
+    augment = _augmentation(options, task)
+    loss = PlannerLoss(planner)
+    with progress_bar(options.steps, "planner") as bar:
+        values = train(
+            "planner",
+            loss,
+            lambda: augment(buffer.sample()),
+            num_steps=options.steps,
+            learning_rate=options.planner_learning_rate,
+            weight_decay=1e-4,
+            target_update=moving_average(loss, options.steps),
+            run=run,
+            logger=logger,
+            checkpoint_every=options.checkpoint_every,
+            resume=options.resume,
+            progress=show_progress(bar),
+        )
+    loss.target_planner_params.to_module(planner)
+    save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
+    return planner, values
+
+
+def _augmentation(options: Train, task: Task) -> TensorDictSequential:
+    """What windows undergo before the planner learns from them."""
+    steps = []
+    if options.exchange and task.alike_columns():
+        steps.append(ExchangeAugmentation(task.alike_columns()))
+    if task.scene and (options.scene_shift or options.scene_turn):
+        shift, turn = options.scene_shift, options.scene_turn
+        steps.append(SceneAugmentation(*task.scene_columns(), shift=shift, turn=turn, history=HISTORY))
+    arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
+    sigma = options.recovery_sigma
+    steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, tool=task.tool_columns))
+    return TensorDictSequential(*steps)
