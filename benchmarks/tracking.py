@@ -26,7 +26,7 @@ from torchrl_koap.training.run_directory import RunDirectory
 @torch.no_grad()
 def follow(task, controller, paths: list[torch.Tensor], joining: float, steps: int, horizon: int = 14) -> list[float]:
     """Mean distance (mm) to the demonstration after each step, over the episodes that still run."""
-    history = controller.history + 1
+    history = controller.num_past + 1
     env = TransformedEnv(make_env_of(task)(len(paths)), policy_transforms(history))
     td, running, errors = env.reset(), torch.ones(len(paths), dtype=torch.bool), []
     columns = list(task.state_columns)

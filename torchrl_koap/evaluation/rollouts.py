@@ -45,7 +45,7 @@ def make_policy(
         planner,
         controller,
         state_columns=state_columns,
-        history=max(planner.history, controller.history + 1),
+        history=max(planner.history, controller.num_past + 1),
         execution=execution,
         replan_interval=replan_interval,
         joining=joining,

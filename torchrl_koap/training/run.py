@@ -116,7 +116,7 @@ def _check_lengths(options: Train, config: dict[str, Any], task: Task, data: Ten
         return
     width = len(task.controller_columns(options.controller_state))
     controller = build_controller(config["controller"], width, task.action_dim)
-    WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.history)
+    WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.num_past)
     if options.analysis:
         WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
 

@@ -24,7 +24,7 @@ class KoopmanLifting(TensorDictModuleBase):
     .. math::
         z_t = g_\theta(x_t), \qquad \hat x_t = g_\psi(z_t)
 
-    (design section 2). ``forward`` writes the lifted states; :meth:`decode` is used by the reconstruction loss.
+    ``forward`` writes the lifted states; :meth:`decode` is used by the reconstruction loss.
 
     Args:
         state_dim (int): size ``d`` of a state.
