@@ -6,12 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import LatentActionMLP
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
-from torchrl_koap.modules.networks import mlp
 
 
 class NonlinearInverseDynamics(LatentInverseDynamics):
@@ -71,10 +71,11 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         reader = LatentActionMLP(
             state_dim, latent_dim, hidden_dims=hidden_dims, num_past=num_past, look_ahead=look_ahead, relative=True
         )
-        super().__init__(reader, mlp(latent_dim, hidden_dims, action_dim), **kwargs)
+        layers = {"num_cells": hidden_dims, "activation_class": nn.ReLU}
+        super().__init__(reader, MLP(latent_dim, action_dim, **layers), **kwargs)
         self.latent_dim = latent_dim
         self.lifting = KoopmanLifting(state_dim, latent_dim, hidden_dims=lifting_dims)
-        self.dynamics = mlp(2 * latent_dim, hidden_dims, latent_dim)
+        self.dynamics = MLP(2 * latent_dim, latent_dim, **layers)
 
     def lift(self, state: Tensor) -> Tensor:
         """Lifted states ``[*B, T, m]`` of raw states ``[*B, T, d]``."""

@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from torchrl_koap.modules.baselines.finite_scalar_quantization import FiniteScalarQuantizer
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
-from torchrl_koap.modules.networks import mlp
 from torchrl_koap.modules.time_alignment import FrameGatherer
 
 
@@ -49,8 +49,8 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
 
     Raises:
-        ValueError: for a negative ``num_past``, a look-ahead without 1, or fewer than 3 levels; at the call for states of
-            another size.
+        ValueError: for a negative ``num_past``, a look-ahead without 1, or fewer than 3 levels; at the call for states
+            of another size.
 
     Examples:
         >>> import torch
@@ -79,11 +79,12 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         reader = FrameGatherer(state_dim, num_past=num_past, look_ahead=look_ahead, least=1)
         if reader.look_ahead[0] != 1:
             raise ValueError(f"look_ahead must contain 1, the transition that is encoded, got {reader.look_ahead}")
-        super().__init__(reader, mlp(latent_dim, hidden_dims, action_dim), **kwargs)
+        layers = {"num_cells": hidden_dims, "activation_class": nn.ReLU}
+        super().__init__(reader, MLP(latent_dim, action_dim, **layers), **kwargs)
         self.latent_dim = latent_dim
-        self.encoder = mlp(reader.num_features, hidden_dims, latent_dim)
+        self.encoder = MLP(reader.num_features, latent_dim, **layers)
         self.quantizer = FiniteScalarQuantizer(latent_dim, levels=levels, num_codebooks=num_codebooks)
-        self.dynamics = mlp((num_past + 1) * state_dim + latent_dim, hidden_dims, state_dim)
+        self.dynamics = MLP((num_past + 1) * state_dim + latent_dim, state_dim, **layers)
 
     def read(self, state: Tensor, frames: range | None = None) -> Tensor:
         """What the inverse model reads, ``[*B, T, num_features]``, of raw states ``[*B, T, d]``."""

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
-from torchrl_koap.modules.networks import SequenceLSTM, mlp
+from torchrl_koap.modules.networks import SequenceLSTM
 from torchrl_koap.modules.time_alignment import FrameGatherer
 
 
@@ -69,7 +70,7 @@ class SupervisedInverseDynamics(_Supervised):
         **kwargs,
     ):
         super().__init__(FrameGatherer(state_dim, num_past=num_past, look_ahead=look_ahead, least=1), **kwargs)
-        self.network = mlp(self.reader.num_features, hidden_dims, action_dim)
+        self.network = MLP(self.reader.num_features, action_dim, num_cells=hidden_dims, activation_class=nn.ReLU)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Normalised actions ``[*B, T, act]``; frames near the ends read a clamped window."""

@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
-from torchrl_koap.modules.networks import mlp
 from torchrl_koap.modules.time_alignment import FrameGatherer
 
 
@@ -68,10 +68,11 @@ class VariationalInverseDynamics(LatentInverseDynamics):
         **kwargs,
     ):
         reader = FrameGatherer(state_dim, num_past=num_past, look_ahead=look_ahead, least=1)
-        super().__init__(reader, mlp(latent_dim, hidden_dims, action_dim), **kwargs)
+        layers = {"num_cells": hidden_dims, "activation_class": nn.ReLU}
+        super().__init__(reader, MLP(latent_dim, action_dim, **layers), **kwargs)
         self.latent_dim = latent_dim
-        self.encoder = mlp(reader.num_features, hidden_dims, 2 * latent_dim)
-        self.decoder = mlp(latent_dim + state_dim, hidden_dims, reader.num_features - state_dim)
+        self.encoder = MLP(reader.num_features, 2 * latent_dim, **layers)
+        self.decoder = MLP(latent_dim + state_dim, reader.num_features - state_dim, **layers)
 
     def read(self, state: Tensor, frames: range | None = None) -> Tensor:
         """What the encoder reads, ``[*B, T, num_features]``, of raw states ``[*B, T, d]``."""

@@ -10,10 +10,9 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.modules import LSTM
+from torchrl.modules import LSTM, MLP
 
 from torchrl_koap.keys import LATENT_ACTION, STATE
-from torchrl_koap.modules.networks import mlp
 from torchrl_koap.modules.time_alignment import FrameGatherer, check_offsets
 
 
@@ -125,7 +124,7 @@ class LatentActionMLP(LatentActionModule):
     ):
         super().__init__(state_dim, latent_dim, **kwargs)
         inputs = self.num_frames * state_dim
-        self.network = mlp(inputs, hidden_dims, latent_dim, dropout=dropout)
+        self.network = MLP(inputs, latent_dim, num_cells=hidden_dims, activation_class=nn.ReLU, dropout=dropout or None)
         self.skip = nn.Linear(inputs, latent_dim, bias=False) if linear_skip else None
 
     def infer(self, frames: Tensor) -> Tensor:
