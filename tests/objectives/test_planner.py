@@ -13,7 +13,7 @@ from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.unet import TemporalUnet
-from torchrl_koap.objectives.planner import PlannerLoss
+from torchrl_koap.objectives import PlannerLoss
 
 KINDS = [
     (s, p)
