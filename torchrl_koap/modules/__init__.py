@@ -25,7 +25,9 @@ from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.policies.action_chunks import ChunkedPolicy
-from torchrl_koap.modules.policies.plan_then_control import EpisodeNoise, PlanThenControl, join_plan, policy_transforms
+from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
+from torchrl_koap.modules.policies.receding_horizon import RecedingHorizonPolicy, policy_transforms
+from torchrl_koap.modules.policies.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
 from torchrl_koap.modules.time_alignment import FrameGatherer
 
 __all__ = [
@@ -52,6 +54,9 @@ __all__ = [
     "Normalizer",
     "PlanThenControl",
     "QuantizedInverseDynamics",
+    "RecedingHorizonPolicy",
+    "RecordedFutures",
+    "RecordedPlanner",
     "RecurrentInverseDynamics",
     "RidgeFit",
     "StatePlanner",
@@ -59,7 +64,7 @@ __all__ = [
     "TemporalUnet",
     "TransformerDenoiser",
     "VariationalInverseDynamics",
-    "join_plan",
+    "blend_plan",
     "make_koopman_inverse_dynamics",
     "policy_transforms",
 ]
