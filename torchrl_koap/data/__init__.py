@@ -14,7 +14,13 @@ from torchrl_koap.data.d3il.unpickling import DamagedPickleError, UnsafePickleEr
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands, subsample_trajectories
 from torchrl_koap.data.lerobot.reader import read_lerobot
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
-from torchrl_koap.data.trajectories import controller_view, flatten_trajectories, select_state, trajectory_lengths
+from torchrl_koap.data.trajectories import (
+    controller_view,
+    flatten_trajectories,
+    mark_labels,
+    select_state,
+    trajectory_lengths,
+)
 from torchrl_koap.data.window_buffer import cut_windows, make_window_buffer
 from torchrl_koap.data.window_sampler import WindowSampler, WindowSamplerWithoutReplacement, WindowUnit
 from torchrl_koap.data.window_table import WindowTable
@@ -49,6 +55,7 @@ __all__ = [
     "load_ted",
     "loads_pickle",
     "make_window_buffer",
+    "mark_labels",
     "read_about",
     "read_lerobot",
     "read_raw_episode",
