@@ -7,10 +7,10 @@ import math
 
 import pytest
 import torch
+from torchrl_koap.tasks.goals import goal_reached
 
 from torchrl_koap.envs import aligning, avoiding, sorting, stacking
 from torchrl_koap.tasks import get_task, goals
-from torchrl_koap.tasks.goals import goal_reached
 
 
 def test_tolerances_are_those_of_the_environments():
