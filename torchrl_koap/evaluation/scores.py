@@ -47,7 +47,7 @@ def score(
         seeds (sequence of int): one per episode.
 
     Keyword Args:
-        num_modes (int): base of the logarithm of the entropy.
+        num_modes (int): base of the logarithm of the entropy, which is None for a single mode.
         mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
         contexts (sequence of int, optional): number of the context of every episode. With it ``mode_entropy`` is the
             mean over contexts, None below two rollouts per context, and ``pooled_mode_entropy`` is that of all
@@ -66,8 +66,8 @@ def score(
     modes = [row["mode"] for row in won if row["mode"] >= 0]
     result = _rate("success", len(won), len(rows), {"episodes": len(rows)})
 
-    def pooled(sample: Sequence[int]) -> float:
-        return mode_entropy(sample, num_modes)
+    def pooled(sample: Sequence[int]) -> float | None:
+        return mode_entropy(sample, num_modes) if num_modes > 1 else None
 
     if contexts is None:
         result |= _entropy("mode_entropy", modes, pooled)
@@ -80,7 +80,7 @@ def score(
                 groups[row["context"]].append(row["mode"])
 
         def conditional(sample: Sequence[Sequence[int]]) -> float | None:
-            return conditional_entropy(sample, num_modes, unsolved=unsolved)
+            return conditional_entropy(sample, num_modes, unsolved=unsolved) if num_modes > 1 else None
 
         result["contexts"] = len(groups)
         if len(rows) >= 2 * len(groups):
@@ -102,7 +102,8 @@ def _rate(name: str, good: int, total: int, first: dict[str, Any]) -> dict[str, 
 
 
 def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:
-    interval = (bootstrap_interval(units, statistic) if len(units) else None) or (None, None)
+    known = len(units) and statistic(units) is not None
+    interval = (bootstrap_interval(units, statistic) if known else None) or (None, None)
     low, high = (None if end is None else min(max(end, 0.0), 1.0) for end in interval)
     return {name: statistic(units), f"{name}_low": low, f"{name}_high": high}
 

@@ -281,10 +281,6 @@ def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
         "last_forward": np.array(uniform(-0.1, 0.2) if lets_go else 1.0),
         "cruise": np.clip(cruise, 0.4, uniform(1.0, 1.05)) * FULL_PUSH,
         "grip": 1 + ar1_noise(generator, 8, 0.06, _HORIZON),
-        "misjudgement": np.stack(
-            [ar1_noise(generator, 12, 0.003, _HORIZON), ar1_noise(generator, 12, 0.003, _HORIZON)], axis=1
-        ),
-        "tremor": np.stack(
-            [ar1_noise(generator, 2, 0.0002, _HORIZON), ar1_noise(generator, 2, 0.0002, _HORIZON)], axis=1
-        ),
+        "misjudgement": np.stack([ar1_noise(generator, 12, 0.003, _HORIZON) for _ in range(2)], axis=1),
+        "tremor": np.stack([ar1_noise(generator, 2, 0.0002, _HORIZON) for _ in range(2)], axis=1),
     }

@@ -3,15 +3,15 @@
 
 What an expert (``Task.expert``) has to offer::
 
-    __init__(modes=, contexts=, seeds=, ...)  a mode, a context [bodies, 3] (None without) and a seed per episode; further
-                                              ones are Task.expert_options
-    act(observation)                          float64 [n, obs] to the next actions [n, act], once per control step
-    finished                                  bool [n]: which episodes are over for the expert
-    rules                                     RecordingRules, optional
+    __init__          (modes=, contexts=, seeds=) a mode, a context [bodies, 3] and a seed per episode, contexts=None in
+                      a task without bodies; Task.expert_options are further arguments
+    act(observation)  float64 [n, obs] to the next actions [n, act], once per control step
+    finished          bool [n]: which episodes are over for the expert
+    rules             RecordingRules, optional
 
-and what an environment has to offer is told in :mod:`torchrl_koap.envs.registry`. An environment with ``raw_log()`` of a
-task with a converter is recorded as D3IL does it (:class:`~torchrl_koap.data.RawEpisode`), any other one as what it
-observed and what was done (:class:`PlainEpisode`).
+What an environment has to offer is told in :mod:`torchrl_koap.envs.registry`. One with ``raw_log()``, of a task with a
+converter, is recorded as D3IL does it (:class:`~torchrl_koap.data.RawEpisode`), any other one as what it observed and
+what was done (:class:`PlainEpisode`).
 """
 
 from __future__ import annotations

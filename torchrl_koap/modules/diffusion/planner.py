@@ -47,7 +47,8 @@ class StatePlanner(ConditionedDiffusion):
         horizon (int): number ``H`` of planned frames. Defaults to 14.
         relative (bool): model displacements from the current state. Defaults to True.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
-            further numbers that the condition holds, such as :class:`~torchrl_koap.tasks.relative_positions.Relations`.
+            further numbers that the condition holds, such as
+            :class:`~torchrl_koap.tasks.relative_positions.RelativePositionFeatures`.
         solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
             flow path.
         num_steps (int): solver steps. Defaults to 10.
