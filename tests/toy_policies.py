@@ -18,7 +18,7 @@ class CountingPlanner(nn.Module):
     """Planned frame ``i`` of a plan made at state ``x`` is ``(x + 1000 (i + 1), x)``."""
 
     history, horizon, num_steps, solver, state_dim = 2, 6, 1, "ddim", 2
-    sample_shape = (6, 2)
+    sample_shape = noise_shape = (6, 2)
     noise_key = "noise"
 
     def __init__(self):

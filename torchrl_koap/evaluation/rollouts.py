@@ -19,7 +19,6 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_koap.evaluation.scores import OUTCOMES, outcome_of
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion.planner import StatePlanner
-from torchrl_koap.modules.diffusion.schedule import SOLVERS
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
 from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
 from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
@@ -100,8 +99,7 @@ def roll_out(
         if futures is not None:
             noise = RecordedFutures(futures[begin : begin + size])
         else:
-            draws = (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
-            noise = EpisodeNoise(part, (*draws, *planner.sample_shape), num_steps=max_steps)
+            noise = EpisodeNoise(part, planner.noise_shape, num_steps=max_steps)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(

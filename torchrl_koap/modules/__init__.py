@@ -25,6 +25,8 @@ from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.policies.action_chunks import ChunkedPolicy
+from torchrl_koap.modules.policies.agent import Agent
+from torchrl_koap.modules.policies.asynchronous import AsynchronousAgent
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
 from torchrl_koap.modules.policies.receding_horizon import RecedingHorizonPolicy, policy_transforms
 from torchrl_koap.modules.policies.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
@@ -32,6 +34,8 @@ from torchrl_koap.modules.time_alignment import FrameGatherer
 
 __all__ = [
     "PRESETS",
+    "Agent",
+    "AsynchronousAgent",
     "ChunkedPolicy",
     "DiffusionPolicy",
     "EpisodeNoise",

@@ -123,6 +123,12 @@ class ConditionedDiffusion(TensorDictModuleBase):
         """Shape ``(H, width)`` of one diffused sequence, and so of its start noise."""
         return self.horizon, self._width
 
+    @property
+    def noise_shape(self) -> tuple[int, ...]:
+        """Shape of everything that is drawn for one sequence: its start noise, and a stochastic solver's steps."""
+        draws = (1 + self.num_steps,) if SOLVERS[self.solver].stochastic else ()
+        return (*draws, *self.sample_shape)
+
     def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
         """Cuts windows of states ``[*B, history + horizon, d]`` into history and future."""
         length = self.history + self.horizon
@@ -204,7 +210,13 @@ class ConditionedDiffusion(TensorDictModuleBase):
                 f" got {list(sequence.shape)}"
             )
 
-    def solve(self, history: Tensor, noise: Tensor | None, generator: torch.Generator | None) -> Tensor:
+    def solve(
+        self,
+        history: Tensor,
+        noise: Tensor | None,
+        generator: torch.Generator | None,
+        known: Tensor | None = None,
+    ) -> Tensor:
         """Samples normalised sequences ``[*B, H, width]`` for raw histories ``[*B, h, d]``.
 
         Args:
@@ -212,6 +224,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
             noise (Tensor, optional): start noise ``[*B, H, width]``, or ``[*B, 1 + num_steps, H, width]`` where the
                 rest are the draws of a stochastic solver. Default: drawn.
             generator (torch.Generator, optional): source of what is drawn.
+            known (Tensor, optional): normalised first frames ``[*B, k, width]`` that the sequence has to have.
 
         Raises:
             ValueError: for a history or noise of another shape.
@@ -238,6 +251,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
             clip=self.clip,
             step_noise=step_noise,
             generator=generator,
+            known=known,
         )
 
     def _solver_now(self, explicit: bool) -> str:

@@ -139,6 +139,36 @@ class StatePlanner(ConditionedDiffusion):
         """:meth:`decode_plan`."""
         return self.decode_plan(history, sequence)
 
-    def plan(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
-        """:meth:`sample`: plans ``[*B, H, d]`` for histories ``[*B, h, d]``, both in raw units."""
-        return self.sample(history, noise, generator)
+    def plan(
+        self,
+        history: Tensor,
+        noise: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        *,
+        known: Tensor | None = None,
+    ) -> Tensor:
+        """Samples plans ``[*B, H, d]`` for histories ``[*B, h, d]``, both in raw units.
+
+        Args:
+            history (Tensor): observed states, the present one last.
+            noise (Tensor, optional): as for :meth:`solve`.
+            generator (torch.Generator, optional): source of what is drawn.
+
+        Keyword Args:
+            known (Tensor, optional): first states ``[*B, k, d]`` that the plan has to have, ``k`` below the horizon:
+                what is executed anyway while the plan is being made (real-time chunking, arXiv 2506.07339).
+
+        Raises:
+            ValueError: for a history, noise or known states of another shape.
+        """
+        if known is None:
+            return self.sample(history, noise, generator)
+        frames = known.shape[-2]
+        if not 1 <= frames < self.horizon or known.shape[-1] != self.state_dim:
+            raise ValueError(
+                f"known states must be [*B, 1..{self.horizon - 1}, {self.state_dim}] (k, state_dim),"
+                f" got {list(known.shape)}"
+            )
+        rest = known[..., -1:, :].expand(*known.shape[:-2], self.horizon - frames, -1)
+        fixed = self.encode_plan(history, torch.cat([known, rest], -2))[..., :frames, :]
+        return self.decode_plan(history, self.solve(history, noise, generator, fixed))

@@ -247,8 +247,18 @@ class NoiseSchedule(nn.Module):
             stops = [Node(float(time), *self._levels[int(time)]) for time in times]
         return [*stops, Node(0.0, 1.0, 0.0)]
 
-    def split(self, output: Tensor, x: Tensor, node: Node, clip: float | None = None) -> tuple[Tensor, Tensor]:
-        """Clean plan and noise that a network output stands for, the plan clipped to ``[-clip, clip]`` if asked."""
+    def split(
+        self, output: Tensor, x: Tensor, node: Node, clip: float | None = None, known: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Clean plan and noise that a network output stands for.
+
+        Args:
+            output (Tensor): of the network, ``[*B, H, d]``.
+            x (Tensor): the noisy plan it was asked about, ``[*B, H, d]``.
+            node (Node): level of its noise.
+            clip (float, optional): the clean plan is clipped to ``[-clip, clip]``.
+            known (Tensor, optional): first frames ``[*B, k, d]`` of the clean plan.
+        """
         if self.prediction == "epsilon":
             sample = (x - output * node.noise) / node.signal
         elif self.prediction == "sample":
@@ -259,7 +269,9 @@ class NoiseSchedule(nn.Module):
             sample = x * node.signal - output * node.noise
         if clip is not None:
             sample = sample.clamp(-clip, clip)
-        elif self.prediction == "epsilon":
+        if known is not None:
+            sample = torch.cat([known, sample[..., known.shape[-2] :, :]], -2)
+        elif clip is None and self.prediction == "epsilon":
             return sample, output
         return sample, (x - sample * node.signal) / node.noise
 
@@ -274,6 +286,7 @@ class NoiseSchedule(nn.Module):
         step_noise: Tensor | None = None,
         generator: torch.Generator | None = None,
         times: Sequence[float] | None = None,
+        known: Tensor | None = None,
     ) -> Tensor:
         """Turns noise into plans.
 
@@ -289,6 +302,8 @@ class NoiseSchedule(nn.Module):
             step_noise (Tensor, optional): the draws of a stochastic solver, ``[num_steps, *B, H, d]``.
             generator (torch.Generator, optional): source of those draws if ``step_noise`` is not given.
             times (sequence of float, optional): own stops instead of ``num_steps`` even ones.
+            known (Tensor, optional): first frames ``[*B, k, d]`` that the clean plan has to have: they take the place
+                of what the network says at every step, so that the rest is made to fit them.
 
         Raises:
             ValueError: for an unknown solver, one of the other path, or a number of steps out of range.
@@ -301,7 +316,7 @@ class NoiseSchedule(nn.Module):
         batch = noise.shape[:-2]
 
         def denoise(x: Tensor, node: Node) -> tuple[Tensor, Tensor]:
-            return self.split(network(x, x.new_full(batch, node.time)), x, node, clip)
+            return self.split(network(x, x.new_full(batch, node.time)), x, node, clip, known)
 
         return SOLVERS[solver].run(denoise, noise, nodes, draws)
 

@@ -82,6 +82,10 @@ class ChunkedPolicy(RecedingHorizonPolicy):
             reader="policy",
         )
 
+    def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
+        """Samples the actions of the next steps ``[*B, interval, act]``, see the base class."""
+        return self.make_chunk(self.state_of(observations), noise)
+
     def make_chunk(self, history: Tensor, noise: Tensor | None) -> Tensor:
         """Samples actions and keeps those that are executed, ``[*B, interval, act]``."""
         state = history[..., -self.planner.history :, :]

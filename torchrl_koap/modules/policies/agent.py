@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_koap.keys import ACTION
-from torchrl_koap.modules.policies.plan_then_control import NOISE, OBSERVATION_HISTORY
+from torchrl_koap.modules.policies.receding_horizon import IS_INIT, OBSERVATION_HISTORY, RecedingHorizonPolicy
 
 
 class Agent:
@@ -24,7 +24,7 @@ class Agent:
     for bit those of the policy in :meth:`torchrl.envs.EnvBase.rollout`.
 
     Args:
-        policy (TensorDictModuleBase): a :class:`~torchrl_koap.modules.PlanThenControl` or
+        policy (RecedingHorizonPolicy): a :class:`~torchrl_koap.modules.PlanThenControl` or
             :class:`~torchrl_koap.modules.ChunkedPolicy`.
 
     Keyword Args:
@@ -49,20 +49,17 @@ class Agent:
         ((3,), (3,))
     """
 
-    def __init__(self, policy: TensorDictModuleBase, *, seed: int = 0, noise: TensorDictModuleBase | None = None):
+    def __init__(self, policy: RecedingHorizonPolicy, *, seed: int = 0, noise: TensorDictModuleBase | None = None):
         self.policy, self.seed, self.noise = policy, seed, noise
         example = next(policy.parameters(), torch.empty(0))
         self.device, self.dtype = example.device, example.dtype
-        self._carried: TensorDict | None = None
-        self._frames: Tensor | None = None
-        self._generators: list[torch.Generator] = []
-        self._shape: tuple[int, ...] | None = None
-        self._ready = False
         self.latencies: list[float] = []
+        self._ready = False
+        self._forget()
 
     def reset(self) -> None:
         """Forgets everything: the next observation begins an episode."""
-        self._carried, self._frames, self._generators, self._shape = None, None, [], None
+        self._forget()
         self._ready = True
 
     @torch.no_grad()
@@ -77,13 +74,13 @@ class Agent:
         """
         began = time.perf_counter()
         observed = self._checked(observation)
+        newest = observed.unsqueeze(-2)
         if self._frames is None:
-            self._frames = observed.unsqueeze(-2).expand(-1, self.policy.history, -1).clone()
+            self._frames = newest.expand(-1, self.policy.history, -1).clone()
         else:
-            self._frames = torch.cat([self._frames[:, 1:], observed.unsqueeze(-2)], -2)
+            self._frames = torch.cat([self._frames[:, 1:], newest], -2)
         action = self._decide()
-        single = len(self._shape) == 1
-        action = action[0] if single else action
+        action = action[0] if len(self._shape) == 1 else action
         result = action if isinstance(observation, Tensor) else action.cpu().numpy()
         self.latencies.append(time.perf_counter() - began)
         return result
@@ -100,12 +97,18 @@ class Agent:
         p50, p99 = np.percentile(times, (50, 99))
         return {"p50": float(p50), "p99": float(p99), "max": float(times.max()), "steps": len(times)}
 
+    def _forget(self) -> None:
+        self._carried: TensorDict | None = None  # what the policy wrote in the last step
+        self._frames: Tensor | None = None  # [n, history, obs]
+        self._generators: list[torch.Generator] = []
+        self._shape: tuple[int, ...] | None = None  # of the observations
+
     def _decide(self) -> Tensor:
         """The action for the frames observed by now ``[n, act]``."""
         robots = len(self._frames)
         td = TensorDict(batch_size=[robots], device=self.device) if self._carried is None else self._carried
         td.set(OBSERVATION_HISTORY, self._frames)
-        td.set("is_init", torch.full((robots, 1), self._carried is None, device=self.device))
+        td.set(IS_INIT, torch.full((robots, 1), self._carried is None, device=self.device))
         td = self._with_noise(td)
         td = self.policy(td)
         self._carried = td
@@ -114,13 +117,12 @@ class Agent:
     def _with_noise(self, td: TensorDict) -> TensorDict:
         if self.noise is not None:
             return self.noise(td)
-        return td.set(NOISE, self._draw())
+        return td.set(self.policy.planner.noise_key, self._noise_for(len(self._frames)))
 
-    def _draw(self) -> Tensor:
+    def _noise_for(self, robots: int) -> Tensor:
+        """Start noise of a plan ``[n, *noise_shape]``, from a stream per robot."""
         if not self._generators:
-            self._generators = [
-                torch.Generator().manual_seed(self.seed + robot) for robot in range(len(self._frames))
-            ]
+            self._generators = [torch.Generator().manual_seed(self.seed + robot) for robot in range(robots)]
         shape = self.policy.planner.noise_shape
         draws = [torch.randn(*shape, generator=generator) for generator in self._generators]
         return torch.stack(draws).to(self.device, self.dtype)
@@ -135,11 +137,12 @@ class Agent:
             raise ValueError(f"an observation must be [obs] or [n, obs], got {list(shape)}")
         if self._shape is not None and shape != self._shape:
             raise ValueError(
-                f"the observation is {list(shape)}, those before were {list(self._shape)}; reset() the agent for another"
-                " robot or batch"
+                f"the observation is {list(shape)}, those before were {list(self._shape)}; reset() the agent for"
+                " another robot or batch"
             )
-        if not observed.isfinite().all():
-            raise ValueError(f"columns {(~observed.isfinite()).reshape(-1, shape[-1]).any(0).nonzero().flatten().tolist()}"
-                             " of the observation are NaN or infinite")
+        bad = ~observed.isfinite()
+        if bad.any():
+            columns = bad.reshape(-1, shape[-1]).any(0).nonzero().flatten().tolist()
+            raise ValueError(f"columns {columns} of the observation are NaN or infinite")
         self._shape = shape
         return observed.to(self.device, self.dtype).reshape(-1, shape[-1])

@@ -114,6 +114,11 @@ class PlanThenControl(RecedingHorizonPolicy):
         plan = self.planner.plan(history[..., -self.planner.history :, :], noise)
         return self._remaining_plans(plan) if self.execution == "feedback" else self._decode_chunk(history, plan)
 
+    def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
+        """Plans and decodes the actions of the next steps ``[*B, interval, act]``, see the base class."""
+        history = self.state_of(observations)
+        return self._decode_chunk(history, self.planner.plan(history[..., -self.planner.history :, :], noise))
+
     def act(self, history: Tensor, cached: Tensor) -> Tensor:
         """Decodes the action from what remains of the plan, or hands out the one decoded before."""
         return self._actions(history, cached)[..., self.history - 1, :] if self.execution == "feedback" else cached

@@ -93,10 +93,10 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         columns = None if controller_columns is None else torch.as_tensor(controller_columns)
         self.register_buffer("controller_columns", columns, persistent=False)
         if callable(state_columns):
-            self._state_of = state_columns
+            self.state_of = state_columns
         else:
             self.register_buffer("state_columns", torch.as_tensor(state_columns), persistent=False)
-            self._state_of = self._select
+            self.state_of = self._select
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self.history, self.replan_interval = history, replan_interval
         self.planner = planner
@@ -110,6 +110,20 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
 
     def make_chunk(self, history: Tensor, noise: Tensor | None) -> Tensor:
         """What is in force in each of the next steps ``[B, interval, ...]``, for states ``[B, history, d]``."""
+        raise NotImplementedError
+
+    def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
+        """The actions of the next ``replan_interval`` steps, decoded at once: stateless and without branches on data.
+
+        This is what is exported: whoever calls it keeps the last observations and counts steps.
+
+        Args:
+            observations (Tensor): ``[*B, history, obs]``, raw units.
+            noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
+
+        Returns:
+            Tensor: ``[*B, replan_interval, act]``.
+        """
         raise NotImplementedError
 
     def act(self, history: Tensor, cached: Tensor) -> Tensor:
@@ -138,7 +152,7 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         """One step of a batch ``[n]``."""
-        tensordict.set(STATE_HISTORY, self._state_of(tensordict.get(self.in_keys[0])))
+        tensordict.set(STATE_HISTORY, self.state_of(tensordict.get(self.in_keys[0])))
         tensordict = self.receding(tensordict)
         action = self.act(tensordict.get(STATE_HISTORY), tensordict.get(self.receding.action_keys[0]))
         return tensordict.set(self.out_keys[0], action)
