@@ -11,9 +11,11 @@ from torchrl_koap.data.d3il.conversion import Converter, RawFolderError, convert
 from torchrl_koap.data.d3il.raw import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
 from torchrl_koap.data.d3il.replay import D3ILExperienceReplay
 from torchrl_koap.data.d3il.unpickling import DamagedPickleError, UnsafePickleError, load_pickle, loads_pickle
+from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstrations
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands, subsample_trajectories
 from torchrl_koap.data.lerobot.reader import read_lerobot
-from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
+from torchrl_koap.data.recordings import Recordings, RecordingsError, make_recordings
+from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, read_task, save_ted
 from torchrl_koap.data.trajectories import (
     controller_view,
     flatten_trajectories,
@@ -37,6 +39,8 @@ __all__ = [
     "RawEpisode",
     "RawEpisodeError",
     "RawFolderError",
+    "Recordings",
+    "RecordingsError",
     "RecoveryAugmentation",
     "UnsafePickleError",
     "WindowSampler",
@@ -53,11 +57,15 @@ __all__ = [
     "load_pickle",
     "load_ted",
     "loads_pickle",
+    "make_demonstrations",
+    "make_recordings",
     "make_window_buffer",
     "mark_labels",
     "read_about",
     "read_lerobot",
     "read_raw_episode",
+    "read_task",
+    "save_demonstrations",
     "save_ted",
     "select_state",
     "subsample_trajectories",

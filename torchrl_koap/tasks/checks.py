@@ -76,12 +76,17 @@ def _column_faults(task: Task) -> list[str]:
     if twice:
         faults.append(f"observation_parts: columns named twice: {', '.join(twice)}")
     if all(kind in ("plain", *FEATURE_COLUMNS) for kind in task.state_parts.values()):
-        for field in ("actuated", "robot"):
+        for field in ("actuated", "robot", "action_targets"):
             wrong = [column for column in getattr(task, field) if not 0 <= column < task.state_dim]
             if wrong:
                 faults.append(f"{field}: the state has {task.state_dim} columns, got {wrong[0]}")
-    if len(task.actuated) not in (0, task.action_dim):
-        faults.append(f"actuated: wanted a state column for each of {task.action_dim} actions, got {task.actuated}")
+    for field in ("actuated", "action_targets"):
+        if len(getattr(task, field)) not in (0, task.action_dim):
+            wanted = f"a state column for each of {task.action_dim} actions"
+            faults.append(f"{field}: wanted {wanted}, got {getattr(task, field)}")
+    if len(task.observation_units) not in (0, task.observation_dim):
+        wanted = f"one for each of {task.observation_dim} columns"
+        faults.append(f"observation_units: wanted {wanted}, got {len(task.observation_units)}")
     if tuple(task.actions)[task.num_delta_actions :] != tuple(task.absolute_actions):
         faults.append(f"absolute_actions: wanted the last of {', '.join(task.actions)}, got {task.absolute_actions}")
     missing = [name for group in task.relative_positions for name in group if name not in task.state_parts]

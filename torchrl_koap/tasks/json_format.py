@@ -54,6 +54,27 @@ def task_from_json(entries: dict[str, Any]) -> Task:
     return Task(**values)
 
 
+def import_strings_of(task: Task) -> dict[str, str]:
+    """What a task names by import strings, and where: the code that using it may run.
+
+    Args:
+        task (Task): the task.
+
+    Examples:
+        >>> from torchrl_koap.tasks import Task, get_task
+        >>> from torchrl_koap.tasks.json_format import import_strings_of
+        >>> import_strings_of(get_task("avoiding"))["env"]
+        'torchrl_koap.envs.avoiding:AvoidingEnv'
+        >>> arm = Task(name="arm", observation_parts={"joints": 2}, actions={"a": "rad"}, position="joints")
+        >>> import_strings_of(arm)
+        {}
+    """
+    named = {field: getattr(task, field) for field in ("env", "expert", "goal", "score", "converter")}
+    named |= {"tool_kinematics": task.tool_kinematics, "modes.index": task.modes.index}
+    named |= {f"state.{part}": kind for part, kind in task.state.items() if ":" in kind}
+    return {place: value for place, value in named.items() if value}
+
+
 def _plain(value: Any, place: str) -> Any:
     if isinstance(value, dict):
         return {key: _plain(entry, f"{place}.{key}") for key, entry in value.items()}

@@ -94,6 +94,9 @@ class Task(StateParts):
         control_hz (float): control steps per second.
         command (str, optional): the part that repeats the last command. Its differences *are* the actions, so it is
             never shown to planner or controller. None: the observation holds no command.
+        observation_units (tuple of str): unit of every observation column; empty: m for positions, rad for angles.
+        action_targets (tuple of int): for absolute actions the state column that each one is the target of: controllers
+            then decode the distance to it. Empty: actions are changes, velocities or efforts.
         absolute_actions (tuple of str): trailing action columns that are commands themselves, not changes of one.
         state (dict): part of the observation to name of its feature (:mod:`torchrl_koap.tasks.features`) or its import
             string, in the order of the state. Empty: every part but the command and the hidden ones, unchanged.
@@ -155,6 +158,8 @@ class Task(StateParts):
     max_steps: int = 400
     control_hz: float = CONTROL_HZ
     command: str | None = None
+    observation_units: tuple[str, ...] = ()
+    action_targets: tuple[int, ...] = ()
     absolute_actions: tuple[str, ...] = ()
     state: dict[str, str] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()
