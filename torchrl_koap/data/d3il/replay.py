@@ -41,7 +41,7 @@ _CONVERSION = 2  # raise it when the same raw files convert to other data
 class D3ILExperienceReplay(BaseDatasetExperienceReplay):
     """Demonstrations of a D3IL task as a replay buffer over flat steps.
 
-    A file of ``T`` rows gives ``T - 1`` steps (specification, section 7). The entries are those of
+    A file of ``T`` rows gives ``T - 1`` steps. The entries are those of
     :mod:`torchrl_koap.keys`; ``state`` holds the columns that a policy may see. Also reached by
     ``torchrl.data.datasets.load_dataset("d3il:avoiding", root=...)``.
 
