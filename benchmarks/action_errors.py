@@ -38,7 +38,7 @@ def action_error(task, data, method: str, fraction: float, seed: int, updates: i
         controller, _, _ = train_controller(run, options, configure(run, options), task, labelled, None)
     columns = task.controller_columns(options.controller_state)
     predicted, true = hidden_action_errors(controller, controller_view(data, columns), labelled)
-    same = slice(task.same_unit)  # a gripper's number has no unit
+    same = task.action_columns()  # a gripper's number has no unit
     return rmse_mm(predicted[:, same], true[:, same])
 
 

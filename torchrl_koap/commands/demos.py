@@ -47,7 +47,7 @@ def run_demos(options: Demos) -> RecordingReport:
     for name in ("ted", "raw"):
         if (options.out / name).exists():
             raise FileExistsError(f"{options.out / name} exists already; choose another --out")
-    episodes = task.demonstrations if options.episodes is None else options.episodes
+    episodes = task.defaults.demonstrations if options.episodes is None else options.episodes
     with tqdm(total=episodes, desc="recording", unit="episode") as bar:
         raw, report = record_episodes(
             task.name,

@@ -104,7 +104,7 @@ def run_train(options: Train) -> dict[str, Any]:
     if options.analysis and not method.acts:
         columns = task.controller_columns(options.controller_state)
         analysis = write_analysis(run, task, data, labelled, controller, columns)
-        summary[f"action_error_{UNITS[task.action_unit]}"] = analysis
+        summary[f"action_error_{UNITS.get(task.action_unit, task.action_unit)}"] = analysis
     run.write_json("summary.json", summary)
     return summary
 
