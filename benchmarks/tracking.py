@@ -19,7 +19,7 @@ from torchrl.envs.utils import step_mdp
 from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.envs.registry import make_env_of
 from torchrl_koap.evaluation.run import load_run
-from torchrl_koap.modules import join_plan, policy_transforms
+from torchrl_koap.modules import blend_plan, policy_transforms
 from torchrl_koap.training.builders import load_demonstrations
 from torchrl_koap.training.run_directory import RunDirectory
 
@@ -27,7 +27,7 @@ from torchrl_koap.training.run_directory import RunDirectory
 @torch.no_grad()
 def follow(task, controller, paths: list[torch.Tensor], joining: float, steps: int, horizon: int = 14) -> list[float]:
     """Mean distance (mm) to the demonstration after each step, over the episodes that still run."""
-    history = controller.history + 1
+    history = controller.num_past + 1
     env = TransformedEnv(make_env_of(task)(len(paths)), policy_transforms(history))
     td, running, errors = env.reset(), torch.ones(len(paths), dtype=torch.bool), []
     columns = list(task.state_columns)
@@ -36,7 +36,7 @@ def follow(task, controller, paths: list[torch.Tensor], joining: float, steps: i
         # the state seen before step t is row t - 1 of a demonstration (row 0 repeats the start)
         rows = torch.arange(step, step + horizon)
         plan = torch.stack([path[rows.clamp_max(len(path) - 1)] for path in paths])
-        window = torch.cat([observed, join_plan(observed, plan, joining)], 1)
+        window = torch.cat([observed, blend_plan(observed, plan, joining)], 1)
         action = controller(TensorDict({"state": window}, batch_size=[len(paths)]))["action"]
         td = env.step(td.set("action", action[:, history - 1]))
         running &= ~td["next", "done"].squeeze(-1)

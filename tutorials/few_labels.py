@@ -58,7 +58,7 @@ inverse_dynamics = make_koopman_inverse_dynamics(
     state_normalizer=Normalizer.fit(data["state"], mode="standard"),
     action_normalizer=Normalizer.fit(data["action"], mode="rms", mask=data["has_action"]),
 )
-history = inverse_dynamics.history
+history = inverse_dynamics.num_past
 inverse_dynamics.fit_scales(cut_windows(data, 16, select=["state"], pad_before=history)["state"])
 loss = KOAPLoss(inverse_dynamics, action_coeff=0.0)
 buffer = make_window_buffer(data, 16, 256, select=["state", "action", "has_action"], pad_before=history)

@@ -10,9 +10,9 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import (
-    ExchangeAugmentation,
+    ObjectPermutation,
+    RandomPlanarTransform,
     RecoveryAugmentation,
-    SceneAugmentation,
     cut_windows,
     extrapolate_ends,
     make_window_buffer,
@@ -115,7 +115,7 @@ def windows(count=64, width=8):
 def test_a_moved_scene_keeps_every_distance_and_angle():
     state = windows()
     state[..., 4:6] /= state[..., 4:6].norm(dim=-1, keepdim=True)
-    augment = SceneAugmentation([(0, 1), (2, 3)], [(4, 5)], shift=0.3, turn=0.8)
+    augment = RandomPlanarTransform([(0, 1), (2, 3)], [(4, 5)], shift=0.3, turn=0.8)
     moved = augment(TensorDict({"state": state}, [64]))["state"]
 
     def seen_from_tool(values):
@@ -134,15 +134,15 @@ def test_a_moved_scene_keeps_every_distance_and_angle():
 
 def test_a_scene_may_stay_where_it_is():
     state = windows()
-    same = SceneAugmentation([(0, 1)], [(4, 5)], shift=0.0, turn=0.0)(TensorDict({"state": state}, [64]))["state"]
+    same = RandomPlanarTransform([(0, 1)], [(4, 5)], shift=0.0, turn=0.0)(TensorDict({"state": state}, [64]))["state"]
     torch.testing.assert_close(same, state)
     with pytest.raises(ValueError, match="shift and turn must be >= 0, got -1"):
-        SceneAugmentation([(0, 1)], [], shift=-1, turn=0)
+        RandomPlanarTransform([(0, 1)], [], shift=-1, turn=0)
 
 
 def test_alike_objects_are_exchanged_whole_and_all_the_time_of_a_window():
     state = windows(count=400)
-    augment = ExchangeAugmentation([[(1, 2), (3, 4)], [(5,), (6,), (7,)]])
+    augment = ObjectPermutation([[(1, 2), (3, 4)], [(5,), (6,), (7,)]])
     found = augment(TensorDict({"state": state}, [400]))["state"]
     assert torch.equal(found[..., 0], state[..., 0])
     kept = (found[..., 1:5] == state[..., 1:5]).all(-1).all(-1)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What demonstrations do not show: how to come back from a little beside them, and where they were heading."""
+"""Augmentations of windows: recovery from displacements, planar transforms, object permutations, continued ends."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchrl_koap.keys import EPISODE, STATE
 
 
 class RecoveryAugmentation(TensorDictModuleBase):
-    r"""Moves the observed frames of a window aside and lets the future come back.
+    r"""Recovery augmentation: moves the observed frames of a window aside and lets the future come back.
 
     .. math::
         x'_{t-j} = x_{t-j} + \delta, \qquad x'_{t+i} = x_{t+i} + \rho^i \delta, \qquad
@@ -86,8 +86,8 @@ class RecoveryAugmentation(TensorDictModuleBase):
         return tensordict.set(self.in_keys[0], shifted)
 
 
-class SceneAugmentation(TensorDictModuleBase):
-    """Moves and turns the whole scene, tool and objects together, about a vertical axis.
+class RandomPlanarTransform(TensorDictModuleBase):
+    """Random planar transform: moves and turns the whole scene, tool and objects together, about a vertical axis.
 
     How a tool pushes an object does not depend on where on the table that happens. A planner trained on few hundred
     demonstrations does not find that out by itself.
@@ -109,9 +109,9 @@ class SceneAugmentation(TensorDictModuleBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data import SceneAugmentation
+        >>> from torchrl_koap.data import RandomPlanarTransform
         >>> window = torch.rand(8, 16, 4)
-        >>> td = SceneAugmentation([(0, 1), (2, 3)], [], shift=0.1, turn=0.5)(TensorDict({"state": window}, [8]))
+        >>> td = RandomPlanarTransform([(0, 1), (2, 3)], [], shift=0.1, turn=0.5)(TensorDict({"state": window}, [8]))
         >>> distance = lambda state: (state[..., :2] - state[..., 2:]).norm(dim=-1)
         >>> torch.allclose(distance(td["state"]), distance(window), atol=1e-5)
         True
@@ -151,8 +151,8 @@ class SceneAugmentation(TensorDictModuleBase):
         return tensordict.set(self.in_keys[0], moved)
 
 
-class ExchangeAugmentation(TensorDictModuleBase):
-    """Exchanges objects that are alike: which of two red boxes is called the first does not matter.
+class ObjectPermutation(TensorDictModuleBase):
+    """Random permutation of interchangeable objects: which of two red boxes is called the first does not matter.
 
     Args:
         groups (sequence): for each kind of object the state columns of each of its instances, all of the same number.
@@ -161,9 +161,9 @@ class ExchangeAugmentation(TensorDictModuleBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data import ExchangeAugmentation
+        >>> from torchrl_koap.data import ObjectPermutation
         >>> windows = TensorDict({"state": torch.arange(4.0).expand(99, 5, 4)}, [99])
-        >>> td = ExchangeAugmentation([[(0, 1), (2, 3)]])(windows)
+        >>> td = ObjectPermutation([[(0, 1), (2, 3)]])(windows)
         >>> sorted(set(td["state"][:, 0, 0].tolist()))
         [0.0, 2.0]
     """

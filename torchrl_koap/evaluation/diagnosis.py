@@ -22,7 +22,7 @@ from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.keys import OBSERVATION
 from torchrl_koap.modules import StatePlanner
-from torchrl_koap.modules.policies.plan_then_control import RecordedPlanner
+from torchrl_koap.modules.policies.replay import RecordedPlanner
 from torchrl_koap.tasks import Task
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from torchrl_koap.data import limit_observations
+from torchrl_koap.data import subsample_trajectories
 from torchrl_koap.evaluation.run import Eval, run_eval
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.builders import load_demonstrations, set_up_torch
@@ -100,7 +100,7 @@ def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) ->
     data = load_demonstrations(options.dataset, task)
     data["action"] = torch.full_like(data["action"], math.nan)
     data["has_action"] = torch.zeros_like(data["has_action"])
-    data = limit_observations(data, observations).to(options.device)
+    data = subsample_trajectories(data, observations).to(options.device)
     config = configure(run, options)
     run.write_json("config.json", config)
     torch.manual_seed(options.seed)

@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
-from torchrl_koap.data import LabelBudget, flatten_trajectories, limit_observations, save_ted
+from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted, subsample_trajectories
 from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
 from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
@@ -249,7 +249,7 @@ def _check_budgets(cells: Sequence[Cell], options: Curve, data: TensorDictBase |
     # windows of another seed lie in another number of trajectories
     for fraction, share, seed in dict.fromkeys((cell.fraction, cell.observations, cell.seed) for cell in cells):
         budget = LabelBudget(fraction, unit=options.units, seed=seed, window=WINDOW, history=HISTORY)
-        limit_observations(budget.apply(data)[0], share)
+        subsample_trajectories(budget.apply(data)[0], share)
 
 
 def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:

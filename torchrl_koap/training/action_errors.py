@@ -43,9 +43,9 @@ def hidden_action_errors(
     windows = cut_windows(data, BEFORE + 1 + AFTER, select=["state", "action", "episode"], pad_before=BEFORE)
     windows = windows[~torch.isin(windows["episode"][:, -1], touched.to(windows["episode"].device))]
     device = next(iter(controller.state_dict().values())).device
-    states = windows["state"][:, BEFORE - min(controller.history, BEFORE) :].to(device)
+    states = windows["state"][:, BEFORE - min(controller.num_past, BEFORE) :].to(device)
     predicted = controller(TensorDict({"state": states}, batch_size=[len(states)]))["action"]
-    return predicted[:, min(controller.history, BEFORE)].cpu(), windows["action"][:, BEFORE]
+    return predicted[:, min(controller.num_past, BEFORE)].cpu(), windows["action"][:, BEFORE]
 
 
 def rmse_mm(predicted: Tensor, true: Tensor) -> float:

@@ -116,13 +116,12 @@ def _train_network(
     """A controller's phases, and its closed form if it has one."""
     options = train_one.options
     controller = build_controller(entry, data["state"].shape[-1], task.action_dim, data).to(options.device)
-    history = controller.history
+    history = controller.num_past
     window = max(WINDOW, controller.num_window_frames)
-    if hasattr(controller, "fit_scales"):
-        windows = cut_windows(data, window, select=["state", "has_action"], pad_before=history)
-        if method.labelled_only:
-            windows = windows[windows["has_action"].squeeze(-1).any(-1)]
-        controller.fit_scales(windows["state"])
+    windows = cut_windows(data, window, select=["state", "has_action"], pad_before=history)
+    if method.labelled_only:
+        windows = windows[windows["has_action"].squeeze(-1).any(-1)]
+    controller.fit_scales(windows["state"])
     values: dict[str, float] = {}
     budget = min(options.controller_steps, options.steps)
     table = WindowTable.build(data, window, pad_before=history)

@@ -10,9 +10,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from torchrl_koap.data import (
-    ExchangeAugmentation,
+    ObjectPermutation,
+    RandomPlanarTransform,
     RecoveryAugmentation,
-    SceneAugmentation,
     cut_windows,
     extrapolate_ends,
     make_window_buffer,
@@ -70,10 +70,10 @@ def _augmentation(options: Train, task: Task) -> TensorDictSequential:
     """What windows undergo before the planner learns from them."""
     steps = []
     if options.exchange and task.interchangeable_columns():
-        steps.append(ExchangeAugmentation(task.interchangeable_columns()))
+        steps.append(ObjectPermutation(task.interchangeable_columns()))
     if task.planar_parts and (options.scene_shift or options.scene_turn):
         shift, turn = options.scene_shift, options.scene_turn
-        steps.append(SceneAugmentation(*task.planar_columns(), shift=shift, turn=turn, history=HISTORY))
+        steps.append(RandomPlanarTransform(*task.planar_columns(), shift=shift, turn=turn, history=HISTORY))
     arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
     sigma = options.recovery_sigma
     steps.append(

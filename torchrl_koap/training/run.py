@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
-from torchrl_koap.data import WindowTable, limit_observations
+from torchrl_koap.data import WindowTable, subsample_trajectories
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import WINDOW, Task, get_task
 from torchrl_koap.training.action_errors import AFTER, BEFORE, UNITS, write_analysis
@@ -73,7 +73,7 @@ def run_train(options: Train) -> dict[str, Any]:
         )
     labelled, report = budget.apply(data, command=task.observation[task.command])
     # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
-    labelled = limit_observations(labelled, options.observation_fraction).to(options.device)
+    labelled = subsample_trajectories(labelled, options.observation_fraction).to(options.device)
     _check_lengths(options, config, task, labelled)
     run.write_json("config.json", config)  # not before the data are known to be good: a wrong call leaves nothing
 
@@ -116,7 +116,7 @@ def _check_lengths(options: Train, config: dict[str, Any], task: Task, data: Ten
         return
     width = len(task.controller_columns(options.controller_state))
     controller = build_controller(config["controller"], width, task.action_dim)
-    WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.history)
+    WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.num_past)
     if options.analysis:
         WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
 
