@@ -12,8 +12,8 @@ from torchrl_koap.envs.experts.path_planning import (
     SHAPE,
     STEP,
     descent,
-    square_distance,
     solve_eikonal,
+    square_distance,
     value_at,
 )
 

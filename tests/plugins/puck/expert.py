@@ -38,14 +38,15 @@ class PuckExpert:
         if self.finished[row]:
             return np.zeros(2)
         ahead = (target - puck) / max(np.linalg.norm(target - puck), 1e-9)
+        across = np.array([-ahead[1], ahead[0]])
         off = robot - puck
-        along, aside = off @ ahead, off - (off @ ahead) * ahead
-        if along < -0.7 * REACH:  # behind the puck: push, and come back to the line
-            wanted = SPEED * ahead - 0.5 * aside
-        else:  # around it
-            side = aside / max(np.linalg.norm(aside), 1e-9) if np.linalg.norm(aside) > 1e-6 else ahead[::-1] * (1, -1)
-            if np.linalg.norm(aside) < REACH + 0.01:
-                wanted = SPEED * (side - 0.3 * ahead)
-            else:
-                wanted = -SPEED * ahead
-        return wanted * min(1.0, SPEED / max(np.linalg.norm(wanted), 1e-9))
+        along, aside = off @ ahead, off @ across
+        if along < -0.75 * REACH and abs(aside) < 0.5 * REACH:  # behind the puck: push, and come back to the line
+            wanted = ahead - np.clip(80 * aside, -3, 3) * across
+        elif along < -0.75 * REACH:  # to a place behind it
+            wanted = -1.5 * REACH * ahead - off
+        elif abs(aside) < 1.5 * REACH:  # make room beside it first
+            wanted = np.copysign(1.0, aside) * across - 0.2 * ahead
+        else:
+            wanted = -ahead
+        return SPEED * wanted / np.linalg.norm(wanted)

@@ -28,8 +28,8 @@ from torchrl_koap.envs.experts.path_planning import (
     SHAPE,
     STEP,
     descent,
-    square_distance,
     solve_eikonal,
+    square_distance,
     value_at,
 )
 from torchrl_koap.envs.experts.recording import RecordingRules
