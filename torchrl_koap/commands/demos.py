@@ -58,5 +58,6 @@ def run_demos(options: Demos) -> RecordingReport:
         )
     data = episodes_to_ted(raw, task.name)
     save_ted(data, options.out / "ted", task=task.source, notes={"seed": options.seed, "modes": list(report.modes)})
-    write_raw_episodes(options.out / "raw", raw)
+    if task.converter is not None:
+        write_raw_episodes(options.out / "raw", raw)
     return report
