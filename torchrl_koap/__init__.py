@@ -1,4 +1,45 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """TorchRL components for imitation learning with few action labels."""
 
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
 __version__ = "0.1.0"
+
+# imported when first asked for: a network or a task costs no simulator, a version no torch
+_LAZY = {
+    "CurveConfig": "torchrl_koap.studies",
+    "EvalConfig": "torchrl_koap.evaluation",
+    "TrainConfig": "torchrl_koap.training",
+    "evaluate": "torchrl_koap.evaluation",
+    "load_policy": "torchrl_koap.evaluation",
+    "register_method": "torchrl_koap.training",
+    "register_task": "torchrl_koap.tasks",
+    "run_curve": "torchrl_koap.studies",
+    "train": "torchrl_koap.training",
+}
+
+__all__ = [  # noqa: F822 - __getattr__ finds them
+    "CurveConfig",
+    "EvalConfig",
+    "TrainConfig",
+    "__version__",
+    "evaluate",
+    "load_policy",
+    "register_method",
+    "register_task",
+    "run_curve",
+    "train",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_LAZY[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})

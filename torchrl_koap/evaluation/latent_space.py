@@ -282,3 +282,14 @@ def analyse_latent(
         "decoder_r2": own,
     }
     return result
+
+
+def error_unit(part: str) -> str:
+    """Unit in which errors of a part of the state are shown, a thousandth of that in the data.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.latent_space import error_unit
+        >>> error_unit("measured_xy"), error_unit("measured_joints")
+        ('mm', 'mrad')
+    """
+    return "mrad" if "joints" in part else "mm"

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from torchrl_koap.evaluation.latent_space import MODELS, OUTSIDE_THE_BUDGET
+from torchrl_koap.evaluation.latent_space import MODELS, OUTSIDE_THE_BUDGET, error_unit
 from torchrl_koap.reports.scenes import FAINT, INK, MUTED, set_title, tidy
 from torchrl_koap.reports.training_plots import BLUE, ORANGE, as_array, save_figure
 from torchrl_koap.tasks import Task
@@ -40,7 +40,7 @@ def plot_latent(latent: Mapping[str, Any], path: str | Path, *, task: Task, eige
 
     Examples:
         >>> import tempfile
-        >>> from torchrl_koap.evaluation.latent_space import MODELS, OUTSIDE_THE_BUDGET
+        >>> from torchrl_koap.evaluation.latent_space import MODELS, OUTSIDE_THE_BUDGET, error_unit
         >>> from torchrl_koap.reports.latent_plot import plot_latent
         >>> from torchrl_koap.tasks import get_task
         >>> errors = {name: {"measured_xy": [0.001, 0.002]} for name in MODELS}
@@ -80,17 +80,6 @@ def action_names(task: Task) -> list[str]:
     if task.action_unit == "rad":
         return [*(f"joint {index + 1}" for index in range(task.same_unit)), "gripper"]
     return list("xyz"[: task.action_dim])
-
-
-def error_unit(part: str) -> str:
-    """Unit in which errors of a part of the state are shown, a thousandth of that in the data.
-
-    Examples:
-        >>> from torchrl_koap.reports.latent_plot import error_unit
-        >>> error_unit("measured_xy"), error_unit("measured_joints")
-        ('mm', 'mrad')
-    """
-    return "mrad" if "joints" in part else "mm"
 
 
 def _draw_spectrum(axes: Axes, values: np.ndarray, facts: Mapping[str, Any]) -> None:
