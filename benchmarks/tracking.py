@@ -19,8 +19,8 @@ from torchrl.envs.utils import step_mdp
 from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.evaluation.run import load_run
 from torchrl_koap.modules import join_plan, policy_transforms
-from torchrl_koap.training.builders import load_demonstrations, make_env_of
-from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.training.builders import make_env_of
+from torchrl_koap.training.datasets import load_demonstrations
 
 
 @torch.no_grad()
@@ -57,7 +57,8 @@ def main() -> None:
     arguments = parser.parse_args()
     print(f"{'run':<20}{'joining':>8}" + "".join(f"{f'step {step}':>12}" for step in arguments.steps) + "   (mm)")
     for run in arguments.runs:
-        task, _, controller = load_run(RunDirectory(run))
+        trained = load_run(run)
+        task, controller = trained.task, trained.controller
         data = load_demonstrations(arguments.dataset, task)
         paths = data["state"].split(trajectory_lengths(data).tolist())[: arguments.episodes]
         for joining in (0.0, 0.8):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from torchrl_koap.commands.cli import Command
+from torchrl_koap.commands.cli import Subcommand
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -43,7 +43,7 @@ def test_targets_exist(target):
 
 @pytest.mark.parametrize("arguments", CALLS, ids=" ".join)
 def test_commands_parse(arguments):
-    options = tyro.cli(Command, args=arguments, prog="koap")
+    options = tyro.cli(Subcommand, args=arguments, prog="koap")
     assert type(options).__name__.lower() == arguments[0]
 
 
@@ -54,9 +54,13 @@ def test_every_command_is_shown():
 
 def test_the_demo_is_the_contract():
     """`make demo` trains on 2 % of the trajectories and rolls out 60 times."""
-    train, evaluation = (tyro.cli(Command, args=words[1:], prog="koap") for words in RECIPES)
-    assert (train.label_fraction, train.label_unit, train.dataset) == (0.02, "trajectory", "scripted")
-    assert (evaluation.run, evaluation.episodes, train.out) == (train.out, 60, evaluation.run)
+    train, evaluation = (tyro.cli(Subcommand, args=words[1:], prog="koap") for words in RECIPES)
+    assert (train.config.label_fraction, train.config.label_unit, train.config.dataset) == (
+        0.02,
+        "trajectory",
+        "scripted",
+    )
+    assert (evaluation.run, evaluation.config.episodes) == (train.config.out, 60)
 
 
 @pytest.mark.parametrize("code", [block for language, block in BLOCKS if language == "python"])

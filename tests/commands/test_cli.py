@@ -19,11 +19,13 @@ import pytest
 import torch
 from tiny_runs import TINY, grid, koap, write_demonstrations
 
+from torchrl_koap.commands.cli import HINT
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import checkpoints
-from torchrl_koap.training.builders import build_controller, load_demonstrations
+from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.checkpoints import load_tensors, save_tensors
+from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.run_directory import RunDirectory
 
 TASK = get_task("avoiding")
@@ -55,7 +57,7 @@ def copied_run(trained_run, tmp_path):
 @pytest.fixture
 def no_report(monkeypatch):
     """Rollouts without pictures, which have tests of their own."""
-    monkeypatch.setattr("torchrl_koap.evaluation.run.write_report", lambda *arguments, **options: None)
+    monkeypatch.setattr("torchrl_koap.commands.eval.write_report", lambda *arguments, **options: None)
 
 
 # koap train
@@ -506,7 +508,10 @@ def test_a_full_disk_damages_no_earlier_evaluation(copied_run, monkeypatch, caps
     before = contents(copied_run)
     monkeypatch.setattr(os, "replace", full_disk)
     assert koap("eval", copied_run, "--episodes", 2, "--threads", 1) == 1
-    assert capsys.readouterr().err.strip().splitlines()[-1] == "koap: [Errno 28] No space left on device"
+    assert (
+        capsys.readouterr().err.strip().splitlines()[-1]
+        == "koap: [Errno 28] No space left on device (KOAP_TRACEBACK=1 shows where)"
+    )
     assert contents(copied_run) == before
 
 
@@ -544,10 +549,8 @@ def test_as_a_program(tmp_path):
     command = [str(program)] if program.exists() else [sys.executable, "-m", "torchrl_koap.commands.cli"]
     wrong = subprocess.run([*command, "eval", str(tmp_path / "none")], capture_output=True, text=True)
     assert wrong.returncode == 1 and wrong.stdout == ""
-    assert (
-        wrong.stderr
-        == f"koap: {tmp_path}/none/config.json is missing: is {tmp_path}/none the folder of a finished `koap train`?\n"
-    )
+    missing = f"{tmp_path}/none/config.json is missing: is {tmp_path}/none the folder of a finished `koap train`?"
+    assert wrong.stderr == f"koap: {missing} ({HINT})\n"
 
 
 def test_doctor_lists_versions(capsys):

@@ -30,7 +30,7 @@ ALL = [("planner", 50), ("planner", 100), ("planner", 150), ("controller", 50), 
 def test_rows_are_read_back(run):
     assert steps_of(run) == ALL
     rows = run.read_metrics()
-    assert tuple(rows[0]) == RunDirectory.COLUMNS
+    assert tuple(rows[0]) == ("phase", "step", "loss_planner", "loss_action")
     assert rows[1]["loss_planner"] == "0.1" and rows[1]["loss_action"] == ""
     assert run.last_metrics("planner") == {"loss_planner": 0.15}
     assert run.last_metrics("controller") == {"loss_action": 0.1}
