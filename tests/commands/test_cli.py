@@ -19,6 +19,7 @@ import pytest
 import torch
 from tiny_runs import TINY, grid, koap, write_demonstrations
 
+import torchrl_koap
 from torchrl_koap.commands.cli import HINT
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.tasks import get_task
@@ -508,10 +509,8 @@ def test_a_full_disk_damages_no_earlier_evaluation(copied_run, monkeypatch, caps
     before = contents(copied_run)
     monkeypatch.setattr(os, "replace", full_disk)
     assert koap("eval", copied_run, "--episodes", 2, "--threads", 1) == 1
-    assert (
-        capsys.readouterr().err.strip().splitlines()[-1]
-        == "koap: [Errno 28] No space left on device (KOAP_TRACEBACK=1 shows where)"
-    )
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line == f"koap: [Errno 28] No space left on device ({HINT})"
     assert contents(copied_run) == before
 
 
@@ -601,3 +600,48 @@ def test_wandb_that_is_not_installed_names_the_extra(demonstrations, tmp_path, m
     command = ["train", "--out", tmp_path / "run", "--dataset", demonstrations, *TINY, "--logger", "wandb"]
     assert "pip install 'torchrl_koap[wandb]'" in fails(capsys, *command)
     assert not (tmp_path / "run").exists()
+
+
+# what every command has
+
+
+def test_version(capsys):
+    assert koap("--version") == 0
+    assert capsys.readouterr().out == f"koap {torchrl_koap.__version__}\n"
+
+
+def test_quiet_says_nothing_but_what_went_wrong(demonstrations, tmp_path, capsys):
+    command = ("train", "--out", tmp_path / "run", "--dataset", demonstrations, *TINY, "--quiet")
+    assert koap(*command) == 0
+    assert capsys.readouterr() == ("", "")
+    assert "holds a run already" in fails(capsys, *command)
+
+
+def test_two_trainings_in_one_folder(copied_run, capsys):
+    """The second one is refused while the first one works, and leaves the folder alone."""
+    with RunDirectory(copied_run).locked("koap train"):
+        before = contents(copied_run)
+        line = fails(capsys, "train", "--out", copied_run, "--resume")
+        assert f"another `koap train` is working in {copied_run}" in line
+        assert contents(copied_run) == before
+
+
+def test_two_trainings_that_begin_together(demonstrations, tmp_path, capsys, monkeypatch):
+    """Both found a new folder; while one reads its demonstrations the other one begins, or is through."""
+    from torchrl_koap.training import run
+
+    out, load = tmp_path / "run", run.load_demonstrations
+    command = ("train", "--out", out, "--dataset", demonstrations, *TINY, "--quiet")
+
+    def meanwhile(*arguments, **options):
+        monkeypatch.setattr(run, "load_demonstrations", load)
+        assert koap(*command) == 0
+        return load(*arguments, **options)
+
+    monkeypatch.setattr(run, "load_demonstrations", meanwhile)
+    assert "holds a run already" in fails(capsys, *command)
+    assert (out / "summary.json").exists()
+
+
+def test_every_error_line_says_how_to_see_more(capsys, tmp_path):
+    assert fails(capsys, "eval", tmp_path).endswith("(KOAP_TRACEBACK=1 shows where)")

@@ -33,7 +33,7 @@ class NearestNeighbours(TensorDictModuleBase):
         self.register_buffer("actions", torch.zeros(0, action_dim))
 
     def features(self, state):
-        """Displacements ``[*B, T, (BEFORE + AFTER) d]`` of the frames around each; frames beyond a window are its ends."""
+        """Displacements ``[*B, T, (BEFORE + AFTER) d]`` of the frames around each; a window ends in repeated frames."""
         state = self.state_normalizer(state)
         frames = torch.arange(state.shape[-2], device=state.device)
         offsets = [offset for offset in range(-BEFORE, AFTER + 1) if offset]
