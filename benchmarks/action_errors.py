@@ -35,7 +35,7 @@ def action_error(task, data, method: str, fraction: float, seed: int, updates: i
         torch.manual_seed(seed)
         controller, _, _ = train_controller(RunDirectory(folder), resolved, labelled)
     predicted, true = hidden_action_errors(controller, controller_view(data, resolved.columns), labelled)
-    same = slice(task.same_unit)  # a gripper's number has no unit
+    same = task.action_columns()  # a gripper's number has no unit
     return rmse_mm(predicted[:, same], true[:, same])
 
 

@@ -50,7 +50,7 @@ def train_unlabelled(data: TensorDictBase, task: Task, preset: str, updates: int
     # the action normaliser is replaced before every fit; nothing else of the first trajectory's labels is used
     controller = build_controller(options, data["state"].shape[-1], task.action_dim, within(data, [0]))
     window = max(WINDOW, controller.num_window_frames)
-    history = controller.history
+    history = controller.num_past
     controller.fit_scales(cut_windows(data, window, select=["state"], pad_before=history)["state"])
     keys = ["state", "action", "has_action"]
     buffer = make_window_buffer(within(data, []), window, 256, select=keys, pad_before=history)

@@ -12,8 +12,10 @@ __version__ = "0.1.0"
 _LAZY = {
     "CurveConfig": "torchrl_koap.studies",
     "EvalConfig": "torchrl_koap.evaluation",
+    "Task": "torchrl_koap.tasks",
     "TrainConfig": "torchrl_koap.training",
     "evaluate": "torchrl_koap.evaluation",
+    "get_task": "torchrl_koap.tasks",
     "load_policy": "torchrl_koap.evaluation",
     "register_method": "torchrl_koap.training",
     "register_task": "torchrl_koap.tasks",
@@ -24,9 +26,11 @@ _LAZY = {
 __all__ = [  # noqa: F822 - __getattr__ finds them
     "CurveConfig",
     "EvalConfig",
+    "Task",
     "TrainConfig",
     "__version__",
     "evaluate",
+    "get_task",
     "load_policy",
     "register_method",
     "register_task",

@@ -77,16 +77,16 @@ def train(loss, data, history, *, labelled_share, updates=300):
 
 def koap(data):
     model = make_koopman_inverse_dynamics(2, 2, **normalizers(data))
-    model.fit_scales(cut_windows(data, 16, select=["state"], pad_before=model.history)["state"])
-    train(KOAPLoss(model, action_coeff=0.0), data, model.history, labelled_share=None)
+    model.fit_scales(cut_windows(data, 16, select=["state"], pad_before=model.num_past)["state"])
+    train(KOAPLoss(model, action_coeff=0.0), data, model.num_past, labelled_share=None)
     fit_closed_form(model, data, shared_axes=task.actuated)
     return model
 
 
 def supervised(data):
     model = SupervisedInverseDynamics(2, 2, look_ahead=(1, 2, 3, 4, 5), **normalizers(data))
-    model.fit_scales(cut_windows(data, 16, select=["state"], pad_before=model.history)["state"])
-    train(InverseDynamicsLoss(model), data, model.history, labelled_share=1.0)
+    model.fit_scales(cut_windows(data, 16, select=["state"], pad_before=model.num_past)["state"])
+    train(InverseDynamicsLoss(model), data, model.num_past, labelled_share=1.0)
     return model
 
 
@@ -105,7 +105,7 @@ def ridge(data):
 
 class Proportional(TensorDictModuleBase):
     in_keys, out_keys = ["state"], ["action"]
-    history, num_window_frames = 0, 4
+    num_past, num_window_frames = 0, 4
 
     def __init__(self):
         super().__init__()

@@ -27,7 +27,7 @@ NETWORKS = ("mlp", "lstm", "fourier")
 
 def make_network(kind="mlp", *, clamped=False, normalizers=True, dropout=0.0, seed=0):
     torch.manual_seed(seed)
-    frames = {"history": HISTORY, "look_ahead": K, "clamped": clamped}
+    frames = {"num_past": HISTORY, "look_ahead": K, "clamped": clamped}
     if kind == "mlp":
         latent_action = LatentActionMLP(3, 4, hidden_dims=(16,), dropout=dropout, **frames)
     elif kind == "lstm":
@@ -309,7 +309,7 @@ def test_keys_of_the_network_are_taken_over_and_renaming_reaches_it():
     assert network.in_keys == ["x"] and network.out_keys[-1] == "a"
     assert network(TensorDict({"x": renamed["window"]}, [3]))["a"].shape == (3, T, 2)
     loss.set_keys(state=None)
-    assert network.in_keys == ["state"] and network.state_key == "state"
+    assert network.in_keys == ["state"] and network.in_key == "state"
 
 
 @pytest.mark.parametrize("entry", ["has_action", "padded"])

@@ -9,24 +9,22 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.objectives import LossModule
 
+from torchrl_koap.modules import InverseDynamics
 from torchrl_koap.training import Method, Phase, register_method
 
 BEFORE, AFTER = 1, 4  # frames of a window that are compared
 
 
-class NearestNeighbours(TensorDictModuleBase):
+class NearestNeighbours(InverseDynamics):
     """Actions of the remembered windows, weighted by ``softmax(-|weight (x - x_i)|^2)``."""
 
-    history, num_window_frames = BEFORE, BEFORE + 1 + AFTER
+    num_past, num_window_frames = BEFORE, BEFORE + 1 + AFTER
 
-    def __init__(self, state_dim, action_dim, *, state_normalizer, action_normalizer):
-        super().__init__()
-        self.in_keys, self.out_keys = ["state"], ["action"]
-        self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
+    def __init__(self, state_dim, action_dim, **normalizers):
+        super().__init__(**normalizers)
         width = (BEFORE + AFTER) * state_dim
         self.weight = nn.Parameter(torch.ones(width))
         self.register_buffer("windows", torch.zeros(0, width))
@@ -34,7 +32,7 @@ class NearestNeighbours(TensorDictModuleBase):
 
     def features(self, state):
         """Displacements ``[*B, T, (BEFORE + AFTER) d]`` of the frames around each; a window ends in repeated frames."""
-        state = self.state_normalizer(state)
+        state = self.normalize_state(state)
         frames = torch.arange(state.shape[-2], device=state.device)
         offsets = [offset for offset in range(-BEFORE, AFTER + 1) if offset]
         around = [state[..., (frames + offset).clamp(0, len(frames) - 1), :] - state for offset in offsets]
@@ -49,14 +47,14 @@ class NearestNeighbours(TensorDictModuleBase):
 
     def forward(self, tensordict):
         """Writes the action of every frame."""
-        found = self.average(self.features(tensordict["state"]), self.windows, self.actions)
-        return tensordict.set("action", self.action_normalizer.inverse(found))
+        found = self.average(self.features(tensordict.get(self.in_key)), self.windows, self.actions)
+        return tensordict.set(self.out_key, self.raw_action(found))
 
     @torch.no_grad()
     def fit_decoder(self, windows, mask, *, groups=None):
         """Remembers the windows of the labelled frames."""
         self.windows = self.features(windows["state"])[mask].clone()
-        self.actions = self.action_normalizer(windows["action"][mask])
+        self.actions = self.normalize_action(windows["action"][mask])
         return {"labels_used": int(mask.sum())}
 
     def _load_from_state_dict(self, state_dict, prefix, *rest):
@@ -79,7 +77,7 @@ class NeighboursLoss(LossModule):
         frames = slice(BEFORE, tensordict["state"].shape[-2] - AFTER)
         shown = tensordict["has_action"][:, frames, 0]
         features = self.controller.features(tensordict["state"])[:, frames][shown]
-        actions = self.controller.action_normalizer(tensordict["action"][:, frames][shown])
+        actions = self.controller.normalize_action(tensordict["action"][:, frames][shown])
         itself = torch.cdist(features, features) < 1e-6  # the same step may be in two windows
         itself &= ~itself.all(-1, keepdim=True)
         found = self.controller.average(features, features, actions, itself)

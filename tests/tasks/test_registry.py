@@ -36,17 +36,14 @@ def test_columns_of_every_task(name):
 def test_hidden_parts_are_no_state():
     task = Task(
         name="toy",
-        observation={"desired": slice(0, 1), "measured": slice(1, 3), "yaw": slice(3, 4), "box": slice(4, 6)},
+        observation_parts={"desired": 1, "measured": 2, "yaw": 1, "box": 2},
         command="desired",
         position="measured",
-        action_dim=1,
-        max_steps=1,
-        control_hz=1.0,
-        num_modes=1,
+        actions={"x": "m"},
         hidden=("yaw",),
     )
     assert task.state_columns == (1, 2, 4, 5)
-    assert task.observation_dim == 6
+    assert task.observation_dim == 6 and task.num_modes == 1
 
 
 def test_unknown_names_suggest_the_nearest():

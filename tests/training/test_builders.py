@@ -12,14 +12,13 @@ from tensordict import TensorDict
 from tiny_runs import demonstration, write_demonstrations
 
 from torchrl_koap.data import LabelBudget, save_ted
+from torchrl_koap.envs.registry import make_env_of, mode_index_of
 from torchrl_koap.keys import validate
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.builders import (
     NORMALIZATION,
     build_controller,
-    make_env_of,
-    mode_index_of,
     set_up_torch,
 )
 from torchrl_koap.training.datasets import load_demonstrations

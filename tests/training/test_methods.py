@@ -60,7 +60,7 @@ def test_every_phase_trains_what_acts_on_windows_with_and_without_labels(name, d
         window = max(WINDOW, controller.num_window_frames)
         share = {"all": None, "mixed": 0.25, "labelled": 1.0}[phase.windows]
         keys = ["state", "action", "has_action"]
-        buffer = make_window_buffer(data, window, 8, select=keys, pad_before=controller.history, labelled_share=share)
+        buffer = make_window_buffer(data, window, 8, select=keys, pad_before=controller.num_past, labelled_share=share)
         batch = buffer.sample()
         if phase.windows == "labelled":
             assert batch["has_action"].any((1, 2)).all()

@@ -50,7 +50,7 @@ class Demos(Command):
         for name in ("ted", "raw"):
             if (self.out / name).exists():
                 raise FileExistsError(f"{self.out / name} exists already; choose another --out")
-        episodes = task.demonstrations if self.episodes is None else self.episodes
+        episodes = task.defaults.demonstrations if self.episodes is None else self.episodes
         with progress_bar(episodes, "recording", unit="episode") as bar:
             raw, report = record_episodes(task.name, episodes, self.seed, self.threads, count_up_to(bar))
         data = episodes_to_ted(raw, task.name)

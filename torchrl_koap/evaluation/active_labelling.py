@@ -246,7 +246,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
     data = load_demonstrations(dataset, task, episodes=episodes)
     # from here on everything outside the budget is NaN
     data, report = trained.budget.apply(data, command=task.observation[task.command])
-    if report.as_dict() != directory.read_entry("summary.json", "labels"):
+    recorded = directory.read_entry("summary.json", "labels")  # runs of older versions name fewer facts
+    if {name: report.as_dict().get(name) for name in recorded} != recorded:
         raise ValueError(f"the demonstrations of {dataset!r} are not those that {directory.path} was trained on")
     steps = infer_steps(controller, controller_view(data, trained.columns))
     choices = rank_trajectories(

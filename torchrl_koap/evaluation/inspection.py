@@ -26,7 +26,7 @@ from torchrl_koap.evaluation.rollouts import make_policy, roll_out
 from torchrl_koap.evaluation.run import TrainedRun, choose_contexts, load_run
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task
-from torchrl_koap.training.builders import make_env_of, set_up_torch
+from torchrl_koap.training.builders import set_up_torch
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import progress_bar
@@ -122,11 +122,13 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
     planner, controller = trained.planner.to(config.device), trained.controller.to(config.device)
     settings = {
         "replan_interval": config.replan_interval,
-        "joining": config.blend_decay,
+        "blend_decay": config.blend_decay,
         "controller_columns": trained.columns,
         "gripper": task.gripper,
     }
     seeds = list(range(config.seed, config.seed + config.episodes))
+    from torchrl_koap.envs.registry import make_env_of  # takes seconds
+
     make_env = make_env_of(task, num_threads=config.threads)
     _, contexts = choose_contexts(task, config.episodes)
     with progress_bar(3, "experiments", unit="experiment") as bar:

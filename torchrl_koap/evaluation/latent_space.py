@@ -64,8 +64,8 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
         TensorDict: ``[M]`` with ``latent_action [M, m]``, ``action``, ``has_action [M]`` and ``episode [M]``.
     """
     keys = [STATE, ACTION, HAS_ACTION, EPISODE]
-    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.history)
-    now = controller.history
+    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
+    now = controller.num_past
     parts = windows[STATE].split(4096)
     latent = torch.cat([controller.infer(part, range(now, now + 1)).squeeze(-2) for part in parts])
     here = windows[:, now]
@@ -139,7 +139,7 @@ def prediction_errors(
     """
     if horizon < 1:
         raise ValueError(f"horizon must be >= 1 step, got {horizon}")
-    now, length = controller.history, controller.num_window_frames + horizon - 1
+    now, length = controller.num_past, controller.num_window_frames + horizon - 1
     windows = cut_windows(data, length, select=[STATE, EPISODE], pad_before=now)
     fitted = torch.isin(windows[EPISODE][:, -1], fit_on)
     known, new = (windows[STATE][rows] for rows in (fitted, ~fitted))
@@ -180,7 +180,7 @@ def _frames_read(controller: KoopmanInverseDynamics, states: Tensor, frames: ran
 
 
 def _fit_linear(controller: KoopmanInverseDynamics, states: Tensor) -> Tensor:
-    now = controller.history
+    now = controller.num_past
     normalized = controller.normalize_state(states).double()
     inputs = torch.cat([normalized[:, now], _frames_read(controller, states, range(now, now + 1))[:, 0]], -1)
     # x_t is among the frames read: only an SVD finds the smallest of the many best answers
@@ -263,7 +263,7 @@ def analyse_latent(
     if hasattr(controller.operator, "eigenvalues"):
         result["eigenvalues"] = spectrum(controller.operator.eigenvalues())
     fit_on = split_trajectories(data[EPISODE], labelled, seed=seed)
-    reach = controller.num_window_frames - 1 - controller.history
+    reach = controller.num_window_frames - 1 - controller.num_past
     horizon = min(horizon, max(1, int(trajectory_lengths(data).min()) - reach))
     held_out = int(len(data[EPISODE].unique()) - len(fit_on))
     errors = prediction_errors(controller, data, fit_on, parts, horizon=horizon)

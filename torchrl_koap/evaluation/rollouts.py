@@ -7,6 +7,7 @@ import itertools
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -19,14 +20,10 @@ from torchrl_koap.evaluation.scores import OUTCOMES, outcome_of
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.diffusion.schedule import SOLVERS
-from torchrl_koap.modules.policies.plan_then_control import (
-    NOISE,
-    OBSERVATION_HISTORY,
-    EpisodeNoise,
-    PlanThenControl,
-    RecordedFutures,
-    policy_transforms,
-)
+from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
+from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
+from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
+from torchrl_koap.tasks.gripper import command_gripper
 
 
 def make_policy(
@@ -36,21 +33,22 @@ def make_policy(
     state_columns: Sequence[int] | Callable[[Tensor], Tensor],
     execution: str = "feedback",
     replan_interval: int = 4,
-    joining: float = 0.8,
+    blend_decay: float = 0.8,
     controller_columns: Sequence[int] | None = None,
     gripper: tuple[int, int] | None = None,
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two."""
+    rule = None if gripper is None else partial(command_gripper, entry=gripper[0], column=gripper[1])
     return PlanThenControl(
         planner,
         controller,
         state_columns=state_columns,
-        history=max(planner.history, controller.history + 1),
+        history=max(planner.history, controller.num_past + 1),
         execution=execution,
         replan_interval=replan_interval,
-        joining=joining,
+        blend_decay=blend_decay,
         controller_columns=controller_columns,
-        gripper=gripper,
+        action_rule=rule,
     )
 
 
@@ -78,7 +76,7 @@ def roll_out(
         batch_size (int, optional): episodes at a time. Default: all. Outcomes do not depend on it.
         contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
         futures (Tensor, optional): recorded futures ``[E, steps, H, d]`` for a policy whose planner is a
-            :class:`~torchrl_koap.modules.policies.plan_then_control.RecordedPlanner`.
+            :class:`~torchrl_koap.modules.policies.replay.RecordedPlanner`.
         progress (callable, optional): called with the number of episodes finished.
 
     Returns:
@@ -116,7 +114,9 @@ def roll_out(
             )
         finally:
             env.close()
-        rollout = rollout.exclude(NOISE, OBSERVATION_HISTORY, ("next", OBSERVATION_HISTORY), "remaining_plan")
+        rollout = rollout.exclude(
+            NOISE, RECORDED_FUTURE, OBSERVATION_HISTORY, ("next", OBSERVATION_HISTORY), "remaining_plan"
+        )
         done = rollout["next", "done"].squeeze(-1)
         lengths = torch.where(done.any(-1), done.int().argmax(-1) + 1, done.shape[-1])
         episodes += [rollout[index, :length] for index, length in enumerate(lengths.tolist())]

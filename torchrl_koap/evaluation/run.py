@@ -14,12 +14,12 @@ from torch import nn
 
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.evaluation.rollouts import make_policy, measure_latency, roll_out, rollouts_to_tensors
-from torchrl_koap.evaluation.scores import d3il_score, score, stacking_scores
+from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ChunkedPolicy, StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, get_task
-from torchrl_koap.training.builders import build_controller, make_env_of, method_named, mode_index_of, set_up_torch
+from torchrl_koap.training.builders import build_controller, method_named, set_up_torch
 from torchrl_koap.training.checkpoints import load_weights, save_tensors
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.methods import Method
@@ -171,7 +171,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             state_columns=task.state_of,
             execution=config.execution,
             replan_interval=config.replan_interval,
-            joining=config.blend_decay,
+            blend_decay=config.blend_decay,
             controller_columns=trained.columns,
             gripper=task.gripper,
         )
@@ -241,6 +241,8 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     sampler = trained.controller if trained.planner is None else trained.planner
     seeds = list(range(config.seed, config.seed + config.episodes))
     numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
+    from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
+
     mode_index = mode_index_of(task)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
         episodes = roll_out(
@@ -252,13 +254,11 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
             contexts=contexts,
             progress=count_up_to(bar),
         )
-    unsolved = "zero" if task.entropy == "contexts" else "skip"
+    unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
     result = score(
         episodes, seeds, num_modes=task.num_modes, mode_index=mode_index, contexts=numbers, unsolved=unsolved
     )
-    if task.source == "stacking":
-        result |= stacking_scores(episodes, numbers, complete=task.name == "stacking")
-    result |= d3il_score(task, result)
+    result |= task_scores(task, result, episodes, numbers)
     rows = result.pop("episode")
     result |= measure_latency(policy, task.observation_dim)
     result |= {
@@ -274,7 +274,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         position=task.observation[task.position],
         mode_index=mode_index,
         interval=config.replan_interval,
-        objects=[task.observation[part] for part in task.drawn.values()],
+        objects=[task.observation[part] for part in task.plotted.values()],
         plans_position=task.plans_position,
     )
     if contexts is not None:  # in full precision: a film of the same episode starts from it

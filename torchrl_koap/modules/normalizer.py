@@ -133,14 +133,6 @@ class Normalizer(nn.Module):
         offset, scale = self._statistics(values)
         return values * scale + offset
 
-    def scale_difference(self, differences: torch.Tensor) -> torch.Tensor:
-        """Normalises differences of values ``[*B, d]``, which have no offset."""
-        return differences / self._statistics(differences)[1]
-
-    def unscale_difference(self, differences: torch.Tensor) -> torch.Tensor:
-        """Turns normalised differences ``[*B, d]`` back."""
-        return differences * self._statistics(differences)[1]
-
     def extra_repr(self) -> str:
         """Size for printing."""
         return f"{self.offset.shape[0]} columns" if self.is_fitted else "no statistics"

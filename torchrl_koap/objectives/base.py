@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictParams
+from tensordict.nn import TensorDictParams
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 
 def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
@@ -45,11 +46,9 @@ class WindowLoss(LossModule):
     """Base of the losses on windows of states of which some frames have an action label.
 
     Args:
-        network (TensorDictModuleBase): the model; has ``set_keys(state=, action=)``.
+        network (InverseDynamics): the controller; its entries of states and actions are those of the loss.
 
     Keyword Args:
-        state_key (NestedKey): the network's entry of states.
-        action_key (NestedKey): the network's entry of actions.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
     Raises:
@@ -77,21 +76,19 @@ class WindowLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    network: TensorDictModuleBase
+    network: InverseDynamics
     network_params: TensorDictParams
     target_network_params: TensorDictParams
 
     uses_labels = False
 
-    def __init__(
-        self, network: TensorDictModuleBase, *, state_key: NestedKey, action_key: NestedKey, reduction: str = "mean"
-    ):
+    def __init__(self, network: InverseDynamics, *, reduction: str = "mean"):
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         super().__init__()
         self.convert_to_functional(network, "network", create_target_params=False)
         self.reduction = reduction
-        super().set_keys(state=state_key, action=action_key)
+        super().set_keys(state=network.in_key, action=network.out_key)
 
     def set_keys(self, **kwargs) -> None:
         """Renames entries (None: back to the default); ``state`` and ``action`` are renamed in the network too."""

@@ -30,7 +30,7 @@ class _KoopmanLoss(WindowLoss):
     target_network_params: TensorDictParams
 
     def __init__(self, network: KoopmanInverseDynamics, *, reduction: str = "mean"):
-        super().__init__(network, state_key=network.state_key, action_key=network.action_key, reduction=reduction)
+        super().__init__(network, reduction=reduction)
 
     def _reconstruction(self, state: Tensor, lifted: Tensor) -> Tensor:
         target = self.network.normalize_state(state)

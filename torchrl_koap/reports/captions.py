@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from torchrl_koap.reports.objects import OBJECTS
+from torchrl_koap.tasks.registry import find_task
 
 _FILM = (
     "Recorded commands, played again in the simulator: the first success, or the first rollout if there is none. Long"
@@ -67,33 +67,6 @@ CAPTIONS = {
         " magnitudes in order, with the time in which such a part of the state fades.",
     ),
 }
-_BOXES = (
-    " The second panel shows the boxes: pale outlines where they start, paths in their colours, a dot where they end, a"
-    " cross in rollouts that failed."
-)
-_SORTING = (
-    _BOXES
-    + " The grey square is the platform, the coloured frames are the bins. Look for boxes that end in a bin of the"
-    " other colour, beside the bins, or nowhere near them."
-)
-_STACKING = (
-    _BOXES + " The circle is how near to the zone's centre a box must come. A dot at its rim is a box that was still in"
-    " the gripper when the rollout ended. Look for boxes that never moved and for those dropped on the way."
-)
-_ROLLOUTS = {
-    "avoiding": " Solid discs are the cylinders; the pale ring is where the rod touches. Hue tells the gap taken in the"
-    " last row, lightness the choices before it. Look for gaps nobody takes, and for paths that brush the rings.",
-    "aligning": " The second panel shows the tray: where it starts (an outline with a thick far side; of many only the"
-    " centre and a line to the far side), its path, a dot where it ends and a cross if the rollout failed; targets are"
-    " drawn likewise. The dashed frames are the ranges of both centres. Look for crosses far from any target: the tray"
-    " was lost; crosses near one: the angle was wrong or time ran out.",
-    "sorting": _SORTING,
-    "sorting_2": _SORTING,
-    "sorting_6": _SORTING,
-    "po_sorting": _SORTING,
-    "stacking": _STACKING,
-    "stacking_1": _STACKING,
-}
 _WITH_OBJECTS = {
     "rollouts.gif": " Squares are the objects, pale lines their paths; black marks are tools that ran out of time.",
     "plans.png": " Outlines and thin coloured lines are the objects of that episode: starts and paths.",
@@ -117,6 +90,9 @@ def caption(name: str, task: str | None = None) -> tuple[str, str]:
         (True, False)
     """
     head, text = CAPTIONS[name]
+    known = find_task(task)
+    if known is None:
+        return head, text
     if name == "rollouts.png":
-        return head, text + _ROLLOUTS.get(task, "")
-    return head, text + (_WITH_OBJECTS.get(name, "") if task in OBJECTS else "")
+        return head, text + known.scene.caption
+    return head, text + (_WITH_OBJECTS.get(name, "") if known.bodies else "")

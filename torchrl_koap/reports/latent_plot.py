@@ -77,9 +77,7 @@ def action_names(task: Task) -> list[str]:
         >>> action_names(get_task("aligning")), action_names(get_task("stacking"))[-2:]
         (['x', 'y', 'z'], ['joint 7', 'gripper'])
     """
-    if task.action_unit == "rad":
-        return [*(f"joint {index + 1}" for index in range(task.same_unit)), "gripper"]
-    return list("xyz"[: task.action_dim])
+    return list(task.action_names)
 
 
 def _draw_spectrum(axes: Axes, values: np.ndarray, facts: Mapping[str, Any]) -> None:

@@ -14,9 +14,10 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from torchrl_koap.evaluation.statistics import mode_entropy
+from torchrl_koap.reports.mode_colors import initials, mode_colors
 from torchrl_koap.reports.scenes import FAINT, INK, MUTED, set_title, tidy
 from torchrl_koap.reports.training_plots import as_array, save_figure
-from torchrl_koap.tasks.modes import initials, mode_choices, mode_colors
+from torchrl_koap.tasks.modes import mode_choices
 
 
 def even_entropy(episodes: int, num_modes: int) -> float:

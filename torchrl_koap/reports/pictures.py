@@ -15,9 +15,8 @@ from safetensors.numpy import load_file
 from torchrl_koap.reports.animation import animate_rollouts, render_rollout
 from torchrl_koap.reports.mode_plots import plot_modes
 from torchrl_koap.reports.rollout_plots import SUCCESS, plot_demonstrations, plot_plans, plot_rollouts
-from torchrl_koap.reports.scenes import SCENES
 from torchrl_koap.reports.training_plots import plot_actions, plot_eigenvalues, plot_losses
-from torchrl_koap.tasks import TASKS
+from torchrl_koap.tasks.registry import find_task
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 FOLDER = "plots"
@@ -94,8 +93,8 @@ def task_names(run_dir: Path) -> dict[str, Any]:
         task = RunDirectory(run_dir).read_json("config.json").get("task")
     except (RunDirectoryError, AttributeError):
         task = None
-    facts = TASKS.get(task) if isinstance(task, str) else None
-    return {"task": task if task in SCENES else None, "num_modes": facts.num_modes if facts else 24}
+    facts = find_task(task)
+    return {"task": facts.name if facts else None, "num_modes": facts.num_modes if facts else 24}
 
 
 def _losses(run_dir: Path, path: Path, **_: Any) -> Path:
@@ -151,16 +150,20 @@ def _demonstrations(run_dir: Path, path: Path, *, task: str | None, **_: Any) ->
 
 def _actions(run_dir: Path, path: Path, *, task: str | None, **_: Any) -> Path:
     data = load_file(run_dir / "actions.safetensors")
-    if task in TASKS and TASKS[task].action_unit == "rad":
-        joints = TASKS[task].same_unit
-        names = [*(f"joint {index + 1}" for index in range(joints)), "gripper"]
-        return plot_actions(data["predicted"], data["true"], path, names=names, unit="mrad", absolute={"gripper": "mm"})
-    return plot_actions(data["predicted"], data["true"], path, names=("x", "y", "z"))
+    facts = find_task(task)
+    if facts is None:
+        return plot_actions(data["predicted"], data["true"], path, names=("x", "y", "z"))
+    shown = {"m": "mm", "rad": "mrad"}
+    absolute = {name: shown.get(facts.actions[name], "") for name in facts.absolute_actions}
+    unit = shown.get(facts.action_unit, facts.action_unit)
+    look = {"names": facts.action_names, "unit": unit, "scale": 1e3 if facts.action_unit in shown else 1.0}
+    return plot_actions(data["predicted"], data["true"], path, absolute=absolute, **look)
 
 
 def _eigenvalues(run_dir: Path, path: Path, *, task: str | None, **_: Any) -> Path:
     data = load_file(run_dir / "eigenvalues.safetensors")
-    hz = TASKS[task].control_hz if task in TASKS else None
+    facts = find_task(task)
+    hz = facts.control_hz if facts else None
     return plot_eigenvalues(data["real"], data["imag"], path, control_hz=hz)
 
 

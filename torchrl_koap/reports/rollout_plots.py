@@ -14,11 +14,12 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from torchrl_koap.reports.mode_colors import mode_colors
 from torchrl_koap.reports.mode_plots import draw_mode_table
 from torchrl_koap.reports.objects import draw_object_paths, draw_starts, legend_handles, object_looks, object_paths
 from torchrl_koap.reports.scenes import BLUE, INK, draw_scene, set_title
 from torchrl_koap.reports.training_plots import as_array, save_figure
-from torchrl_koap.tasks.modes import mode_choices, mode_colors, mode_name
+from torchrl_koap.tasks.modes import mode_choices, mode_name
 
 TIMEOUT, SUCCESS, COLLISION = 0, 1, 2
 OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision"}

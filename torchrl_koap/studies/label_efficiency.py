@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import LabelBudget, flatten_trajectories, limit_observations, save_ted
+from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted, subsample_trajectories
 from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
 from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
@@ -220,7 +220,7 @@ def _first_look(root: RunDirectory, options: CurveConfig, task: Task) -> TensorD
     if options.units != "trajectory":
         LabelBudget(1, unit=options.units)  # knows the units
         return None
-    number = options.demonstrations or task.demonstrations
+    number = options.demonstrations or task.defaults.demonstrations
     return flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number)
 
 
@@ -232,7 +232,7 @@ def _demonstrations(root: RunDirectory, options: CurveConfig, task: Task) -> str
     if not (folder / "ted").exists():
         from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 
-        episodes = options.demonstrations or task.demonstrations
+        episodes = options.demonstrations or task.defaults.demonstrations
         with progress_bar(episodes, "demonstrations", unit="episode") as bar:
             data, _ = record_demonstrations(task.name, episodes, 0, progress=count_up_to(bar))
         save_ted(data, folder / "ted", task=task.source)
@@ -246,7 +246,7 @@ def _check_budgets(cells: Sequence[Cell], options: CurveConfig, data: TensorDict
     # windows of another seed lie in another number of trajectories
     for fraction, share, seed in dict.fromkeys((cell.fraction, cell.observations, cell.seed) for cell in cells):
         budget = LabelBudget(fraction, unit=options.units, seed=seed, window=WINDOW, history=HISTORY)
-        limit_observations(budget.apply(data)[0], share)
+        subsample_trajectories(budget.apply(data)[0], share)
 
 
 def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:

@@ -213,7 +213,7 @@ def _draw(
 
 def _error_unit(task: str) -> str:
     try:
-        return {"m": "mm", "rad": "mrad"}.get(get_task(task).action_unit, "")
+        return {"m": "mm", "rad": "mrad"}.get(get_task(task).action_unit, get_task(task).action_unit)
     except ValueError:
         return ""
 

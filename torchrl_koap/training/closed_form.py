@@ -32,16 +32,16 @@ def fit_closed_form(controller: nn.Module, data: TensorDictBase, *, shared_axes:
         dict: penalty, number of labels and held-out error of the fit, or what another controller's fit returns.
     """
     keys = ["state", "action", "has_action", "episode"]
-    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.history)
+    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
     mask = windows["has_action"].squeeze(-1) & ~windows["padded"].squeeze(-1)
-    # every step is frame `history` of one window; at other frames a clamped look-ahead would count it again
-    mask[:, : controller.history], mask[:, controller.history + 1 :] = False, False
+    # every step is frame `num_past` of one window; at other frames a clamped look-ahead would count it again
+    mask[:, : controller.num_past], mask[:, controller.num_past + 1 :] = False, False
     extra = {}
     if isinstance(controller, KoopmanInverseDynamics):
         through_zero = not controller.action_normalizer.offset.any()
         extra = {"default_penalty": DEFAULT_PENALTY, "bias": not through_zero}
         if shared_axes and isinstance(controller.latent_action, LatentActionFourier):
-            extra["shared_axes"] = shared_axes
+            extra["tied_axes"] = shared_axes
     fit = controller.fit_decoder(windows, mask, groups=windows["episode"][:, -1], **extra)
     if not isinstance(fit, RidgeFit):
         return dict(fit or {})

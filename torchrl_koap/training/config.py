@@ -192,11 +192,11 @@ def resolve(config: TrainConfig) -> ResolvedConfig:
 
 def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
     defaults = {
-        "steps": task.planner_steps,
-        "recovery_sigma": task.recovery_sigma,
-        "episodes": task.demonstrations,
-        "relative": task.relative,
-        "channels": task.channels,
+        "steps": task.defaults.planner_steps,
+        "recovery_sigma": task.defaults.recovery_sigma,
+        "episodes": task.defaults.demonstrations,
+        "relative": task.defaults.relative,
+        "channels": task.defaults.channels,
     }
     return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
 

@@ -23,7 +23,6 @@ from torchrl_koap.training.config import ResolvedConfig
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.methods import LABELLED_SHARES, Method, Phase
 from torchrl_koap.training.progress import progress_bar, show_losses
-from torchrl_koap.training.released_settings import epochs_of
 from torchrl_koap.training.run_directory import RunDirectory
 
 _KEYS = ["state", "action", "has_action"]
@@ -67,7 +66,7 @@ class _Training:
     def __init__(self, run: RunDirectory, resolved: ResolvedConfig, logger: Any):
         self.run, self.options, self.logger, self.task = run, resolved.options, logger, resolved.task
         self.released = resolved.released
-        self.epochs = epochs_of(resolved.task.name)
+        self.epochs = resolved.task.defaults.released_epochs
         self.updates = 0
 
     def batch_size(self, own: int) -> int:
@@ -112,13 +111,12 @@ def _train_network(
     options, task = train_one.options, train_one.task
     controller = build_controller(entry, data["state"].shape[-1], task.action_dim, data, method=method)
     controller = controller.to(options.device)
-    history = controller.history
+    history = controller.num_past
     window = max(WINDOW, controller.num_window_frames)
-    if hasattr(controller, "fit_scales"):
-        windows = cut_windows(data, window, select=["state", "has_action"], pad_before=history)
-        if method.labelled_only:
-            windows = windows[windows["has_action"].squeeze(-1).any(-1)]
-        controller.fit_scales(windows["state"])
+    windows = cut_windows(data, window, select=["state", "has_action"], pad_before=history)
+    if method.labelled_only:
+        windows = windows[windows["has_action"].squeeze(-1).any(-1)]
+    controller.fit_scales(windows["state"])
     values: dict[str, float] = {}
     budget = min(options.controller_steps, options.steps)
     table = WindowTable.build(data, window, pad_before=history)

@@ -37,7 +37,7 @@ def load_demonstrations(
         from torchrl_koap.envs.experts.demonstrations import record_demonstrations  # needs a simulator
 
         data, _ = record_demonstrations(
-            task.name, task.demonstrations if episodes is None else episodes, seed, progress=progress
+            task.name, task.defaults.demonstrations if episodes is None else episodes, seed, progress=progress
         )
     elif not Path(dataset).is_dir():
         raise FileNotFoundError(f"dataset {dataset!r} is neither 'scripted' nor a folder")

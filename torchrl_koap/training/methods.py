@@ -90,12 +90,10 @@ class Method:
     """A way to get from few labels to a policy.
 
     A ``"controller"`` maps windows of states ``[*B, T, d]`` to actions ``[*B, T, act]`` and follows the plans of the
-    planner that all controllers share. It is a ``TensorDictModule`` that reads ``"state"``, writes ``"action"`` and
-    offers ``history`` (frames before the current one that it reads), ``num_window_frames`` (frames of the shortest
-    window in which a frame has all it reads) and, if it has scales of its own, ``fit_scales(windows)``, which is called
-    with windows of states before any update. With ``closed_form`` it also has ``fit_decoder(windows, mask, groups=)``,
-    called once after all updates with windows of which frame ``history`` counts where ``mask`` is True; it returns
-    numbers for the summary, or a :class:`~torchrl_koap.modules.RidgeFit`.
+    planner that all controllers share: a :class:`~torchrl_koap.modules.InverseDynamics`, whose docstring lists what is
+    asked of one. With ``closed_form`` it also has ``fit_decoder(windows, mask, groups=)``, called once after all
+    updates with windows of which frame ``num_past`` counts where ``mask`` is True; it returns numbers for the summary,
+    or a :class:`~torchrl_koap.modules.RidgeFit`.
 
     A ``"policy"`` has no planner beside it: see :class:`~torchrl_koap.modules.DiffusionPolicy` for what it offers.
 

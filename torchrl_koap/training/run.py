@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import WindowTable, limit_observations
+from torchrl_koap.data import WindowTable, subsample_trajectories
 from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training.action_errors import AFTER, BEFORE, UNITS, write_analysis
 from torchrl_koap.training.builders import build_controller, set_up_torch
@@ -65,7 +65,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
             data = load_demonstrations(options.dataset, task, episodes=options.episodes, progress=count_up_to(bar))
         labelled, report = resolved.budget.apply(data, command=task.observation[task.command])
         # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
-        labelled = limit_observations(labelled, options.observation_fraction).to(options.device)
+        labelled = subsample_trajectories(labelled, options.observation_fraction).to(options.device)
         _check_lengths(resolved, labelled)
         if not mine:
             held.enter_context(run.locked("koap train"))
@@ -98,7 +98,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         }
         if options.analysis and resolved.method.has_planner:
             analysis = write_analysis(run, task, data, labelled, controller, resolved.columns)
-            summary[f"action_error_{UNITS[task.action_unit]}"] = analysis
+            summary[f"action_error_{UNITS.get(task.action_unit, task.action_unit)}"] = analysis
         run.write_json("summary.json", summary)
     return summary
 
@@ -120,7 +120,7 @@ def train_shared_planner(config: TrainConfig) -> dict[str, float]:
     data = load_demonstrations(options.dataset, resolved.task)
     data["action"] = torch.full_like(data["action"], torch.nan)
     data["has_action"] = torch.zeros_like(data["has_action"])
-    data = limit_observations(data, options.observation_fraction).to(options.device)
+    data = subsample_trajectories(data, options.observation_fraction).to(options.device)
     content = to_json(resolved)
     check_resume(run, content, resume=options.resume)
     run.write_json("config.json", content)
@@ -147,7 +147,7 @@ def _check_lengths(resolved: ResolvedConfig, data: TensorDictBase) -> None:
     controller = build_controller(
         resolved.controller, len(resolved.columns), resolved.task.action_dim, method=resolved.method
     )
-    WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.history)
+    WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.num_past)
     if resolved.options.analysis:
         WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
 

@@ -113,13 +113,13 @@ def test_options_override_the_preset_and_reach_the_parts():
         linear_skip=True,
         structure="block_diagonal",
         look_ahead=(2, 5),
-        history=3,
+        num_past=3,
         clamped=False,
         include_state=True,
         latent_dim=10,
     )
     f = model.latent_action
-    assert (f.history, f.look_ahead, f.relative, f.clamped, f.latent_dim) == (3, (2, 5), True, False, 10)
+    assert (f.num_past, f.look_ahead, f.relative, f.clamped, f.latent_dim) == (3, (2, 5), True, False, 10)
     assert f.skip is not None and any(getattr(layer, "p", None) == 0.3 for layer in f.network)
     assert model.operator.structure == "block_diagonal" and model.lifting.include_state
     fourier = make_koopman_inverse_dynamics(

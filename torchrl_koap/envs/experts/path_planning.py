@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Travel costs in the plane: least cost of a path through a field of slowness, and distances to squares.
+"""Eikonal path planning in the plane: least cost of a path through a field of slowness, and distances to squares.
 
 The cost ``T(p)`` of the cheapest path from ``p`` to a source obeys the eikonal equation ``|grad T| = s`` with slowness
 ``s`` (cost per metre), solved on a grid by fast sweeping (Zhao 2005): Gauss-Seidel passes in alternating directions.

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from torchrl_koap.envs.experts.noise import drift
+from torchrl_koap.envs.experts.noise import ar1_noise
 from torchrl_koap.envs.experts.path_planning import (
     FAR,
     ORIGIN,
@@ -32,7 +32,9 @@ from torchrl_koap.envs.experts.path_planning import (
     travel_cost,
     value_at,
 )
-from torchrl_koap.envs.sorting import BIN_HALF, BIN_X, BOX_HALF, box_colours, mode_colours
+from torchrl_koap.envs.experts.recording import RecordingRules
+from torchrl_koap.envs.sorting import box_colours, mode_colours
+from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X, BOX_HALF
 
 ROD_RADIUS = 0.01
 ARRIVED_Y = 0.232  # m; beyond, a box has left the platform
@@ -243,6 +245,8 @@ class SortingExpert:
         ([True, True], [0, 1])
     """
 
+    rules = RecordingRules(most_rows=699)
+
     def __init__(self, modes: Sequence[int], contexts, seeds: Sequence, *, num_boxes: int = 4):
         modes, seeds, contexts = list(modes), list(seeds), np.asarray(contexts)
         if not modes or len(modes) != len(seeds) or contexts.shape != (len(modes), num_boxes, 3):
@@ -351,5 +355,5 @@ def _draw(generator: np.random.Generator, num_boxes: int) -> dict[str, np.ndarra
         "taste": generator.normal(0, 0.03, num_boxes),
         "aim": generator.uniform(-0.015, 0.015, num_boxes),
         "pause": np.array(generator.integers(0, 6)),
-        "tempo": generator.uniform(0.95, 1.05) * (1 + drift(generator, 15, 0.04, _HORIZON)),
+        "tempo": generator.uniform(0.95, 1.05) * (1 + ar1_noise(generator, 15, 0.04, _HORIZON)),
     }

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import torch
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.nn.probabilistic import InteractionType, interaction_type
 from tensordict.utils import NestedKey
 from torch import nn
@@ -18,8 +19,8 @@ Tensor = torch.Tensor
 class ConditionedDiffusion(TensorDictModuleBase):
     """Base of the generative models: condition, start noise and solver; subclasses say what the sequence is.
 
-    A subclass encodes and decodes the diffused sequence ``[*B, H, width]`` in units of its own, and samples it by
-    :meth:`solve`.
+    A subclass encodes and decodes the diffused sequence ``[*B, H, width]`` in units of its own (:meth:`decode`); what
+    is said here once is the condition, the start noise, the solver, the sampling and the entries.
 
     Args:
         denoiser (nn.Module): ``denoiser(sequence [*B, H, width], time [*B], condition [*B, h * d + f])``, of the shape
@@ -29,17 +30,19 @@ class ConditionedDiffusion(TensorDictModuleBase):
     Keyword Args:
         state_dim (int): number ``d`` of state columns.
         width (int): columns of the diffused sequence.
-        history (int): number ``h`` of observed frames, the current one included.
-        horizon (int): number ``H`` of frames of the sequence.
+        in_key (NestedKey): default entry of the history.
+        out_key (NestedKey): default entry of the sequence.
+        history (int): number ``h`` of observed frames, the current one included. Defaults to 2.
+        horizon (int): number ``H`` of frames of the sequence. Defaults to 14.
         relative (bool): the condition holds the older frames as displacements from the current one.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with ``num_features``.
         solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
             flow path.
-        num_steps (int): solver steps.
-        clip (float, optional): bound of the normalised sequence at every solver step.
-        in_keys (list of NestedKey): the entry of the history.
-        out_keys (list of NestedKey): the entry of the sequence.
-        noise_key (NestedKey, optional): entry of the start noise.
+        num_steps (int): solver steps. Defaults to 10.
+        clip (float, optional): bound of the normalised sequence at every solver step. Defaults to no bound.
+        in_keys (list of NestedKey, optional): the entry of the history, instead of ``in_key``.
+        out_keys (list of NestedKey, optional): the entry of the sequence, instead of ``out_key``.
+        noise_key (NestedKey, optional): entry of the start noise, read if present. Defaults to ``"noise"``.
 
     Raises:
         ValueError: for sizes below 1, several in- or out-keys, an unknown or unfit solver.
@@ -54,23 +57,26 @@ class ConditionedDiffusion(TensorDictModuleBase):
         *,
         state_dim: int,
         width: int,
-        history: int,
-        horizon: int,
+        in_key: NestedKey,
+        out_key: NestedKey,
         relative: bool,
-        features: nn.Module | None,
-        solver: str | None,
-        num_steps: int,
-        clip: float | None,
-        in_keys: list[NestedKey],
-        out_keys: list[NestedKey],
-        noise_key: NestedKey | None,
+        history: int = 2,
+        horizon: int = 14,
+        features: nn.Module | None = None,
+        solver: str | None = None,
+        num_steps: int = 10,
+        clip: float | None = None,
+        in_keys: list[NestedKey] | None = None,
+        out_keys: list[NestedKey] | None = None,
+        noise_key: NestedKey | None = "noise",
     ):
         super().__init__()
         sizes = {"state_dim": state_dim, self.width_name: width, "history": history, "horizon": horizon}
         for name, value in sizes.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
-        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
+        self.in_keys = [in_key] if in_keys is None else list(in_keys)
+        self.out_keys = [out_key] if out_keys is None else list(out_keys)
         if len(self.in_keys) != 1 or len(self.out_keys) != 1:
             raise ValueError(f"one in_key and one out_key are needed, got {self.in_keys} and {self.out_keys}")
         self.denoiser = denoiser
@@ -105,6 +111,12 @@ class ConditionedDiffusion(TensorDictModuleBase):
     def num_steps(self, number: int) -> None:
         self.schedule.nodes(number)
         self._num_steps = number
+
+    def _rename(self, history: NestedKey | None, sequence: NestedKey | None) -> None:
+        if history is not None:
+            self.in_keys = [history]
+        if sequence is not None:
+            self.out_keys = [sequence]
 
     @property
     def sample_shape(self) -> tuple[int, int]:
@@ -161,6 +173,36 @@ class ConditionedDiffusion(TensorDictModuleBase):
             time = self.schedule.sample_time(sample) if time is None else time.to(sample.dtype)
             noisy, target = self.schedule.add_noise(sample, noise, time), self.schedule.target(sample, noise, time)
         return (self.denoiser(noisy, time, condition) - target).square()
+
+    def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Raw plans or actions ``[*B, H, width]`` of normalised sequences, given raw histories ``[*B, h, d]``."""
+        raise NotImplementedError
+
+    def sample(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
+        """Samples sequences ``[*B, H, width]`` for histories ``[*B, h, d]``, both in raw units.
+
+        Args:
+            history (Tensor): raw history.
+            noise (Tensor, optional): as for :meth:`solve`.
+            generator (torch.Generator, optional): source of what is drawn.
+
+        Raises:
+            ValueError: for a history or noise of another shape.
+        """
+        return self.decode(history, self.solve(history, noise, generator))
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the sampled sequence into the tensordict."""
+        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        return tensordict.set(self.out_keys[0], self.sample(tensordict.get(self.in_keys[0]), noise))
+
+    def _check_sequence(self, sequence: Tensor) -> None:
+        if sequence.shape[-2:] != self.sample_shape:
+            raise ValueError(
+                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self._width}] (horizon, {self.width_name}),"
+                f" got {list(sequence.shape)}"
+            )
 
     def solve(self, history: Tensor, noise: Tensor | None, generator: torch.Generator | None) -> Tensor:
         """Samples normalised sequences ``[*B, H, width]`` for raw histories ``[*B, h, d]``.

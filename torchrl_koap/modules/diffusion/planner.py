@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import nn
 
@@ -47,7 +45,7 @@ class StatePlanner(ConditionedDiffusion):
         horizon (int): number ``H`` of planned frames. Defaults to 14.
         relative (bool): model displacements from the current state. Defaults to True.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
-            further numbers that the condition holds, such as :class:`~torchrl_koap.tasks.relative_positions.Relations`.
+            further numbers that the condition holds, such as the relative positions of objects.
         solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
             flow path.
         num_steps (int): solver steps. Defaults to 10.
@@ -80,41 +78,29 @@ class StatePlanner(ConditionedDiffusion):
         schedule: NoiseSchedule | None = None,
         *,
         state_dim: int,
-        history: int = 2,
-        horizon: int = 14,
         relative: bool = True,
-        features: nn.Module | None = None,
-        solver: str | None = None,
-        num_steps: int = 10,
-        clip: float | None = None,
-        in_keys: list[NestedKey] | None = None,
-        out_keys: list[NestedKey] | None = None,
-        noise_key: NestedKey | None = "noise",
+        **options,
     ):
         super().__init__(
             denoiser,
             schedule,
             state_dim=state_dim,
             width=state_dim,
-            history=history,
-            horizon=horizon,
             relative=relative,
-            features=features,
-            solver=solver,
-            num_steps=num_steps,
-            clip=clip,
-            in_keys=[keys.HISTORY] if in_keys is None else in_keys,
-            out_keys=[keys.PLAN] if out_keys is None else out_keys,
-            noise_key=noise_key,
+            in_key=keys.HISTORY,
+            out_key=keys.PLAN,
+            **options,
         )
-        self.plan_normalizer = identity_normalizer(horizon * state_dim)
+        self.plan_normalizer = identity_normalizer(self.horizon * state_dim)
 
     def set_keys(self, *, history: NestedKey | None = None, plan: NestedKey | None = None) -> None:
-        """Renames the entries read and written."""
-        if history is not None:
-            self.in_keys = [history]
-        if plan is not None:
-            self.out_keys = [plan]
+        """Renames the entries read and written.
+
+        Keyword Args:
+            history (NestedKey, optional): entry of the history.
+            plan (NestedKey, optional): entry of the plan.
+        """
+        self._rename(history, plan)
 
     def fit_normalizers(self, windows: Tensor, *, mode: str = "minmax", per_step: bool = True) -> None:
         """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
@@ -140,11 +126,7 @@ class StatePlanner(ConditionedDiffusion):
 
     def encode_plan(self, history: Tensor, plan: Tensor) -> Tensor:
         """Raw plan ``[*B, H, d]`` to the normalised sequence that noise is added to."""
-        if plan.shape[-2:] != (self.horizon, self.state_dim):
-            raise ValueError(
-                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self.state_dim}] (horizon, state_dim),"
-                f" got {list(plan.shape)}"
-            )
+        self._check_sequence(plan)
         plan = plan - history[..., -1:, :] if self.relative else plan
         return self.plan_normalizer(plan.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
 
@@ -153,12 +135,10 @@ class StatePlanner(ConditionedDiffusion):
         plan = self.plan_normalizer.inverse(sequence.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
         return plan + history[..., -1:, :] if self.relative else plan
 
-    def plan(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
-        """Samples plans ``[*B, H, d]`` for histories ``[*B, h, d]``, both in raw units; see the class for ``noise``."""
-        return self.decode_plan(history, self.solve(history, noise, generator))
+    def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """:meth:`decode_plan`."""
+        return self.decode_plan(history, sequence)
 
-    @dispatch(auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the plan into the tensordict."""
-        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
-        return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
+    def plan(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
+        """:meth:`sample`: plans ``[*B, H, d]`` for histories ``[*B, h, d]``, both in raw units."""
+        return self.sample(history, noise, generator)

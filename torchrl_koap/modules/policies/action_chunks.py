@@ -5,20 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import NestedKey
 from torch import Tensor
-from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_koap.keys import ACTION
 from torchrl_koap.modules.diffusion.policy import ACTION_CHUNK, DiffusionPolicy
-from torchrl_koap.modules.policies.plan_then_control import NOISE, OBSERVATION_HISTORY
-
-STATE_HISTORY = "state_history"
+from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
 
 
-class ChunkedPolicy(TensorDictModuleBase):
+class ChunkedPolicy(RecedingHorizonPolicy):
     """Executes the first ``replan_interval`` actions of every chunk of a :class:`DiffusionPolicy`.
 
     ::
@@ -27,8 +22,8 @@ class ChunkedPolicy(TensorDictModuleBase):
         chunk sampled at     0                                   4
         action               a_0      a_1      a_2      a_3      a'_0
 
-    Every environment of a batch begins a new chunk in its own rhythm, counted from its own reset
-    (:class:`torchrl.modules.MultiStepActorWrapper`). Start noise is read from the entry ``"noise"`` if it is there
+    Every environment of a batch begins a new chunk in its own rhythm, counted from its own reset; batches may have any
+    shape. Start noise is read from the entry ``"noise"`` if it is there
     (:class:`~torchrl_koap.modules.EpisodeNoise`). Use it as a
     :class:`~torchrl_koap.modules.PlanThenControl` that needs no controller, in
     :func:`~torchrl_koap.evaluation.rollouts.roll_out` and everywhere else.
@@ -74,56 +69,22 @@ class ChunkedPolicy(TensorDictModuleBase):
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
-        super().__init__()
-        if history < planner.history:
-            raise ValueError(f"the policy reads {planner.history} observed frames, history is only {history}")
-        if not 1 <= replan_interval <= planner.horizon:
-            raise ValueError(f"replan_interval must be in 1..{planner.horizon} (the horizon), got {replan_interval}")
-        columns = None if controller_columns is None else torch.as_tensor(controller_columns)
-        self.register_buffer("controller_columns", columns, persistent=False)
-        if callable(state_columns):
-            self._state_of = state_columns
-        else:
-            self.register_buffer("state_columns", torch.as_tensor(state_columns), persistent=False)
-            self._state_of = self._select
-        self.in_keys, self.out_keys = [history_key, "is_init"], [action_key, ACTION_CHUNK]
-        self.history, self.replan_interval = history, replan_interval
-        self.planner = planner
-        self.receding = MultiStepActorWrapper(
-            _Chunk(planner, replan_interval),
-            n_steps=replan_interval,
-            action_keys=[action_key],
-            chunk_keys=[ACTION_CHUNK],
-            init_key="is_init",
+        super().__init__(
+            planner,
+            state_columns=state_columns,
+            history=history,
+            replan_interval=replan_interval,
+            controller_columns=controller_columns,
+            history_key=history_key,
+            action_key=action_key,
+            cached_key=action_key,
+            chunk_key=ACTION_CHUNK,
+            reader="policy",
         )
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action of the current step (and the chunk that the next one continues from)."""
-        observed = tensordict.get(self.in_keys[0], None)
-        for name, value in ((self.in_keys[0], observed), ("is_init", tensordict.get("is_init", None))):
-            if value is None:
-                raise KeyError(f"the policy reads {name!r}: append policy_transforms() to the environment")
-        if observed.shape[-2] != self.history:
-            raise ValueError(
-                f"{self.in_keys[0]!r} must hold {self.history} frames on axis -2, got {list(observed.shape)}"
-            )
-        state = self._state_of(observed[..., -self.planner.history :, :])
+    def make_chunk(self, history: Tensor, noise: Tensor | None) -> Tensor:
+        """Samples actions and keeps those that are executed, ``[*B, interval, act]``."""
+        state = history[..., -self.planner.history :, :]
         if self.controller_columns is not None:
             state = state[..., self.controller_columns]
-        return self.receding(tensordict.set(STATE_HISTORY, state))
-
-    def _select(self, observed: Tensor) -> Tensor:
-        return observed[..., self.state_columns]
-
-
-class _Chunk(TensorDictModuleBase):
-    """The part that runs only when a new chunk is due."""
-
-    def __init__(self, planner: DiffusionPolicy, num_steps: int):
-        super().__init__()
-        self.planner, self.num_steps = planner, num_steps
-        self.in_keys, self.out_keys = [STATE_HISTORY], [ACTION_CHUNK]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        actions = self.planner.sample(tensordict.get(STATE_HISTORY), tensordict.get(NOISE, None))
-        return tensordict.set(ACTION_CHUNK, actions[..., : self.num_steps, :])
+        return self.planner.sample(state, noise)[..., : self.replan_interval, :]

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.modules import LinearActionDecoder, Normalizer, make_koopman_inverse_dynamics
-from torchrl_koap.modules.koopman.shared_filter import fit_shared_filter
+from torchrl_koap.modules.koopman.inverse_dynamics import fit_tied_axis_ridge
 
 
 def test_the_filter_solves_the_ridge_equations():
@@ -18,12 +18,12 @@ def test_the_filter_solves_the_ridge_equations():
     target = np.concatenate([action[:, 0].numpy(), action[:, 1].numpy()])
     weight = 0.3 * (rows**2).sum(1).mean()
     expected = np.linalg.solve(rows.T @ rows + weight * np.eye(4), rows.T @ target)
-    np.testing.assert_allclose(fit_shared_filter(steps, action, penalty=0.3).numpy(), expected, rtol=1e-9)
+    np.testing.assert_allclose(fit_tied_axis_ridge(steps, action, penalty=0.3).numpy(), expected, rtol=1e-9)
 
 
 def test_axes_that_differ_are_refused():
     with pytest.raises(ValueError, match=r"\[N, S, act\]"):
-        fit_shared_filter(torch.zeros(5, 3, 2), torch.zeros(5, 3))
+        fit_tied_axis_ridge(torch.zeros(5, 3, 2), torch.zeros(5, 3))
 
 
 def test_a_ridge_around_a_prior_is_a_ridge_around_zero_on_the_rest():
@@ -62,8 +62,8 @@ def test_an_axis_without_labels_worth_the_name_is_decoded_like_the_other():
         model.fit_scales(spread)
         state, action = one_axis_still(200)
         mask = torch.ones(200, 16, dtype=torch.bool)
-        model.fit_decoder(TensorDict({"state": state, "action": action}, [200]), mask, shared_axes=axes, bias=False)
-        frame = model.history
+        model.fit_decoder(TensorDict({"state": state, "action": action}, [200]), mask, tied_axes=axes, bias=False)
+        frame = model.num_past
         decoded = model(TensorDict({"state": spread}, [500]))["action"][:, frame, 1]
         true = spread[:, frame + 3, 1] - spread[:, frame + 2, 1]
         answers[axes] = (decoded - true).square().mean().sqrt() / true.square().mean().sqrt()
@@ -71,12 +71,12 @@ def test_an_axis_without_labels_worth_the_name_is_decoded_like_the_other():
     assert answers[0, 1] < 0.4
 
 
-def test_shared_axes_need_fourier_latent_actions_and_one_axis_per_action_entry():
+def test_tied_axes_need_fourier_latent_actions_and_one_axis_per_action_entry():
     windows = TensorDict({"state": torch.randn(8, 16, 2), "action": torch.randn(8, 16, 2)}, [8])
     mask = torch.ones(8, 16, dtype=torch.bool)
     with pytest.raises(ValueError, match="LatentActionMLP"):
         make_koopman_inverse_dynamics(2, 2, preset="released", latent_dim=8, hidden_dim=8).fit_decoder(
-            windows, mask, shared_axes=(0, 1)
+            windows, mask, tied_axes=(0, 1)
         )
     with pytest.raises(ValueError, match="one state column per action entry"):
-        make_koopman_inverse_dynamics(2, 2).fit_decoder(windows, mask, shared_axes=(0,))
+        make_koopman_inverse_dynamics(2, 2).fit_decoder(windows, mask, tied_axes=(0,))

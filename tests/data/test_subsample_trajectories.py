@@ -8,7 +8,7 @@ import math
 import pytest
 import torch
 
-from torchrl_koap.data import LabelBudget, flatten_trajectories, limit_observations
+from torchrl_koap.data import LabelBudget, flatten_trajectories, subsample_trajectories
 
 LENGTHS = [20 + 3 * index for index in range(10)]
 
@@ -32,7 +32,7 @@ def labelled_of(data):
 def test_whole_trajectories_are_kept_in_their_order_with_all_labels(seed):
     data = make_data(3, seed)
     before = data.clone()
-    kept = limit_observations(data, 0.5, seed=seed)
+    kept = subsample_trajectories(data, 0.5, seed=seed)
     episodes = kept["episode"].unique_consecutive()
     assert len(episodes) == 5 and (episodes.diff() > 0).all()
     assert [int((kept["episode"] == episode).sum()) for episode in episodes] == [LENGTHS[e] for e in episodes]
@@ -46,22 +46,22 @@ def test_whole_trajectories_are_kept_in_their_order_with_all_labels(seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_smaller_share_is_part_of_every_larger_one(seed):
     data = make_data(1, seed)
-    shares = [kept_of(limit_observations(data, share / 10, seed=seed)) for share in range(1, 11)]
+    shares = [kept_of(subsample_trajectories(data, share / 10, seed=seed)) for share in range(1, 11)]
     assert [len(share) for share in shares] == list(range(1, 11))
     assert all(small < large for small, large in zip(shares, shares[1:], strict=False))
 
 
 def test_the_seed_chooses_and_everything_is_everything():
     data = make_data(1)
-    assert len({frozenset(kept_of(limit_observations(data, 0.5, seed=seed))) for seed in range(8)}) > 1
-    assert limit_observations(data, 1.0) is data
-    assert limit_observations(data, 0.97) is data  # 9.7 of 10
+    assert len({frozenset(kept_of(subsample_trajectories(data, 0.5, seed=seed))) for seed in range(8)}) > 1
+    assert subsample_trajectories(data, 1.0) is data
+    assert subsample_trajectories(data, 0.97) is data  # 9.7 of 10
 
 
 def test_without_labels_any_share_may_be_kept():
     data = make_data(None)
     data["has_action"] = torch.zeros_like(data["has_action"])
-    assert len(kept_of(limit_observations(data, 0.1))) == 1
+    assert len(kept_of(subsample_trajectories(data, 0.1))) == 1
 
 
 @pytest.mark.parametrize(
@@ -77,4 +77,4 @@ def test_without_labels_any_share_may_be_kept():
 )
 def test_a_share_that_cannot_be_kept_is_named(labelled, fraction, message):
     with pytest.raises(ValueError, match=message):
-        limit_observations(make_data(labelled), fraction)
+        subsample_trajectories(make_data(labelled), fraction)
