@@ -28,7 +28,7 @@ from torchrl_koap.training.controller import train_controller
 
 def action_error(task, data, method: str, fraction: float, seed: int, updates: int) -> float:
     """Error of one controller, trained as ``koap train`` does."""
-    labelled, _ = LabelBudget(fraction, seed=seed).apply(data, command=task.observation[task.command])
+    labelled, _ = LabelBudget(fraction, seed=seed).apply(data, command=task.command_columns)
     with tempfile.TemporaryDirectory() as folder:
         config = TrainConfig(out=Path(folder), task=task.name, method=method, seed=seed, controller_steps=updates)
         resolved = resolve(config)

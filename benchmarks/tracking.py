@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How well a controller follows a perfect plan: the recorded future of demonstrations, with and without blending it into the present state.
+"""How well a controller follows a perfect plan: the recorded future of demonstrations, with and without blending.
 
     python benchmarks/tracking.py RUN --dataset DIR
 

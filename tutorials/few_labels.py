@@ -44,7 +44,7 @@ torch.manual_seed(0)
 task = get_task("avoiding")
 demonstrations, _ = record_demonstrations("avoiding", episodes=48)
 demonstrations = select_state(demonstrations, task.state_columns)
-data, report = LabelBudget(2, unit="trajectory").apply(demonstrations, command=task.observation[task.command])
+data, report = LabelBudget(2, unit="trajectory").apply(demonstrations, command=task.command_columns)
 
 # %%
 # Latent actions from states alone

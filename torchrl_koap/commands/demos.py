@@ -55,5 +55,6 @@ class Demos(Command):
             raw, report = record_episodes(task.name, episodes, self.seed, self.threads, count_up_to(bar))
         data = episodes_to_ted(raw, task.name)
         save_ted(data, self.out / "ted", task=task.source, notes={"seed": self.seed, "modes": list(report.modes)})
-        write_raw_episodes(self.out / "raw", raw)
+        if task.converter is not None:
+            write_raw_episodes(self.out / "raw", raw)
         return report

@@ -67,7 +67,7 @@ def save_ted(
     """
     folder = Path(folder)
     known = find_task(task)
-    command = known.observation.get(known.command) if known else None
+    command = known.command_columns if known else None
     keys.validate(data, command=command)
     entries = data.items(True, True, is_leaf=is_leaf_nontensor)
     strange = [key for key, value in entries if not isinstance(value, torch.Tensor)]

@@ -245,7 +245,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
     dataset, episodes = (directory.read_entry("config.json", name) for name in ("dataset", "episodes"))
     data = load_demonstrations(dataset, task, episodes=episodes)
     # from here on everything outside the budget is NaN
-    data, report = trained.budget.apply(data, command=task.observation[task.command])
+    data, report = trained.budget.apply(data, command=task.command_columns)
     recorded = directory.read_entry("summary.json", "labels")  # runs of older versions name fewer facts
     if {name: report.as_dict().get(name) for name in recorded} != recorded:
         raise ValueError(f"the demonstrations of {dataset!r} are not those that {directory.path} was trained on")

@@ -63,8 +63,8 @@ class Body:
 
     Examples:
         >>> from torchrl_koap.tasks.scene import Body
-        >>> Body("puck", position="puck_xy", color="blue").label
-        'puck'
+        >>> Body("mug", position="mug_xy", color="blue").label
+        'mug'
     """
 
     name: str

@@ -29,6 +29,11 @@ class StateParts:
         return slices
 
     @property
+    def command_columns(self) -> slice | None:
+        """Observation columns that repeat the last command, None where none do."""
+        return None if self.command is None else self.observation[self.command]
+
+    @property
     def observation_dim(self) -> int:
         """Number of observation columns."""
         return max(part.stop for part in self.observation.values())

@@ -168,7 +168,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         return self
 
     def _begin(self, task: Task, data: TensorDictBase, label_budget: LabelBudget | None, kwargs: dict) -> None:
-        command = task.observation.get(task.command)
+        command = task.command_columns
         keys.validate(data, command=command)
         for key, wanted in ((keys.OBSERVATION, task.observation_dim), (keys.ACTION, task.action_dim)):
             if data.get(key).shape[-1] != wanted:

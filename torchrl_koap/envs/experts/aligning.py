@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A simulated joystick player for Aligning that pushes the tray into the target pose, from inside or from outside.
+"""Scripted expert of Aligning: a joystick player that pushes the tray into the target pose, from inside or outside.
 
 The player looks at the scene, picks the contact (a corner inside the tray, or a place on one of its walls) from which
 one smooth push leads to the target, and then
@@ -67,7 +67,7 @@ CONTACTS = _contacts()
 
 
 class AligningExpert:
-    """Pushes trays into their target poses, each in an asked mode.
+    """Scripted expert of Aligning for a batch of episodes: pushes trays into their target poses, each in its mode.
 
     Args:
         modes (sequence of int): per episode 0 (from inside) or 1 (from outside).

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A simulated joystick player for Avoiding that takes any of the 24 ways to the finish line.
+"""Scripted expert of Avoiding: a simulated joystick player that takes any of the 24 ways to the finish line.
 
 The player is modelled after the human demonstrations, who held a stick per axis: pauses, pushes that are held and let
 go, saturation at full deflection, and a dead zone below which nothing moves. In one control step it
@@ -77,7 +77,7 @@ def clearance(episode: Episode) -> float:
 
 
 class AvoidingExpert:
-    """Players of a batch of episodes, one mode and one seed each.
+    """Scripted expert of Avoiding for a batch of episodes, one mode and one seed each.
 
     Args:
         modes (sequence of int): the mode each episode shall take, ``n`` numbers of 0 to 23.

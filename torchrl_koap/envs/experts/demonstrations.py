@@ -164,6 +164,7 @@ def write_raw_episodes(folder: str | Path, raw: Sequence[RawEpisode]) -> list[Pa
 
     Raises:
         FileExistsError: if the folder holds pickles already; none is touched.
+        TypeError: if episodes were recorded without D3IL's log.
 
     Examples:
         >>> import tempfile
@@ -173,6 +174,8 @@ def write_raw_episodes(folder: str | Path, raw: Sequence[RawEpisode]) -> list[Pa
         ...     [file.name for file in write_raw_episodes(folder, raw)]
         ['env_000_00.pkl']
     """
+    if any(isinstance(episode, PlainEpisode) for episode in raw):
+        raise TypeError("episodes recorded without D3IL's log cannot be written as its pickles; save them as TED data")
     folder = Path(folder)
     if folder.is_dir() and any(folder.glob("*.pkl")):
         raise FileExistsError(f"{folder} holds pickles already; they are left as they are")

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A simulated person at the gripper who stacks the three boxes of Stacking in a wanted order.
+"""Scripted expert of Stacking: a simulated person at the gripper who stacks the three boxes in a wanted order.
 
 What it does next follows from what it sees now, so similar situations give similar motions. For every box::
 
@@ -45,7 +45,7 @@ _REACH, _GRASP, _CARRY, _RELEASE, _RETREAT = range(5)
 
 
 class StackingExpert:
-    """People of a batch of episodes, one order and one seed each.
+    """Scripted expert of Stacking for a batch of episodes, one order and one seed each.
 
     Args:
         modes (sequence of int): order of the boxes of each episode, 0 to 5, see
