@@ -9,15 +9,29 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from torchrl_koap.reports.scenes import INK, MUTED, set_title, tidy
-from torchrl_koap.reports.training_plots import BLUE, ORANGE, save_figure
-from torchrl_koap.tasks import Task
+from torchrl_koap.reports.pictures import NothingToDraw, picture
+from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, save_figure, set_title, tidy
+from torchrl_koap.tasks import Task, get_task
 
 EXPERIMENTS = {
     "imagined": "planner alone\n(imagined)",
     "followed": "controller alone\n(recorded states)",
     "closed_loop": "both\n(closed loop)",
 }
+
+
+@picture(
+    "inspect.png",
+    source="inspect.json",
+    title="Which part fails",
+    caption="Success of the planner's own imagination, of the controller on recorded states, and of both in closed"
+    " loop; distances of executed states to plans.",
+    place=70,
+)
+def _draw_inspection(result: Mapping[str, Any], path: Path, *, task: str | None) -> Path:
+    if "closed_loop" not in result or task is None:
+        raise NothingToDraw("the experiments in the simulator were left out")
+    return plot_inspection(result, get_task(task), path)
 
 
 def plot_inspection(result: Mapping[str, Any], task: Task, path: str | Path) -> Path:
@@ -42,7 +56,7 @@ def plot_inspection(result: Mapping[str, Any], task: Task, path: str | Path) -> 
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
     for index, name in enumerate(EXPERIMENTS):
         value = result[name]
-        left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "closed_loop" else "#9cc3f5")
+        left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "closed_loop" else PALE_BLUE)
         left.vlines(index, 100 * value["low"], 100 * value["high"], color=INK, linewidth=1.4)
         left.annotate(f"n = {value['episodes']}", (index, 2), ha="center", fontsize=8, color=MUTED)
     left.set_xticks(range(3), EXPERIMENTS.values(), fontsize=8)

@@ -17,7 +17,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
 from torchrl_koap.reports.scenes import BLUE, GREEN, INK, MUTED, RED
-from torchrl_koap.reports.training_plots import as_array
+from torchrl_koap.reports.style import as_array
 
 
 @dataclass(frozen=True)
