@@ -52,14 +52,14 @@ def plot_inspection(result: Mapping[str, Any], task: Task, path: str | Path) -> 
         ...     plot_inspection(result, get_task("avoiding"), f"{folder}/inspect.png").name
         'inspect.png'
     """
-    figure = Figure(figsize=(9.2, 3.8), layout="constrained")
+    figure = Figure(figsize=(9.8, 4.1), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
     for index, name in enumerate(EXPERIMENTS):
         value = result[name]
         left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "closed_loop" else PALE_BLUE)
         left.vlines(index, 100 * value["low"], 100 * value["high"], color=INK, linewidth=1.4)
-        left.annotate(f"n = {value['episodes']}", (index, 2), ha="center", fontsize=8, color=MUTED)
-    left.set_xticks(range(3), EXPERIMENTS.values(), fontsize=8)
+    numbers = [f"{words}\nn = {result[name]['episodes']}" for name, words in EXPERIMENTS.items()]
+    left.set_xticks(range(3), numbers, fontsize=8)
     left.set_ylim(0, 105)
     left.set_ylabel("success (%)")
     set_title(left, "Who reaches the goal (95 % intervals)")
@@ -75,9 +75,9 @@ def plot_inspection(result: Mapping[str, Any], task: Task, path: str | Path) -> 
     names = list(result["plan_to_execution"])
     right.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
     right.invert_yaxis()
-    right.set_xlabel("root mean square distance after the last step of a plan (m, rad, or on the unit circle)")
+    right.set_xlabel("root mean square distance after the last step of a plan\n(m, rad, or on the unit circle)")
     set_title(right, "How far execution is")
     if names:
-        right.legend(frameon=False, fontsize=8)
+        right.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.24), ncols=2)
     tidy(right)
     return save_figure(figure, path)

@@ -18,7 +18,7 @@ from torchrl_koap.evaluation.latent_verdict import ON_THE_CIRCLE, unit_circle_si
 from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, PALE_BLUE, as_array, set_title, tidy
 
 SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}
-_TIMES = (0.01, 0.03, 0.1, 0.3, 1, 3, 10)
+_TIMES = (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 20)
 
 
 def as_spectrum(real: Any, imag: Any) -> np.ndarray:
@@ -52,6 +52,8 @@ def draw_spectrum(axes: Axes, values: np.ndarray) -> None:
     axes.axvline(0, color=FAINT, linewidth=0.6, zorder=0.5)
     reach = 1.1 * min(max(1.0, float(np.abs(values).max())), 4.0)  # the title counts those beyond
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1, xlabel="real part", ylabel="imaginary part")
+    if reach < 2:
+        axes.set(xticks=(-1, -0.5, 0, 0.5, 1), yticks=(-1, -0.5, 0, 0.5, 1))
     panels = [axes]
     centre = np.array([values.real.min() + values.real.max(), values.imag.min() + values.imag.max()]) / 2
     spread = max(np.ptp(values.real), np.ptp(values.imag), 0.002)
@@ -96,7 +98,9 @@ def draw_distances(axes: Axes, values: np.ndarray, *, control_hz: float | None =
     low, high = min(size.min() - 1, -2 * ON_THE_CIRCLE), max(size.max() - 1, 2 * ON_THE_CIRCLE)
     axes.set_ylim(1.6 * low, 1.6 * high)
     bottom, top = axes.get_ylim()
-    ticks = [sign * 10.0**power for sign in (-1, 1) for power in range(-3, 4)]
+    near = max(-low, high) < 20 * ON_THE_CIRCLE  # within two per cent: decades alone would be one tick
+    steps = (1, 2, 5) if near else (1,)
+    ticks = [sign * step * 10.0**power for sign in (-1, 1) for step in steps for power in range(-3, 4)]
     ticks = sorted(tick for tick in [*ticks, 0.0] if bottom <= tick <= top)
     axes.set_yticks(ticks, [f"{tick:+g}" if tick else "0" for tick in ticks])
     axes.yaxis.set_minor_locator(NullLocator())
