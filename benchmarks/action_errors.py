@@ -29,7 +29,7 @@ from torchrl_koap.training.run_directory import RunDirectory
 
 def action_error(task, data, method: str, fraction: float, seed: int, updates: int) -> float:
     """Error of one controller, trained as ``koap train`` does."""
-    labelled, _ = LabelBudget(fraction, seed=seed).apply(data, command=task.observation[task.command])
+    labelled, _ = LabelBudget(fraction, seed=seed).apply(data, command=task.command_columns)
     with tempfile.TemporaryDirectory() as folder:
         options = Train(out=Path(folder), task=task.name, method=method, seed=seed, controller_steps=updates)
         options = with_task_defaults(options, task)
@@ -38,7 +38,7 @@ def action_error(task, data, method: str, fraction: float, seed: int, updates: i
         controller, _, _ = train_controller(run, options, configure(run, options), task, labelled, None)
     columns = task.controller_columns(options.controller_state)
     predicted, true = hidden_action_errors(controller, controller_view(data, columns), labelled)
-    same = slice(task.same_unit)  # a gripper's number has no unit
+    same = task.action_columns()  # a gripper's number has no unit
     return rmse_mm(predicted[:, same], true[:, same])
 
 

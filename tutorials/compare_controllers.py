@@ -46,7 +46,7 @@ demonstrations = select_state(demonstrations, task.state_columns)
 
 
 def budget(count):
-    data, _ = LabelBudget(count, seed=1).apply(demonstrations, command=task.observation[task.command])
+    data, _ = LabelBudget(count, seed=1).apply(demonstrations, command=task.command_columns)
     return data
 
 
@@ -157,7 +157,7 @@ chosen = rank_trajectories(
 )
 first = data["episode"][data["has_action"].squeeze(-1)][:1].tolist()
 asked = LabelBudget.of_episodes([*first, *(choice.episode for choice in chosen)])
-data, _ = asked.apply(demonstrations, command=task.observation[task.command])
+data, _ = asked.apply(demonstrations, command=task.command_columns)
 suggested = rmse_mm(*hidden_action_errors(koap(data).eval(), demonstrations, data))
 
 # %%

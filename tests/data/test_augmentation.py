@@ -162,11 +162,11 @@ def test_shifted_columns_may_be_chosen():
 def test_a_tool_follows_the_joints_and_comes_back_with_them():
     joints = torch.rand(30, 16, 7, dtype=torch.float64) - 0.5
     state = torch.cat([joints, torch.rand(30, 16, 1).double(), tool_position(joints)], -1)
-    augment = RecoveryAugmentation(0.02, columns=range(7), tool=(8, 9, 10))
+    augment = RecoveryAugmentation(0.02, columns=range(7), tool=(8, 9, 10), kinematics=tool_position)
     found = augment(TensorDict({"state": state.clone()}, [30]))["state"]
     torch.testing.assert_close(found[..., 8:], tool_position(found[..., :7]))
     assert torch.equal(found[..., 7], state[..., 7])
     away = (found - state)[..., 8:].norm(dim=-1)
     assert 0.002 < away[:, 1].mean() < 0.05 and away[:, 15].mean() < 0.02 * away[:, 1].mean()
-    with pytest.raises(ValueError, match="follows the arm's seven joints"):
+    with pytest.raises(ValueError, match="wanted columns and kinematics"):
         RecoveryAugmentation(0.02, columns=(0, 1), tool=(2, 3, 4))

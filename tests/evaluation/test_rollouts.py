@@ -11,7 +11,7 @@ from torchrl.envs import TransformedEnv
 from toy_episodes import episode_of, number
 from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength, PlannedStep, wandering_planner
 
-from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.transforms import EndEffectorNoise
 from torchrl_koap.evaluation.rollouts import (
     make_policy,

@@ -18,7 +18,7 @@ from run_files import make_demonstrations, make_object_rollouts, make_rollouts
 
 from torchrl_koap.evaluation.latent_space import spectrum
 from torchrl_koap.reports import mode_plots, objects, rollout_plots, training_plots
-from torchrl_koap.tasks import modes
+from torchrl_koap.reports.mode_colors import mode_colors
 
 
 @pytest.fixture
@@ -231,7 +231,7 @@ def test_modes_histogram(figures, tmp_path):
     assert titles(figures[0])[0].endswith("; 1 without a mode")
     levels = [line[0][1] for line in drawn_lines(axes)]
     assert levels[5] == pytest.approx(4 * 2 / 3) and sum(levels) == pytest.approx(4)
-    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], modes.mode_colors("avoiding"))
+    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], mode_colors("avoiding"))
 
 
 def test_rollouts_are_cut_coloured_and_counted(figures, tmp_path):
@@ -240,7 +240,7 @@ def test_rollouts_are_cut_coloured_and_counted(figures, tmp_path):
     assert titles(figures[0])[0] == "2 of 4 rollouts succeed, out of time: 1, collision: 1"
     lines = axes.collections[0]
     np.testing.assert_allclose(lines.get_segments(), ROLLOUTS["position"][:2])
-    np.testing.assert_allclose(lines.get_colors()[:, :3], modes.mode_colors("avoiding")[:2])
+    np.testing.assert_allclose(lines.get_colors()[:, :3], mode_colors("avoiding")[:2])
     late, hit = axes.lines[1:]  # the first line is the finish
     assert len(late.get_xdata()) == 20 and len(hit.get_xdata()) == 10
     np.testing.assert_allclose(axes.collections[-1].get_offsets()[0], ROLLOUTS["position"][3, 9])
@@ -277,7 +277,7 @@ def test_objects_get_a_panel(task, figures, tmp_path):
             np.testing.assert_allclose(found[0], wanted[0])
     entries = [text.get_text() for text in figures[0].axes[2].get_legend().get_texts()]
     assert entries[:2] == ["out of time", "collision"] and entries[-2:] == ["end", "end of a failure"]
-    assert entries[2:-2] == list(dict.fromkeys(look.name for look in looks))
+    assert entries[2:-2] == list(dict.fromkeys(look.label for look in looks))
 
 
 def test_plans_of_a_task_with_objects(figures, tmp_path):

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from tiny_runs import demonstration, write_demonstrations
 
 from torchrl_koap.data import LabelBudget, save_ted
+from torchrl_koap.envs.registry import make_env_of, mode_index_of
 from torchrl_koap.keys import validate
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import get_task
@@ -21,8 +22,6 @@ from torchrl_koap.training.builders import (
     build_controller,
     build_planner,
     load_demonstrations,
-    make_env_of,
-    mode_index_of,
     set_up_torch,
 )
 from torchrl_koap.training.methods import METHODS

@@ -47,7 +47,7 @@ def poisoned(data, budget, *, inside=False):
 
     Of a trajectory with a hidden action all commands are: their differences are its actions.
     """
-    labelled = budget.apply(data, command=TASK.observation[TASK.command])[0]
+    labelled = budget.apply(data, command=TASK.command_columns)[0]
     data = data.clone()
     if inside:
         data["action"] = torch.where(labelled["has_action"], data["action"] * 1.5, data["action"])

@@ -47,7 +47,7 @@ def run_demos(options: Demos) -> RecordingReport:
     for name in ("ted", "raw"):
         if (options.out / name).exists():
             raise FileExistsError(f"{options.out / name} exists already; choose another --out")
-    episodes = task.demonstrations if options.episodes is None else options.episodes
+    episodes = task.defaults.demonstrations if options.episodes is None else options.episodes
     with tqdm(total=episodes, desc="recording", unit="episode") as bar:
         raw, report = record_episodes(
             task.name,
@@ -58,5 +58,6 @@ def run_demos(options: Demos) -> RecordingReport:
         )
     data = episodes_to_ted(raw, task.name)
     save_ted(data, options.out / "ted", task=task.source, notes={"seed": options.seed, "modes": list(report.modes)})
-    write_raw_episodes(options.out / "raw", raw)
+    if task.converter is not None:
+        write_raw_episodes(options.out / "raw", raw)
     return report

@@ -33,7 +33,7 @@ from torchrl_koap.reports.latent_plot import error_unit, plot_latent
 from torchrl_koap.reports.pictures import FOLDER
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task
-from torchrl_koap.training.builders import load_demonstrations, make_env_of, set_up_torch
+from torchrl_koap.training.builders import load_demonstrations, set_up_torch
 from torchrl_koap.training.run_directory import RunDirectory
 
 _NEAR = 0.015  # m; recorded tool paths followed within this are followed well
@@ -116,6 +116,8 @@ def _experiments(
         "gripper": task.gripper,
     }
     seeds = list(range(options.seed, options.seed + options.episodes))
+    from torchrl_koap.envs.registry import make_env_of  # takes seconds
+
     make_env = make_env_of(task, num_threads=options.threads)
     _, contexts = choose_contexts(task, options.episodes)
     with tqdm(total=3, desc="experiments", unit="experiment") as bar:

@@ -105,7 +105,7 @@ def run_suggest(options: Suggest) -> SuggestedLabels:
     dataset, episodes = (run.read_entry("config.json", name) for name in ("dataset", "episodes"))
     data = load_demonstrations(dataset, task, episodes=episodes)
     # from here on everything outside the budget is NaN
-    data, report = budget_of(run).apply(data, command=task.observation[task.command])
+    data, report = budget_of(run).apply(data, command=task.command_columns)
     recorded = run.read_entry("summary.json", "labels")  # runs of older versions name fewer facts
     if {name: report.as_dict().get(name) for name in recorded} != recorded:
         raise ValueError(f"the demonstrations of {dataset!r} are not those that {run.path} was trained on")

@@ -7,7 +7,7 @@ from torchrl_koap.data.augmentation import (
     RecoveryAugmentation,
     extrapolate_ends,
 )
-from torchrl_koap.data.d3il.conversion import CONVERTERS, Converter, RawFolderError, convert_raw_files, find_raw_files
+from torchrl_koap.data.d3il.conversion import Converter, RawFolderError, convert_raw_files, find_raw_files
 from torchrl_koap.data.d3il.raw import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
 from torchrl_koap.data.d3il.replay import D3ILExperienceReplay
 from torchrl_koap.data.d3il.unpickling import DamagedPickleError, UnsafePickleError, load_pickle, loads_pickle
@@ -26,7 +26,6 @@ from torchrl_koap.data.window_sampler import WindowSampler, WindowSamplerWithout
 from torchrl_koap.data.window_table import WindowTable
 
 __all__ = [
-    "CONVERTERS",
     "Converter",
     "D3ILExperienceReplay",
     "DamagedDataError",

@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.keys import EPISODE, STATE
-from torchrl_koap.tasks.panda_kinematics import tool_position
 
 
 class RecoveryAugmentation(TensorDictModuleBase):
@@ -31,8 +31,10 @@ class RecoveryAugmentation(TensorDictModuleBase):
         history (int): observed frames of the window. Defaults to ``2``.
         decay (float): share ``rho`` of the shift that remains after each planned frame. Defaults to ``0.7``.
         columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
-        tool (sequence of int, optional): state columns of the tool's position; they follow the arm's seven joints,
-            which are then ``columns`` (:func:`~torchrl_koap.tasks.panda_kinematics.tool_position`).
+        tool (sequence of int, optional): state columns of the tool's position; they follow the arm's joints, which
+            are then ``columns``.
+        kinematics (callable, optional): the function from joints ``[*B, J]`` to the position of the tool ``[*B, 3]``,
+            needed with ``tool``, such as :func:`~torchrl_koap.tasks.panda_kinematics.tool_position`.
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
 
     Examples:
@@ -52,17 +54,19 @@ class RecoveryAugmentation(TensorDictModuleBase):
         decay: float = 0.7,
         columns: Sequence[int] | None = None,
         tool: Sequence[int] | None = None,
+        kinematics: Callable[[Tensor], Tensor] | None = None,
         key: NestedKey = STATE,
     ):
         super().__init__()
-        if tool is not None and (columns is None or len(columns) != 7):
-            raise ValueError(f"a tool follows the arm's seven joints, got columns {columns}")
+        if tool is not None and (columns is None or kinematics is None):
+            raise ValueError(f"a tool follows joints: wanted columns and kinematics, got {columns} and {kinematics}")
         if sigma < 0 or not 0 <= decay < 1:
             raise ValueError(f"sigma must be >= 0 and decay in [0, 1), got {sigma} and {decay}")
         self.in_keys, self.out_keys = [key], [key]
         self.sigma, self.history, self.decay = sigma, history, decay
         self.columns = None if columns is None else list(columns)
         self.tool = None if tool is None else list(tool)
+        self.kinematics = kinematics
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by shifted ones."""
@@ -77,7 +81,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
         remaining = self.decay ** frames.clamp_min(0).to(state.dtype)
         shifted = state + 2 * self.sigma * size * shift * remaining[:, None]
         if self.tool is not None and self.sigma:
-            moved = tool_position(shifted[..., self.columns]) - tool_position(state[..., self.columns])
+            moved = self.kinematics(shifted[..., self.columns]) - self.kinematics(state[..., self.columns])
             shifted[..., self.tool] = shifted[..., self.tool] + moved
         return tensordict.set(self.in_keys[0], shifted)
 

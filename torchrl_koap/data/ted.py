@@ -24,7 +24,7 @@ from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import replacing_folder
-from torchrl_koap.tasks import TASKS
+from torchrl_koap.tasks.registry import find_task
 
 FORMAT = 1
 _ABOUT = "about.json"
@@ -66,7 +66,8 @@ def save_ted(
         (torch.Size([8]), [3, 5], {'seed': 0})
     """
     folder = Path(folder)
-    command = TASKS[task].observation[TASKS[task].command] if task in TASKS else None
+    known = find_task(task)
+    command = known.command_columns if known else None
     keys.validate(data, command=command)
     entries = data.items(True, True, is_leaf=is_leaf_nontensor)
     strange = [key for key, value in entries if not isinstance(value, torch.Tensor)]

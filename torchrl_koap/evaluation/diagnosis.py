@@ -24,7 +24,6 @@ from torchrl_koap.keys import OBSERVATION
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.policies.replay import RecordedPlanner
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.goals import goal_reached
 
 
 @torch.no_grad()
@@ -58,13 +57,14 @@ def contexts_of(task: Task, observation: Tensor) -> Tensor:
     ``tan(yaw)`` gives the yaw of a box up to half a turn, which looks the same.
     """
     rows = []
-    for name in task.objects:
-        xy = observation[:, task.observation[task.drawn[name]]][:, :2]
-        if f"{name}_quaternion" in task.observation:
-            w, _, _, z = observation[:, task.observation[f"{name}_quaternion"]].unbind(-1)
+    for body in task.bodies:
+        xy = observation[:, task.observation[body.position]][:, :2]
+        turned = observation[:, task.observation[body.yaw]] if body.yaw else xy.new_zeros(len(xy), 1)
+        if turned.shape[-1] == 4:
+            w, _, _, z = turned.unbind(-1)
             yaw = 2 * torch.atan2(z * w.sign(), w.abs())
         else:
-            yaw = observation[:, task.observation[f"{name}_tan_yaw"]].squeeze(-1).atan()
+            yaw = turned.squeeze(-1).atan()
         rows.append(torch.cat([xy, yaw[:, None]], -1))
     return torch.stack(rows, 1)
 
@@ -173,7 +173,7 @@ def rate(good: Sequence[bool]) -> Mapping[str, float]:
 
 def imagined_success(task: Task, imagined: Tensor) -> list[bool]:
     """Which imagined episodes ``[E, T, d]`` reach the goal at any time."""
-    return goal_reached(task, imagined).any(-1).tolist()
+    return task.goal_reached(imagined).any(-1).tolist()
 
 
 def executed_success(episodes: Sequence[TensorDict]) -> list[bool]:

@@ -14,7 +14,7 @@ from torch import nn
 from tqdm import tqdm
 
 from torchrl_koap.evaluation.rollouts import make_policy, measure_latency, roll_out, rollouts_to_tensors
-from torchrl_koap.evaluation.scores import d3il_score, score, stacking_scores
+from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ChunkedPolicy, StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
@@ -24,9 +24,7 @@ from torchrl_koap.training.builders import (
     build_controller,
     build_diffusion_policy,
     build_planner,
-    make_env_of,
     method_named,
-    mode_index_of,
     set_up_torch,
 )
 from torchrl_koap.training.checkpoints import load_weights, save_tensors
@@ -168,6 +166,8 @@ def run_eval(options: Eval) -> dict[str, Any]:
     policy = policy.to(options.device)
     seeds = list(range(options.seed, options.seed + options.episodes))
     numbers, contexts = choose_contexts(task, options.episodes, options.rollouts_per_context, options.contexts_file)
+    from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
+
     mode_index = mode_index_of(task)
     with tqdm(total=options.episodes, desc="rollouts", unit="episode") as bar:
         episodes = roll_out(
@@ -179,13 +179,11 @@ def run_eval(options: Eval) -> dict[str, Any]:
             contexts=contexts,
             progress=lambda finished: bar.update(finished - bar.n),
         )
-    unsolved = "zero" if task.entropy == "contexts" else "skip"
+    unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
     result = score(
         episodes, seeds, num_modes=task.num_modes, mode_index=mode_index, contexts=numbers, unsolved=unsolved
     )
-    if task.source == "stacking":
-        result |= stacking_scores(episodes, numbers, complete=task.name == "stacking")
-    result |= d3il_score(task, result)
+    result |= task_scores(task, result, episodes, numbers)
     rows = result.pop("episode")
     result |= measure_latency(policy, task.observation_dim)
     result |= {
@@ -201,7 +199,7 @@ def run_eval(options: Eval) -> dict[str, Any]:
         position=task.observation[task.position],
         mode_index=mode_index,
         interval=options.replan_interval,
-        objects=[task.observation[part] for part in task.drawn.values()],
+        objects=[task.observation[part] for part in task.plotted.values()],
         plans_position=task.plans_position,
     )
     if contexts is not None:  # in full precision: a film of the same episode starts from it

@@ -14,17 +14,17 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from torchrl_koap.reports.mode_colors import mode_colors
 from torchrl_koap.reports.objects import object_looks, object_paths
 from torchrl_koap.reports.pictures import NotFilmed, NothingToDraw, picture
 from torchrl_koap.reports.rollout_plots import executed_paths, has_objects, keep_inside
 from torchrl_koap.reports.scenes import draw_scene
 from torchrl_koap.reports.style import FAILURE_MARKS, INK, NO_MODE, SUCCESS, as_array, set_title
-from torchrl_koap.tasks.modes import mode_colors
+from torchrl_koap.tasks.registry import get_task
 
 HOLD_SECONDS = 1.5
 MOST_PICTURES = 170  # of an animation from above, unless a stride is given
 FILM_PICTURES = 24  # of a film likewise: software rendering takes 0.1 s each
-CAMERAS = {"aligning": "cage", "sorting": "cage", "sorting_2": "cage", "sorting_6": "cage", "po_sorting": "cage"}
 _VIDEO = "a .mp4 needs imageio with ffmpeg: pip install imageio imageio-ffmpeg, or write a .gif"
 
 
@@ -171,9 +171,9 @@ def render_rollout(
         RuntimeError: if no OpenGL library can be used; the message says what to install.
     """
     _check_kind(path)
-    from torchrl_koap.tasks import get_task  # takes seconds, as what follows
-
     facts = get_task(task)
+    if facts.env is None or facts.scene.camera is None:
+        raise RuntimeError(f"task {task!r} names no camera of a simulator to film it with")
     actions = as_array("actions", actions, [None, facts.action_dim])
     actions = actions[np.isfinite(actions).all(1)].astype(np.float64)
     if facts.objects:
@@ -186,14 +186,14 @@ def render_rollout(
     import torch
 
     from torchrl_koap.envs.mujoco.rendering import Renderer
-    from torchrl_koap.envs.registry import ENVIRONMENTS
+    from torchrl_koap.envs.registry import make_env
 
-    env = ENVIRONMENTS[task](1, max_steps=len(actions) + 1, dtype=torch.float64)
+    env = make_env(facts, 1, max_steps=len(actions) + 1, dtype=torch.float64)
     renderer = None
 
     def pictures() -> Iterator[np.ndarray]:
         data = env.reset() if context is None else env.reset(contexts=context)
-        view = camera or CAMERAS.get(task, "front")
+        view = camera or facts.scene.camera
         yield renderer.render(env.sims.data[0], view)
         for number, action in enumerate(actions):
             data = env.step(data.set("action", data["observation"].new_tensor(action[None])))["next"]

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from safetensors.numpy import load_file
 
 from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET
-from torchrl_koap.reports.pictures import NothingToDraw, action_columns, picture
+from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.spectrum_plot import as_spectrum, draw_spectrum
 from torchrl_koap.reports.style import (
     BLUE,
@@ -91,7 +91,7 @@ def plot_latent(latent: Mapping[str, Any], path: str | Path, *, task: Task, eige
         values = as_array("eigenvalues", eigenvalues, [None])
         draw_spectrum(axes["spectrum"], as_spectrum(values.real, values.imag))
     _draw_errors(axes["errors"], latent["multi_step"], task)
-    _draw_probe(axes["probe"], outside, [name for name, _ in action_columns(task)])
+    _draw_probe(axes["probe"], outside, list(task.action_names))
     figure.suptitle(
         f"probe and decoder: for analysis only, reads {outside['labels_read']:,} labels, outside the budget",
         fontsize=10,

@@ -16,10 +16,11 @@ from matplotlib.ticker import MaxNLocator
 from safetensors.numpy import load_file
 
 from torchrl_koap.evaluation.statistics import mode_entropy
+from torchrl_koap.reports.mode_colors import initials, mode_colors
 from torchrl_koap.reports.pictures import picture
-from torchrl_koap.reports.scenes import AVOIDING_CYLINDERS
 from torchrl_koap.reports.style import FAINT, INK, MUTED, SUCCESS, as_array, legend_beside, save_figure, set_title, tidy
-from torchrl_koap.tasks.modes import initials, mode_choices, mode_colors
+from torchrl_koap.tasks.avoiding import OBSTACLES
+from torchrl_koap.tasks.modes import mode_choices
 
 _ROW_REACH = 0.03  # m before and behind a row of cylinders: the gap is the one at the first frame within it
 
@@ -157,7 +158,7 @@ def recorded_modes(demonstrations: Mapping[str, Any], task: str | None) -> np.nd
     position = as_array("position", demonstrations["position"], [None, 2])
     episode = as_array("episode", demonstrations["episode"], [len(position)])
     rows: dict[float, list[float]] = {}
-    for x, y, _ in AVOIDING_CYLINDERS:
+    for _, x, y, *_ in OBSTACLES:
         rows.setdefault(y, []).append(x)
     modes = []
     for path in np.split(position, np.flatnonzero(np.diff(episode) != 0) + 1):

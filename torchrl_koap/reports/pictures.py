@@ -25,14 +25,14 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from torchrl_koap.tasks import TASKS
+from torchrl_koap.tasks.registry import find_task
 
 FOLDER = "plots"
 FACTS = {
     "task": "name of the run's task, None where its scene cannot be drawn",
     "num_modes": "number of modes of the task",
     "control_hz": "control steps per second, None where unknown",
-    "actions": "names and units of the action columns, None where unknown",
+    "actions": "name, unit and whether it is absolute of every action column, None where unknown",
     "run_dir": "the run directory",
 }
 _BUILT_IN = ("rollout_plots", "animation", "mode_plots", "training_plots", "latent_plot", "diagnosis_plot")
@@ -231,38 +231,17 @@ def run_facts(run_dir: Path) -> dict[str, Any]:
         name = json.loads((run_dir / "config.json").read_text(encoding="utf-8")).get("task")
     except (OSError, ValueError, AttributeError):
         name = None
-    task = TASKS.get(name) if isinstance(name, str) else None
+    task = find_task(name)
+    columns = None
+    if task is not None:
+        columns = [(column, unit, column in task.absolute_actions) for column, unit in task.actions.items()]
     return {
         "task": name if task else None,
         "num_modes": task.num_modes if task else 24,
         "control_hz": task.control_hz if task else None,
-        "actions": action_columns(task) if task else None,
+        "actions": columns,
         "run_dir": run_dir,
     }
-
-
-def action_columns(task: Any) -> list[tuple[str, str]]:
-    """Name and unit of every action column of a task.
-
-    Args:
-        task (Task): the task.
-
-    Examples:
-        >>> from torchrl_koap.reports.pictures import action_columns
-        >>> from torchrl_koap.tasks import get_task
-        >>> action_columns(get_task("aligning")), action_columns(get_task("stacking"))[-2:]
-        ([('x', 'm'), ('y', 'm'), ('z', 'm')], [('joint 7', 'rad'), ('gripper', 'm')])
-    """
-    names, unit = getattr(task, "action_names", ()), task.action_unit or ""
-    if names:
-        units = getattr(task, "action_units", ()) or (unit,) * len(names)
-        return list(zip(names, units, strict=True))
-    if unit == "rad":
-        rest = task.action_dim - task.same_unit
-        return [(f"joint {n + 1}", unit) for n in range(task.same_unit)] + [("gripper", "m")] * rest
-    if unit == "m" and task.action_dim <= 3:
-        return [(name, unit) for name in "xyz"[: task.action_dim]]
-    return [(f"action {n + 1}", unit) for n in range(task.action_dim)]
 
 
 def _facts_of(draw: Callable) -> list[tuple[str, inspect.Parameter]]:

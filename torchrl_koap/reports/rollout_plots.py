@@ -14,6 +14,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from torchrl_koap.reports.mode_colors import mode_colors
 from torchrl_koap.reports.mode_plots import draw_mode_table
 from torchrl_koap.reports.objects import draw_object_paths, draw_starts, legend_handles, object_looks, object_paths
 from torchrl_koap.reports.pictures import NothingToDraw, picture
@@ -30,47 +31,26 @@ from torchrl_koap.reports.style import (
     set_title,
     thousandths,
 )
-from torchrl_koap.tasks import TASKS
-from torchrl_koap.tasks.modes import mode_choices, mode_colors, mode_name
+from torchrl_koap.tasks.modes import mode_choices, mode_name
+from torchrl_koap.tasks.registry import find_task
 
 _MOST_ROOM = 0.5  # of the scene's own size is added on a side where paths leave it, at most
-_BOXES = (
-    " The second panel shows the boxes: pale outlines where they start, paths in their colours, a dot where they end, a"
-    " cross in rollouts that failed."
-)
-_SORTING = (
-    _BOXES
-    + " The grey square is the platform, the coloured frames are the bins. Look for boxes that end in a bin of the"
-    " other colour, beside the bins, or nowhere near them."
-)
-_STACKING = (
-    _BOXES + " The circle is how near to the zone's centre a box must come. A dot at its rim is a box that was still in"
-    " the gripper when the rollout ended. Look for boxes that never moved and for those dropped on the way."
-)
-SCENE_CAPTIONS = {
-    "avoiding": " Solid discs are the cylinders; the pale ring is where the rod touches. Hue tells the gap taken in the"
-    " last row, lightness the choices before it. Look for gaps nobody takes, and for paths that brush the rings.",
-    "aligning": " The second panel shows the tray: where it starts (an outline with a thick far side; of many only the"
-    " centre and a line to the far side), its path, a dot where it ends and a cross if the rollout failed; targets are"
-    " drawn likewise. The dashed frames are the ranges of both centres. Look for crosses far from any target: the tray"
-    " was lost; crosses near one: the angle was wrong or time ran out.",
-    "sorting": _SORTING,
-    "sorting_2": _SORTING,
-    "sorting_6": _SORTING,
-    "po_sorting": _SORTING,
-    "stacking": _STACKING,
-    "stacking_1": _STACKING,
-}
 
 
 def scene_caption(task: str | None) -> str:
     """What the caption of the rollouts adds for a task."""
-    return SCENE_CAPTIONS.get(task, "")
+    known = find_task(task)
+    return known.scene.caption if known else ""
 
 
 def has_objects(sentence: str) -> Callable[[str | None], str]:
     """Adds a sentence to the caption of tasks with objects."""
-    return lambda task: sentence if task in TASKS and TASKS[task].objects else ""
+
+    def caption_of(task: str | None) -> str:
+        known = find_task(task)
+        return sentence if known and known.bodies else ""
+
+    return caption_of
 
 
 def executed_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:

@@ -189,11 +189,11 @@ def plot_eigenvalues(real: Any, imag: Any, path: str | Path, *, control_hz: floa
     " offset in the error histogram means drift.",
     place=90,
 )
-def _draw_actions(data: Mapping[str, Any], path: Path, *, actions: Sequence[tuple[str, str]] | None) -> Path:
+def _draw_actions(data: Mapping[str, Any], path: Path, *, actions: Sequence[tuple[str, str, bool]] | None) -> Path:
     if not actions or len(actions) != data["true"].shape[-1]:
         return plot_actions(data["predicted"], data["true"], path)
-    names, units = zip(*actions, strict=True)
-    levels = [name for name, unit in actions if unit != units[0]]  # a number that is set, not a change per step
+    names, units, _ = zip(*actions, strict=True)
+    levels = [name for name, _, level in actions if level]  # a number that is set, not a change per step
     return plot_actions(data["predicted"], data["true"], path, names=names, units=units, absolute=levels)
 
 

@@ -221,7 +221,7 @@ def _first_look(root: RunDirectory, options: Curve, task: Task) -> TensorDictBas
     if options.units != "trajectory":
         LabelBudget(1, unit=options.units)  # knows the units
         return None
-    number = options.demonstrations or task.demonstrations
+    number = options.demonstrations or task.defaults.demonstrations
     return flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number)
 
 
@@ -233,7 +233,7 @@ def _demonstrations(root: RunDirectory, options: Curve, task: Task) -> str:
     if not (folder / "ted").exists():
         from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 
-        episodes = options.demonstrations or task.demonstrations
+        episodes = options.demonstrations or task.defaults.demonstrations
         with tqdm(total=episodes, desc="demonstrations", unit="episode") as bar:
             data, _ = record_demonstrations(
                 task.name, episodes, 0, progress=lambda recorded, wanted: bar.update(recorded - bar.n)

@@ -12,10 +12,10 @@ from torchrl_koap.studies.label_efficiency import Curve, run_curve
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.studies.table import read_cells, write_cells
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
-TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_1")
+PAPER_TASKS = tuple(name for name, task in TASKS.items() if task.in_paper)
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Preset:
 
     title: str
     methods: str
-    tasks: tuple[str, ...] = TASKS
+    tasks: tuple[str, ...] = PAPER_TASKS
     levels: tuple[int, ...] = (1, 2, 3, 4, 5)
     observations: str = "1"
 

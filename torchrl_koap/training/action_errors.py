@@ -53,9 +53,9 @@ def rmse_mm(predicted: Tensor, true: Tensor) -> float:
     return (predicted - true).square().mean().sqrt().item() * 1e3
 
 
-def _drawn(task: Task, observation: Tensor) -> dict[str, Tensor]:
+def _plotted(task: Task, observation: Tensor) -> dict[str, Tensor]:
     """Positions of the tool ``[N, 2]`` and, where there are any, of the objects ``[N, objects, 2]`` for pictures."""
-    starts = [task.observation[part].start for part in (task.position, *task.drawn.values())]
+    starts = [task.observation[part].start for part in (task.position, *task.plotted.values())]
     tool, *objects = (observation[:, start : start + 2] for start in starts)
     return {"position": tool.contiguous()} | ({"objects": torch.stack(objects, 1)} if objects else {})
 
@@ -78,13 +78,13 @@ def write_analysis(
     predicted, true = hidden_action_errors(controller, viewed, labelled)
     has_action = labelled["has_action"].squeeze(-1)
     shown = {"state": data["state"], "episode": data["episode"], "labelled": has_action}
-    save_tensors(run.path / "demonstrations.safetensors", shown | _drawn(task, data["observation"]))
+    save_tensors(run.path / "demonstrations.safetensors", shown | _plotted(task, data["observation"]))
     if not len(true):
         return {"note": "every trajectory has a label in the budget: there is nothing to measure on"}
     save_tensors(run.path / "actions.safetensors", {"predicted": predicted, "true": true})
     ridge = LinearInverseDynamics(len(columns), task.action_dim).to(data["state"].dtype)
     fit_closed_form(ridge, labelled)
-    same = slice(task.same_unit)
+    same = task.action_columns()
     by_ridge, _ = hidden_action_errors(ridge, viewed, labelled)
     return {
         "controller": rmse_mm(predicted[:, same], true[:, same]),

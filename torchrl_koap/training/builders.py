@@ -58,7 +58,7 @@ def load_demonstrations(
     """
     if dataset == "scripted":
         data, _ = record_demonstrations(
-            task.name, task.demonstrations if episodes is None else episodes, seed, progress=progress
+            task.name, task.defaults.demonstrations if episodes is None else episodes, seed, progress=progress
         )
     elif not Path(dataset).is_dir():
         raise FileNotFoundError(f"dataset {dataset!r} is neither 'scripted' nor a folder")
@@ -193,26 +193,3 @@ def set_up_torch(threads: int, device: str) -> None:
     if kind == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device {device!r} was asked for, but torch finds no CUDA here (see `koap doctor`)")
     torch.set_num_threads(threads)
-
-
-def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
-    """A function that makes an environment of the task with a given number of parallel episodes."""
-    from torchrl.envs import TransformedEnv
-
-    from torchrl_koap.envs.registry import ENVIRONMENTS  # the simulator is not needed to train from recorded data
-    from torchrl_koap.envs.transforms import EndEffectorNoise
-
-    make = lookup(ENVIRONMENTS, task.name, "task with an environment")
-
-    def make_env(num_envs: int):
-        env = make(num_envs, num_threads=num_threads, max_steps=task.max_steps)
-        return TransformedEnv(env, EndEffectorNoise(task, task.noise)) if task.noise else env
-
-    return make_env
-
-
-def mode_index_of(task: Task) -> Callable[[torch.Tensor], torch.Tensor]:
-    """The function that turns a task's leaf ``mode`` into a number."""
-    from torchrl_koap.envs.registry import MODE_INDEX
-
-    return lookup(MODE_INDEX, task.name, "task with an environment")

@@ -171,11 +171,11 @@ def started_with(run: RunDirectory, options: Train) -> Train:
 def with_task_defaults(options: Train, task: Task) -> Train:
     """Fills in what was left to the task."""
     defaults = {
-        "steps": task.planner_steps,
-        "recovery_sigma": task.recovery_sigma,
-        "episodes": task.demonstrations,
-        "relative": task.relative,
-        "channels": task.channels,
+        "steps": task.defaults.planner_steps,
+        "recovery_sigma": task.defaults.recovery_sigma,
+        "episodes": task.defaults.demonstrations,
+        "relative": task.defaults.relative,
+        "channels": task.defaults.channels,
     }
     left = {name: value for name, value in defaults.items() if getattr(options, name) is None}
     return replace(options, **left)

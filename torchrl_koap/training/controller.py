@@ -24,7 +24,7 @@ from torchrl_koap.training.config import Train, method_of
 from torchrl_koap.training.loop import moving_average, train
 from torchrl_koap.training.methods import METHODS, Method, Phase
 from torchrl_koap.training.progress import progress_bar, show_progress
-from torchrl_koap.training.released_settings import epochs_of, get_released
+from torchrl_koap.training.released_settings import get_released
 from torchrl_koap.training.run_directory import RunDirectory
 
 _KEYS = ["state", "action", "has_action"]
@@ -72,7 +72,7 @@ class _Training:
     def __init__(self, run: RunDirectory, options: Train, logger, task: Task):
         self.run, self.options, self.logger = run, options, logger
         self.released = get_released(options.method) if options.released_settings else None
-        self.epochs = epochs_of(task.name)
+        self.epochs = task.defaults.released_epochs
         self.updates = 0
 
     def batch_size(self, own: int) -> int:

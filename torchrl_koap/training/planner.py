@@ -69,12 +69,14 @@ def train_planner(
 def _augmentation(options: Train, task: Task) -> TensorDictSequential:
     """What windows undergo before the planner learns from them."""
     steps = []
-    if options.exchange and task.alike_columns():
-        steps.append(ObjectPermutation(task.alike_columns()))
-    if task.scene and (options.scene_shift or options.scene_turn):
+    if options.exchange and task.interchangeable_columns():
+        steps.append(ObjectPermutation(task.interchangeable_columns()))
+    if task.planar_parts and (options.scene_shift or options.scene_turn):
         shift, turn = options.scene_shift, options.scene_turn
-        steps.append(RandomPlanarTransform(*task.scene_columns(), shift=shift, turn=turn, history=HISTORY))
+        steps.append(RandomPlanarTransform(*task.planar_columns(), shift=shift, turn=turn, history=HISTORY))
     arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
     sigma = options.recovery_sigma
-    steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, tool=task.tool_columns))
+    steps.append(
+        RecoveryAugmentation(sigma, history=HISTORY, columns=arm, tool=task.tool_columns, kinematics=task.tool_position)
+    )
     return TensorDictSequential(*steps)

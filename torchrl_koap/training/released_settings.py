@@ -22,7 +22,6 @@ from torchrl_koap.objectives import InverseDynamicsLoss, KOAPLoss
 from torchrl_koap.training.methods import METHODS, Method, Phase, without_actions
 
 BATCH_SIZE, WEIGHT_DECAY, WARMUP = 256, 0.01, 200
-EPOCHS = {"avoiding": 500, "sorting": 400, "stacking": 400, "aligning": 200, "po_sorting": 200}
 POLICY_EPOCHS = 200
 # of the diffusion policy: 11.95 M parameters, all 50 ancestral steps
 POLICY = {"denoiser": "released", "prediction": "epsilon", "solver": "ddpm", "solver_steps": 50, "clip": 1.0}
@@ -84,8 +83,3 @@ def get_released(name: str) -> Released:
     """
     lookup(METHODS, name, "method")
     return lookup(RELEASED, name, "method with released settings:")
-
-
-def epochs_of(task: str) -> int:
-    """Epochs of a controller in the first public code (``koap_release_notes`` section 5)."""
-    return EPOCHS.get(task, EPOCHS.get(task.split("_")[0], 400))

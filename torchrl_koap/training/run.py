@@ -71,7 +71,7 @@ def run_train(options: Train) -> dict[str, Any]:
             episodes=options.episodes,
             progress=lambda recorded, wanted: bar.update(recorded - bar.n),
         )
-    labelled, report = budget.apply(data, command=task.observation[task.command])
+    labelled, report = budget.apply(data, command=task.command_columns)
     # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
     labelled = subsample_trajectories(labelled, options.observation_fraction).to(options.device)
     _check_lengths(options, config, task, labelled)
@@ -104,7 +104,7 @@ def run_train(options: Train) -> dict[str, Any]:
     if options.analysis and not method.acts:
         columns = task.controller_columns(options.controller_state)
         analysis = write_analysis(run, task, data, labelled, controller, columns)
-        summary[f"action_error_{UNITS[task.action_unit]}"] = analysis
+        summary[f"action_error_{UNITS.get(task.action_unit, task.action_unit)}"] = analysis
     run.write_json("summary.json", summary)
     return summary
 

@@ -57,7 +57,7 @@ def made_up(task, lengths=(5, 8), seed=0):
     """Random observations of a task whose command follows from the actions."""
     generator = torch.Generator().manual_seed(seed)
     facts = get_task(task)
-    command, size = facts.observation[facts.command], facts.same_unit
+    command, size = facts.observation[facts.command], facts.num_delta_actions
     frames_of, steps_of = [], []
     for length in lengths:
         frames = torch.randn(length, facts.observation_dim, generator=generator, dtype=torch.float64)
@@ -212,7 +212,7 @@ def test_unknown_names_are_told(tmp_path, recorded, warnings):
 @pytest.mark.parametrize("task", ["avoiding", "stacking"])
 def test_absolute_actions(tmp_path, task, own_row):
     data = made_up(task)
-    command, size = get_task(task).observation[get_task(task).command], get_task(task).same_unit
+    command, size = get_task(task).observation[get_task(task).command], get_task(task).num_delta_actions
     positions = torch.cat([frames[:, command] if own_row else frames[1:, command] for frames, _ in episodes_of(data)])
     rows = iter(positions.tolist())
 

@@ -12,7 +12,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from toy_policies import EpisodesOfRandomLength, state_number
 
-from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.modules import (
     ChunkedPolicy,

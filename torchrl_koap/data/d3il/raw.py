@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """One demonstration in D3IL's raw layout: read with checks, written for other tools.
 
-One pickle per demonstration (section 9 of the specification), one row per control step, ``T`` rows::
+One pickle per demonstration (docs/d3il.md, Recordings), one row per control step, ``T`` rows::
 
     context                                              what the scene was reset to; None in Avoiding
     robot    c_pos, c_vel, des_c_pos            (T, 3)   measured velocity and pose, commanded pose of the end effector

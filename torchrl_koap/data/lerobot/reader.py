@@ -31,11 +31,7 @@ def column_names(task: Task) -> list[str]:
         >>> column_names(get_task("sorting_2"))[2:7]
         ['measured_xy_0', 'measured_xy_1', 'red_1_xy_0', 'red_1_xy_1', 'red_1_tan_yaw']
     """
-    names = []
-    for part, columns in task.observation.items():
-        size = columns.stop - columns.start
-        names += [part] if size == 1 else [f"{part}_{index}" for index in range(size)]
-    return names
+    return list(task.observation_names)
 
 
 def read_lerobot(
@@ -158,7 +154,7 @@ def _checked_actions(task: Task, frames: np.ndarray, actions: np.ndarray, kind: 
     """Changes of the desired position ``[T - 1, act]`` that lead from each row to the next one."""
     if actions.shape[1] != task.action_dim:
         raise ValueError(f"column 'action' has {actions.shape[1]} entries, task {task.name!r} has {task.action_dim}")
-    desired, size = frames[:, task.observation[task.command]], task.same_unit
+    desired, size = frames[:, task.command_columns], task.num_delta_actions
     changes = np.concatenate([np.diff(desired[:, :size], axis=0), desired[1:, size:]], 1)
     gaps = {
         "delta": np.abs(actions[:-1] - changes).max(),

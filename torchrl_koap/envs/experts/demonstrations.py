@@ -20,8 +20,9 @@ from tensordict import TensorDict
 from torchrl_koap.data import RawEpisode, flatten_trajectories, write_raw_episode
 from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.experts.recording import FAULTS, RECIPES, Recipe, play
-from torchrl_koap.tasks import get_task
+from torchrl_koap.envs.experts.recording import FAULTS, Episode, PlainEpisode, RecordingRules, expert_of, play
+from torchrl_koap.envs.registry import make_env
+from torchrl_koap.tasks import Task, get_task
 
 MAX_ATTEMPTS = 20
 _PER_CONTEXT = 4  # attempts before an episode gets another context
@@ -117,29 +118,35 @@ def record_episodes(
     seed: int = 0,
     num_threads: int = 2,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[list[RawEpisode], RecordingReport]:
+) -> tuple[list[Episode], RecordingReport]:
     """Records demonstrations with everything D3IL's recorder logs; arguments as in :func:`record_demonstrations`.
 
     Returns:
-        tuple: the episodes, for :func:`episodes_to_ted` and :func:`write_raw_episodes`, and the report.
+        tuple: the episodes, for :func:`episodes_to_ted` and, of a task of D3IL, :func:`write_raw_episodes`, and the
+        report.
     """
-    name = get_task(task).source
+    facts = get_task(get_task(task).source)
+    expert_of(facts)
     for option, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_threads", num_threads, 1)):
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{option} must be an integer of at least {least}, got {value!r}")
-    return _record(name, RECIPES[name](), episodes, seed, num_threads, progress or (lambda done, total: None))
+    return _record(facts, episodes, seed, num_threads, progress or (lambda done, total: None), None)
 
 
-def episodes_to_ted(raw: Sequence[RawEpisode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:
+def episodes_to_ted(raw: Sequence[Episode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:
     """Converts recorded episodes to flat TED data, just as reading their raw files would.
 
     Args:
-        raw (sequence of RawEpisode): ``T`` rows each, which make ``T - 1`` steps.
+        raw (sequence of Episode): of ``T`` rows of a raw one become ``T - 1`` steps, of a plain one ``T``.
         task (str): name of the task.
         dtype (torch.dtype): floating type of the entries.
     """
-    convert = get_converter(task).convert
-    pairs = [convert(episode) for episode in raw]
+    pairs = [
+        (episode.observation, episode.action)
+        if isinstance(episode, PlainEpisode)
+        else get_converter(task).convert(episode)
+        for episode in raw
+    ]
     return flatten_trajectories(
         [torch.from_numpy(frames) for frames, _ in pairs], [torch.from_numpy(steps) for _, steps in pairs], dtype=dtype
     )
@@ -157,6 +164,7 @@ def write_raw_episodes(folder: str | Path, raw: Sequence[RawEpisode]) -> list[Pa
 
     Raises:
         FileExistsError: if the folder holds pickles already; none is touched.
+        TypeError: if episodes were recorded without D3IL's log.
 
     Examples:
         >>> import tempfile
@@ -166,6 +174,8 @@ def write_raw_episodes(folder: str | Path, raw: Sequence[RawEpisode]) -> list[Pa
         ...     [file.name for file in write_raw_episodes(folder, raw)]
         ['env_000_00.pkl']
     """
+    if any(isinstance(episode, PlainEpisode) for episode in raw):
+        raise TypeError("episodes recorded without D3IL's log cannot be written as its pickles; save them as TED data")
     folder = Path(folder)
     if folder.is_dir() and any(folder.glob("*.pkl")):
         raise FileExistsError(f"{folder} holds pickles already; they are left as they are")
@@ -190,29 +200,35 @@ def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
 
 
 def _record(
-    task: str, recipe: Recipe, episodes: int, seed: int, num_threads: int, progress: Callable[[int, int], None]
-) -> tuple[list[RawEpisode], RecordingReport]:
+    task: Task,
+    episodes: int,
+    seed: int,
+    num_threads: int,
+    progress: Callable[[int, int], None],
+    rules: RecordingRules | None,
+) -> tuple[list[Episode], RecordingReport]:
     start = time.perf_counter()
-    modes = balanced_modes(episodes, recipe.num_modes, seed)
-    env = recipe.make_env(episodes, num_threads=num_threads, dtype=torch.float64)
-    raw: list[RawEpisode | None] = [None] * episodes
+    modes = balanced_modes(episodes, task.num_modes, seed)
+    env = make_env(task, episodes, num_threads=num_threads, max_steps=task.max_steps, dtype=torch.float64)
+    raw: list[Episode | None] = [None] * episodes
     attempts = [0] * episodes
     failures = dict.fromkeys(FAULTS, 0)
+    contexts = None
     try:
         for attempt in range(MAX_ATTEMPTS):
-            if attempt % _PER_CONTEXT == 0 and env.task.objects:
-                contexts = draw_contexts(env.task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
+            if attempt % _PER_CONTEXT == 0 and task.bodies:
+                contexts = draw_contexts(task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
             rows = np.array([index for index in range(episodes) if raw[index] is None])
             already = episodes - len(rows)
             results = play(
                 env,
-                recipe,
                 task,
                 rows,
                 [modes[row] for row in rows],
-                contexts[rows] if env.task.objects else None,
+                contexts,
                 [(seed, int(row), attempt) for row in rows],
                 lambda over, already=already: progress(already + over, episodes),
+                rules=rules,
             )
             for row, (episode, fault) in zip(rows, results, strict=True):
                 attempts[row] += 1
@@ -227,4 +243,4 @@ def _record(
     if missing:
         raise RecordingError(f"no good attempt out of {MAX_ATTEMPTS} for episodes {missing}: {failures}")
     rows, seconds = [len(episode) for episode in raw], time.perf_counter() - start
-    return raw, RecordingReport(task, seed, modes, rows, attempts, failures, seconds, recipe.num_modes)
+    return raw, RecordingReport(task.name, seed, modes, rows, attempts, failures, seconds, task.num_modes)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Travel costs in the plane: least cost of a path through a field of slowness, and distances to squares.
+"""Eikonal path planning in the plane: least cost of a path through a field of slowness, and distances to squares.
 
 The cost ``T(p)`` of the cheapest path from ``p`` to a source obeys the eikonal equation ``|grad T| = s`` with slowness
 ``s`` (cost per metre), solved on a grid by fast sweeping (Zhao 2005): Gauss-Seidel passes in alternating directions.
@@ -40,7 +40,7 @@ def square_distance(x, y, square, half):
 
 
 @njit(cache=True)
-def travel_cost(slowness, cost, sweeps=2):
+def solve_eikonal(slowness, cost, sweeps=2):
     """Cheapest cost to the sources, everywhere on the grid.
 
     Args:
@@ -53,10 +53,10 @@ def travel_cost(slowness, cost, sweeps=2):
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.path_planning import FAR, SHAPE, STEP, travel_cost
+        >>> from torchrl_koap.envs.experts.path_planning import FAR, SHAPE, STEP, solve_eikonal
         >>> cost = np.full(SHAPE, FAR)
         >>> cost[0] = 0.0
-        >>> bool(np.isclose(travel_cost(np.ones(SHAPE), cost)[5, 40], 5 * STEP))
+        >>> bool(np.isclose(solve_eikonal(np.ones(SHAPE), cost)[5, 40], 5 * STEP))
         True
     """
     width, height = cost.shape

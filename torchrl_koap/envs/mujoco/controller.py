@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The controller that runs every millisecond, compiled: inverse kinematics, joint PD and finger force (spec section 3).
+"""The compiled controller: inverse kinematics, joint PD and finger force every millisecond (docs/d3il.md, Controller).
 
 One call advances one simulation by all substeps of a control step without coming back to Python: the compiled loop
 computes the motor commands and calls ``mj_step`` of the MuJoCo library through its address. It holds no interpreter
@@ -26,7 +26,7 @@ from torchrl_koap.envs.mujoco.linear_algebra import clip, solve_clipped
 TIMESTEP = 0.001
 KP = np.array([120.0, 120.0, 120.0, 120.0, 50.0, 30.0, 10.0])
 KD = np.array([10.0, 10.0, 10.0, 10.0, 6.0, 5.0, 3.0])
-# Joint 3's upper bound is 2.0 in the original although the joint reaches 2.8973 (spec section 10.7).
+# Joint 3's upper bound is 2.0 in the original although the joint reaches 2.8973.
 Q_MIN = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 Q_MAX = np.array([2.8973, 1.7628, 2.0, -0.0698, 2.8973, 3.7525, 2.8973])
 Q_REST = np.array([0.0, 0.174, 0.0, -0.872, 0.0, 1.222, 0.785])
@@ -258,7 +258,7 @@ def _write_log(row, pointers, qpos, qvel, q_des, v_des, a_des, tcp, quat):
 
 @njit(nogil=True, cache=True)
 def track_pose(step, model, data, pointers, rows, commands, widths, grasping, substeps, targets, speeds, started, log):
-    """Tracks Cartesian commands for ``substeps`` physics steps in each of the simulations ``rows`` (spec 3.1, 3.3).
+    """Tracks Cartesian commands for ``substeps`` physics steps in each of the simulations ``rows``.
 
     Args:
         step (int): address of ``mj_step``.
@@ -313,7 +313,7 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
 
 @njit(nogil=True, cache=True)
 def track_joints(step, model, data, pointers, rows, commands, widths, grasping, substeps, log):
-    """Holds joint targets for ``substeps`` physics steps in each of the simulations ``rows`` (spec 3.2, 3.3).
+    """Holds joint targets for ``substeps`` physics steps in each of the simulations ``rows``.
 
     The arguments are those of :func:`track_pose`, except ``commands``: joint angles [n, 7] in rad.
     """

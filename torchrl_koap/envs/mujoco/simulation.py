@@ -109,7 +109,7 @@ class SimulationBatch:
         *,
         width: float = controller.FINGER_RESET,
     ) -> None:
-        """Puts simulations into their start state (spec section 4), one substep included.
+        """Puts simulations into their start state (docs/d3il.md, Reset), one substep included.
 
         Args:
             rows (np.ndarray): indices of the simulations.
@@ -133,7 +133,7 @@ class SimulationBatch:
         self.track_joints(rows, commands, substeps=1)
 
     def track_pose(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
-        """Advances simulations by ``substeps`` while the TCP follows ``commands`` (spec section 3.1).
+        """Advances simulations by ``substeps`` while the TCP follows ``commands``.
 
         Args:
             rows (np.ndarray): indices of the simulations.
@@ -145,7 +145,7 @@ class SimulationBatch:
         self._run(controller.track_pose, rows, (commands, self.widths, self.grasping, substeps, *state))
 
     def track_joints(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
-        """Advances simulations by ``substeps`` while the joints are held at ``commands`` [n, 7] (spec section 3.2)."""
+        """Advances simulations by ``substeps`` while the joints are held at ``commands`` [n, 7]."""
         commands = np.ascontiguousarray(commands, dtype=np.float64)
         self._run(controller.track_joints, rows, (commands, self.widths, self.grasping, substeps, self.log))
 
