@@ -70,7 +70,7 @@ def test_what_a_training_writes(trained_run, demonstrations):
     assert summary["labels"]["selected_units"] == 2 and summary["labels"]["trajectories_touched"] == 2
     assert summary["labels"]["total_transitions"] == sum(29 + index for index in range(8))
     controller = build_controller(config["controller"], 2, 2)
-    unseen = 2 * (controller.num_window_frames - 1 - controller.history)  # the ends of two trajectories
+    unseen = 2 * (controller.num_window_frames - 1 - controller.num_past)  # the ends of two trajectories
     assert summary["decoder_fit"]["labels_used"] == summary["labels"]["labelled_transitions"] - unseen
     assert summary["action_error_mm"]["controller"] > 0 and summary["action_error_mm"]["ridge"] > 0
     rows = RunDirectory(trained_run).read_metrics()

@@ -69,7 +69,7 @@ class Normalizer(nn.Module):
         if offset is not None:
             if offset.ndim != 1 or offset.shape != scale.shape:
                 raise ValueError(f"offset and scale must be [d], got {list(offset.shape)} and {list(scale.shape)}")
-            if not (offset.isfinite().all() and scale.isfinite().all() and (scale > 0).all()):
+            if not offset.is_meta and not (offset.isfinite().all() and scale.isfinite().all() and (scale > 0).all()):
                 raise ValueError("offset must be finite, scale finite and positive")
             offset, scale = offset.detach().clone(), scale.detach().clone()
         self.register_buffer("offset", offset)

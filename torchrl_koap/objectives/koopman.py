@@ -7,7 +7,7 @@ r"""Losses of the Koopman inverse dynamics model.
     L_{kpm} = \overline{|K g(x_t) + u_t - g(x_{t+1})|^2}, \quad
     L_a = \overline{|D u_t + b - a_t|^2}
 
-(design section 2). All residuals are in normalised units. ``L_a`` averages over the labelled frames alone; a batch
+All residuals are in normalised units. ``L_a`` averages over the labelled frames alone; a batch
 without labels gives exactly 0, and an unlabelled (NaN) action reaches neither value nor gradient.
 """
 

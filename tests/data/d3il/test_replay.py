@@ -293,7 +293,7 @@ def test_save_refuses(tmp_path):
 def test_flatten_trajectories_checks():
     with pytest.raises(ValueError, match="trajectory 1: .*T - 1"):
         flatten_trajectories([torch.zeros(3, 2), torch.zeros(3, 2)], [torch.zeros(2, 1), torch.zeros(3, 1)])
-    with pytest.raises(ValueError, match="other columns"):
+    with pytest.raises(ValueError, match="trajectory 1 has 1 observation"):
         flatten_trajectories([torch.zeros(3, 2), torch.zeros(3, 1)], [torch.zeros(2, 1), torch.zeros(2, 1)])
     with pytest.raises(ValueError, match="0 trajectories"):
         flatten_trajectories([], [])

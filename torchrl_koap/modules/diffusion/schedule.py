@@ -186,12 +186,14 @@ class NoiseSchedule(nn.Module):
             raise ValueError(f"num_train_steps must be at least 1, got {num_train_steps}")
         self.schedule, self.path, self.prediction = schedule, kind.path, prediction
         self.num_train_steps = num_train_steps
-        table = kind.signal(num_train_steps)
+        with torch.device("cpu"):  # the numbers are read below, also where modules are built without storage
+            table = kind.signal(num_train_steps)
         signal, noise = (table, 1 - table) if self.path == "flow" else (table.sqrt(), (1 - table).sqrt())
         # Solvers read numbers from here: exact in every dtype, no device synchronisation, constants for torch.compile.
         self._levels = tuple(zip(signal.tolist(), noise.tolist(), strict=True))
-        self.register_buffer("signal", signal.to(torch.get_default_dtype()))
-        self.register_buffer("noise", noise.to(torch.get_default_dtype()))
+        default = {"dtype": torch.get_default_dtype(), "device": torch.get_default_device()}
+        self.register_buffer("signal", signal.to(**default))
+        self.register_buffer("noise", noise.to(**default))
 
     def extra_repr(self) -> str:
         """Shows the options in ``print(schedule)``."""

@@ -47,7 +47,9 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
 
     Every environment of a batch begins a new chunk in its own rhythm, counted from its own reset
     (:class:`torchrl.modules.MultiStepActorWrapper`, which wants one batch dimension: batches of any other shape, ``[]``
-    of a single environment included, are flattened around it). What is in force travels in the tensordict.
+    of a single environment included, are flattened around it). What is in force travels in the tensordict; where it is
+    lost on the way (a :class:`torchrl.envs.ParallelEnv` whose workers reset by themselves hands on its own entries
+    alone), the policy remembers what it wrote last.
 
     Args:
         planner (nn.Module): samples what chunks are made of; has ``history``, ``horizon`` and ``noise_key``, the entry
@@ -100,6 +102,7 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self.history, self.replan_interval = history, replan_interval
         self.planner = planner
+        self._written: TensorDictBase | None = None
         self.receding = MultiStepActorWrapper(
             _Chunk(self.make_chunk, planner.noise_key, chunk_key),
             n_steps=replan_interval,
@@ -126,14 +129,23 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
             raise ValueError(
                 f"{self.in_keys[0]!r} must hold {self.history} frames on axis -2, got {list(observed.shape)}"
             )
+        batch, cached, chunk = tensordict.batch_size, self.receding.action_keys[0], self.out_keys[1]
+        kept = [chunk, self.receding.counter_key]
+        if self._written is not None and self._written.batch_size == batch and tensordict.get(chunk, None) is None:
+            if not tensordict.get(IS_INIT).all():
+                tensordict.update(self._written)
+        tensordict = self._any_batch(tensordict, [*kept, cached])
+        self._written = tensordict.select(*kept)
+        return tensordict
+
+    def _any_batch(self, tensordict: TensorDictBase, kept: list[NestedKey]) -> TensorDictBase:
+        """One step of a batch of any shape."""
         batch = tensordict.batch_size
         if len(batch) == 1:
             return self._step(tensordict)
-        cached, chunk = self.receding.action_keys[0], self.out_keys[1]
-        kept = [chunk, self.receding.counter_key]
         flat = tensordict.select(*self.in_keys, self.planner.noise_key, *kept, strict=False)
         flat = self._step(flat.reshape(-1) if batch else flat.unsqueeze(0))
-        written = flat.select(*self.out_keys, *kept, cached, STATE_HISTORY)
+        written = flat.select(*self.out_keys, *kept, STATE_HISTORY)
         return tensordict.update(written.reshape(batch) if batch else written[0])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
