@@ -19,6 +19,7 @@ from torchrl_koap.evaluation.latent_verdict import (
     MODELS,
     ON_THE_CIRCLE,
     OUTSIDE_THE_BUDGET,
+    error_unit,
     judge_latent_model,
     unit_circle_sides,
 )
@@ -29,6 +30,7 @@ __all__ = [
     "MODELS",
     "OUTSIDE_THE_BUDGET",
     "analyse_latent",
+    "error_unit",
     "explained",
     "infer_steps",
     "judge_latent_model",

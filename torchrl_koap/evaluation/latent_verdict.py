@@ -66,5 +66,16 @@ def judge_latent_model(multi_step: Mapping[str, Any]) -> list[str]:
     return faults
 
 
+def error_unit(part: str) -> str:
+    """Unit in which errors of a part of the state are shown, a thousandth of that in the data.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.latent_verdict import error_unit
+        >>> error_unit("measured_xy"), error_unit("measured_joints")
+        ('mm', 'mrad')
+    """
+    return "mrad" if "joints" in part else "mm"
+
+
 def _times(large: float, small: float) -> str:
     return f"{large / small:.3g} times" if small > 0 else "infinitely"

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from safetensors.numpy import load_file
 
-from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET
+from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET, error_unit
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.spectrum_plot import as_spectrum, draw_spectrum
 from torchrl_koap.reports.style import (
@@ -28,7 +28,6 @@ from torchrl_koap.reports.style import (
     legend_beside,
     save_figure,
     set_title,
-    thousandths,
     tidy,
 )
 from torchrl_koap.tasks import Task, get_task
@@ -100,17 +99,6 @@ def plot_latent(latent: Mapping[str, Any], path: str | Path, *, task: Task, eige
         ha="right",
     )
     return save_figure(figure, path)
-
-
-def error_unit(part: str) -> str:
-    """Unit in which errors of a part of the state are shown, a thousandth of that in the data.
-
-    Examples:
-        >>> from torchrl_koap.reports.latent_plot import error_unit
-        >>> error_unit("measured_xy"), error_unit("measured_joints")
-        ('mm', 'mrad')
-    """
-    return thousandths("rad" if "joints" in part else "m")[0]
 
 
 def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
