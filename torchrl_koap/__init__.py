@@ -8,16 +8,41 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# public names, imported when they are asked for: the package itself imports neither torch nor a simulator
-_LAZY = {"Task": "torchrl_koap.tasks", "get_task": "torchrl_koap.tasks", "register_task": "torchrl_koap.tasks"}
+# imported when first asked for: a network or a task costs no simulator, a version no torch
+_LAZY = {
+    "CurveConfig": "torchrl_koap.studies",
+    "EvalConfig": "torchrl_koap.evaluation",
+    "Task": "torchrl_koap.tasks",
+    "TrainConfig": "torchrl_koap.training",
+    "evaluate": "torchrl_koap.evaluation",
+    "get_task": "torchrl_koap.tasks",
+    "load_policy": "torchrl_koap.evaluation",
+    "register_method": "torchrl_koap.training",
+    "register_task": "torchrl_koap.tasks",
+    "run_curve": "torchrl_koap.studies",
+    "train": "torchrl_koap.training",
+}
 
-__all__ = ["Task", "__version__", "get_task", "register_task"]
+__all__ = [  # noqa: F822 - __getattr__ finds them
+    "CurveConfig",
+    "EvalConfig",
+    "Task",
+    "TrainConfig",
+    "__version__",
+    "evaluate",
+    "get_task",
+    "load_policy",
+    "register_method",
+    "register_task",
+    "run_curve",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_LAZY[name]), name)
 
 
 def __dir__() -> list[str]:

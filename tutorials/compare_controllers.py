@@ -153,7 +153,7 @@ data = budget(1)
 model = koap(data)
 steps = infer_steps(model, data)
 chosen = rank_trajectories(
-    steps["latent_action"], steps["episode"], steps["has_action"], penalty=0.15, criterion="gain", count=4
+    steps["latent_action"], steps["episode"], steps["has_action"], penalty=0.15, criterion="a_optimal", count=4
 )
 first = data["episode"][data["has_action"].squeeze(-1)][:1].tolist()
 asked = LabelBudget.of_episodes([*first, *(choice.episode for choice in chosen)])

@@ -12,7 +12,6 @@ import torch
 from tensordict import TensorDict
 from tiny_runs import koap
 
-from torchrl_koap.commands.inspect import verdict
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.diagnosis import (
@@ -25,6 +24,7 @@ from torchrl_koap.evaluation.diagnosis import (
     recorded_futures,
     tracking_errors,
 )
+from torchrl_koap.evaluation.inspection import verdict
 from torchrl_koap.tasks import get_task
 
 AVOIDING = get_task("avoiding")

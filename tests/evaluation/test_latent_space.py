@@ -12,8 +12,8 @@ import torch
 from tiny_runs import TINY, koap
 from torch import nn
 
-from torchrl_koap.commands.inspect import verdict
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+from torchrl_koap.evaluation.inspection import verdict
 from torchrl_koap.evaluation.latent_space import (
     OUTSIDE_THE_BUDGET,
     analyse_latent,

@@ -6,8 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from tqdm import tqdm
-
+from torchrl_koap.commands.command import Command
 from torchrl_koap.data import save_ted
 from torchrl_koap.envs.experts.demonstrations import (
     RecordingReport,
@@ -16,10 +15,12 @@ from torchrl_koap.envs.experts.demonstrations import (
     write_raw_episodes,
 )
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.training.progress import count_up_to, progress_bar
 
 
-@dataclass
-class Demos:
+@dataclass(kw_only=True)
+class Demos(Command):
     """Record scripted demonstrations, as memory-mapped TED and as D3IL raw pickles.
 
     Attributes:
@@ -28,6 +29,7 @@ class Demos:
         episodes: number of demonstrations, spread evenly over the modes (default: that of the task).
         seed: seed of the players' variation.
         threads: simulator threads.
+        plugins: modules that register tasks; imported before anything else.
     """
 
     out: Path
@@ -35,29 +37,24 @@ class Demos:
     episodes: int | None = None
     seed: int = 0
     threads: int = 2
+    plugins: Plugins = ()
 
+    def __call__(self) -> RecordingReport:
+        """Records and writes; returns the account of attempts.
 
-def run_demos(options: Demos) -> RecordingReport:
-    """Records and writes; returns the account of attempts.
-
-    Raises:
-        FileExistsError: if the folder holds demonstrations already.
-    """
-    task = get_task(options.task)
-    for name in ("ted", "raw"):
-        if (options.out / name).exists():
-            raise FileExistsError(f"{options.out / name} exists already; choose another --out")
-    episodes = task.defaults.demonstrations if options.episodes is None else options.episodes
-    with tqdm(total=episodes, desc="recording", unit="episode") as bar:
-        raw, report = record_episodes(
-            task.name,
-            episodes,
-            options.seed,
-            options.threads,
-            lambda recorded, wanted: bar.update(recorded - bar.n),
-        )
-    data = episodes_to_ted(raw, task.name)
-    save_ted(data, options.out / "ted", task=task.source, notes={"seed": options.seed, "modes": list(report.modes)})
-    if task.converter is not None:
-        write_raw_episodes(options.out / "raw", raw)
-    return report
+        Raises:
+            FileExistsError: if the folder holds demonstrations already.
+        """
+        load_plugins(self.plugins)
+        task = get_task(self.task)
+        for name in ("ted", "raw"):
+            if (self.out / name).exists():
+                raise FileExistsError(f"{self.out / name} exists already; choose another --out")
+        episodes = task.defaults.demonstrations if self.episodes is None else self.episodes
+        with progress_bar(episodes, "recording", unit="episode") as bar:
+            raw, report = record_episodes(task.name, episodes, self.seed, self.threads, count_up_to(bar))
+        data = episodes_to_ted(raw, task.name)
+        save_ted(data, self.out / "ted", task=task.source, notes={"seed": self.seed, "modes": list(report.modes)})
+        if task.converter is not None:
+            write_raw_episodes(self.out / "raw", raw)
+        return report

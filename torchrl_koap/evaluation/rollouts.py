@@ -32,7 +32,7 @@ def make_policy(
     state_columns: Sequence[int] | Callable[[Tensor], Tensor],
     execution: str = "feedback",
     replan_interval: int = 4,
-    joining: float = 0.8,
+    blend_decay: float = 0.8,
     controller_columns: Sequence[int] | None = None,
     gripper: tuple[int, int] | None = None,
 ) -> PlanThenControl:
@@ -45,7 +45,7 @@ def make_policy(
         history=max(planner.history, controller.num_past + 1),
         execution=execution,
         replan_interval=replan_interval,
-        blend_decay=joining,
+        blend_decay=blend_decay,
         controller_columns=controller_columns,
         action_rule=rule,
     )

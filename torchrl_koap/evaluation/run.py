@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap eval``: closed-loop rollouts of a trained run, scored with intervals."""
+"""Closed-loop evaluation of a run directory: loading it as a policy, rollouts, scores with intervals."""
 
 from __future__ import annotations
 
@@ -9,34 +9,30 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
-from tqdm import tqdm
 
+from torchrl_koap.data import LabelBudget
 from torchrl_koap.evaluation.rollouts import make_policy, measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ChunkedPolicy, StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
-from torchrl_koap.reports.run_report import write_report
-from torchrl_koap.tasks import REPLAN_INTERVAL, Task, get_task
-from torchrl_koap.training.builders import (
-    build_controller,
-    build_diffusion_policy,
-    build_planner,
-    method_named,
-    set_up_torch,
-)
+from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, get_task
+from torchrl_koap.training.builders import build_controller, method_named, set_up_torch
 from torchrl_koap.training.checkpoints import load_weights, save_tensors
+from torchrl_koap.training.diffusion_builders import build_planner
+from torchrl_koap.training.methods import Method
+from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 
 @dataclass
-class Eval:
-    """Evaluate a trained run in closed loop and write its report.
+class EvalConfig:
+    """Rollouts of a trained run in closed loop.
 
     Attributes:
-        run: run directory of `koap train`.
         episodes: number of rollouts; tasks with contexts take the fixed ones of the evaluation table in turn.
         rollouts_per_context: rollouts in each context; from 2 on the entropy of the modes per context is known.
         seed: seed of the first rollout; the others count on from it.
@@ -44,17 +40,15 @@ class Eval:
         solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
         solver_steps: another number of solver steps.
         replan_interval: control steps per plan.
-        joining: how slowly plans are joined to the present state; 0 turns it off.
+        blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are.
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
         task: refuse a run of another task than this.
         threads: torch and simulator threads.
         device: "cpu" or "cuda".
-        report: draw the pictures and write the report.
-        animate: make an animation of the rollouts for the report.
+        plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
     """
 
-    run: tyro.conf.Positional[Path]
     episodes: int = 60
     rollouts_per_context: int = 1
     seed: int = 100
@@ -62,49 +56,142 @@ class Eval:
     solver: str | None = None
     solver_steps: int | None = None
     replan_interval: int = REPLAN_INTERVAL
-    joining: float = 0.8
+    blend_decay: float = 0.8
     batch_size: int | None = None
     contexts_file: Path | None = None
     task: str | None = None
     threads: int = 2
     device: str = "cpu"
-    report: bool = True
-    animate: bool = True
+    plugins: Plugins = ()
 
 
-def load_run(run: RunDirectory, task: str | None = None) -> tuple[Task, StatePlanner | None, nn.Module]:
-    """Planner and controller of a finished run, in evaluation mode; a diffusion policy has no planner beside it.
+@dataclass(frozen=True)
+class TrainedRun:
+    """A finished run: its networks with their weights, and what they were trained on.
+
+    Args:
+        directory (RunDirectory): its folder.
+        config (dict): its ``config.json``.
+        task (Task): the task.
+        method (Method): the method.
+        planner (StatePlanner, optional): None for a policy of its own.
+        controller (nn.Module): the controller, or the policy.
+        columns (tuple of int): state columns that the controller reads.
+    """
+
+    directory: RunDirectory
+    config: dict[str, Any]
+    task: Task
+    method: Method
+    planner: StatePlanner | None
+    controller: nn.Module
+    columns: tuple[int, ...]
+
+    @property
+    def budget(self) -> LabelBudget:
+        """The label budget it was trained with."""
+        episodes = self.config.get("label_episodes")
+        if episodes is not None:
+            return LabelBudget.of_episodes(episodes)
+        names = ("label_count", "label_fraction", "label_unit", "seed")
+        count, fraction, unit, seed = (self.directory.read_entry("config.json", name) for name in names)
+        return LabelBudget(fraction if count is None else count, unit=unit, seed=seed, window=WINDOW, history=HISTORY)
+
+
+def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
+    """Loads a finished run, its networks in evaluation mode; the plugins it was trained with are imported first.
+
+    Args:
+        run (str or Path): its folder.
+
+    Keyword Args:
+        task (str, optional): refuse a run of another task.
 
     Raises:
         RunDirectoryError: if the folder is no finished run, or one of another task than asked for.
         CheckpointError: if weights are damaged, of another task or without their statistics.
+        PluginError: if a plugin of the run cannot be imported.
     """
-    trained_on, *parts = (run.read_entry("config.json", name) for name in ("task", "planner", "controller"))
+    directory = RunDirectory(run)
+    trained_on, planner_entry, entry = (
+        directory.read_entry("config.json", name) for name in ("task", "planner", "controller")
+    )
     if task is not None and task != trained_on:
-        raise RunDirectoryError(f"{run.path} was trained on task {trained_on!r}, not on {task!r}")
-    facts = get_task(trained_on)
-    modules: dict[str, nn.Module] = {}
-    if method_named(parts[1]).acts:
-        modules["controller"] = build_diffusion_policy(
-            parts[0], facts.state_dim, facts.action_dim, facts.planner_features()
+        raise RunDirectoryError(f"{directory.path} was trained on task {trained_on!r}, not on {task!r}")
+    config = directory.read_json("config.json")
+    load_plugins(config.get("plugins") or ())
+    facts, method = get_task(trained_on), method_named(entry)
+    columns = facts.controller_columns(entry.get("state", "all"))
+    if method.has_planner:
+        planner = build_planner(planner_entry, facts.state_dim, facts.planner_features())
+        controller = build_controller(entry, len(columns), facts.action_dim, method=method)
+    else:
+        planner = None
+        controller = method.build(facts.state_dim, facts.action_dim, facts.planner_features(), planner_entry)
+    for name, module in {"planner": planner, "controller": controller}.items():
+        if module is not None:
+            load_weights(directory.path / f"{name}.safetensors", module.eval(), task=facts.name)
+    return TrainedRun(directory, config, facts, method, planner, controller, columns)
+
+
+def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) -> TensorDictModuleBase:
+    """A run as a policy: observations in, an action per control step out.
+
+    An environment needs :func:`~torchrl_koap.modules.policy_transforms` of ``policy.history`` for it, which hand it the
+    last observations.
+
+    Args:
+        run (str, Path or TrainedRun): a run directory, or what :func:`load_run` made of one.
+        config (EvalConfig, optional): execution, solver, interval between plans and device; the rest is not used.
+
+    Raises:
+        ValueError: for an unknown execution or solver, or an interval out of range.
+        RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`.
+    """
+    config = EvalConfig() if config is None else config
+    lookup(EXECUTIONS, config.execution, "execution")
+    trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
+    sampler = trained.controller if trained.planner is None else trained.planner
+    if config.solver is not None:
+        sampler.solver = config.solver
+    if config.solver_steps is not None:
+        sampler.num_steps = config.solver_steps
+    task = trained.task
+    if trained.planner is None:
+        policy = ChunkedPolicy(
+            trained.controller,
+            state_columns=task.state_of,
+            history=trained.controller.history,
+            replan_interval=config.replan_interval,
         )
     else:
-        modules["planner"] = build_planner(parts[0], facts.state_dim, facts.planner_features())
-        modules["controller"] = build_controller(parts[1], len(columns_of(run, facts)), facts.action_dim)
-    for name, module in modules.items():
-        load_weights(run.path / f"{name}.safetensors", module.eval(), task=facts.name)
-    return facts, modules.get("planner"), modules["controller"]
-
-
-def columns_of(run: RunDirectory, task: Task) -> tuple[int, ...]:
-    """State columns that the controller of a run reads."""
-    return task.controller_columns(run.read_entry("config.json", "controller").get("state", "all"))
+        policy = make_policy(
+            trained.planner,
+            trained.controller,
+            state_columns=task.state_of,
+            execution=config.execution,
+            replan_interval=config.replan_interval,
+            blend_decay=config.blend_decay,
+            controller_columns=trained.columns,
+            gripper=task.gripper,
+        )
+    return policy.to(config.device)
 
 
 def choose_contexts(
     task: Task, episodes: int, rollouts_per_context: int = 1, contexts_file: Path | None = None
 ) -> tuple[list[int] | None, np.ndarray | None]:
-    """Number of the context of every rollout, and the contexts; None for a task in which all episodes start alike."""
+    """Number of the context of every rollout, and the contexts; None for a task in which all episodes start alike.
+
+    Args:
+        task (Task): the task.
+        episodes (int): number of rollouts.
+        rollouts_per_context (int): rollouts in each context.
+        contexts_file (Path, optional): a context file of D3IL instead of the evaluation table.
+
+    Raises:
+        ValueError: if there are too few contexts, or the task has none.
+    """
     if not task.objects:
         given = {"contexts_file": contexts_file is not None, "rollouts_per_context": rollouts_per_context != 1}
         for name, unfit in given.items():
@@ -126,58 +213,46 @@ def choose_contexts(
     return numbers, table[numbers]
 
 
-def run_eval(options: Eval) -> dict[str, Any]:
-    """Evaluates; returns what is written to ``eval.json``.
+def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
+    """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
+
+    Args:
+        run (str or Path): a run directory.
+        config (EvalConfig, optional): how many rollouts, and how. Default: 60 as in training.
+
+    Returns:
+        dict: what ``eval.json`` holds: success and entropy with intervals, speed, a row per episode.
 
     Raises:
         ValueError: for unknown options or fewer than one episode.
+        RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`.
     """
+    config = EvalConfig() if config is None else config
     for name in ("episodes", "batch_size", "rollouts_per_context"):
-        value = getattr(options, name)
+        value = getattr(config, name)
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
-    lookup(EXECUTIONS, options.execution, "execution")
-    set_up_torch(options.threads, options.device)
-    run = RunDirectory(options.run)
-    task, planner, controller = load_run(run, options.task)
-    sampler = controller if planner is None else planner
-    if options.solver is not None:
-        sampler.solver = options.solver
-    if options.solver_steps is not None:
-        sampler.num_steps = options.solver_steps
-    if planner is None:
-        policy = ChunkedPolicy(
-            controller,
-            state_columns=task.state_of,
-            history=controller.history,
-            replan_interval=options.replan_interval,
-        )
-    else:
-        policy = make_policy(
-            planner,
-            controller,
-            state_columns=task.state_of,
-            execution=options.execution,
-            replan_interval=options.replan_interval,
-            joining=options.joining,
-            controller_columns=columns_of(run, task),
-            gripper=task.gripper,
-        )
-    policy = policy.to(options.device)
-    seeds = list(range(options.seed, options.seed + options.episodes))
-    numbers, contexts = choose_contexts(task, options.episodes, options.rollouts_per_context, options.contexts_file)
+    lookup(EXECUTIONS, config.execution, "execution")
+    set_up_torch(config.threads, config.device)
+    load_plugins(config.plugins)
+    trained = load_run(run, task=config.task)
+    directory, task = trained.directory, trained.task
+    policy = load_policy(trained, config)
+    sampler = trained.controller if trained.planner is None else trained.planner
+    seeds = list(range(config.seed, config.seed + config.episodes))
+    numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
     from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
 
     mode_index = mode_index_of(task)
-    with tqdm(total=options.episodes, desc="rollouts", unit="episode") as bar:
+    with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
         episodes = roll_out(
             policy,
-            make_env_of(task, num_threads=options.threads),
+            make_env_of(task, num_threads=config.threads),
             seeds,
             max_steps=task.max_steps,
-            batch_size=options.batch_size,
+            batch_size=config.batch_size,
             contexts=contexts,
-            progress=lambda finished: bar.update(finished - bar.n),
+            progress=count_up_to(bar),
         )
     unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
     result = score(
@@ -187,25 +262,23 @@ def run_eval(options: Eval) -> dict[str, Any]:
     rows = result.pop("episode")
     result |= measure_latency(policy, task.observation_dim)
     result |= {
-        "execution": "chunks" if planner is None else options.execution,
+        "execution": "chunks" if trained.planner is None else config.execution,
         "solver": sampler.solver,
         "solver_steps": sampler.num_steps,
-        "replan_interval": options.replan_interval,
-        "joining": options.joining,
+        "replan_interval": config.replan_interval,
+        "blend_decay": config.blend_decay,
         "episode": rows,
     }
     rollouts = rollouts_to_tensors(
         [episode.cpu() for episode in episodes],
         position=task.observation[task.position],
         mode_index=mode_index,
-        interval=options.replan_interval,
+        interval=config.replan_interval,
         objects=[task.observation[part] for part in task.plotted.values()],
         plans_position=task.plans_position,
     )
     if contexts is not None:  # in full precision: a film of the same episode starts from it
         rollouts["context"] = torch.from_numpy(contexts)
-    save_tensors(run.path / "rollouts.safetensors", rollouts, {"task": task.name})
-    run.write_json("eval.json", result)
-    if options.report:
-        write_report(run.path, animation=options.animate)
+    save_tensors(directory.path / "rollouts.safetensors", rollouts, {"task": task.name})
+    directory.write_json("eval.json", result)
     return result

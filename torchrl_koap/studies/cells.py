@@ -7,23 +7,14 @@ last and in one go, marks it as done, so a process may be killed at any moment.
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from torchrl_koap.data import subsample_trajectories
-from torchrl_koap.evaluation.run import Eval, run_eval
-from torchrl_koap.tasks import get_task
-from torchrl_koap.training.builders import load_demonstrations, set_up_torch
-from torchrl_koap.training.config import Train, configure, with_task_defaults
-from torchrl_koap.training.methods import METHODS
-from torchrl_koap.training.planner import train_planner
-from torchrl_koap.training.run import run_train
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.evaluation import EvalConfig, evaluate
+from torchrl_koap.training import RunDirectory, RunDirectoryError, TrainConfig, get_method, train
+from torchrl_koap.training.run import train_shared_planner
 
 DONE = "cell.json"
 
@@ -52,7 +43,7 @@ class Cell:
     @property
     def planner(self) -> str | None:
         """The folder of the planner that it shares, None for a method without one."""
-        return None if METHODS[self.method].acts else planner_folder(self.observations)
+        return planner_folder(self.observations) if get_method(self.method).has_planner else None
 
 
 def planner_folder(observations: float) -> str:
@@ -85,27 +76,17 @@ def _is_readable(run: RunDirectory, name: str) -> bool:
 def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) -> None:
     """Trains a planner on states alone: all actions are hidden before anything looks at the data.
 
-    Args:
+    Keyword Args:
         folder (str): where to.
         observations (float): share of the trajectories to use.
-        settings (dict): options of :class:`~torchrl_koap.training.config.Train`.
+        settings (dict): options of :class:`~torchrl_koap.training.TrainConfig`.
     """
     began = time.perf_counter()
     resume = (Path(folder) / "config.json").exists()
-    options = Train(out=Path(folder), observation_fraction=observations, resume=resume, **settings)
-    task = get_task(options.task)
-    options = with_task_defaults(options, task)
-    set_up_torch(options.threads, options.device)
-    run = RunDirectory(options.out)
-    data = load_demonstrations(options.dataset, task)
-    data["action"] = torch.full_like(data["action"], math.nan)
-    data["has_action"] = torch.zeros_like(data["has_action"])
-    data = subsample_trajectories(data, observations).to(options.device)
-    config = configure(run, options)
-    run.write_json("config.json", config)
-    torch.manual_seed(options.seed)
-    _, values = train_planner(run, options, config, task, data, None)
-    run.write_json(DONE, {"train_seconds": time.perf_counter() - began} | values)
+    values = train_shared_planner(
+        TrainConfig(out=Path(folder), observation_fraction=observations, resume=resume, **settings)
+    )
+    RunDirectory(folder).write_json(DONE, {"train_seconds": time.perf_counter() - began} | values)
 
 
 def do_cell(
@@ -113,18 +94,18 @@ def do_cell(
 ) -> None:
     """Trains and evaluates a cell, from where it was left.
 
-    Args:
+    Keyword Args:
         folder (str): its run directory.
         cell (dict): fields of :class:`Cell`.
         planner (str, optional): folder of the planner to share.
-        settings (dict): options of :class:`~torchrl_koap.training.config.Train`.
-        evaluation (dict): options of :class:`~torchrl_koap.evaluation.run.Eval`.
+        settings (dict): options of :class:`~torchrl_koap.training.TrainConfig`.
+        evaluation (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig`.
     """
     path, this = Path(folder), Cell(**cell)
     began = time.perf_counter()
     if not _is_readable(RunDirectory(path), "summary.json"):
-        run_train(
-            Train(
+        train(
+            TrainConfig(
                 out=path,
                 method=this.method,
                 label_fraction=this.fraction,
@@ -136,7 +117,7 @@ def do_cell(
             )
         )
     trained = time.perf_counter()
-    result = run_eval(Eval(run=path, animate=False, report=False, **evaluation))
+    result = evaluate(path, EvalConfig(**evaluation))
     run = RunDirectory(path)
     run.write_json(
         DONE,

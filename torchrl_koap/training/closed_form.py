@@ -10,9 +10,9 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from torchrl_koap.data import cut_windows
-from torchrl_koap.modules import KoopmanInverseDynamics, LatentActionFourier
+from torchrl_koap.modules import KoopmanInverseDynamics, LatentActionFourier, RidgeFit
 
-# one or two labelled trajectories cannot be left out to choose the penalty; measured in benchmarks/RESULTS.md
+# one or two labelled trajectories cannot be left out to choose the penalty
 DEFAULT_PENALTY = 0.15
 
 
@@ -20,7 +20,8 @@ def fit_closed_form(controller: nn.Module, data: TensorDictBase, *, shared_axes:
     """Fits a controller's linear decoder on every labelled step that sees its whole look-ahead, each used once.
 
     Args:
-        controller (nn.Module): a :class:`KoopmanInverseDynamics` or :class:`LinearInverseDynamics`.
+        controller (nn.Module): a :class:`KoopmanInverseDynamics`, :class:`LinearInverseDynamics`, or another controller
+            with ``fit_decoder(windows, mask, groups=)``.
         data (TensorDictBase): flat data after the label budget was applied.
 
     Keyword Args:
@@ -28,7 +29,7 @@ def fit_closed_form(controller: nn.Module, data: TensorDictBase, *, shared_axes:
             Fourier latent actions (:meth:`KoopmanInverseDynamics.fit_decoder`).
 
     Returns:
-        dict: penalty, number of labels and held-out error of the fit.
+        dict: penalty, number of labels and held-out error of the fit, or what another controller's fit returns.
     """
     keys = ["state", "action", "has_action", "episode"]
     windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
@@ -42,6 +43,8 @@ def fit_closed_form(controller: nn.Module, data: TensorDictBase, *, shared_axes:
         if shared_axes and isinstance(controller.latent_action, LatentActionFourier):
             extra["tied_axes"] = shared_axes
     fit = controller.fit_decoder(windows, mask, groups=windows["episode"][:, -1], **extra)
+    if not isinstance(fit, RidgeFit):
+        return dict(fit or {})
     # LAPACK's last digits depend on where memory lies: keep those that two equal runs share
     held_out = float(f"{fit.errors[fit.penalty]:.6g}")
     return {"penalty": fit.penalty, "labels_used": fit.num_labels, "held_out_error": held_out}

@@ -1,26 +1,25 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Options of ``koap train`` and the ``config.json`` that a run keeps of them."""
+"""What a training is asked to do, and the same with every default filled in and every name looked up."""
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
-import sys
-from dataclasses import asdict, dataclass, fields, replace
+import importlib.util
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
-from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
+from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task, get_task
 from torchrl_koap.training.methods import Method, get_method
-from torchrl_koap.training.released_settings import POLICY, get_released
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.training.plugins import Plugins
+from torchrl_koap.training.released_settings import POLICY, Released, get_released
+from torchrl_koap.training.run_directory import RunDirectory
 
 
 @dataclass
-class Train:
+class TrainConfig:
     """Train planner and controller on demonstrations of which few have action labels.
 
     Attributes:
@@ -34,7 +33,7 @@ class Train:
         seed: seed of label choice, initialisation and batches.
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
         method: "koap", "linear" (ridge on raw frames), "dd" (supervised inverse dynamics), "dp" (Diffusion Policy), or
-            another name in torchrl_koap.training.methods.METHODS.
+            another name in torchrl_koap.training.methods.METHODS, those that plugins register included.
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
         preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
@@ -66,6 +65,8 @@ class Train:
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
         logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
+        plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
+            reads the run.
     """
 
     out: Path
@@ -109,18 +110,133 @@ class Train:
     resume: bool = False
     logger: str = "csv"
     analysis: bool = True
+    plugins: Plugins = ()
 
 
-# options with which a run may be resumed differently; with other threads sums are rounded differently
-FREE = ("out", "threads", "checkpoint_every", "resume")
+@dataclass(frozen=True)
+class ResolvedConfig:
+    """A :class:`TrainConfig` that leaves nothing open: what planner and controller are trained by.
+
+    Args:
+        options (TrainConfig): with the task's defaults where nothing was asked for.
+        task (Task): the task.
+        method (Method): the method, with the decoder asked for.
+        teacher (Method, optional): the method that labels the rest of the data for it.
+        released (Released, optional): the settings of the first public code, if they were asked for.
+        budget (LabelBudget): which labels may be seen.
+        planner (dict): what :func:`~torchrl_koap.training.diffusion_builders.build_planner` takes.
+        controller (dict): what :func:`~torchrl_koap.training.builders.build_controller` takes.
+    """
+
+    options: TrainConfig
+    task: Task
+    method: Method
+    teacher: Method | None
+    released: Released | None
+    budget: LabelBudget
+    planner: dict[str, Any]
+    controller: dict[str, Any]
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """State columns that the controller reads."""
+        return self.task.controller_columns(self.options.controller_state)
 
 
-def budget_of(options: Train) -> LabelBudget:
-    """The label budget that the options describe.
+def resolve(config: TrainConfig) -> ResolvedConfig:
+    """Looks every name up and fills every default in, once; plugins must have been imported.
+
+    Args:
+        config (TrainConfig): what is asked for.
 
     Raises:
-        ValueError: if it is out of range, or episodes are given together with another choice.
+        ValueError: for unknown names, numbers out of range, and options that exclude each other.
+        RunDirectoryError: if ``planner_from`` is no finished run.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training.config import TrainConfig, resolve
+        >>> resolved = resolve(TrainConfig(out=Path("run"), task="avoiding", method="linear"))
+        >>> resolved.options.steps, resolved.method.closed_form, resolved.columns
+        (5000, True, (0, 1))
     """
+    task = get_task(config.task)
+    options = _with_task_defaults(config, task)
+    released = _released(options)
+    method = _method(options) if released is None else released.method
+    _check(options, method)
+    if options.planner_from is not None:
+        planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
+    else:
+        planner = _planner_entry(options)
+    if released is not None and not method.has_planner:
+        planner |= POLICY
+    controller = {
+        "method": options.method,
+        "decoder": options.decoder,
+        "released": options.released_settings,
+        "preset": "released" if options.released_settings else options.preset or method.presets[0],
+        "state": options.controller_state if method.has_planner else "all",
+    }
+    return ResolvedConfig(
+        options=options,
+        task=task,
+        method=method,
+        teacher=get_method(method.teacher) if method.teacher else None,
+        released=released,
+        budget=_budget(options),
+        planner=planner,
+        controller=controller,
+    )
+
+
+def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
+    defaults = {
+        "steps": task.defaults.planner_steps,
+        "recovery_sigma": task.defaults.recovery_sigma,
+        "episodes": task.defaults.demonstrations,
+        "relative": task.defaults.relative,
+        "channels": task.defaults.channels,
+    }
+    return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
+
+
+def _released(options: TrainConfig) -> Released | None:
+    if not options.released_settings:
+        if options.epochs is not None:
+            raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
+        return None
+    if options.decoder is not None or options.preset is not None:
+        raise ValueError("released settings come with their own decoder and preset: no --decoder, no --preset")
+    if options.epochs is not None and options.epochs < 1:
+        raise ValueError(f"epochs must be >= 1, got {options.epochs}")
+    return get_released(options.method)
+
+
+def _method(options: TrainConfig) -> Method:
+    method = get_method(options.method, options.decoder)
+    if options.preset is not None:
+        lookup(PRESETS, options.preset, "preset")
+        if options.preset not in method.presets:
+            has = list(method.presets)
+            raise ValueError(f"method {options.method!r} has no preset {options.preset!r}, it has {has}")
+    return method
+
+
+def _check(options: TrainConfig, method: Method) -> None:
+    lookup(("csv", "wandb"), options.logger, "logger")
+    if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
+        raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
+    if not method.has_planner and options.planner_from is not None:
+        raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
+    if options.steps < 1 or options.controller_steps < 0:
+        raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
+    for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
+
+
+def _budget(options: TrainConfig) -> LabelBudget:
     if options.label_episodes is not None:
         if options.label_count is not None or options.label_unit != "trajectory":
             raise ValueError("label_episodes are trajectories of their own choice: no label_count or label_unit")
@@ -129,63 +245,8 @@ def budget_of(options: Train) -> LabelBudget:
     return LabelBudget(amount, unit=options.label_unit, seed=options.seed, window=WINDOW, history=HISTORY)
 
 
-def method_of(options: Train) -> Method:
-    """The method that the options name.
-
-    Raises:
-        ValueError: if there is none, or not with that decoder or released settings.
-    """
-    if options.released_settings:
-        if options.decoder is not None or options.preset is not None:
-            raise ValueError("released settings come with their own decoder and preset: no --decoder, no --preset")
-        if options.epochs is not None and options.epochs < 1:
-            raise ValueError(f"epochs must be >= 1, got {options.epochs}")
-        return get_released(options.method).method
-    if options.epochs is not None:
-        raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
-    method = get_method(options.method, options.decoder)
-    if (
-        options.preset is not None
-        and lookup(PRESETS, options.preset, "preset")
-        and (options.preset not in method.presets)
-    ):
-        raise ValueError(f"method {options.method!r} has no preset {options.preset!r}, it has {list(method.presets)}")
-    return method
-
-
-def started_with(run: RunDirectory, options: Train) -> Train:
-    """The options of a resumed run: what was not asked for otherwise is as it was."""
-    if not (options.resume and (run.path / "config.json").exists()):
-        return options
-    earlier = run.read_json("config.json")
-    left = [field.name for field in fields(options) if getattr(options, field.name) == field.default]
-    kept = {name: earlier[name] for name in left if name in earlier}
-    for name in ("channels", "label_episodes"):
-        if kept.get(name) is not None:
-            kept[name] = tuple(kept[name])
-    if kept.get("planner_from") is not None:
-        kept["planner_from"] = Path(kept["planner_from"])
-    return replace(options, **kept)
-
-
-def with_task_defaults(options: Train, task: Task) -> Train:
-    """Fills in what was left to the task."""
-    defaults = {
-        "steps": task.defaults.planner_steps,
-        "recovery_sigma": task.defaults.recovery_sigma,
-        "episodes": task.defaults.demonstrations,
-        "relative": task.defaults.relative,
-        "channels": task.defaults.channels,
-    }
-    left = {name: value for name, value in defaults.items() if getattr(options, name) is None}
-    return replace(options, **left)
-
-
-def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
-    """Everything that ``config.json`` holds; compared with what is there already."""
-    config = asdict(options)
-    config |= {name: str(config[name]) for name in ("out", "planner_from") if config[name] is not None}
-    config["planner"] = {
+def _planner_entry(options: TrainConfig) -> dict[str, Any]:
+    return {
         "denoiser": options.denoiser,
         "channels": list(options.channels),
         "schedule": options.schedule,
@@ -198,36 +259,3 @@ def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
         "solver_steps": options.solver_steps,
         "clip": 1.2 if options.prediction == "sample" else 1.0,
     }
-    if options.planner_from is not None:
-        config["planner"] = RunDirectory(options.planner_from).read_entry("config.json", "planner")
-    method = method_of(options)
-    if method.acts and options.released_settings:
-        config["planner"] |= POLICY
-    config["controller"] = {
-        "method": options.method,
-        "decoder": options.decoder,
-        "released": options.released_settings,
-        "preset": "released" if options.released_settings else options.preset or method.presets[0],
-        "state": "all" if method.acts else options.controller_state,
-    }
-    for name in ("channels", "label_episodes"):
-        if config[name] is not None:
-            config[name] = list(config[name])
-    config["command"] = "koap " + " ".join(sys.argv[1:])
-    config["versions"] = {"python": platform.python_version()} | {
-        name: importlib.metadata.version(name) for name in ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
-    }
-    if (run.path / "config.json").exists():
-        if not options.resume:
-            raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
-        earlier = run.read_json("config.json")
-        free = {*FREE, "command", "versions"}
-        # a folder that is gone was moved, probably together with this run: there is nothing to compare with
-        paths = {name: earlier.get(name) for name in ("dataset", "planner_from")}
-        free |= {name for name, path in paths.items() if path not in (None, "scripted") and not Path(path).exists()}
-        changed = [key for key in config if key not in free and config[key] != earlier.get(key)]
-        if changed:
-            raise RunDirectoryError(
-                f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so"
-            )
-    return config

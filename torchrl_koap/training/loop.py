@@ -38,7 +38,7 @@ class DivergedError(RuntimeError):
     """A loss that became NaN or infinite."""
 
 
-def train(
+def train_phase(
     phase: str,
     loss_module: nn.Module,
     sample: Callable[[], TensorDictBase],

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The planner's part of ``koap train``."""
+"""The part of a training that needs no labels: the planner."""
 
 from __future__ import annotations
 
@@ -20,19 +20,30 @@ from torchrl_koap.data import (
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
-from torchrl_koap.training.builders import build_planner
 from torchrl_koap.training.checkpoints import load_weights, save_weights
-from torchrl_koap.training.config import Train
-from torchrl_koap.training.loop import moving_average, phase_finished, train
-from torchrl_koap.training.progress import progress_bar, show_progress
+from torchrl_koap.training.config import ResolvedConfig, TrainConfig
+from torchrl_koap.training.diffusion_builders import build_planner
+from torchrl_koap.training.loop import moving_average, phase_finished, train_phase
+from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.run_directory import RunDirectory
 
 
 def train_planner(
-    run: RunDirectory, options: Train, config: dict[str, Any], task: Task, data: TensorDictBase, logger
+    run: RunDirectory, resolved: ResolvedConfig, data: TensorDictBase, logger: Any = None
 ) -> tuple[StatePlanner, dict[str, float]]:
-    """Trains the planner, takes it over from another run, or loads it where that is done; returns it and its losses."""
-    planner = build_planner(config["planner"], data["state"].shape[-1], task.planner_features()).to(options.device)
+    """Trains the planner, takes it over from another run, or loads it where that is done.
+
+    Args:
+        run (RunDirectory): where weights, metrics and checkpoints go.
+        resolved (ResolvedConfig): all options.
+        data (TensorDictBase): flat data with the whole ``state``; no action is looked at.
+        logger (optional): a TorchRL logger.
+
+    Returns:
+        tuple: the planner and its last losses.
+    """
+    options, task = resolved.options, resolved.task
+    planner = build_planner(resolved.planner, data["state"].shape[-1], task.planner_features()).to(options.device)
     source = run.path if options.planner_from is None else Path(options.planner_from)
     if options.planner_from is not None or (options.resume and phase_finished(run, "planner")):
         load_weights(source / "planner.safetensors", planner, task=task.name)
@@ -46,8 +57,8 @@ def train_planner(
     buffer = make_window_buffer(extended, WINDOW, options.batch_size, select=["state"], pad_before=1)
     augment = _augmentation(options, task)
     loss = PlannerLoss(planner)
-    with progress_bar(options.steps, "planner") as bar:
-        values = train(
+    with progress_bar(options.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
+        values = train_phase(
             "planner",
             loss,
             lambda: augment(buffer.sample()),
@@ -59,14 +70,14 @@ def train_planner(
             logger=logger,
             checkpoint_every=options.checkpoint_every,
             resume=options.resume,
-            progress=show_progress(bar),
+            progress=show_losses(bar),
         )
     loss.target_planner_params.to_module(planner)
     save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
     return planner, values
 
 
-def _augmentation(options: Train, task: Task) -> TensorDictSequential:
+def _augmentation(options: TrainConfig, task: Task) -> TensorDictSequential:
     """What windows undergo before the planner learns from them."""
     steps = []
     if options.exchange and task.interchangeable_columns():

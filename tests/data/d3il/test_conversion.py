@@ -25,7 +25,7 @@ from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, get_task
-from torchrl_koap.training.builders import load_demonstrations
+from torchrl_koap.training.datasets import load_demonstrations
 
 ROOT3 = math.sqrt(3)
 

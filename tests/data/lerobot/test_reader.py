@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_koap.commands.doctor import Validate, run_validate
+from torchrl_koap.commands.doctor import Validate
 from torchrl_koap.data import D3ILExperienceReplay, RawFolderError, flatten_trajectories, read_about, read_lerobot
 from torchrl_koap.data.d3il import replay as d3il_module
 from torchrl_koap.data.lerobot import reader as lerobot_module
@@ -19,7 +19,7 @@ from torchrl_koap.data.lerobot.reader import column_names
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, get_task
-from torchrl_koap.training.builders import load_demonstrations
+from torchrl_koap.training.datasets import load_demonstrations
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra lerobot)")
 import pyarrow as pa  # noqa: E402
@@ -144,7 +144,7 @@ def test_round_trip_of_recorded_demonstrations(tmp_path, recorded, version, warn
     assert (dataset.data.exclude("state") == recorded).all()
     assert torch.equal(dataset.data["state"], recorded["observation"][:, 2:])
     assert (load_demonstrations(str(root), get_task("avoiding")).exclude("state") == recorded).all()
-    assert run_validate(Validate(str(root)))["trajectories"] == "3"
+    assert Validate(dataset=str(root))()["trajectories"] == "3"
     assert not warnings
 
 

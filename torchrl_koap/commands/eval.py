@@ -1,0 +1,38 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap eval``: closed-loop rollouts of a trained run, scored with intervals, and its report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from torchrl_koap.commands.command import Command, Options
+from torchrl_koap.evaluation import EvalConfig, evaluate
+from torchrl_koap.reports.run_report import write_report
+
+
+@dataclass(kw_only=True)
+class Eval(Command):
+    """Evaluate a trained run in closed loop and write its report.
+
+    Attributes:
+        run: run directory of `koap train`.
+        config: all options of the rollouts.
+        report: draw the pictures and write the report.
+        animate: make an animation of the rollouts for the report.
+    """
+
+    run: tyro.conf.Positional[Path]
+    config: Options[EvalConfig]
+    report: bool = True
+    animate: bool = True
+
+    def __call__(self) -> dict[str, Any]:
+        """Evaluates and reports."""
+        result = evaluate(self.run, self.config)
+        if self.report:
+            write_report(self.run, animation=self.animate)
+        return result
