@@ -25,7 +25,7 @@ from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import replacing_folder
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.json_format import import_strings_of
+from torchrl_koap.tasks.json_format import plain_task_from_json
 from torchrl_koap.tasks.registry import find_task
 
 FORMAT = 1
@@ -142,16 +142,9 @@ def read_task(folder: str | Path) -> Task | None:
     if definition is None:
         return None
     try:
-        task = Task.from_json(definition)
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
-        raise DamagedDataError(f"{Path(folder) / _ABOUT}: its task is damaged: {error}") from error
-    code = import_strings_of(task)
-    if code:
-        raise DamagedDataError(
-            f"{Path(folder) / _ABOUT}: its task names code in {', '.join(code)}; register such a task by"
-            " --plugin instead"
-        )
-    return task
+        return plain_task_from_json(definition)
+    except ValueError as error:
+        raise DamagedDataError(f"{Path(folder) / _ABOUT}: {error}") from error
 
 
 def load_ted(folder: str | Path, *, task: str | None = None, memmap: bool = True) -> TensorDict:

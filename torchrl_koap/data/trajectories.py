@@ -181,12 +181,18 @@ def select_state(
     return data.copy().set(keys.STATE, data.get(keys.OBSERVATION)[..., columns])
 
 
-def controller_view(data: TensorDictBase, columns: Sequence[int]) -> TensorDictBase:
+def controller_view(
+    data: TensorDictBase, columns: Sequence[int], *, action_targets: Sequence[int] = ()
+) -> TensorDictBase:
     """The same data as a controller with a mask sees them.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` with ``state``; not changed.
         columns (sequence of int): columns of the state to keep.
+
+    Keyword Args:
+        action_targets (sequence of int): for actions that are targets, the state column of each: what is left of an
+            action is the distance to it. Default: actions stay as they are.
 
     Examples:
         >>> import torch
@@ -195,4 +201,7 @@ def controller_view(data: TensorDictBase, columns: Sequence[int]) -> TensorDictB
         >>> controller_view(TensorDict({"state": torch.tensor([[1.0, 2.0, 3.0]])}, [1]), (0, 2))["state"]
         tensor([[1., 3.]])
     """
-    return data.copy().set(keys.STATE, data.get(keys.STATE)[..., list(columns)])
+    state, view = data.get(keys.STATE), data.copy()
+    if action_targets:
+        view.set(keys.ACTION, view.get(keys.ACTION) - state[..., list(action_targets)])
+    return view.set(keys.STATE, state[..., list(columns)])

@@ -249,7 +249,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
     recorded = directory.read_entry("summary.json", "labels")  # runs of older versions name fewer facts
     if {name: report.as_dict().get(name) for name in recorded} != recorded:
         raise ValueError(f"the demonstrations of {dataset!r} are not those that {directory.path} was trained on")
-    steps = infer_steps(controller, controller_view(data, trained.columns))
+    steps = infer_steps(controller, controller_view(data, trained.columns, action_targets=task.action_targets))
     choices = rank_trajectories(
         steps["latent_action"],
         steps[EPISODE],

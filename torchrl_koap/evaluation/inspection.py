@@ -125,7 +125,7 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
         "replan_interval": config.replan_interval,
         "blend_decay": config.blend_decay,
         "controller_columns": trained.columns,
-        "gripper": task.gripper,
+        "action_rule": task.action_rule,
     }
     seeds = list(range(config.seed, config.seed + config.episodes))
     from torchrl_koap.envs.registry import make_env_of  # takes seconds
@@ -169,7 +169,7 @@ def _look_into(config: InspectConfig, trained: TrainedRun, data: TensorDictBase)
         for name, part in task.state_slices.items()
     }
     parts = {name: places for name, places in parts.items() if places}
-    view = controller_view(data, columns)
+    view = controller_view(data, columns, action_targets=task.action_targets)
     return analyse_latent(controller, view, labelled, parts, horizon=config.latent_steps)
 
 

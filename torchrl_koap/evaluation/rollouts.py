@@ -7,7 +7,6 @@ import itertools
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -22,7 +21,6 @@ from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
 from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
 from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
-from torchrl_koap.tasks.gripper import command_gripper
 
 
 def make_policy(
@@ -34,10 +32,23 @@ def make_policy(
     replan_interval: int = 4,
     blend_decay: float = 0.8,
     controller_columns: Sequence[int] | None = None,
-    gripper: tuple[int, int] | None = None,
+    action_rule: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> PlanThenControl:
-    """Planner and controller as a policy that observes as many frames as the longer-sighted of the two."""
-    rule = None if gripper is None else partial(command_gripper, entry=gripper[0], column=gripper[1])
+    """Planner and controller as a policy that observes as many frames as the longer-sighted of the two.
+
+    Args:
+        planner (StatePlanner): the planner.
+        controller (TensorDictModuleBase): the inverse dynamics.
+
+    Keyword Args:
+        state_columns (sequence of int, or callable): as for :class:`~torchrl_koap.modules.PlanThenControl`, and so are
+            all others.
+        execution (str): ``"feedback"`` or ``"open_loop"``.
+        replan_interval (int): steps per plan.
+        blend_decay (float): share of the distance to the plan that remains after each frame.
+        controller_columns (sequence of int, optional): columns of the state that the controller reads.
+        action_rule (callable, optional): has the last word on actions, such as ``task.action_rule``.
+    """
     return PlanThenControl(
         planner,
         controller,
@@ -47,7 +58,7 @@ def make_policy(
         replan_interval=replan_interval,
         blend_decay=blend_decay,
         controller_columns=controller_columns,
-        action_rule=rule,
+        action_rule=action_rule,
     )
 
 

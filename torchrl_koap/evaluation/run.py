@@ -18,7 +18,7 @@ from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ChunkedPolicy, StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
-from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, get_task
+from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
 from torchrl_koap.training.builders import build_controller, method_named, set_up_torch
 from torchrl_koap.training.checkpoints import load_weights, save_tensors
 from torchrl_koap.training.diffusion_builders import build_planner
@@ -120,7 +120,7 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
         raise RunDirectoryError(f"{directory.path} was trained on task {trained_on!r}, not on {task!r}")
     config = directory.read_json("config.json")
     load_plugins(config.get("plugins") or ())
-    facts, method = get_task(trained_on), method_named(entry)
+    facts, method = task_of(config), method_named(entry)
     columns = facts.controller_columns(entry.get("state", "all"))
     if method.has_planner:
         planner = build_planner(planner_entry, facts.state_dim, facts.planner_features())
@@ -173,7 +173,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             replan_interval=config.replan_interval,
             blend_decay=config.blend_decay,
             controller_columns=trained.columns,
-            gripper=task.gripper,
+            action_rule=task.action_rule,
         )
     return policy.to(config.device)
 

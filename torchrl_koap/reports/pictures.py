@@ -25,7 +25,7 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from torchrl_koap.tasks.registry import find_task
+from torchrl_koap.tasks import task_of
 
 FOLDER = "plots"
 FACTS = {
@@ -228,15 +228,14 @@ def run_facts(run_dir: Path) -> dict[str, Any]:
         run_dir (Path): the run directory; ``config.json`` is read if it is there.
     """
     try:
-        name = json.loads((run_dir / "config.json").read_text(encoding="utf-8")).get("task")
-    except (OSError, ValueError, AttributeError):
-        name = None
-    task = find_task(name)
+        task = task_of(json.loads((run_dir / "config.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # a run of a task that nobody knows here
+        task = None
     columns = None
     if task is not None:
         columns = [(column, unit, column in task.absolute_actions) for column, unit in task.actions.items()]
     return {
-        "task": name if task else None,
+        "task": task.name if task else None,
         "num_modes": task.num_modes if task else 24,
         "control_hz": task.control_hz if task else None,
         "actions": columns,

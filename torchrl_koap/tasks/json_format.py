@@ -54,6 +54,35 @@ def task_from_json(entries: dict[str, Any]) -> Task:
     return Task(**values)
 
 
+def plain_task_from_json(entries: dict[str, Any]) -> Task:
+    """The task that a data set or run brings along: plain facts, no code.
+
+    A folder that somebody sent must not decide what is run.
+
+    Args:
+        entries (dict): as :func:`task_to_json` wrote them.
+
+    Raises:
+        ValueError: if the entries are damaged, or name code to import.
+
+    Examples:
+        >>> from torchrl_koap.tasks import get_task
+        >>> from torchrl_koap.tasks.json_format import plain_task_from_json
+        >>> plain_task_from_json(get_task("avoiding").to_json())  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        ValueError: task 'avoiding' names code in env, expert, ...; register it by --plugin instead
+    """
+    try:
+        task = task_from_json(entries)
+        code = import_strings_of(task)
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise ValueError(f"the task is damaged: {error}") from error
+    if code:
+        raise ValueError(f"task {task.name!r} names code in {', '.join(code)}; register it by --plugin instead")
+    return task
+
+
 def import_strings_of(task: Task) -> dict[str, str]:
     """What a task names by import strings, and where: the code that using it may run.
 

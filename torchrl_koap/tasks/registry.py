@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
+from typing import Any
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks.task import Task
@@ -13,6 +14,7 @@ GROUP = "torchrl_koap.tasks"
 TASKS: dict[str, Task] = {}
 _observers: list[Callable[[Task], None]] = []
 _loaded = False
+_adopted: set[str] = set()  # names of tasks that came with data
 
 
 def register_task(task: Task) -> Task:
@@ -84,6 +86,59 @@ def find_task(name: object) -> Task | None:
     if isinstance(name, str) and name not in TASKS:
         load_entry_points()
     return TASKS.get(name) if isinstance(name, str) else None
+
+
+def adopt_task(task: Task) -> Task:
+    """Makes a task known that came with a data set or a run; the next one of that name takes its place.
+
+    Args:
+        task (Task): the task.
+
+    Raises:
+        ValueError: if a package has registered another task of that name.
+
+    Examples:
+        >>> from torchrl_koap.tasks import Task, get_task
+        >>> from torchrl_koap.tasks.registry import adopt_task
+        >>> for joints in (6, 7):
+        ...     arm = Task(name="my_arm", observation_parts={"joints": joints}, actions={"a": "rad"}, position="joints")
+        ...     adopted = adopt_task(arm)
+        >>> get_task("my_arm").observation_dim
+        7
+    """
+    if task.name in _adopted:
+        TASKS[task.name] = task
+    elif TASKS.get(task.name) != task:
+        register_task(task)
+        _adopted.add(task.name)
+    return TASKS[task.name]
+
+
+def is_adopted(task: Task) -> bool:
+    """Whether a task came with data: no package registers it, so a run has to bring it along."""
+    return task.name in _adopted
+
+
+def task_of(config: Mapping[str, Any]) -> Task:
+    """The task of a run, from its ``config.json``: the one it brings along, or a registered one.
+
+    Args:
+        config (mapping): content of ``config.json``.
+
+    Raises:
+        ValueError: if the task it brings along is damaged or names code, or nobody has registered it.
+
+    Examples:
+        >>> from torchrl_koap.tasks.registry import task_of
+        >>> task_of({"task": "avoiding"}).state_dim
+        2
+    """
+    definition = config.get("task_definition")
+    if definition is None:
+        return get_task(config["task"])
+    from torchrl_koap.tasks.json_format import plain_task_from_json
+
+    return adopt_task(plain_task_from_json(definition))
 
 
 def load_entry_points() -> None:

@@ -222,6 +222,15 @@ class Task(StateParts):
         return self.action_dim - len(self.absolute_actions)
 
     @property
+    def action_rule(self) -> Callable[[Tensor, Tensor], Tensor] | None:
+        """What has the last word on decoded actions (:mod:`torchrl_koap.tasks.action_rules`), None if nothing has."""
+        if self.gripper is None and not self.action_targets:
+            return None
+        from torchrl_koap.tasks.action_rules import ActionRule
+
+        return ActionRule(self.gripper, self.action_targets)
+
+    @property
     def num_modes(self) -> int:
         """Number of modes, base of the logarithm of their entropy."""
         return self.modes.number

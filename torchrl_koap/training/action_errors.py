@@ -33,7 +33,7 @@ def hidden_action_errors(
 
     Args:
         controller (nn.Module): writes actions ``[*B, T, act]`` for windows of states ``[*B, T, d]``.
-        data (TensorDictBase): flat, fully labelled.
+        data (TensorDictBase): flat, with all labels that there are.
         labelled (TensorDictBase): the same after the budget was applied.
 
     Returns:
@@ -41,7 +41,8 @@ def hidden_action_errors(
     """
     touched = labelled["episode"][labelled["has_action"].squeeze(-1)].unique()
     windows = cut_windows(data, BEFORE + 1 + AFTER, select=["state", "action", "episode"], pad_before=BEFORE)
-    windows = windows[~torch.isin(windows["episode"][:, -1], touched.to(windows["episode"].device))]
+    known = windows["action"][:, BEFORE].isfinite().all(-1)  # the data may lack labels themselves
+    windows = windows[known & ~torch.isin(windows["episode"][:, -1], touched.to(windows["episode"].device))]
     device = next(iter(controller.state_dict().values())).device
     states = windows["state"][:, BEFORE - min(controller.num_past, BEFORE) :].to(device)
     predicted = controller(TensorDict({"state": states}, batch_size=[len(states)]))["action"]
@@ -73,14 +74,14 @@ def write_analysis(
     ``columns`` are the state columns that the controller reads. Writes ``actions.safetensors`` and
     ``demonstrations.safetensors`` for the report.
     """
-    labelled = controller_view(labelled.cpu(), columns)
-    viewed = controller_view(data, columns)
+    labelled = controller_view(labelled.cpu(), columns, action_targets=task.action_targets)
+    viewed = controller_view(data, columns, action_targets=task.action_targets)
     predicted, true = hidden_action_errors(controller, viewed, labelled)
     has_action = labelled["has_action"].squeeze(-1)
     shown = {"state": data["state"], "episode": data["episode"], "labelled": has_action}
     save_tensors(run.path / "demonstrations.safetensors", shown | _plotted(task, data["observation"]))
     if not len(true):
-        return {"note": "every trajectory has a label in the budget: there is nothing to measure on"}
+        return {"note": "no trajectory outside the budget has labels: there is nothing to measure on"}
     save_tensors(run.path / "actions.safetensors", {"predicted": predicted, "true": true})
     ridge = LinearInverseDynamics(len(columns), task.action_dim).to(data["state"].dtype)
     fit_closed_form(ridge, labelled)

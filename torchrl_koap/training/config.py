@@ -8,14 +8,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.data import LabelBudget
+from tensordict import TensorDictBase
+
+from torchrl_koap.data import LabelBudget, controller_view
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
-from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task, get_task
+from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
+from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.methods import Method, get_method
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.run_directory import RunDirectory
+
+LABEL_FRACTION, ALL_LABELS = 0.02, 1.0  # defaults for data with all labels, and for data that lack some
 
 
 @dataclass
@@ -24,9 +29,11 @@ class TrainConfig:
 
     Attributes:
         out: run directory to write.
-        task: name of the task.
-        dataset: "scripted", or a folder: of D3IL raw pickles, a LeRobot data set, or written by `koap demos`.
-        label_fraction: share of the trajectories, windows or transitions that keep their actions.
+        task: name of the task (default: that of the data set, if it says so; else "avoiding").
+        dataset: "scripted", or a folder: written by `koap demos`, `koap convert` or save_demonstrations, of D3IL raw
+            pickles, or a LeRobot data set.
+        label_fraction: share of the trajectories, windows or transitions that keep their actions (default: 0.02; all
+            labels that there are, where data lack some).
         label_count: number of them instead of a share.
         label_episodes: these trajectories instead of a random choice, as `koap suggest` names them.
         label_unit: "trajectory", "window" (the paper's levels) or "transition".
@@ -70,9 +77,9 @@ class TrainConfig:
     """
 
     out: Path
-    task: str = "avoiding"
+    task: str | None = None
     dataset: str = "scripted"
-    label_fraction: float = 0.02
+    label_fraction: float | None = None
     label_count: int | None = None
     label_episodes: tuple[int, ...] | None = None
     label_unit: str = "trajectory"
@@ -142,6 +149,18 @@ class ResolvedConfig:
         """State columns that the controller reads."""
         return self.task.controller_columns(self.options.controller_state)
 
+    def controller_view(self, data: TensorDictBase) -> TensorDictBase:
+        """Flat data ``[N]`` as the controller sees them: its columns, and actions as distances to their targets."""
+        return controller_view(data, self.columns, action_targets=self.task.action_targets)
+
+    def with_labels_of(self, data: TensorDictBase) -> ResolvedConfig:
+        """The same with the share of labels that is the default for these data, if none was asked for."""
+        if self.options.label_fraction is not None:
+            return self
+        share = ALL_LABELS if not data["has_action"].all() else LABEL_FRACTION
+        options = replace(self.options, label_fraction=share)
+        return replace(self, options=options, budget=_budget(options))
+
 
 def resolve(config: TrainConfig) -> ResolvedConfig:
     """Looks every name up and fills every default in, once; plugins must have been imported.
@@ -160,8 +179,8 @@ def resolve(config: TrainConfig) -> ResolvedConfig:
         >>> resolved.options.steps, resolved.method.closed_form, resolved.columns
         (5000, True, (0, 1))
     """
-    task = get_task(config.task)
-    options = _with_task_defaults(config, task)
+    task = find_task_of(config.dataset, config.task)
+    options = replace(_with_task_defaults(config, task), task=task.name)
     released = _released(options)
     method = _method(options) if released is None else released.method
     _check(options, method)
@@ -242,6 +261,7 @@ def _budget(options: TrainConfig) -> LabelBudget:
             raise ValueError("label_episodes are trajectories of their own choice: no label_count or label_unit")
         return LabelBudget.of_episodes(options.label_episodes)
     amount = options.label_fraction if options.label_count is None else options.label_count
+    amount = LABEL_FRACTION if amount is None else amount
     return LabelBudget(amount, unit=options.label_unit, seed=options.seed, window=WINDOW, history=HISTORY)
 
 

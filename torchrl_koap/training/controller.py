@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from torchrl_koap.data import WindowTable, controller_view, cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.data import WindowTable, cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.tasks import HORIZON, WINDOW
@@ -46,7 +46,7 @@ def train_controller(
     train_one = _Training(run, resolved, logger)
     fit: dict[str, Any] = {}
     if method.has_planner:
-        view = controller_view(data, resolved.columns)
+        view = resolved.controller_view(data)
         controller, fit, values = _train_network(train_one, method, resolved.controller, view)
     else:
         if resolved.teacher is not None:
@@ -185,7 +185,9 @@ def _relabelled(train_one: _Training, resolved: ResolvedConfig, data: TensorDict
     teacher = resolved.teacher
     phases = tuple(replace(phase, name=f"teacher_{phase.name}") for phase in teacher.phases)
     entry = {"method": teacher.name, "preset": resolved.controller["preset"]}
-    view = controller_view(data, resolved.columns)
+    view = resolved.controller_view(data)
     controller, _, _ = _train_network(train_one, replace(teacher, phases=phases), entry, view)
     labelled = relabel(controller, view, window=max(WINDOW, controller.num_window_frames))
+    if resolved.task.action_targets:
+        labelled["action"] = labelled["action"] + data["state"][..., list(resolved.task.action_targets)]
     return data.copy().update(labelled.select("action", "has_action"))

@@ -8,6 +8,7 @@ import platform
 from dataclasses import asdict
 from typing import Any
 
+from torchrl_koap.tasks.registry import is_adopted
 from torchrl_koap.training.config import ResolvedConfig
 
 _PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
@@ -22,6 +23,8 @@ def to_json(resolved: ResolvedConfig, command: str | None = None) -> dict[str, A
     """
     options = asdict(resolved.options)
     content = {name: _plain(value) for name, value in options.items()}
+    if is_adopted(resolved.task):
+        content["task_definition"] = resolved.task.to_json()  # nobody has registered it: it comes with the data
     content |= {"planner": resolved.planner, "controller": resolved.controller}
     if command is not None:
         content["command"] = command

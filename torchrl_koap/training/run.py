@@ -63,6 +63,9 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
 
         with progress_bar(None, "demonstrations", unit="episode", shown=options.dataset == "scripted") as bar:
             data = load_demonstrations(options.dataset, task, episodes=options.episodes, progress=count_up_to(bar))
+        resolved = resolved.with_labels_of(data)
+        options = resolved.options
+        content["label_fraction"] = options.label_fraction
         labelled, report = resolved.budget.apply(data, command=task.command_columns)
         # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
         labelled = subsample_trajectories(labelled, options.observation_fraction).to(options.device)
