@@ -2,7 +2,7 @@
 """Control steps per second of the environments, per core and over threads, against the original simulator.
 
     python benchmarks/env_speed.py --task avoiding --num-envs 60 --steps 40 --threads 1 2
-    python benchmarks/env_speed.py --task aligning --num-envs 30 --steps 150 --recordings ../shared/d3il_reference
+    python benchmarks/env_speed.py --task aligning --num-envs 30 --steps 150 --recordings d3il_reference
 
 The original (one environment, one core, Python controller) makes 19 to 80 control steps per second, depending on the
 task; ratios are against that. With ``--recordings`` every environment plays the first recorded episode of the task,
@@ -25,7 +25,7 @@ import torch
 from torchrl_koap.envs import ManipulationEnv
 from torchrl_koap.envs.registry import make_env
 
-# control steps per second of the original
+# control steps per second of the original on one core (docs/d3il.md, Repeatability)
 ANCHORS = {"avoiding": 26.0, "aligning": 27.5, "sorting": 19.0, "stacking": 80.5}
 
 

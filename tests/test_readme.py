@@ -10,11 +10,15 @@ from pathlib import Path
 import pytest
 import tyro
 
+import torchrl_koap
 from torchrl_koap.commands.cli import Subcommand
+from torchrl_koap.reports import pictures
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "RESULTS.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TEXT = "".join(page.read_text() for page in PAGES if "results" not in page.parts)
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
 SHELL = [
     shlex.split(line, comments=True)
     for language, block in BLOCKS
@@ -65,26 +69,46 @@ def test_the_demo_is_the_contract():
 
 @pytest.mark.parametrize("code", [block for language, block in BLOCKS if language == "python"])
 def test_python_runs(code, tmp_path, monkeypatch):
+    """Training itself takes minutes: its options are made and checked, and what it returns is made up."""
+    called = []
+    scores = {"success_rate": 1.0, "mode_entropy": 0.0}
+    monkeypatch.setattr(torchrl_koap, "train", lambda config: called.append(config) or config.out, raising=False)
+    monkeypatch.setattr(torchrl_koap, "evaluate", lambda run, config: called.append(config) or scores, raising=False)
+    monkeypatch.setattr(pictures, "_PICTURES", dict(pictures.all_pictures()))
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
+    assert "train(" not in code or [type(config).__name__ for config in called] == ["TrainConfig", "EvalConfig"]
 
 
-LINKS = [link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
-PATHS = re.findall(r"`((?:torchrl_koap|tutorials|benchmarks|tests)/[\w./]*)`", README)
+PATHS = re.findall(r"`((?:torchrl_koap|tutorials|benchmarks|tests|docs)/[\w./]*)`", TEXT)
 
 
-@pytest.mark.parametrize("path", sorted({path for path in (*LINKS, *PATHS) if path}))
-def test_links_lead_somewhere(path):
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    links = [link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", page.read_text()) if "://" not in link]
+    for link in filter(None, links):
+        assert (page.parent / link).exists(), link
+
+
+@pytest.mark.parametrize("path", sorted(set(PATHS)))
+def test_paths_named_in_the_text_exist(path):
     assert (ROOT / path).exists()
+
+
+def test_usage_comes_before_any_figure():
+    """The first screen says what it is and how it is used; results follow."""
+    shell, plot = README.index("koap train"), README.index("success_and_entropy.png")
+    assert README.index("docs/pictures/pipeline.svg") < README.index("import") < shell < plot
+    assert len(README[:plot].splitlines()) < 50
 
 
 def test_options_named_in_the_text_exist():
     """Every ``--option`` in running text is one of some command."""
-    text = re.sub(r"^```.*?^```", "", README, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^```.*?^```", "", TEXT, flags=re.MULTILINE | re.DOTALL)
     sources = "".join(path.read_text() for path in (ROOT / "torchrl_koap").rglob("*.py"))
     for option in re.findall(r"`--([a-z][a-z-]*)", text):
         assert re.search(rf"^    {option.replace('-', '_')}:", sources, re.MULTILINE), option
 
 
 def test_nothing_is_left_to_fill_in():
-    assert not re.findall(r"@@|TODO|XXX|FIXME", README)
+    assert not re.findall(r"@@|TODO|XXX|FIXME", TEXT)

@@ -23,8 +23,8 @@ from torchrl_koap.envs.experts.demonstrations import record_demonstrations, reco
 from torchrl_koap.evaluation.diagnosis import contexts_of
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.keys import validate
-from torchrl_koap.reports.captions import caption
 from torchrl_koap.reports.objects import object_looks
+from torchrl_koap.reports.pictures import all_pictures
 from torchrl_koap.reports.scenes import BLUE, draw_scene
 from torchrl_koap.tasks import TASKS, Task, get_task
 from torchrl_koap.tasks.modes import mode_name
@@ -109,8 +109,8 @@ def test_it_is_drawn():
     assert axes.texts[0].get_text() == "goal" and axes.get_xlim() == (0.2, 0.8)
     (look,) = object_looks("puck", 1)
     assert look.label == "puck" and to_rgb(look.color) == to_rgb(BLUE)
-    assert caption("rollouts.png", "puck")[1].endswith("passes the post on one side.")
-    assert "Squares are the objects" in caption("rollouts.gif", "puck")[1]
+    assert all_pictures()["rollouts.png"].caption_for("puck").endswith("passes the post on one side.")
+    assert "Squares are the objects" in all_pictures()["rollouts.gif"].caption_for("puck")
 
 
 def test_gymnasium_knows_it():

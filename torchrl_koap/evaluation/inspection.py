@@ -21,7 +21,8 @@ from torchrl_koap.evaluation.diagnosis import (
     rate,
     tracking_errors,
 )
-from torchrl_koap.evaluation.latent_space import MODELS, OUTSIDE_THE_BUDGET, analyse_latent, error_unit
+from torchrl_koap.evaluation.latent_space import analyse_latent
+from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET, error_unit, judge_latent_model
 from torchrl_koap.evaluation.rollouts import make_policy, roll_out
 from torchrl_koap.evaluation.run import TrainedRun, choose_contexts, load_run
 from torchrl_koap.modules import KoopmanInverseDynamics
@@ -196,7 +197,9 @@ def _latent_says(latent: dict[str, Any]) -> str:
     shared = outside["judged_trajectories_in_budget"]
     reservation = f" ({shared} of these {errors['judged_trajectories']} have labels in the budget)" if shared else ""
     probe, own = (min(outside[name]) for name in ("probe_r2", "decoder_r2"))
-    return (
+    faults = judge_latent_model(errors)
+    said = f"A fault to look into: {'; '.join(faults)}. " if faults else ""
+    return said + (
         f"{errors['steps']} steps ahead the latent dynamics miss the {part.replace('_', ' ')} by {ahead['koopman']}"
         f" ({ahead['reconstruction']} of mapping back alone), a linear model on raw states by {ahead['linear']},"
         f" standing still by {ahead['copy_last']}. Outside the budget,"

@@ -15,15 +15,34 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import cut_windows, trajectory_lengths
+from torchrl_koap.evaluation.latent_verdict import (
+    MODELS,
+    ON_THE_CIRCLE,
+    OUTSIDE_THE_BUDGET,
+    error_unit,
+    judge_latent_model,
+    unit_circle_sides,
+)
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics, LinearActionDecoder
 
-OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"
-MODELS = ("koopman", "reconstruction", "linear", "copy_last")
+__all__ = [
+    "MODELS",
+    "OUTSIDE_THE_BUDGET",
+    "analyse_latent",
+    "error_unit",
+    "explained",
+    "infer_steps",
+    "judge_latent_model",
+    "prediction_errors",
+    "probe",
+    "spectrum",
+    "split_trajectories",
+]
 _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
 
 
-def spectrum(eigenvalues: Tensor, *, tolerance: float = 1e-3, slowest: int = 5) -> dict[str, Any]:
+def spectrum(eigenvalues: Tensor, *, tolerance: float = ON_THE_CIRCLE, slowest: int = 5) -> dict[str, Any]:
     r"""Where the eigenvalues of an operator lie, and in how many steps its slowest parts fade to 1/e.
 
     Args:
@@ -41,13 +60,11 @@ def spectrum(eigenvalues: Tensor, *, tolerance: float = 1e-3, slowest: int = 5) 
         {'spectral_radius': 1.25, 'inside': 1, 'on': 1, 'outside': 1, 'slowest_decay_steps': [1.0]}
     """
     size = eigenvalues.detach().abs().double().sort(descending=True).values
-    inside = size[size < 1 - tolerance]
-    outside = int((size > 1 + tolerance).sum())
+    sides = unit_circle_sides(size.tolist(), tolerance=tolerance)
+    inside = size[[side == "inside" for side in sides]]
     return {
         "spectral_radius": size[0].item(),
-        "inside": len(inside),
-        "on": len(size) - len(inside) - outside,
-        "outside": outside,
+        **{side: sides.count(side) for side in ("inside", "on", "outside")},
         "slowest_decay_steps": (-1 / inside[:slowest].log()).tolist(),
     }
 
@@ -282,14 +299,3 @@ def analyse_latent(
         "decoder_r2": own,
     }
     return result
-
-
-def error_unit(part: str) -> str:
-    """Unit in which errors of a part of the state are shown, a thousandth of that in the data.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.latent_space import error_unit
-        >>> error_unit("measured_xy"), error_unit("measured_joints")
-        ('mm', 'mrad')
-    """
-    return "mrad" if "joints" in part else "mm"

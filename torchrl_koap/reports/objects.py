@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
-from torchrl_koap.reports.scenes import INK, MUTED, color_of
-from torchrl_koap.reports.training_plots import as_array
+from torchrl_koap.reports.scenes import color_of
+from torchrl_koap.reports.style import INK, MUTED, as_array
 from torchrl_koap.tasks import Body
 from torchrl_koap.tasks.registry import find_task
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Draws what stands still in a task, from above (:class:`~torchrl_koap.tasks.Scene`), and the look of all pictures."""
+"""Draws what stands still in a task, from above (:class:`~torchrl_koap.tasks.Scene`)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
 from torchrl_koap.lookup import lookup
+from torchrl_koap.reports.style import BLUE, FAINT, GREEN, MUTED, RED, tidy
 from torchrl_koap.tasks import Shape, get_task
-
-INK, MUTED, FAINT = "#1f2328", "#6b7280", "#c9ced6"
-RED, GREEN, BLUE = "#cf222e", "#1a7f37", "#1f6feb"
 
 _NAMED = {"red": RED, "green": GREEN, "blue": BLUE, "grey": MUTED}
 # how a role is drawn; a shape's own colour goes before the role's
@@ -85,21 +83,3 @@ def draw_scene(axes: Axes, task: str | None) -> Axes:
     axes.set_ylabel("y (m)")
     tidy(axes)
     return axes
-
-
-def tidy(axes: Axes) -> Axes:
-    """Light frame, small ticks and labels: the look that all pictures share."""
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color(FAINT)
-    axes.tick_params(which="both", color=FAINT, labelsize=8, labelcolor=MUTED)
-    for label in (axes.xaxis.label, axes.yaxis.label):
-        label.set_size(9)
-        label.set_color(INK)
-    return axes
-
-
-def set_title(axes: Axes, text: str) -> None:
-    """Title of a panel, flush left."""
-    axes.set_title(text, loc="left", fontsize=9.5, color=INK, linespacing=1.35)

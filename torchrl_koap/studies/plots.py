@@ -16,8 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
-from torchrl_koap.reports.scenes import FAINT, INK, set_title, tidy
-from torchrl_koap.reports.training_plots import save_figure
+from torchrl_koap.reports.style import FAINT, INK, save_figure, set_title, tidy
 from torchrl_koap.studies.summary import Summary, percent
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#56b4e9", "#882255", "#7a8b00")
