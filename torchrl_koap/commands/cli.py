@@ -14,11 +14,14 @@ import tyro
 
 from torchrl_koap import __version__
 from torchrl_koap.commands.bench import Bench
+from torchrl_koap.commands.convert import Convert
 from torchrl_koap.commands.curve import Curve
 from torchrl_koap.commands.demos import Demos
 from torchrl_koap.commands.doctor import Doctor, Validate
 from torchrl_koap.commands.eval import Eval
+from torchrl_koap.commands.export import Export
 from torchrl_koap.commands.inspect import Inspect
+from torchrl_koap.commands.latency import Latency
 from torchrl_koap.commands.suggest import Suggest
 from torchrl_koap.commands.train import Train
 from torchrl_koap.training.progress import without_progress_bars
@@ -29,13 +32,16 @@ HINT = "KOAP_TRACEBACK=1 shows where"
 DESCRIPTION = "Imitation learning with few action labels. `koap --version` prints the version."
 
 Subcommand = (
-    Annotated[Demos, tyro.conf.subcommand("demos")]
+    Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Curve, tyro.conf.subcommand("curve")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Suggest, tyro.conf.subcommand("suggest")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Latency, tyro.conf.subcommand("latency")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]
 )

@@ -15,6 +15,7 @@ from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstra
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands, subsample_trajectories
 from torchrl_koap.data.lerobot.reader import read_lerobot
 from torchrl_koap.data.recordings import Recordings, RecordingsError, make_recordings
+from torchrl_koap.data.sources import read_recordings
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, read_task, save_ted
 from torchrl_koap.data.trajectories import (
     controller_view,
@@ -64,6 +65,7 @@ __all__ = [
     "read_about",
     "read_lerobot",
     "read_raw_episode",
+    "read_recordings",
     "read_task",
     "save_demonstrations",
     "save_ted",
