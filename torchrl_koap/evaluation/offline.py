@@ -99,7 +99,9 @@ def _plans(trained: TrainedRun, data: TensorDictBase, **options: Any) -> dict[st
         return {"note": f"method {trained.config['method']!r} is a policy of its own: it makes no plans"}
     held_out = trained.config.get("validation_episodes") or []
     if not held_out:
-        return {"note": "no trajectory was held out from the planner (--validation-fraction; two trajectories at least)"}
+        return {
+            "note": "no trajectory was held out from the planner (--validation-fraction; two trajectories at least)"
+        }
     unseen = data[torch.isin(data["episode"], torch.tensor(held_out))]
     return {"trajectories": len(held_out)} | plan_errors(trained.planner, unseen, trained.task, **options)
 
@@ -109,7 +111,9 @@ def _actions(trained: TrainedRun, data: TensorDictBase, labelled: TensorDictBase
     if trained.planner is None:
         note = {"note": f"method {trained.config['method']!r} is a policy of its own: it decodes no recorded states"}
         return dict.fromkeys(SPLITS, note)
-    view, seen = (controller_view(part, trained.columns, action_targets=task.action_targets) for part in (data, labelled))
+    view, seen = (
+        controller_view(part, trained.columns, action_targets=task.action_targets) for part in (data, labelled)
+    )
     controller = trained.controller.cpu()
     return {
         "outside_budget": errors_outside_budget(controller, view, seen, task),
@@ -120,7 +124,9 @@ def _actions(trained: TrainedRun, data: TensorDictBase, labelled: TensorDictBase
 def _per_trajectory(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[dict[str, Any]]:
     rows = [{"judged": "plans", **row} for row in plan.get("trajectory", ())]
     for split in SPLITS:
-        rows += [{"judged": f"actions, {split.replace('_', ' ')}", **row} for row in action[split].get("trajectory", ())]
+        rows += [
+            {"judged": f"actions, {split.replace('_', ' ')}", **row} for row in action[split].get("trajectory", ())
+        ]
     return rows
 
 
@@ -181,6 +187,8 @@ def describe_offline(result: Mapping[str, Any]) -> str:
         lines += [f"{head}: {action[split]['note']}"] if "note" in action[split] else []
         for row in action[split].get("unit", ()):
             shown, factor = thousandths(row["unit"])
-            values = [f"{name.replace('_', ' ')} {factor * row[name]:.4g}" for name in ("controller", "ridge", "mean_action")]
+            values = [
+                f"{name.replace('_', ' ')} {factor * row[name]:.4g}" for name in ("controller", "ridge", "mean_action")
+            ]
             lines.append(f"{head}, RMSE{f' ({shown})' if shown else ''}: {', '.join(values)}")
     return "\n".join([*lines, *(f"FAULT: {fault}" for fault in result["faults"])])

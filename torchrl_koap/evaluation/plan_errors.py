@@ -77,7 +77,10 @@ def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
     """
     now, before = history[..., -1:, :], history[..., -2:-1, :]
     ahead = torch.arange(1, horizon + 1, device=history.device, dtype=history.dtype)[:, None]
-    return {"standing_still": now.expand(*now.shape[:-2], horizon, -1), "constant_velocity": now + ahead * (now - before)}
+    return {
+        "standing_still": now.expand(*now.shape[:-2], horizon, -1),
+        "constant_velocity": now + ahead * (now - before),
+    }
 
 
 @torch.no_grad()

@@ -132,7 +132,8 @@ def plot_action_errors(errors: Mapping[str, Mapping[str, Any]], path: str | Path
     """Errors of decoded actions by column and unit, beside a ridge's and those of always giving the mean action.
 
     Args:
-        errors (mapping): by split, of :func:`~torchrl_koap.evaluation.label_errors.summarise_errors`; notes are skipped.
+        errors (mapping): by split, of :func:`~torchrl_koap.evaluation.label_errors.summarise_errors`; notes are
+            skipped.
         path (str or Path): png to write.
 
     Examples:
@@ -156,7 +157,8 @@ def plot_action_errors(errors: Mapping[str, Mapping[str, Any]], path: str | Path
         judged = f"{part['labels']:,} labels of {part['trajectories']} trajectories"
         set_title(line[0], f"{_SPLITS.get(name, name)}\n{judged}")
     handles = [Line2D([], [], color=color, linewidth=6, label=label) for label, color in _ACTIONS.values()]
-    handles.append(Line2D([], [], color=RED, linewidth=6, label="controller, no better than the mean"))
+    if any(row["controller"] >= row["mean_action"] for _, part in parts for row in part["column"]):
+        handles.append(Line2D([], [], color=RED, linewidth=6, label="controller, no better than the mean"))
     legend_beside(panels[0, -1], handles=handles)
     return save_figure(figure, path)
 
@@ -225,7 +227,9 @@ def plot_columns(
         points = np.column_stack([time, state[:, index]])
         lines = np.split(points, borders)
         axes.add_collection(LineCollection(lines, colors="#9aa1ab", linewidths=0.6, alpha=0.7))
-        axes.add_collection(LineCollection(np.stack([points[along], points[along + 1]], 1), colors=BLUE, linewidths=1.3))
+        axes.add_collection(
+            LineCollection(np.stack([points[along], points[along + 1]], 1), colors=BLUE, linewidths=1.3)
+        )
         axes.autoscale_view()
         name, unit = columns[index]
         set_title(axes, f"{name} ({unit})" if unit else name)

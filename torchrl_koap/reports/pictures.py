@@ -36,7 +36,15 @@ FACTS = {
     "columns": "name and unit of every state column of a task without an environment, None for others",
     "run_dir": "the run directory",
 }
-_BUILT_IN = ("rollout_plots", "offline_plots", "animation", "mode_plots", "training_plots", "latent_plot", "diagnosis_plot")
+_BUILT_IN = (
+    "rollout_plots",
+    "offline_plots",
+    "animation",
+    "mode_plots",
+    "training_plots",
+    "latent_plot",
+    "diagnosis_plot",
+)
 _MOVING = (".gif", ".mp4")
 
 

@@ -77,7 +77,9 @@ def write_report(
         notes=notes,
         tiles=_tiles(config, summary, evaluation, facts["num_modes"]),
         evaluated=bool(evaluation),
-        commands={name: _filled(command, run_dir) for name, command in (_OFFLINE_COMMANDS if offline else _COMMANDS).items()},
+        commands={
+            name: _filled(command, run_dir) for name, command in (_OFFLINE_COMMANDS if offline else _COMMANDS).items()
+        },
         labels=summary.get("labels"),
         labels_read=number(_action_errors(summary)[0].get("analysis_labels_read")),
         label_figure=next((item for item in figures if item.get("name") == _BESIDE_LABELS), None),

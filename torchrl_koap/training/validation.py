@@ -81,9 +81,7 @@ def validation_of(planner_from: Path, dataset: str) -> list[int]:
     return list(config.get("validation_episodes") or ()) if same else []
 
 
-def without_validation(
-    data: TensorDictBase, episodes: Sequence[int], *, keep_labelled: bool = False
-) -> TensorDictBase:
+def without_validation(data: TensorDictBase, episodes: Sequence[int], *, keep_labelled: bool = False) -> TensorDictBase:
     """The data that may be learnt from.
 
     Args:
