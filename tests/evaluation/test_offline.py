@@ -63,8 +63,7 @@ def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):
 def test_latent_space_and_suggestions(run):
     verdict = inspect(run, InspectConfig(latent_only=True, threads=1)).result["verdict"]
     assert "mrad" in verdict and " mm" not in verdict.replace("mrad", "")
-    held_out = set(suggest(run, SuggestConfig(count=7)).suggestions[0])
-    assert held_out
+    assert {row["episode"] for row in suggest(run, SuggestConfig(count=7)).suggestions} == set(range(3, 10))
     with pytest.raises(ValueError, match="task 'arm' has no environment to make experiments in: --latent-only"):
         inspect(run)
 
@@ -127,9 +126,7 @@ def test_a_data_set_that_has_moved_or_changed(tmp_path):
     assert evaluate(run, moved)["plan_errors"]["trajectories"] == 1
     shutil.rmtree(tmp_path / "elsewhere")
     save_arm(tmp_path / "elsewhere", joints=2, labelled=4)
-    with pytest.raises(
-        RunDirectoryError, match="is not the one that .* was trained on: its trajectories or labels differ"
-    ):
+    with pytest.raises(RunDirectoryError, match="is not the one that .* trajectories or labels differ"):
         evaluate(run, moved)
 
 

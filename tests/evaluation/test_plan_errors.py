@@ -59,7 +59,7 @@ def test_both_ways_of_a_fork_are_no_mistake_and_units_stay_apart():
     assert joint["standing_still"]["energy_score"]["per_step"] == pytest.approx([1, 2, 3, 4])
     assert joint["standing_still"]["best_of"]["overall"] == pytest.approx(2.5)
     # but for the first situation of each trajectory, whose earlier frame is the same, constant velocity is right
-    assert joint["constant_velocity"]["energy_score"]["overall"] == pytest.approx(2.5 / 26, rel=1e-5)
+    assert joint["constant_velocity"]["energy_score"]["overall"] == pytest.approx(2.5 / 25, rel=1e-5)
     assert joint["planner"]["best_of"]["overall"] == pytest.approx(0)  # one of 16 went the right way
     # half of the samples are right: 0.5 * 2 k - 0.5 * (8 / 15) * 2 k
     assert joint["planner"]["energy_score"]["per_step"][3] == pytest.approx(4 * (1 - 8 / 15), rel=0.1)
