@@ -44,9 +44,13 @@ class Demos(Command):
 
         Raises:
             FileExistsError: if the folder holds demonstrations already.
+            ValueError: if the task has no environment or no scripted expert.
         """
         load_plugins(self.plugins)
         task = get_task(self.task)
+        if task.env is None or task.expert is None:
+            lacks = "environment" if task.env is None else "scripted expert"
+            raise ValueError(f"task {task.name!r} has no {lacks}: there is nothing to record demonstrations with")
         for name in ("ted", "raw"):
             if (self.out / name).exists():
                 raise FileExistsError(f"{self.out / name} exists already; choose another --out")

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap eval``: closed-loop rollouts of a trained run, scored with intervals, and its report."""
+"""``koap eval``: a trained run scored with intervals in closed loop, or on recorded data, and its report."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import tyro
 
 from torchrl_koap.commands.command import Command, Options
 from torchrl_koap.evaluation import EvalConfig, evaluate
+from torchrl_koap.evaluation.offline import KIND, describe_offline
 from torchrl_koap.reports.run_report import write_report
 
 
 @dataclass(kw_only=True)
 class Eval(Command):
-    """Evaluate a trained run in closed loop and write its report.
+    """Evaluate a trained run, in closed loop or, without an environment, on recorded data, and write its report.
 
     Attributes:
         run: run directory of `koap train`.
@@ -30,9 +31,9 @@ class Eval(Command):
     report: bool = True
     animate: bool = True
 
-    def __call__(self) -> dict[str, Any]:
-        """Evaluates and reports."""
+    def __call__(self) -> dict[str, Any] | str:
+        """Evaluates and reports; the figures of an evaluation without an environment come in words."""
         result = evaluate(self.run, self.config)
         if self.report:
             write_report(self.run, animation=self.animate)
-        return result
+        return describe_offline(result) if result.get("kind") == KIND else result

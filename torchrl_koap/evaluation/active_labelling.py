@@ -243,6 +243,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
             " train with `--decoder ridge`"
         )
     dataset, episodes = (directory.read_entry("config.json", name) for name in ("dataset", "episodes"))
+    if dataset != "scripted" and not Path(dataset).is_dir():
+        raise ValueError(f"the demonstrations {dataset!r} that {directory.path} was trained on are not there any more")
     data = load_demonstrations(dataset, task, episodes=episodes)
     # from here on everything outside the budget is NaN
     data, report = trained.budget.apply(data, command=task.command_columns)

@@ -23,12 +23,12 @@ from torchrl_koap.evaluation.diagnosis import (
 )
 from torchrl_koap.evaluation.latent_space import analyse_latent
 from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET, error_unit, judge_latent_model
+from torchrl_koap.evaluation.offline import load_training_data
 from torchrl_koap.evaluation.rollouts import make_policy, roll_out
 from torchrl_koap.evaluation.run import TrainedRun, choose_contexts, load_run
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task
 from torchrl_koap.training.builders import set_up_torch
-from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import progress_bar
 
@@ -102,8 +102,13 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
     load_plugins(config.plugins)
     trained = load_run(run)
     directory, task = trained.directory, trained.task
+    if task.env is None and not config.latent_only:
+        raise ValueError(
+            f"task {task.name!r} has no environment to make experiments in: --latent-only looks into the latent space,"
+            " `koap eval` judges plans and actions on recorded data"
+        )
     dataset = config.dataset or directory.read_entry("config.json", "dataset")
-    data = load_demonstrations(dataset, task, episodes=directory.read_entry("config.json", "episodes"))
+    data = load_training_data(trained, dataset)
     if config.latent_only:  # what earlier experiments found stays
         earlier = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
         result = {name: value for name, value in earlier.items() if name != "verdict"}
@@ -183,16 +188,17 @@ def verdict(result: dict[str, Any], task: Task) -> str:
     sentences = [_experiments_say(result, task)] if "imagined" in result else []
     latent = result.get("latent", {})
     if "multi_step" in latent:
-        sentences.append(_latent_says(latent))
+        sentences.append(_latent_says(latent, task))
     elif not sentences:
         sentences.append(latent["note"])
     return ". ".join(sentences)
 
 
-def _latent_says(latent: dict[str, Any]) -> str:
+def _latent_says(latent: dict[str, Any], task: Task) -> str:
     errors = latent["multi_step"]
     part = next(iter(errors["koopman"]))
-    ahead = {model: f"{1e3 * errors[model][part][-1]:.3g} {error_unit(part)}" for model in MODELS}
+    shown, factor = error_unit(part, task)
+    ahead = {model: f"{factor * errors[model][part][-1]:.3g} {shown}".rstrip() for model in MODELS}
     outside = latent[OUTSIDE_THE_BUDGET]
     shared = outside["judged_trajectories_in_budget"]
     reservation = f" ({shared} of these {errors['judged_trajectories']} have labels in the budget)" if shared else ""

@@ -4,7 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from torchrl_koap.tasks.units import thousandths
+
+if TYPE_CHECKING:
+    from torchrl_koap.tasks import Task
 
 OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"
 MODELS = ("koopman", "reconstruction", "linear", "copy_last")
@@ -66,15 +71,25 @@ def judge_latent_model(multi_step: Mapping[str, Any]) -> list[str]:
     return faults
 
 
-def error_unit(part: str) -> str:
-    """Unit in which errors of a part of the state are shown, a thousandth of that in the data.
+def error_unit(part: str, task: Task) -> tuple[str, float]:
+    """Unit in which errors of a part of the state are shown, and the factor to it.
+
+    Args:
+        part (str): the part. Where the task says no units, positions are in m and joints in rad.
+        task (Task): the task. A part whose columns have several units is shown without any.
 
     Examples:
         >>> from torchrl_koap.evaluation.latent_verdict import error_unit
-        >>> error_unit("measured_xy"), error_unit("measured_joints")
-        ('mm', 'mrad')
+        >>> from torchrl_koap.tasks import get_task
+        >>> error_unit("measured_xy", get_task("avoiding")), error_unit("measured_joints", get_task("avoiding"))
+        (('mm', 1000.0), ('mrad', 1000.0))
     """
-    return "mrad" if "joints" in part else "mm"
+    if not task.observation_units:
+        if task.env is None:
+            return "", 1.0
+        return thousandths("rad" if "joints" in part else "m")
+    units = set(task.observation_units[task.observation[part]])
+    return thousandths(units.pop()) if len(units) == 1 else ("", 1.0)
 
 
 def _times(large: float, small: float) -> str:

@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torchrl_koap.data import LabelBudget
+from torchrl_koap.evaluation.offline import evaluate_offline
 from torchrl_koap.evaluation.rollouts import make_policy, measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.lookup import lookup
@@ -30,7 +31,7 @@ from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 @dataclass
 class EvalConfig:
-    """Rollouts of a trained run in closed loop.
+    """Rollouts of a trained run in closed loop; without an environment plans and actions on recorded data.
 
     Attributes:
         episodes: number of rollouts; tasks with contexts take the fixed ones of the evaluation table in turn.
@@ -44,6 +45,8 @@ class EvalConfig:
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
         task: refuse a run of another task than this.
+        dataset: for a task without an environment: where the data set of the training is now (default: where it was).
+        samples: for a task without an environment: plans that are sampled in each recorded situation.
         threads: torch and simulator threads.
         device: "cpu" or "cuda".
         plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
@@ -60,6 +63,8 @@ class EvalConfig:
     batch_size: int | None = None
     contexts_file: Path | None = None
     task: str | None = None
+    dataset: str | None = None
+    samples: int = 16
     threads: int = 2
     device: str = "cpu"
     plugins: Plugins = ()
@@ -216,19 +221,23 @@ def choose_contexts(
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
     """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
 
+    A task without an environment is judged on recorded data instead
+    (:func:`~torchrl_koap.evaluation.offline.evaluate_offline`), and there is ``eval.json`` alone.
+
     Args:
         run (str or Path): a run directory.
         config (EvalConfig, optional): how many rollouts, and how. Default: 60 as in training.
 
     Returns:
-        dict: what ``eval.json`` holds: success and entropy with intervals, speed, a row per episode.
+        dict: what ``eval.json`` holds: success and entropy with intervals, speed, a row per episode; or, with
+        ``kind`` ``"offline"``, errors of plans and actions, and no success.
 
     Raises:
         ValueError: for unknown options or fewer than one episode.
         RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`.
     """
     config = EvalConfig() if config is None else config
-    for name in ("episodes", "batch_size", "rollouts_per_context"):
+    for name in ("episodes", "batch_size", "rollouts_per_context", "samples"):
         value = getattr(config, name)
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
@@ -237,6 +246,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     load_plugins(config.plugins)
     trained = load_run(run, task=config.task)
     directory, task = trained.directory, trained.task
+    if task.env is None:
+        return _judge_offline(trained, config)
+    if config.dataset is not None:
+        raise ValueError(f"dataset is for tasks without an environment; task {task.name!r} is rolled out in its own")
     policy = load_policy(trained, config)
     sampler = trained.controller if trained.planner is None else trained.planner
     seeds = list(range(config.seed, config.seed + config.episodes))
@@ -281,4 +294,16 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         rollouts["context"] = torch.from_numpy(contexts)
     save_tensors(directory.path / "rollouts.safetensors", rollouts, {"task": task.name})
     directory.write_json("eval.json", result)
+    return result
+
+
+def _judge_offline(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:
+    """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
+    choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
+    policy = load_policy(trained, config)
+    result = evaluate_offline(trained, dataset=config.dataset, samples=config.samples, seed=config.seed)
+    sampler = trained.controller if trained.planner is None else trained.planner
+    result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
+    result |= {"solver": sampler.solver, "solver_steps": sampler.num_steps, "seed": config.seed}
+    trained.directory.write_json("eval.json", result)
     return result

@@ -32,7 +32,7 @@ from torchrl_koap.reports.style import (
 )
 from torchrl_koap.tasks import Task, get_task
 
-_BLOWN_UP = 1e6  # mm; a prediction further off is left out of the picture
+_BLOWN_UP = 1e6  # in the unit shown; a prediction further off is left out of the picture
 _LABELS = {
     "koopman": ("latent dynamics", BLUE),
     "reconstruction": ("lifted and mapped back", PALE_BLUE),
@@ -103,15 +103,16 @@ def plot_latent(latent: Mapping[str, Any], path: str | Path, *, task: Task, eige
 
 def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
     part = next(iter(errors["koopman"]))
+    shown, factor = error_unit(part, task)
     steps = np.arange(1, errors["steps"] + 1)
     for model in MODELS:
-        values = 1e3 * np.asarray(errors[model][part], dtype=float)
+        values = factor * np.asarray(errors[model][part], dtype=float)
         label, color = _LABELS[model]
         axes.plot(steps, np.where((values > 0) & (values < _BLOWN_UP), values, np.nan), ".-", color=color, label=label)
     axes.set_yscale("log")
     axes.margins(y=0.1)
     axes.set_xlabel(f"control steps ahead, {1e3 / task.control_hz:.0f} ms each\n(latent actions given)")
-    axes.set_ylabel(f"root mean square distance ({error_unit(part)})")
+    axes.set_ylabel(f"root mean square distance ({shown})" if shown else "root mean square distance")
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
     judged = f"on {errors['judged_trajectories']} demonstrations"

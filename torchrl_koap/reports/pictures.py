@@ -33,9 +33,18 @@ FACTS = {
     "num_modes": "number of modes of the task",
     "control_hz": "control steps per second, None where unknown",
     "actions": "name, unit and whether it is absolute of every action column, None where unknown",
+    "columns": "name and unit of every state column of a task without an environment, None for others",
     "run_dir": "the run directory",
 }
-_BUILT_IN = ("rollout_plots", "animation", "mode_plots", "training_plots", "latent_plot", "diagnosis_plot")
+_BUILT_IN = (
+    "rollout_plots",
+    "offline_plots",
+    "animation",
+    "mode_plots",
+    "training_plots",
+    "latent_plot",
+    "diagnosis_plot",
+)
 _MOVING = (".gif", ".mp4")
 
 
@@ -231,7 +240,7 @@ def run_facts(run_dir: Path) -> dict[str, Any]:
         task = task_of(json.loads((run_dir / "config.json").read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # a run of a task that nobody knows here
         task = None
-    columns = None
+    columns, offline = None, task is not None and task.env is None
     if task is not None:
         columns = [(column, unit, column in task.absolute_actions) for column, unit in task.actions.items()]
     return {
@@ -239,6 +248,7 @@ def run_facts(run_dir: Path) -> dict[str, Any]:
         "num_modes": task.num_modes if task else 24,
         "control_hz": task.control_hz if task else None,
         "actions": columns,
+        "columns": list(zip(task.state_names, task.state_units, strict=True)) if offline else None,
         "run_dir": run_dir,
     }
 

@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from torchrl_koap.reports.mode_colors import mode_colors
 from torchrl_koap.reports.mode_plots import draw_mode_table
 from torchrl_koap.reports.objects import draw_object_paths, draw_starts, legend_handles, object_looks, object_paths
+from torchrl_koap.reports.offline_plots import plot_columns
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.scenes import draw_scene
 from torchrl_koap.reports.style import (
@@ -307,6 +308,19 @@ def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:
     caption_of=has_objects(" Beside it the objects that were moved."),
     place=80,
 )
+def _draw_demonstrations(
+    demonstrations: Mapping[str, Any],
+    path: Path,
+    *,
+    task: str | None,
+    columns: Sequence[tuple[str, str]] | None = None,
+    control_hz: float | None = None,
+) -> Path:
+    if columns is not None:  # no environment says what lies in a plane
+        return plot_columns(demonstrations, path, columns=columns, control_hz=control_hz)
+    return plot_demonstrations(demonstrations, path, task=task)
+
+
 def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, task: str | None = "avoiding") -> Path:
     """Paths of the demonstrations; transitions with an action label are emphasised, the others grey.
 

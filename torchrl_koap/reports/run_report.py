@@ -11,13 +11,17 @@ from typing import Any
 from torchrl_koap.reports.html import bar, duration, number, write_page
 from torchrl_koap.reports.mode_plots import even_entropy
 from torchrl_koap.reports.pictures import FOLDER, all_pictures, draw_pictures, run_facts
+from torchrl_koap.reports.style import thousandths
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
+_SIMULATED = ("rollouts.safetensors", "inspect.json")
 _BESIDE_LABELS = "demonstrations.png"
 _COMMANDS = {"train": "koap train --out {run}", "eval": "koap eval {run} --episodes 60 --seed 100"}
+_OFFLINE_COMMANDS = _COMMANDS | {"eval": "koap eval {run}"}
+_PLAN_BASELINES = ("standing_still", "constant_velocity")
 _SUMMARY_ELSEWHERE = ("labels",)
-_EVAL_ELSEWHERE = ("episode", "command")
+_EVAL_ELSEWHERE = ("episode", "command", "trajectory", "faults")
 _CONFIG_ELSEWHERE = ("versions", "command")
 
 
@@ -62,7 +66,9 @@ def write_report(
         notes += note
     config, summary, evaluation = files["config"], files["summary"], files["eval"]
     facts = run_facts(run_dir)
-    figures, missing = _figures(run_dir, problems, facts["task"])
+    offline = facts["columns"] is not None
+    notes += evaluation.get("faults") or []
+    figures, missing = _figures(run_dir, problems, facts["task"], offline=offline)
     return write_page(
         "run.html",
         run_dir / "index.html",
@@ -71,14 +77,16 @@ def write_report(
         notes=notes,
         tiles=_tiles(config, summary, evaluation, facts["num_modes"]),
         evaluated=bool(evaluation),
-        commands={name: _filled(command, run_dir) for name, command in _COMMANDS.items()},
+        commands={
+            name: _filled(command, run_dir) for name, command in (_OFFLINE_COMMANDS if offline else _COMMANDS).items()
+        },
         labels=summary.get("labels"),
         labels_read=number(_action_errors(summary)[0].get("analysis_labels_read")),
         label_figure=next((item for item in figures if item.get("name") == _BESIDE_LABELS), None),
         figures=[item for item in figures if item["name"] != _BESIDE_LABELS],
         missing=missing,
         numbers=_numbers(summary, evaluation),
-        episodes=evaluation.get("episode"),
+        episodes=evaluation.get("episode") or evaluation.get("trajectory"),
         again=_commands(run_dir, config, evaluation),
         configured=bool(config),
         has_command=_given(config, "command"),
@@ -116,7 +124,7 @@ def _tile(name: str, value: str, note: str, bar: tuple[float, float, float] | No
 
 def _tiles(config: Mapping, summary: Mapping, evaluation: Mapping, num_modes: int) -> list[dict[str, Any]]:
     """The headline numbers, those that there are."""
-    tiles = []
+    tiles = _offline_tiles(evaluation)
     rate, episodes = number(evaluation.get("success_rate")), number(evaluation.get("episodes"))
     contexts = number(evaluation.get("contexts"))
     among = f" in {contexts:g} contexts" if contexts else ""
@@ -162,6 +170,26 @@ def _tiles(config: Mapping, summary: Mapping, evaluation: Mapping, num_modes: in
     return tiles
 
 
+def _offline_tiles(evaluation: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Errors of plans and actions, of an evaluation without an environment."""
+    tiles = []
+    for row in evaluation.get("plan_errors", {}).get("unit", ()):
+        shown, factor = thousandths(row["unit"])
+        values = {name: factor * row[name]["energy_score"]["overall"] for name in ("planner", *_PLAN_BASELINES)}
+        note = ", ".join(f"{name.replace('_', ' ')} {values[name]:.3g}" for name in _PLAN_BASELINES)
+        head = f"plan error, energy score, {len(row['columns'])} columns"
+        tiles.append(_tile(head, f"{values['planner']:.3g} {shown}".rstrip(), note))
+    errors = evaluation.get("action_errors", {})
+    split = evaluation.get("action_errors_on")
+    for row in errors.get(split, {}).get("unit", ()) if split else ():
+        shown, factor = thousandths(row["unit"])
+        others = [f"{name.replace('_', ' ')} {factor * row[name]:.3g}" for name in ("ridge", "mean_action")]
+        others.append(f"n = {errors[split]['labels']:,} labels, {split.replace('_', ' ')}")
+        head = f"action error, {len(row['columns'])} columns"
+        tiles.append(_tile(head, f"{factor * row['controller']:.3g} {shown}".rstrip(), ", ".join(others)))
+    return tiles
+
+
 def _between(evaluation: Mapping[str, Any], name: str, form: str) -> str:
     """The interval of an entry in words, empty if it has none."""
     low, high = (number(evaluation.get(f"{name}_{end}")) for end in ("low", "high"))
@@ -183,9 +211,9 @@ def _rate(evaluation: Mapping[str, Any], name: str, head: str, what: str) -> lis
 
 def _action_errors(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
     """Errors of the predicted actions, empty if there are none, and their unit."""
-    for unit in ("mm", "mrad"):
-        if isinstance(summary.get(f"action_error_{unit}"), Mapping):
-            return summary[f"action_error_{unit}"], unit
+    for name, errors in summary.items():
+        if name.startswith("action_error") and isinstance(errors, Mapping):
+            return errors, name.removeprefix("action_error").removeprefix("_")
     return {}, ""
 
 
@@ -198,7 +226,7 @@ def _share(labels: Mapping[str, Any]) -> str:
 
 
 def _figures(
-    run_dir: Path, problems: Mapping[str, str], task: str | None
+    run_dir: Path, problems: Mapping[str, str], task: str | None, *, offline: bool
 ) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
     """What is to be shown, and for each command the titles of the pictures whose source it would leave."""
     figures, missing = [], {}
@@ -210,6 +238,8 @@ def _figures(
         if file is not None:
             moving = file.endswith((".gif", ".mp4"))
             figures.append(figure | {"source": f"{FOLDER}/{file}", "beside": moving})
+        elif (item.source in _SIMULATED) if offline else (item.source == "eval.json"):
+            continue  # no command makes it for this task
         elif not (run_dir / item.source).exists():
             missing.setdefault(_filled(item.command, run_dir), []).append(item.title)
         elif item.empty:
@@ -243,6 +273,8 @@ def _command(command: Any) -> str:
 
 def _eval_command(run_dir: Path, evaluation: Mapping[str, Any]) -> str:
     words = ["koap", "eval", str(run_dir)]
+    if evaluation.get("kind") == "offline":
+        evaluation = {name: evaluation.get(name) for name in ("seed", "solver", "solver_steps")}
     episode = evaluation.get("episode")
     first = episode[0] if isinstance(episode, list) and episode and isinstance(episode[0], Mapping) else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}

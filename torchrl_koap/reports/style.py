@@ -11,6 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from torchrl_koap.tasks.units import thousandths as thousandths
+
 INK, MUTED, FAINT, PALE = "#1f2328", "#6b7280", "#c9ced6", "#f4f5f7"
 RED, GREEN, BLUE, ORANGE = "#cf222e", "#1a7f37", "#1f6feb", "#d9730d"
 PALE_BLUE, WARNING = "#9cc3f5", "#9a3412"
@@ -19,24 +21,6 @@ TIMEOUT, SUCCESS, COLLISION = 0, 1, 2
 OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision"}
 FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X"}
 NO_MODE = "#8a919c"
-_THOUSANDTHS = {"m": "mm", "rad": "mrad", "s": "ms", "N": "mN"}
-
-
-def thousandths(unit: str) -> tuple[str, float]:
-    """Unit in which small values are shown, and the factor to it: the one place where metres become millimetres.
-
-    Args:
-        unit (str): unit of the data; one that has no thousandth of its own is shown as it is.
-
-    Returns:
-        tuple: the unit shown, and what values are multiplied with.
-
-    Examples:
-        >>> from torchrl_koap.reports.style import thousandths
-        >>> thousandths("m"), thousandths("rad"), thousandths("volt")
-        (('mm', 1000.0), ('mrad', 1000.0), ('volt', 1.0))
-    """
-    return (_THOUSANDTHS[unit], 1e3) if unit in _THOUSANDTHS else (unit, 1.0)
 
 
 def as_array(name: str, value: Any, shape: Sequence[int | None]) -> np.ndarray:

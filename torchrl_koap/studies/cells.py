@@ -13,10 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
+from torchrl_koap.evaluation.offline import KIND
+from torchrl_koap.tasks.units import thousandths
 from torchrl_koap.training import RunDirectory, RunDirectoryError, TrainConfig, get_method, train
 from torchrl_koap.training.run import train_shared_planner
 
 DONE = "cell.json"
+_ERRORS = ("relative_plan_error", "relative_action_error")
 
 
 @dataclass(frozen=True)
@@ -126,8 +129,7 @@ def do_cell(
             "labels": run.read_entry("summary.json", "labels"),
             "train_seconds": trained - began,
             "eval_seconds": time.perf_counter() - trained,
-            "episodes": result["episodes"],
-            "successes": _successes(result),
+            **_counts(result),
         },
     )
 
@@ -163,8 +165,9 @@ def _results(run: RunDirectory) -> dict[str, Any]:
     done, summary, result = (run.read_json(name) for name in (DONE, "summary.json", "eval.json"))
     try:
         columns = _columns(done, summary, result)
-        episodes = done.get("episodes", result["episodes"])  # a cell of before says nothing of them
-        same = (done["successes"], episodes) == (_successes(result), result["episodes"])
+        counts = _counts(result)
+        done.setdefault("episodes", counts["episodes"])  # a cell of before says nothing of them
+        same = all(done[name] == value for name, value in counts.items())
     except (KeyError, TypeError, AttributeError) as error:
         raise RunDirectoryError(f"{run.path}: its results are damaged ({type(error).__name__}: {error})") from error
     if not same:
@@ -172,18 +175,29 @@ def _results(run: RunDirectory) -> dict[str, Any]:
     return columns
 
 
-def _successes(result: dict[str, Any]) -> int:
-    return round(result["success_rate"] * result["episodes"])
+def _counts(result: dict[str, Any]) -> dict[str, Any]:
+    """What says whether an evaluation is the one that a cell was finished with."""
+    if result.get("kind") == KIND:
+        return {"episodes": None, "successes": None, **{name: result[name] for name in _ERRORS}}
+    return {"episodes": result["episodes"], "successes": round(result["success_rate"] * result["episodes"])}
 
 
 def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
     labels = done["labels"]
-    errors = next((value for name, value in summary.items() if name.startswith("action_error_")), {})
-    entropy = result["mode_entropy"]
-    return {
+    errors = next((value for name, value in summary.items() if name.startswith("action_error")), {})
+    common = {
         "labelled_units": labels["selected_units"],
         "labelled_transitions": labels["labelled_transitions"],
         "trajectories_touched": labels["trajectories_touched"],
+        "action_error": errors.get("controller"),
+        "controller_updates": summary["controller_updates"],
+        "train_seconds": done["train_seconds"],
+        "eval_seconds": done["eval_seconds"],
+    }
+    if result.get("kind") == KIND:
+        return common | {"action_error": _own_error(result)} | {name: result[name] for name in _ERRORS}
+    entropy = result["mode_entropy"]
+    return common | {
         "episodes": result["episodes"],
         "successes": done["successes"],
         "success_rate": result["success_rate"],
@@ -192,8 +206,13 @@ def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, An
         "mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy,
         "collisions": result["collisions"],
         "mean_steps": result["mean_steps"],
-        "action_error": errors.get("controller"),
-        "controller_updates": summary["controller_updates"],
-        "train_seconds": done["train_seconds"],
-        "eval_seconds": done["eval_seconds"],
     }
+
+
+def _own_error(result: dict[str, Any]) -> float | None:
+    """Error of the actions in the unit of the first column, as it is shown; None if nothing was measured."""
+    split = result["action_errors_on"]
+    if split is None:
+        return None
+    row = result["action_errors"][split]["unit"][0]
+    return row["controller"] * thousandths(row["unit"])[1]

@@ -19,8 +19,8 @@ from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.studies.table import write_cells
-from torchrl_koap.tasks import HISTORY, WINDOW, Task, get_task
-from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.tasks import HISTORY, WINDOW, Task
+from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
@@ -37,8 +37,9 @@ class CurveConfig:
     Attributes:
         out: folder of the curve; the same command goes on where it was interrupted, and may add methods, fractions or
             seeds.
-        task: name of the task.
-        dataset: "scripted", or a folder: of D3IL raw pickles, a LeRobot data set, or written by `koap demos`.
+        task: name of the task (default: that of the data set, if it says so; else "avoiding").
+        dataset: "scripted", or a folder: written by `koap demos` or save_demonstrations, of D3IL raw pickles, or a
+            LeRobot data set.
         demonstrations: number of scripted demonstrations (default: that of the task).
         methods: names in torchrl_koap.training.methods.METHODS, with commas between.
         fractions: shares of the units that keep their labels, with commas between.
@@ -57,7 +58,7 @@ class CurveConfig:
     """
 
     out: Path
-    task: str = "avoiding"
+    task: str | None = None
     dataset: str = "scripted"
     demonstrations: int | None = None
     methods: str = ALL
@@ -112,7 +113,8 @@ def run_curve(config: CurveConfig) -> dict[str, Any]:
     options = _with_earlier_plugins(config)
     load_plugins(options.plugins)
     cells = _cells(options)
-    task = get_task(options.task)
+    task = find_task_of(options.dataset, options.task)
+    options = replace(options, task=task.name)
     for name in ("seeds", "demonstrations", "episodes", "steps", "controller_steps", "epochs", "workers"):
         value = getattr(options, name)
         if value is not None and value < 1:
@@ -216,6 +218,8 @@ def _dataset(options: CurveConfig) -> str:
 
 def _first_look(root: RunDirectory, options: CurveConfig, task: Task) -> TensorDictBase | None:
     """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
+    if options.dataset == "scripted" and task.env is None:
+        raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: name a --dataset")
     if options.dataset != "scripted":
         return load_demonstrations(_dataset(options), task)
     if (root.path / "demonstrations" / "ted").exists():

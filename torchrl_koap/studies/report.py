@@ -42,6 +42,13 @@ _CAPTIONS = {
         " were read for this picture only; nothing was trained or selected with them. A smaller error need not mean"
         " more success: the planner has its own failures.",
     ),
+    "relative_action_error": (
+        "Action error against the labels",
+        "Mean over seeds, with the best and the worst seed. There is no environment to succeed in, so actions decoded"
+        " from recorded states are compared with recorded ones: on labels outside the budget where the data have some"
+        " (read for this only), else inside it, a labelled trajectory left out at a time. 1 (dashed): no better than"
+        " always giving the mean action. Columns of every unit count alike.",
+    ),
     "observations": (
         "Success against the trajectories used",
         "How much the trajectories without labels are worth: the same share of labels, but only part of all"
@@ -109,8 +116,9 @@ def write_curve_report(
         options=options,
         table=table_rows(summaries),
         paper=_paper_rows(summaries, points),
+        offline=any(item.offline for item in summaries),
         figures=_draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows)), points),
-        compared=_comparison_rows(compared, reference),
+        compared=_comparison_rows(compared, reference, offline=any(item.offline for item in summaries)),
         reference=reference,
         not_done=[f"{cell_name(row)}: {why_not_done(row)}" for row in rows if row["status"] != "done"],
         times=times,
@@ -170,7 +178,10 @@ def _draw(
         if any(item.entropy is not None for item in main):
             plot_entropy(main, base / f"{name}_entropy.png", **common)
             figures.append(_figure(name, "entropy", task))
-        if any((item.action_error_low or 0) > 0 for item in main):
+        if any((item.relative_action_error_low or 0) > 0 for item in main):
+            plot_action_error(main, base / f"{name}_relative_action_error.png", relative=True, **common)
+            figures.append(_figure(name, "relative_action_error", task))
+        elif any((item.action_error_low or 0) > 0 for item in main):
             plot_action_error(main, base / f"{name}_action_error.png", unit=_error_unit(task), **common)
             figures.append(_figure(name, "action_error", task))
         if len(shares) > 1 and any(item.success is not None for item in items):
@@ -204,10 +215,13 @@ def _paper_rows(summaries: Sequence[Summary], paper: Sequence[Mapping[str, Any]]
     return rows
 
 
-def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str) -> list[dict[str, str]]:
+def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str, *, offline: bool) -> list[dict[str, str]]:
     rows = []
     for row in compared:
         known = row["difference"] is not None
+        written, head, unit = _points, "difference (points)", "contexts"
+        if offline:
+            written, head, unit = _share, "difference of the relative action error", "trajectories"
         names = {"task": row["task"]} if len({other["task"] for other in compared}) > 1 else {}
         if len({other["observations"] for other in compared}) > 1:
             names["trajectories used"] = percent(row["observations"])
@@ -216,11 +230,11 @@ def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str) -> l
             | {
                 "labels": percent(row["fraction"]),
                 f"{reference} against": row["method"],
-                "difference (points)": _points(row["difference"]) if known else "nothing in common",
-                "95 % interval": f"{_points(row['low'])} to {_points(row['high'])}" if known else "–",
+                head: written(row["difference"]) if known else "nothing in common",
+                "95 % interval": "–" if row["low"] is None else f"{written(row['low'])} to {written(row['high'])}",
                 "p": p_text(row["p"]),
                 "p (Holm)": p_text(row["p_holm"]),
-                "contexts": str(row["contexts"] or 0),
+                unit: str(row["contexts"] or 0),
                 "seeds": str(row["seeds"] or 0),
                 "n (pairs)": str(row["n"]),
             }
@@ -230,6 +244,10 @@ def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str) -> l
 
 def _points(difference: float) -> str:
     return f"{round(100 * difference, 1) + 0.0:+.1f}"  # the sum turns -0.0 into 0.0
+
+
+def _share(difference: float) -> str:
+    return f"{round(difference, 3) + 0.0:+.3f}"
 
 
 def _times(rows: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, str]], float]:

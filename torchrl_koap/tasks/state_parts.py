@@ -78,6 +78,16 @@ class StateParts:
         return tuple(name for part, kind in self.state_parts.items() for name in self._feature_names(part, kind))
 
     @property
+    def state_units(self) -> tuple[str, ...]:
+        """Unit of every state column: that of its observation column where the part is unchanged, else ``""``."""
+        given = getattr(self, "observation_units", ()) or ("",) * self.observation_dim
+        units: list[str] = []
+        for part, kind in self.state_parts.items():
+            names = self._feature_names(part, kind)
+            units += given[self.observation[part]] if kind == "plain" else [""] * len(names)
+        return tuple(units)
+
+    @property
     def plans_position(self) -> bool:
         """Whether the state begins with the position that pictures draw."""
         return next(iter(self.state_parts.items())) == (self.position, "plain")

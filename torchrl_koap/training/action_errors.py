@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl_koap.data import controller_view, cut_windows
 from torchrl_koap.modules import LinearInverseDynamics
 from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.units import thousandths
 from torchrl_koap.training.checkpoints import save_tensors
 from torchrl_koap.training.closed_form import fit_closed_form
 from torchrl_koap.training.run_directory import RunDirectory
@@ -39,14 +40,65 @@ def hidden_action_errors(
     Returns:
         tuple of Tensor: both ``[N, act]``, raw units; ``N = 0`` if every trajectory has a label.
     """
+    return first_actions(controller, data, episodes_outside(data, labelled))[:2]
+
+
+def episodes_outside(data: TensorDictBase, labelled: TensorDictBase) -> Tensor:
+    """Numbers of the trajectories of which no label was in the budget.
+
+    Args:
+        data (TensorDictBase): flat, with all labels that there are.
+        labelled (TensorDictBase): the same, or a part, after the budget was applied.
+    """
     touched = labelled["episode"][labelled["has_action"].squeeze(-1)].unique()
+    every = data["episode"].unique()
+    return every[~torch.isin(every, touched.to(every.device))]
+
+
+@torch.no_grad()
+def first_actions(
+    controller: nn.Module, data: TensorDictBase, episodes: Tensor | Sequence[int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Predicted and true actions on the labelled steps of some trajectories, see :func:`hidden_action_errors`.
+
+    Args:
+        controller (nn.Module): writes actions ``[*B, T, act]`` for windows of states ``[*B, T, d]``.
+        data (TensorDictBase): flat, as the controller sees it.
+        episodes (Tensor or sequence of int): the trajectories.
+
+    Returns:
+        tuple of Tensor: both ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
+    """
     windows = cut_windows(data, BEFORE + 1 + AFTER, select=["state", "action", "episode"], pad_before=BEFORE)
     known = windows["action"][:, BEFORE].isfinite().all(-1)  # the data may lack labels themselves
-    windows = windows[known & ~torch.isin(windows["episode"][:, -1], touched.to(windows["episode"].device))]
+    wanted = torch.as_tensor(episodes, device=windows["episode"].device)
+    windows = windows[known & torch.isin(windows["episode"][:, -1], wanted)]
     device = next(iter(controller.state_dict().values())).device
     states = windows["state"][:, BEFORE - min(controller.num_past, BEFORE) :].to(device)
     predicted = controller(TensorDict({"state": states}, batch_size=[len(states)]))["action"]
-    return predicted[:, min(controller.num_past, BEFORE)].cpu(), windows["action"][:, BEFORE]
+    return predicted[:, min(controller.num_past, BEFORE)].cpu(), windows["action"][:, BEFORE], windows["episode"][:, -1]
+
+
+def rmse(predicted: Tensor, true: Tensor, unit: str) -> float:
+    """Root of the mean squared error over steps and axes, in the unit that :func:`thousandths` shows ``unit`` in.
+
+    Args:
+        predicted (Tensor): ``[N, act]``.
+        true (Tensor): ``[N, act]``.
+        unit (str): unit of both.
+    """
+    return (predicted - true).square().mean().sqrt().item() * thousandths(unit)[1]
+
+
+def error_entry(unit: str) -> str:
+    """Name of the entry of ``summary.json`` that holds the errors of actions in ``unit``.
+
+    Examples:
+        >>> from torchrl_koap.training.action_errors import error_entry
+        >>> error_entry("m"), error_entry("")
+        ('action_error_mm', 'action_error')
+    """
+    return f"action_error_{thousandths(unit)[0]}" if unit else "action_error"
 
 
 def rmse_mm(predicted: Tensor, true: Tensor) -> float:
@@ -77,9 +129,13 @@ def write_analysis(
     labelled = controller_view(labelled.cpu(), columns, action_targets=task.action_targets)
     viewed = controller_view(data, columns, action_targets=task.action_targets)
     predicted, true = hidden_action_errors(controller, viewed, labelled)
-    has_action = labelled["has_action"].squeeze(-1)
+    # trajectories that the training does not use have no label
+    has_action = torch.zeros(len(data), dtype=torch.bool)
+    has_action[torch.isin(data["episode"], labelled["episode"])] = labelled["has_action"].squeeze(-1)
     shown = {"state": data["state"], "episode": data["episode"], "labelled": has_action}
-    save_tensors(run.path / "demonstrations.safetensors", shown | _plotted(task, data["observation"]))
+    if task.env is not None:  # otherwise nobody knows what lies in a plane
+        shown |= _plotted(task, data["observation"])
+    save_tensors(run.path / "demonstrations.safetensors", shown)
     if not len(true):
         return {"note": "no trajectory outside the budget has labels: there is nothing to measure on"}
     save_tensors(run.path / "actions.safetensors", {"predicted": predicted, "true": true})
@@ -88,7 +144,7 @@ def write_analysis(
     same = task.action_columns()
     by_ridge, _ = hidden_action_errors(ridge, viewed, labelled)
     return {
-        "controller": rmse_mm(predicted[:, same], true[:, same]),
-        "ridge": rmse_mm(by_ridge[:, same], true[:, same]),
+        "controller": rmse(predicted[:, same], true[:, same], task.action_unit),
+        "ridge": rmse(by_ridge[:, same], true[:, same], task.action_unit),
         "analysis_labels_read": len(true),
     }

@@ -19,6 +19,7 @@ from torchrl_koap.training.methods import Method, get_method
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.training.validation import default_fraction
 
 LABEL_FRACTION, ALL_LABELS = 0.02, 1.0  # defaults for data with all labels, and for data that lack some
 
@@ -39,6 +40,8 @@ class TrainConfig:
         label_unit: "trajectory", "window" (the paper's levels) or "transition".
         seed: seed of label choice, initialisation and batches.
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
+        validation_fraction: share of the trajectories that the planner never sees, those without labels first, for
+            `koap eval` to judge its plans by (default: 0.1 for a task without an environment, else none).
         method: "koap", "linear" (ridge on raw frames), "dd" (supervised inverse dynamics), "dp" (Diffusion Policy), or
             another name in torchrl_koap.training.methods.METHODS, those that plugins register included.
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
@@ -84,6 +87,7 @@ class TrainConfig:
     label_episodes: tuple[int, ...] | None = None
     label_unit: str = "trajectory"
     observation_fraction: float = 1.0
+    validation_fraction: float | None = None
     seed: int = 0
     method: str = "koap"
     released_settings: bool = False
@@ -219,6 +223,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
         "episodes": task.defaults.demonstrations,
         "relative": task.defaults.relative,
         "channels": task.defaults.channels,
+        "validation_fraction": default_fraction(task),
     }
     return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
 
@@ -253,6 +258,8 @@ def _check(options: TrainConfig, method: Method) -> None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
     if options.steps < 1 or options.controller_steps < 0:
         raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
+    if not 0 <= (options.validation_fraction or 0) < 1:
+        raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
     for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
         if getattr(options, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.data import WindowTable, subsample_trajectories
 from torchrl_koap.tasks import WINDOW
-from torchrl_koap.training.action_errors import AFTER, BEFORE, UNITS, write_analysis
+from torchrl_koap.training.action_errors import AFTER, BEFORE, error_entry, write_analysis
 from torchrl_koap.training.builders import build_controller, set_up_torch
 from torchrl_koap.training.checkpoints import load_weights
 from torchrl_koap.training.config import ResolvedConfig, TrainConfig, resolve
@@ -27,6 +27,7 @@ from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.provenance import to_json
 from torchrl_koap.training.resume import check_resume, started_with
 from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.training.validation import choose_validation, validation_of, without_validation
 
 
 def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
@@ -69,7 +70,12 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         labelled, report = resolved.budget.apply(data, command=task.command_columns)
         # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
         labelled = subsample_trajectories(labelled, options.observation_fraction).to(options.device)
+        held_out = _validation(resolved, labelled)
+        if held_out:
+            content["validation_episodes"] = held_out
         _check_lengths(resolved, labelled)
+        planner_data = without_validation(labelled, held_out)
+        labelled = without_validation(labelled, held_out, keep_labelled=True)
         if not mine:
             held.enter_context(run.locked("koap train"))
             check_resume(run, content, resume=options.resume)  # another one may have begun here in the meantime
@@ -81,7 +87,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
             torch.manual_seed(options.seed)
             planner, planner_values = None, {}
             if resolved.method.has_planner:
-                planner, planner_values = train_planner(run, resolved, labelled, logger)
+                planner, planner_values = train_planner(run, resolved, planner_data, logger)
             planned = time.perf_counter()
             torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
             controller, fit, controller_values = train_controller(run, resolved, labelled, logger)
@@ -101,7 +107,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         }
         if options.analysis and resolved.method.has_planner:
             analysis = write_analysis(run, task, data, labelled, controller, resolved.columns)
-            summary[f"action_error_{UNITS.get(task.action_unit, task.action_unit)}"] = analysis
+            summary[error_entry(task.action_unit)] = analysis
         run.write_json("summary.json", summary)
     return summary
 
@@ -121,14 +127,28 @@ def train_shared_planner(config: TrainConfig) -> dict[str, float]:
     options = resolved.options
     set_up_torch(options.threads, options.device)
     data = load_demonstrations(options.dataset, resolved.task)
+    # all cells of a curve share it, whichever labels they draw: only labels that there are count as such here
+    held_out = choose_validation(data, options.validation_fraction, seed=options.seed)
     data["action"] = torch.full_like(data["action"], torch.nan)
     data["has_action"] = torch.zeros_like(data["has_action"])
     data = subsample_trajectories(data, options.observation_fraction).to(options.device)
     content = to_json(resolved)
+    if held_out:
+        content["validation_episodes"] = held_out
     check_resume(run, content, resume=options.resume)
     run.write_json("config.json", content)
     torch.manual_seed(options.seed)
-    return train_planner(run, resolved, data)[1]
+    return train_planner(run, resolved, without_validation(data, held_out))[1]
+
+
+def _validation(resolved: ResolvedConfig, labelled: TensorDictBase) -> list[int]:
+    """Trajectories that the planner does not see, or, where it is taken over, has not seen."""
+    options = resolved.options
+    if not resolved.method.has_planner:
+        return []
+    if options.planner_from is not None:
+        return validation_of(options.planner_from, options.dataset)
+    return choose_validation(labelled, options.validation_fraction, seed=options.seed)
 
 
 def _build_once(resolved: ResolvedConfig) -> None:
