@@ -66,7 +66,8 @@ def test_nobody_names_the_commands():
 def test_training_loads_no_simulator_and_no_pictures():
     """Of what TorchRL does not load by itself: it looks for MuJoCo when its losses are imported."""
     script = (
-        "import sys, torchrl.objectives\nbefore = set(sys.modules)\nimport torchrl_koap.training\n"
+        "import sys, torchrl.objectives\nbefore = set(sys.modules)\n"
+        "import torchrl_koap.training\ntorchrl_koap.training.train\n"
         "print(*(name for name in set(sys.modules) - before if '.' not in name or 'torchrl_koap' in name))"
     )
     loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from torchrl_koap.lookup import exports
 
 __version__ = "0.1.0"
 
@@ -39,10 +38,7 @@ __all__ = [  # noqa: F822 - __getattr__ finds them
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_LAZY[name]), name)
+__getattr__ = exports(__name__, _LAZY)
 
 
 def __dir__() -> list[str]:

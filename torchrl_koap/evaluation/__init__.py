@@ -1,11 +1,28 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a trained run is worth: rollouts, scores, diagnosis, and which demonstrations to label next."""
 
-from torchrl_koap.evaluation.active_labelling import SuggestConfig, SuggestedLabels, rank_trajectories, suggest
-from torchrl_koap.evaluation.inspection import InspectConfig, Inspection, inspect
-from torchrl_koap.evaluation.run import EvalConfig, TrainedRun, evaluate, load_policy, load_run
+from torchrl_koap.lookup import exports
 
-__all__ = [
+# imported when first asked for: pictures need a reader of run directories, not TorchRL
+__getattr__ = exports(
+    __name__,
+    {
+        "EvalConfig": "torchrl_koap.evaluation.run",
+        "InspectConfig": "torchrl_koap.evaluation.inspection",
+        "Inspection": "torchrl_koap.evaluation.inspection",
+        "SuggestConfig": "torchrl_koap.evaluation.active_labelling",
+        "SuggestedLabels": "torchrl_koap.evaluation.active_labelling",
+        "TrainedRun": "torchrl_koap.evaluation.run",
+        "evaluate": "torchrl_koap.evaluation.run",
+        "inspect": "torchrl_koap.evaluation.inspection",
+        "load_policy": "torchrl_koap.evaluation.run",
+        "load_run": "torchrl_koap.evaluation.run",
+        "rank_trajectories": "torchrl_koap.evaluation.active_labelling",
+        "suggest": "torchrl_koap.evaluation.active_labelling",
+    },
+)
+
+__all__ = [  # noqa: F822
     "EvalConfig",
     "InspectConfig",
     "Inspection",

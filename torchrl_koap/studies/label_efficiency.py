@@ -81,6 +81,9 @@ class CurveConfig:
     address: str | None = None
     plugins: Plugins = ()
 
+    def __post_init__(self):
+        self.out = Path(self.out)  # so that a string will do in Python
+
 
 # what all cells of a folder must have in common; the rest may grow
 _FIXED = (

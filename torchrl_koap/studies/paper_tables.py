@@ -105,6 +105,9 @@ class BenchConfig:
     address: str | None = None
     plugins: Plugins = ()
 
+    def __post_init__(self):
+        self.out = Path(self.out)  # so that a string will do in Python
+
 
 def run_bench(config: BenchConfig) -> dict[str, Any]:
     """Does what is missing of a comparison; writes ``cells.csv`` and the report over all tasks.

@@ -1,14 +1,30 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """From demonstrations to a run directory with planner and controller."""
 
-from torchrl_koap.training.config import ResolvedConfig, TrainConfig, resolve
-from torchrl_koap.training.datasets import load_demonstrations
-from torchrl_koap.training.methods import METHODS, Method, Phase, get_method, register_method
-from torchrl_koap.training.plugins import PluginError, load_plugins
-from torchrl_koap.training.run import train
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.lookup import exports
 
-__all__ = [
+# imported when first asked for: pictures need a reader of run directories, not TorchRL
+__getattr__ = exports(
+    __name__,
+    {
+        "METHODS": "torchrl_koap.training.methods",
+        "Method": "torchrl_koap.training.methods",
+        "Phase": "torchrl_koap.training.methods",
+        "PluginError": "torchrl_koap.training.plugins",
+        "ResolvedConfig": "torchrl_koap.training.config",
+        "RunDirectory": "torchrl_koap.training.run_directory",
+        "RunDirectoryError": "torchrl_koap.training.run_directory",
+        "TrainConfig": "torchrl_koap.training.config",
+        "get_method": "torchrl_koap.training.methods",
+        "load_demonstrations": "torchrl_koap.training.datasets",
+        "load_plugins": "torchrl_koap.training.plugins",
+        "register_method": "torchrl_koap.training.methods",
+        "resolve": "torchrl_koap.training.config",
+        "train": "torchrl_koap.training.run",
+    },
+)
+
+__all__ = [  # noqa: F822
     "METHODS",
     "Method",
     "Phase",

@@ -119,6 +119,9 @@ class TrainConfig:
     analysis: bool = True
     plugins: Plugins = ()
 
+    def __post_init__(self):
+        self.out = Path(self.out)  # so that a string will do in Python
+
 
 @dataclass(frozen=True)
 class ResolvedConfig:
