@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Facts of the tasks are consistent with each other and with the specification."""
+"""Facts of the tasks are consistent with each other and with docs/d3il.md."""
 
 from __future__ import annotations
 
