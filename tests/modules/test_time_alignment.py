@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The time picture of the design: which frames are read, which count, replayed on a known linear system."""
+"""Time alignment: which frames are read, which count, replayed on a known linear system."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def offsets(num_past, look_ahead):
 # the table
 
 
-def test_table_of_the_design():
-    """Section 3: f for a_1 reads x_0, x_1 and x_{1+k}; the last index is clamped to the window's end."""
+def test_frames_read_for_each_action():
+    """f for a_1 reads x_0, x_1 and x_{1+k}; the last index is clamped to the window's end."""
     index = frame_index(range(T), T, 1, 8)
     assert index.dtype == torch.int64
     assert index[1].tolist() == [0, 1, 9]

@@ -190,7 +190,7 @@ def test_single_losses_are_the_terms_of_the_sum():
 
 @pytest.mark.parametrize("kind", NETWORKS)
 def test_gradients_in_plain_loops(kind):
-    """Also of the target g(x_{t+1}), which is not detached (koap_release_notes 3.1)."""
+    """Also of the target g(x_{t+1}), which is not detached, as in KOAP's first public code."""
     network, batch = make_network(kind), make_batch(3)
     parameters = dict(network.named_parameters())
     expected = in_plain_loops(network, batch, False)

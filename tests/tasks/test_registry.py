@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Facts of the tasks are consistent with each other and with the specification."""
+"""Facts of the tasks are consistent with each other and with docs/d3il.md."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl_koap.tasks import TASKS, Modes, Task, get_task, register_task
 from torchrl_koap.tasks import registry as registry_module
 
 
-def test_avoiding_follows_the_specification():
+def test_facts_of_avoiding():
     task = get_task("avoiding")
     assert task.observation_dim == 4
     assert task.action_dim == 2

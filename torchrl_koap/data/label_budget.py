@@ -43,6 +43,13 @@ class LabelReport:
         seed (int): seed of the draw.
         available_units (int): units with a label in the data as they came; those that could be drawn.
         available_transitions (int): transitions with a label in the data as they came.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories
+        >>> _, report = LabelBudget(1).apply(flatten_trajectories([torch.rand(6, 2)] * 4, [torch.rand(5, 1)] * 4))
+        >>> report.labelled_transitions, report.total_transitions, report.trajectories_touched
+        (5, 20, 1)
     """
 
     unit: str

@@ -68,6 +68,12 @@ class ManipulationEnv(RawLog, EnvBase):
 
     Raises:
         ValueError: for sizes below 1, a non-floating dtype, or contexts of a wrong shape or out of range.
+
+    Examples:
+        >>> from torchrl_koap.envs import AvoidingEnv  # a task of this base
+        >>> env = AvoidingEnv(num_envs=2)
+        >>> env.task.name, env.reset()["success"].flatten().tolist()
+        ('avoiding', [False, False])
     """
 
     def __init__(
@@ -293,7 +299,12 @@ class ManipulationEnv(RawLog, EnvBase):
         return {"simulation": self.sims.get_state(index)} | rows
 
     def set_state(self, index: int, state: dict) -> None:
-        """Restores what :meth:`get_state` returned; the episode then continues bit for bit."""
+        """Restores what :meth:`get_state` returned; the episode then continues bit for bit.
+
+        Args:
+            index (int): which environment.
+            state (dict): from :meth:`get_state`, of any environment of the same task.
+        """
         self.sims.set_state(index, state["simulation"])
         for name, value in state.items():
             if name != "simulation":

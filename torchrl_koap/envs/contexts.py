@@ -103,6 +103,13 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
 def check_contexts(task: Task, contexts) -> np.ndarray:
     """Contexts as an array, or an error that names what is wrong with them.
 
+    Args:
+        task (Task): tells the objects and where each may start.
+        contexts (array): ``[C, objects, 3]``: x, y (m) and yaw (rad).
+
+    Returns:
+        np.ndarray: the contexts, float64.
+
     Raises:
         ValueError: if the task has none, the shape is not ``[C, objects, 3]``, or an object lies where the task never
             puts it.
@@ -177,6 +184,14 @@ def yaw_quaternions(yaw: np.ndarray) -> np.ndarray:
 
 
 def poses_of(contexts: np.ndarray, height: float) -> np.ndarray:
-    """Poses ``[..., objects, 7]`` of objects that contexts ``[..., objects, 3]`` place at a height (m)."""
+    """Poses of the objects that contexts place on a level.
+
+    Args:
+        contexts (np.ndarray): x, y (m) and yaw (rad), ``[..., objects, 3]``.
+        height (float): z of all objects (m).
+
+    Returns:
+        np.ndarray: positions (m) and quaternions (w, x, y, z), ``[..., objects, 7]``.
+    """
     level = np.full((*contexts.shape[:-1], 1), height)
     return np.concatenate([contexts[..., :2], level, yaw_quaternions(contexts[..., 2])], -1)

@@ -12,6 +12,12 @@ class RawLog:
     """Base of :class:`~torchrl_koap.envs.base.ManipulationEnv`: its last control step in D3IL's layout.
 
     Reads ``sims`` (:class:`~torchrl_koap.envs.mujoco.simulation.SimulationBatch`), ``commands`` and ``task``.
+
+    Examples:
+        >>> from torchrl_koap.envs import AvoidingEnv
+        >>> env = AvoidingEnv(num_envs=2)
+        >>> env.rollout(2)["action"].shape, env.raw_log()["j_pos"].shape
+        (torch.Size([2, 2, 2]), (2, 7))
     """
 
     def raw_log(self) -> dict[str, np.ndarray]:

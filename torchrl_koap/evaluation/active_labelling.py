@@ -36,6 +36,11 @@ class Suggestion:
     Args:
         episode (int): its number.
         score (float, optional): what the criterion gives it when its turn comes, in units of the noise variance.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.active_labelling import Suggestion
+        >>> Suggestion(episode=57, score=0.31).episode
+        57
     """
 
     episode: int
@@ -176,6 +181,10 @@ class SuggestConfig:
         seed: seed of "random".
         threads: torch threads.
         plugins: modules that register tasks or methods, besides those that the run was trained with.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.active_labelling import SuggestConfig, suggest
+        >>> suggest("runs/koap", SuggestConfig(count=3))  # doctest: +SKIP
     """
 
     count: int = 5
@@ -195,6 +204,12 @@ class SuggestedLabels:
         labelled_steps (int): labels of the run that the choice builds on.
         labelled_episodes (list of int): trajectories with a label in the run.
         suggestions (list of dict): ``rank``, ``episode``, ``steps`` to label and ``score``, best first.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.active_labelling import SuggestedLabels
+        >>> row = {"rank": 1, "episode": 57, "steps": 120, "score": 0.31}
+        >>> print(str(SuggestedLabels("a_optimal", 0.1, 80, [3], [row])).splitlines()[-1])
+        with these labelled: koap train --label-episodes 3 57 ...
     """
 
     criterion: str

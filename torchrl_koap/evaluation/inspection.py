@@ -50,6 +50,10 @@ class InspectConfig:
         threads: torch and simulator threads.
         device: "cpu" or "cuda".
         plugins: modules that register tasks or methods, besides those that the run was trained with.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.inspection import InspectConfig, inspect
+        >>> inspect("runs/koap", InspectConfig(latent_only=True)).result["verdict"]  # doctest: +SKIP
     """
 
     episodes: int = 30
@@ -72,6 +76,12 @@ class Inspection:
         result (dict): what ``inspect.json`` holds: the three experiments, if they were made, ``latent``, ``verdict``.
         task (Task): the task.
         eigenvalues (Tensor, optional): of the Koopman operator, complex ``[m]``; None for a method without one.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.inspection import Inspection
+        >>> from torchrl_koap.tasks import get_task
+        >>> Inspection({"verdict": "the planner fails"}, get_task("avoiding"), eigenvalues=None).result["verdict"]
+        'the planner fails'
     """
 
     result: dict[str, Any]

@@ -214,7 +214,14 @@ def _roll_linear(controller: KoopmanInverseDynamics, weight: Tensor, states: Ten
 
 
 def explained(predicted: Tensor, true: Tensor) -> list[float]:
-    """Share ``R^2`` of the variance of every column of ``true [N, a]`` that predictions explain; NaN if it has none.
+    """Share ``R^2`` of the variance of every column that predictions explain.
+
+    Args:
+        predicted (Tensor): predictions ``[N, a]``.
+        true (Tensor): what they are compared with, ``[N, a]``.
+
+    Returns:
+        list of float: one per column, at most 1; NaN for a column without variance.
 
     Examples:
         >>> import torch

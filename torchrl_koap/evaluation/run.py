@@ -50,6 +50,10 @@ class EvalConfig:
         threads: torch and simulator threads.
         device: "cpu" or "cuda".
         plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
+
+    Examples:
+        >>> from torchrl_koap.evaluation import EvalConfig, evaluate
+        >>> evaluate("runs/koap", EvalConfig(episodes=20, execution="open_loop"))["success_rate"]  # doctest: +SKIP
     """
 
     episodes: int = 60
@@ -82,6 +86,12 @@ class TrainedRun:
         planner (StatePlanner, optional): None for a policy of its own.
         controller (nn.Module): the controller, or the policy.
         columns (tuple of int): state columns that the controller reads.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.run import load_run
+        >>> trained = load_run("runs/koap")  # doctest: +SKIP
+        >>> trained.method.name, trained.budget.amount  # doctest: +SKIP
+        ('koap', 0.02)
     """
 
     directory: RunDirectory

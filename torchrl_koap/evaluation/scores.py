@@ -148,7 +148,16 @@ def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], cont
 
 
 def first_box_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
-    """As :func:`stacking_scores`, of the first box alone, with which episodes of Stacking-1 end."""
+    """Stacking's scores of the first box alone, with which episodes of Stacking-1 end.
+
+    Args:
+        result (dict): from :func:`score`; not looked at.
+        episodes (sequence of TensorDict): rollouts of :class:`~torchrl_koap.envs.stacking.StackingEnv`.
+        contexts (sequence of int): number of the context of every episode.
+
+    Returns:
+        dict: the entries of :func:`stacking_scores` about the first box.
+    """
     return _stacked(episodes, contexts, most=1)
 
 

@@ -142,6 +142,13 @@ class LatentInverseDynamics(InverseDynamics):
 
     Keyword Args:
         **kwargs: normalisers and keys, see :class:`InverseDynamics`.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import NonlinearInverseDynamics  # a subclass
+        >>> model = NonlinearInverseDynamics(2, 2, latent_dim=8)
+        >>> model.out_keys, model.infer(torch.randn(3, 16, 2)).shape
+        (['latent_action', 'action'], torch.Size([3, 16, 8]))
     """
 
     def __init__(self, reader: FrameGatherer, action_decoder: nn.Module, **kwargs):
@@ -150,7 +157,15 @@ class LatentInverseDynamics(InverseDynamics):
         self.action_decoder = action_decoder
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Latents ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
+        """Latents of a window of raw states; a subclass says how.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), m]``.
+        """
         raise NotImplementedError
 
     def decode(self, latent: Tensor) -> Tensor:

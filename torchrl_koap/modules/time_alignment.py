@@ -201,7 +201,18 @@ class FrameGatherer(nn.Module):
         return torch.cat([steps[..., :n, :], read[..., n : n + 1, :], steps[..., n:, :]], -2) / self.scales
 
     def forward(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """:meth:`gather`, the frames read side by side: ``[*B, len(frames), num_features]``."""
+        """What every frame reads, side by side: :meth:`gather` in one row per frame.
+
+        Args:
+            state (Tensor): states ``[*B, T, d]`` in the networks' units.
+            frames (range, optional): frames to read for. Default: all.
+
+        Returns:
+            Tensor: ``[*B, len(frames), num_features]``.
+
+        Raises:
+            ValueError: if the states have another number of columns.
+        """
         return self.gather(state, frames).flatten(-2)
 
     @torch.no_grad()

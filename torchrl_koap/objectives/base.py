@@ -18,6 +18,10 @@ from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     """An entry that must be there.
 
+    Args:
+        tensordict (TensorDictBase): a batch.
+        key (NestedKey): the entry.
+
     Raises:
         KeyError: if it is not; the message lists what is.
     """
@@ -28,7 +32,15 @@ def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def read_mask(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
-    """A mask of the frames of windows ``[*B, T, d]`` as bool ``[*B, T]``; stored with a trailing 1 or not.
+    """A mask of the frames of windows, stored with a trailing 1 or not.
+
+    Args:
+        tensordict (TensorDictBase): a batch.
+        key (NestedKey): the entry, bool ``[*B, T, 1]`` or ``[*B, T]``.
+        state (Tensor): windows ``[*B, T, d]``, for the shape.
+
+    Returns:
+        Tensor: bool ``[*B, T]``.
 
     Raises:
         KeyError: if it is not there.
@@ -53,6 +65,16 @@ class WindowLoss(LossModule):
 
     Raises:
         ValueError: for an unknown reduction.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KoopmanReconstructionLoss  # a subclass
+        >>> loss = KoopmanReconstructionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> loss.set_keys(state="frames")
+        >>> loss.in_keys, loss(TensorDict({"frames": torch.randn(4, 16, 2)}, [4]))["loss_reconstruction"].shape
+        (['frames'], torch.Size([]))
     """
 
     @dataclass

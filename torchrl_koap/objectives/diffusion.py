@@ -37,6 +37,16 @@ class DenoisingLoss(LossModule):
 
     Raises:
         ValueError: if ``reduction`` is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
+        >>> from torchrl_koap.objectives import PlannerLoss  # a subclass
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> loss = PlannerLoss(planner, create_target_params=False, reduction="none")
+        >>> loss(TensorDict({"state": torch.randn(8, 16, 2)}, [8]))["loss_planner"].shape
+        torch.Size([8, 14, 2])
     """
 
     name: str
@@ -63,7 +73,16 @@ class DenoisingLoss(LossModule):
         raise NotImplementedError
 
     def encode(self, history: Tensor, sequence: Tensor, counts: Tensor | None) -> Tensor:
-        """The normalised sequence that noise is added to; steps that do not count hold finite numbers."""
+        """The normalised sequences that noise is added to; a subclass says how.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): raw plans or actions ``[*B, H, width]``.
+            counts (Tensor, optional): steps that count, bool ``[*B, H, 1]``; None: all.
+
+        Returns:
+            Tensor: ``[*B, H, width]``, finite numbers also where steps do not count.
+        """
         raise NotImplementedError
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
@@ -201,7 +220,16 @@ class PlannerLoss(DenoisingLoss):
         return history, plan, self._mask(tensordict, plan)
 
     def encode(self, history: Tensor, sequence: Tensor, counts: Tensor | None) -> Tensor:
-        """The normalised plan (:meth:`DenoisingLoss.encode`)."""
+        """The normalised plans; steps that do not count stay where the robot is.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): raw plans ``[*B, H, d]``.
+            counts (Tensor, optional): steps that count, bool ``[*B, H, 1]``; None: all.
+
+        Returns:
+            Tensor: ``[*B, H, d]``.
+        """
         if counts is not None:  # before the network: padding may hold anything, and 0 * nan is nan
             sequence = torch.where(counts, sequence, history[..., -1:, :])
         return self.planner.encode_plan(history, sequence)
@@ -312,7 +340,16 @@ class DiffusionPolicyLoss(DenoisingLoss):
         return history, *self._actions(tensordict, state)
 
     def encode(self, history: Tensor, sequence: Tensor, counts: Tensor | None) -> Tensor:
-        """The normalised actions (:meth:`DenoisingLoss.encode`)."""
+        """The normalised actions, 0 where they do not count.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): raw actions ``[*B, H, act]``.
+            counts (Tensor): steps that count, bool ``[*B, H, 1]``.
+
+        Returns:
+            Tensor: ``[*B, H, act]``.
+        """
         # before the network and the residual: masking afterwards would leave NaN in the gradient
         return torch.where(counts, self.policy.encode_actions(torch.where(counts, sequence, 0.0)), 0.0)
 

@@ -94,6 +94,15 @@ class KoopmanDynamicsLoss(_KoopmanLoss):
 
     Keyword Args:
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KoopmanDynamicsLoss
+        >>> loss = KoopmanDynamicsLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4]))["loss_koopman"].shape
+        torch.Size([])
     """
 
     out_keys = ["loss_koopman"]
@@ -117,6 +126,17 @@ class LatentActionLoss(_KoopmanLoss):
 
     Keyword Args:
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where unlabelled).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import LatentActionLoss
+        >>> loss = LatentActionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> batch = TensorDict({"state": torch.randn(4, 16, 2), "action": torch.full((4, 16, 2), torch.nan),
+        ...                     "has_action": torch.zeros(4, 16, 1, dtype=torch.bool)}, [4])
+        >>> loss(batch)["loss_action"].item()
+        0.0
     """
 
     out_keys = ["loss_action"]

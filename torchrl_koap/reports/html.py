@@ -148,7 +148,16 @@ def interval_bar(value: float, low: float, high: float) -> str:
 
 
 def bar(value: float, low: float, high: float) -> tuple[float, float, float]:
-    """A share and its interval in percent, cut to 0..100."""
+    """A share and its interval in percent, cut to 0..100.
+
+    Args:
+        value (float): the share, 0 to 1.
+        low (float): lower end of its interval.
+        high (float): upper end.
+
+    Returns:
+        tuple of float: the three in percent.
+    """
     value, low, high = (100 * min(max(part, 0.0), 1.0) for part in (value, low, high))
     return value, low, high
 

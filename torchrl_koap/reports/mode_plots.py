@@ -31,6 +31,13 @@ def even_entropy(episodes: int, num_modes: int) -> float:
     A few episodes cannot fill all modes evenly, so this is below 1: what a policy without preferences scores on
     average. It is the exact mean over the binomial counts.
 
+    Args:
+        episodes (int): number of episodes.
+        num_modes (int): number of modes, and base of the logarithm.
+
+    Returns:
+        float: 0 to 1.
+
     Examples:
         >>> from torchrl_koap.reports.mode_plots import even_entropy
         >>> even_entropy(1, 24), round(even_entropy(60, 24), 3), round(even_entropy(10_000, 24), 3)

@@ -142,7 +142,15 @@ def draw_object_paths(axes: Axes, paths: Sequence[np.ndarray], looks: Sequence[B
 
 
 def legend_handles(looks: Sequence[Body], good: Sequence[bool] = ()) -> list[Line2D]:
-    """Entries of a legend: every kind of body once, and the marks of :func:`draw_object_paths` that occur."""
+    """Entries of a legend: every kind of body once, and the marks of :func:`draw_object_paths` that occur.
+
+    Args:
+        looks (sequence of Body): bodies that are drawn.
+        good (sequence of bool): whether each drawn episode succeeded.
+
+    Returns:
+        list of Line2D: handles with labels, for ``axes.legend(handles=...)``.
+    """
     handles = {}
     for look in looks:
         style = {"linestyle": "--" if look.still else "-", "linewidth": 1.6}

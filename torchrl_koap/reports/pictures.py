@@ -70,6 +70,12 @@ class Picture:
         place (int): pictures stand in the report in this order.
         caption_of (callable, optional): from the name of a task (or None) to a further sentence of the caption.
         empty (str): what the report says where the source holds nothing to draw; nothing if it is empty.
+
+    Examples:
+        >>> from torchrl_koap.reports.pictures import all_pictures
+        >>> picture = all_pictures()["rollouts.png"]
+        >>> picture.source, picture.caption_for() == picture.caption
+        ('rollouts.safetensors', True)
     """
 
     name: str

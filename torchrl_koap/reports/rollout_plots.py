@@ -249,7 +249,17 @@ def plot_plans(
 
 
 def choose_episodes(mode: Any, outcome: Any, count: int) -> list[int]:
-    """Up to two failures, then successes, a new mode each as long as there are any, then what is left.
+    """Numbers of the episodes worth showing.
+
+    Up to two failures, then successes, a new mode each as long as there are any, then what is left.
+
+    Args:
+        mode (array): mode of every episode, int [E]; -1 where it has none.
+        outcome (array): outcome of every episode, int [E]; 1 is success.
+        count (int): how many to choose at most.
+
+    Returns:
+        list of int: rows of the arrays.
 
     Examples:
         >>> from torchrl_koap.reports.rollout_plots import choose_episodes

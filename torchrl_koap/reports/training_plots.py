@@ -124,6 +124,13 @@ def plot_losses(metrics: Mapping[str, Sequence[float]], path: str | Path) -> Pat
 def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
     """Mean of the values at most ``reach`` places away, leaving out NaN; shorter windows at both ends.
 
+    Args:
+        values (np.ndarray): numbers [N].
+        reach (int): places to either side.
+
+    Returns:
+        np.ndarray: means [N]; NaN where there is nothing to average.
+
     Examples:
         >>> import numpy as np
         >>> from torchrl_koap.reports.training_plots import running_mean

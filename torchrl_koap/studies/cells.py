@@ -31,6 +31,11 @@ class Cell:
         fraction (float): share of the units that keep their labels.
         observations (float): share of the trajectories that are used at all.
         seed (int): of label choice, initialisation and batches.
+
+    Examples:
+        >>> from torchrl_koap.studies.cells import Cell
+        >>> Cell("koap", fraction=0.02, observations=1.0, seed=0).folder
+        'cells/koap-0.02-1-seed0'
     """
 
     method: str

@@ -55,6 +55,12 @@ class CurveConfig:
         launcher: "local" or "ray".
         address: of a Ray cluster (default: one on this machine).
         plugins: modules that register tasks, methods or pictures; every cell imports them, and every later call.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.studies.label_efficiency import CurveConfig, run_curve
+        >>> config = CurveConfig(out=Path("curve"), methods="koap,dd", fractions="0.01,0.1", seeds=2)
+        >>> run_curve(config)  # doctest: +SKIP
     """
 
     out: Path

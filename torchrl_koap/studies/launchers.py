@@ -32,6 +32,12 @@ class Job:
         arguments (dict): its keyword arguments, plain values.
         log (Path): file that what it prints is appended to.
         needs (tuple of str): names of the jobs that must have succeeded before.
+
+    Examples:
+        >>> import time
+        >>> from torchrl_koap.studies.launchers import Job
+        >>> Job("after", time.sleep, {"secs": 0}, needs=("before",)).needs
+        ('before',)
     """
 
     name: str
@@ -135,7 +141,16 @@ def _schedule(waiting: list[Job], pool: Any) -> Iterator[tuple[Job, str | None]]
 
 
 def run_logged(job_log: str, function: Callable[..., None], arguments: dict[str, Any]) -> str | None:
-    """Calls a function with everything it prints going to a file; returns why it failed, if it did."""
+    """Calls a function with everything it prints going to a file.
+
+    Args:
+        job_log (str): file to append to.
+        function (callable): what to call.
+        arguments (dict): its keyword arguments.
+
+    Returns:
+        str or None: why it failed, None if it did not.
+    """
     try:
         with _open_log(job_log) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
             try:

@@ -55,6 +55,13 @@ class Comparison:
         contexts (int): number of contexts compared.
         seeds (int): number of training seeds that both methods have.
         pairs (int): number of pairs of rollouts behind it.
+
+    Examples:
+        >>> from torchrl_koap.studies.paired_comparison import compare
+        >>> same = {0: {(context, 7): True for context in range(6)}}
+        >>> result = compare(same, same)
+        >>> result.difference, result.p, result.seeds, result.pairs
+        (0.0, 1.0, 1, 6)
     """
 
     difference: float

@@ -29,6 +29,11 @@ class Preset:
         tasks (tuple of str): tasks it is made on.
         levels (int, optional): label levels, from the fewest labels on. Default: all of the task.
         observations (str): shares of the trajectories that are used at all.
+
+    Examples:
+        >>> from torchrl_koap.studies.paper_tables import Preset
+        >>> Preset("Two methods", "koap,dd", tasks=("avoiding",)).levels
+        (1, 2, 3, 4, 5)
     """
 
     title: str
@@ -74,6 +79,12 @@ class BenchConfig:
         launcher: "local" or "ray".
         address: of a Ray cluster.
         plugins: modules that register tasks, methods or pictures.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.studies.paper_tables import BenchConfig, run_bench
+        >>> config = BenchConfig(out=Path("bench"), table=1, tasks="avoiding", seeds=1)
+        >>> run_bench(config)  # doctest: +SKIP
     """
 
     out: Path

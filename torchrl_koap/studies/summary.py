@@ -41,6 +41,13 @@ class Summary:
         labelled_transitions (float, optional): mean number of distinct transitions whose action was read.
         trajectories_touched (float, optional): mean number of trajectories they lie in.
         train_seconds (float, optional): mean time of training; ``eval_seconds`` that of evaluation.
+
+    Examples:
+        >>> from torchrl_koap.studies.summary import summarise
+        >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.02, "seed": 0, "status": "missing"}
+        >>> summary = summarise([cell])[0]
+        >>> summary.missing, summary.success is None
+        ((0,), True)
     """
 
     task: str
@@ -199,6 +206,10 @@ def cell_name(row: Mapping[str, Any]) -> str:
 
 def percent(share: float | None, digits: int | None = None) -> str:
     """A share in percent, with as few digits as it has if ``digits`` is not given.
+
+    Args:
+        share (float, optional): the share, 1 for the whole; None gives a dash.
+        digits (int, optional): digits after the point.
 
     Examples:
         >>> from torchrl_koap.studies.summary import percent

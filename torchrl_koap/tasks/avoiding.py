@@ -27,12 +27,30 @@ OBSTACLES = (
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether the tool is behind the finish line, bool ``[*B]`` of states ``[*B, 2]``."""
+    """Whether the tool is behind the finish line.
+
+    Args:
+        task (Task): not looked at.
+        state (Tensor): positions ``[*B, 2]`` of the tool (m).
+
+    Returns:
+        Tensor: bool ``[*B]``.
+    """
     return state[..., 1] > FINISH_Y
 
 
 def score(result: dict[str, Any], episodes: Any = None, contexts: Any = None) -> dict[str, float]:
-    """D3IL's figure: 0.8 success + 0.2 entropy."""
+    """D3IL's figure: 0.8 success + 0.2 entropy.
+
+    Args:
+        result (dict): figures of :func:`~torchrl_koap.evaluation.scores.score`; ``success_rate`` and ``mode_entropy``
+            are read.
+        episodes (optional): not looked at.
+        contexts (optional): not looked at.
+
+    Returns:
+        dict: ``d3il_score``.
+    """
     return {"d3il_score": 0.8 * result["success_rate"] + 0.2 * result["mode_entropy"]}
 
 

@@ -26,6 +26,12 @@ class RelativePosition:
         origin (slice): state columns of the position it is seen from; where it has 2, the height is taken as it is.
         yaw (slice, optional): state columns ``cos, sin`` of the yaw of the frame it is seen in.
         other_yaw (slice, optional): ``cos, sin`` of a yaw to be told relative to that frame, too.
+
+    Examples:
+        >>> from torchrl_koap.tasks.relative_positions import RelativePosition
+        >>> tool_from_box = RelativePosition(place=slice(0, 2), origin=slice(2, 4), yaw=slice(4, 6))
+        >>> tool_from_box.other_yaw is None
+        True
     """
 
     place: slice

@@ -32,14 +32,30 @@ def _boxes_of(task: Task, state: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether all boxes are piled in the zone, bool ``[*B]`` of states ``[*B, d]``."""
+    """Whether all boxes are piled in the zone.
+
+    Args:
+        task (Task): tells the boxes and the columns of their positions.
+        state (Tensor): states ``[*B, d]``, positions in m.
+
+    Returns:
+        Tensor: bool ``[*B]``: all within :data:`ZONE_RADIUS` of its centre, heights more than :data:`HEIGHT_GAP` apart.
+    """
     boxes, near = _boxes_of(task, state)
     height = boxes[..., 2].sort(-1).values
     return near.all(-1) & (height.diff(dim=-1).amin(-1) > HEIGHT_GAP)
 
 
 def first_box_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether any box is in the zone, bool ``[*B]`` of states ``[*B, d]``."""
+    """Whether any box is in the zone.
+
+    Args:
+        task (Task): tells the boxes and the columns of their positions.
+        state (Tensor): states ``[*B, d]``, positions in m.
+
+    Returns:
+        Tensor: bool ``[*B]``.
+    """
     return _boxes_of(task, state)[1].any(-1)
 
 

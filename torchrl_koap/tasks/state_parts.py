@@ -16,7 +16,14 @@ FEATURE_COLUMNS = {"plane": ("x", "y"), "tan_yaw": ("cos_2yaw", "sin_2yaw"), "qu
 
 
 class StateParts:
-    """Base of :class:`~torchrl_koap.tasks.Task`: which columns observation and state have, by part and by name."""
+    """Base of :class:`~torchrl_koap.tasks.Task`: which columns observation and state have, by part and by name.
+
+    Examples:
+        >>> from torchrl_koap.tasks import get_task
+        >>> avoiding = get_task("avoiding")
+        >>> avoiding.observation_dim, avoiding.command_columns, avoiding.state_dim
+        (4, slice(0, 2, None), 2)
+    """
 
     @cached_property
     def observation(self) -> dict[str, slice]:

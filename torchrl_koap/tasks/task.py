@@ -70,6 +70,11 @@ class Defaults:
         relative (bool): plans are displacements from the present state.
         recovery_sigma (float): typical shift of the recovery augmentation, in the units of the robot's columns.
         released_epochs (int): epochs of a controller in KOAP's first public code.
+
+    Examples:
+        >>> from torchrl_koap.tasks.task import Defaults
+        >>> Defaults(demonstrations=50, relative=False).planner_steps
+        12000
     """
 
     demonstrations: int = 200

@@ -102,7 +102,12 @@ def error_entry(unit: str) -> str:
 
 
 def rmse_mm(predicted: Tensor, true: Tensor) -> float:
-    """Root of the mean squared error over steps and axes, m to mm (rad to mrad)."""
+    """Root of the mean squared error over steps and axes, in mm (mrad for angles).
+
+    Args:
+        predicted (Tensor): actions ``[N, a]`` (m or rad).
+        true (Tensor): the actions that were recorded, of the same shape.
+    """
     return (predicted - true).square().mean().sqrt().item() * 1e3
 
 
@@ -123,8 +128,19 @@ def write_analysis(
 ) -> dict[str, Any]:
     """Action error of the controller, and of a ridge on the same raw columns and labels, on hidden trajectories.
 
-    ``columns`` are the state columns that the controller reads. Writes ``actions.safetensors`` and
-    ``demonstrations.safetensors`` for the report.
+    Writes ``actions.safetensors`` and ``demonstrations.safetensors`` for the report.
+
+    Args:
+        run (RunDirectory): where to.
+        task (Task): the task.
+        data (TensorDictBase): flat data ``[N]`` with every label there is; read after training alone.
+        labelled (TensorDictBase): the same data with the labels of the budget.
+        controller (nn.Module): the controller.
+        columns (sequence of int): state columns that it reads.
+
+    Returns:
+        dict: ``controller`` and ``ridge``, root mean squared errors in mm or mrad, and ``analysis_labels_read``; a
+        ``note`` alone where no hidden trajectory has labels.
     """
     labelled = controller_view(labelled.cpu(), columns, action_targets=task.action_targets)
     viewed = controller_view(data, columns, action_targets=task.action_targets)

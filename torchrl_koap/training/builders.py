@@ -74,6 +74,10 @@ def method_named(options: Mapping[str, Any]) -> Method:
 def set_up_torch(threads: int, device: str) -> None:
     """Sets the number of threads and checks that the device is there.
 
+    Args:
+        threads (int): number of torch threads, at least 1.
+        device (str): ``"cpu"`` or ``"cuda"``, with an index or not.
+
     Raises:
         ValueError: if the number is below 1, or this machine has no such device.
     """

@@ -77,6 +77,12 @@ class TrainConfig:
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
             reads the run.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training import TrainConfig, train
+        >>> config = TrainConfig(out=Path("runs/koap"), task="avoiding", label_fraction=0.05)
+        >>> train(config)  # doctest: +SKIP
     """
 
     out: Path
@@ -140,6 +146,13 @@ class ResolvedConfig:
         budget (LabelBudget): which labels may be seen.
         planner (dict): what :func:`~torchrl_koap.training.diffusion_builders.build_planner` takes.
         controller (dict): what :func:`~torchrl_koap.training.builders.build_controller` takes.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training.config import TrainConfig, resolve
+        >>> resolved = resolve(TrainConfig(out=Path("runs/koap"), label_fraction=0.05))
+        >>> resolved.task.name, resolved.method.name, resolved.budget.amount, resolved.options.steps
+        ('avoiding', 'koap', 0.05, 5000)
     """
 
     options: TrainConfig

@@ -313,5 +313,13 @@ def get_method(name: str, decoder: str | None = None) -> Method:
 
 
 def normalizers_of(state: nn.Module, action: nn.Module) -> Mapping[str, nn.Module]:
-    """The two normalisers as the keyword arguments that every network takes."""
+    """The two normalisers as the keyword arguments that every network takes.
+
+    Args:
+        state (nn.Module): maps raw states ``[*B, d]`` to the network's units.
+        action (nn.Module): maps raw actions ``[*B, act]`` to them.
+
+    Returns:
+        dict: ``state_normalizer`` and ``action_normalizer``.
+    """
     return {"state_normalizer": state, "action_normalizer": action}

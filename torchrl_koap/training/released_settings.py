@@ -34,13 +34,28 @@ class Released:
     Args:
         method (Method): network and phases.
         learning_rate (float): reached after the warm-up and kept.
+
+    Examples:
+        >>> from torchrl_koap.training.released_settings import get_released
+        >>> released = get_released("koap")
+        >>> released.method.name, released.learning_rate
+        ('koap', 0.0003)
     """
 
     method: Method
     learning_rate: float
 
     def updates(self, phase: Phase, table: WindowTable, epochs: int) -> int:
-        """Updates of a phase: passes over the windows that it trains on."""
+        """Updates of a phase: epochs times the batches of an epoch.
+
+        Args:
+            phase (Phase): tells which windows it trains on.
+            table (WindowTable): the windows.
+            epochs (int): passes over them.
+
+        Returns:
+            int: at least 1.
+        """
         number = int(table.labelled.sum()) if phase.windows == "labelled" else len(table.starts)
         return max(epochs * math.ceil(number / BATCH_SIZE), 1)
 

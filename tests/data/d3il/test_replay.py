@@ -56,7 +56,7 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_values_follow_the_specification(folder, dtype):
+def test_values_are_those_of_the_raw_episodes(folder, dtype):
     data = validate(D3ILExperienceReplay("avoiding", folder, dtype=dtype).data)
     assert data.shape == (sum(LENGTHS) - len(LENGTHS),)
     begin = 0

@@ -39,7 +39,7 @@ def test_released_has_the_released_number_of_parameters(state_dim, expected):
 
 
 def test_released_parts_have_the_released_sizes():
-    """koap_release_notes section 3.1 and 3: encoder, decoder, z_act, act_decoder and K in Avoiding."""
+    """Parameters of the networks of KOAP's first public code in Avoiding (docs/first_code.md), and frames read."""
     model = make_koopman_inverse_dynamics(2, 2, preset="released")
     assert count(model.lifting.encoder) == 397_824 and count(model.lifting.decoder) == 788_994
     assert count(model.latent_action) == 199_168 and count(model.action_decoder) == 1_026

@@ -39,6 +39,11 @@ class Converter:
         convert (callable): from a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``,
             as float64 arrays.
         unread (tuple of str): objects that may be logged as well and are not read.
+
+    Examples:
+        >>> from torchrl_koap.data.d3il.conversion import AVOIDING
+        >>> AVOIDING.robot, AVOIDING.folder
+        (('des_c_pos', 'c_pos'), 'avoiding/data')
     """
 
     robot: tuple[str, ...]

@@ -62,6 +62,13 @@ class RawEpisode:
         robot (dict): arrays ``(T, ...)`` by name, see the module's table.
         objects (dict): for each object of the scene its arrays ``(T, ...)`` by name.
         context (optional): what the scene was reset to, plain containers and arrays.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data.d3il.raw import RawEpisode
+        >>> episode = RawEpisode(robot={"des_c_pos": np.zeros((40, 3)), "c_pos": np.zeros((40, 3))})
+        >>> len(episode), episode.objects
+        (40, {})
     """
 
     robot: Mapping[str, np.ndarray]

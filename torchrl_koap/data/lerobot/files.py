@@ -40,6 +40,13 @@ class LeRobotEpisode:
         file (Path): where its first row lies.
         observation (np.ndarray): float64 ``[T, d]``.
         action (np.ndarray): float64 ``[T, a]``.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap.data.lerobot.files import LeRobotEpisode
+        >>> LeRobotEpisode(0, Path("data.parquet"), np.zeros((50, 6)), np.zeros((50, 6))).observation.shape
+        (50, 6)
     """
 
     number: int
@@ -57,6 +64,11 @@ class LeRobotFolder:
         widths (dict): columns of each observation feature, in the order in which they lie side by side.
         episodes (list of LeRobotEpisode): the sound ones, in the order of their numbers.
         problems (list of str): what is wrong with the others.
+
+    Examples:
+        >>> from torchrl_koap.data.lerobot.files import read_lerobot_folder
+        >>> read_lerobot_folder("recordings/so101").widths  # doctest: +SKIP
+        {'observation.state': 6}
     """
 
     info: Mapping[str, Any]

@@ -38,6 +38,13 @@ class Recordings:
         sources (tuple of str): where each trajectory is from, for messages.
         control_hz (float, optional): frames per second, if the source says so.
         skipped (tuple of str): entries of the source that were left out, images for example.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data import make_recordings
+        >>> recordings = make_recordings([np.zeros((5, 3))], [np.ones((5, 2))], control_hz=30.0)
+        >>> recordings.state_names, recordings.num_labels
+        (('state_0', 'state_1', 'state_2'), 4)
     """
 
     states: list[np.ndarray]

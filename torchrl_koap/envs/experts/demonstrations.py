@@ -47,6 +47,12 @@ class RecordingReport:
             ``close`` (nearly touched a cylinder), ``slow``.
         num_modes (int): modes the task has.
         seconds (float): wall-clock time.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.demonstrations import RecordingReport
+        >>> report = RecordingReport("avoiding", 0, modes=[3, 7], rows=[80, 95], attempts=[1, 2], failures={"mode": 1})
+        >>> report.failed_attempts
+        1
     """
 
     task: str
@@ -119,11 +125,22 @@ def record_episodes(
     num_threads: int = 2,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[Episode], RecordingReport]:
-    """Records demonstrations with everything D3IL's recorder logs; arguments as in :func:`record_demonstrations`.
+    """Records demonstrations with everything D3IL's recorder logs.
+
+    Args:
+        task (str): name of the task.
+        episodes (int): number of demonstrations.
+        seed (int): seed of modes and players. Same seed, same demonstrations, whatever the number of threads.
+        num_threads (int): threads that advance the physics.
+        progress (callable, optional): called with the number of demonstrations recorded and wanted.
 
     Returns:
         tuple: the episodes, for :func:`episodes_to_ted` and, of a task of D3IL, :func:`write_raw_episodes`, and the
         report.
+
+    Raises:
+        ValueError: if the task is unknown or has no expert, or a number is out of range.
+        RecordingError: if an episode fails again and again.
     """
     facts = get_task(get_task(task).source)
     expert_of(facts)
@@ -188,6 +205,14 @@ def write_raw_episodes(folder: str | Path, raw: Sequence[RawEpisode]) -> list[Pa
 
 def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
     """Modes of a recording: each as often as any other, a remainder drawn without repetition.
+
+    Args:
+        episodes (int): number of demonstrations.
+        num_modes (int): modes of the task.
+        seed (int): seed of the remainder.
+
+    Returns:
+        list of int: mode of every demonstration.
 
     Examples:
         >>> from torchrl_koap.envs.experts.demonstrations import balanced_modes

@@ -79,7 +79,16 @@ def solve_eikonal(slowness, cost, sweeps=2):
 
 @njit(cache=True)
 def value_at(field, x, y):
-    """Bilinear interpolation of a field [X, Y] at a point (m), at the border outside the grid."""
+    """Bilinear interpolation of a field, constant beyond the border of the grid.
+
+    Args:
+        field (np.ndarray): values on the grid [X, Y].
+        x (float): x of the point (m).
+        y (float): y of the point (m).
+
+    Returns:
+        float: the value, NaN for a point that is NaN.
+    """
     if np.isnan(x + y):
         return np.nan
     u = min(max((x - ORIGIN[0]) / STEP, 0.0), field.shape[0] - 1.001)
@@ -93,10 +102,20 @@ def value_at(field, x, y):
 
 @njit(cache=True)
 def descent(field, x, y, reach=0.016, softness=0.002):
-    """Direction [2] in which a field is least at a distance ``reach`` (m) from a point.
+    """Direction in which a field is least at a distance from a point.
 
     Values within about ``softness`` of the least one count too, which smooths the direction; a mere gradient would
     shiver between the walls of narrow passages.
+
+    Args:
+        field (np.ndarray): values on the grid [X, Y].
+        x (float): x of the point (m).
+        y (float): y of the point (m).
+        reach (float): the distance (m).
+        softness (float): how much above the least one a value still counts, in the unit of the field.
+
+    Returns:
+        np.ndarray: unit vector [2].
     """
     values = np.empty(32)
     for k in range(32):

@@ -42,6 +42,12 @@ class PlainEpisode:
     Args:
         observation (np.ndarray): ``[T + 1, obs]``.
         action (np.ndarray): ``[T, act]``.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.envs.experts.recording import PlainEpisode
+        >>> len(PlainEpisode(observation=np.zeros((41, 4)), action=np.zeros((40, 2))))
+        40
     """
 
     observation: np.ndarray

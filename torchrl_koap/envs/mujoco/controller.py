@@ -122,7 +122,16 @@ def _rotate(axes, index, angle):
 
 @njit(cache=True)
 def forward_kinematics(q, axes, origins, tcp, quat):
-    """Frames of the seven joints (rows 1-7), TCP position and quaternion for the joint angles ``q``."""
+    """Forward kinematics of the arm: frames of its joints and pose of the TCP, in the frame of its base.
+
+    Args:
+        q (np.ndarray): joint angles [7] (rad).
+        axes (np.ndarray): receives the axes x, y, z of the joints' frames in rows 1-7 [8, 3, 3]; row 0 ends as the
+            hand's.
+        origins (np.ndarray): receives their origins [8, 3] (m).
+        tcp (np.ndarray): receives the position of the TCP [3] (m).
+        quat (np.ndarray): receives its quaternion [4] (w, x, y, z).
+    """
     for i in range(3):
         for k in range(3):
             axes[0, i, k] = 1.0 if i == k else 0.0
@@ -180,7 +189,22 @@ def _quaternion(axes, quat):
 
 @njit(cache=True)
 def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors):
-    """Moves ``q`` in place by three damped steps towards the pose ``target`` (position and unit quaternion)."""
+    """Inverse kinematics: moves joint angles in place, by three damped steps, towards a pose of the TCP.
+
+    Args:
+        target (np.ndarray): position (m) and unit quaternion (w, x, y, z) [7].
+        q (np.ndarray): joint angles [7] (rad), overwritten.
+        axes (np.ndarray): scratch space [8, 3, 3].
+        origins (np.ndarray): scratch space [8, 3].
+        tcp (np.ndarray): scratch space [3].
+        quat (np.ndarray): scratch space [4].
+        jacobian (np.ndarray): scratch space [6, 7].
+        matrix (np.ndarray): scratch space [6, 6].
+        task (np.ndarray): scratch space [6].
+        null (np.ndarray): scratch space [7].
+        factor (np.ndarray): scratch space [6, 6].
+        vectors (np.ndarray): scratch space [6, 6].
+    """
     for _ in range(IK_ITERATIONS):
         forward_kinematics(q, axes, origins, tcp, quat)
         near = 0.0
@@ -315,7 +339,17 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
 def track_joints(step, model, data, pointers, rows, commands, widths, grasping, substeps, log):
     """Holds joint targets for ``substeps`` physics steps in each of the simulations ``rows``.
 
-    The arguments are those of :func:`track_pose`, except ``commands``: joint angles [n, 7] in rad.
+    Args:
+        step (int): address of ``mj_step``.
+        model (int): address of the shared mjModel.
+        data (np.ndarray): addresses of the mjData [n], int64.
+        pointers (np.ndarray): addresses of their arrays [n, NUM_POINTERS], int64.
+        rows (np.ndarray): indices of the simulations to advance, int64.
+        commands (np.ndarray): joint angles [n, 7] (rad), float64.
+        widths (np.ndarray): finger targets [n] (m).
+        grasping (np.ndarray): whether the fingers press [n], bool.
+        substeps (int): physics steps per control step.
+        log (np.ndarray): receives one row per simulation after the first substep, as in :func:`track_pose`.
     """
     zero = np.zeros(7)
     for row in rows:

@@ -82,9 +82,25 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         return self.lifting.encode(self.normalize_state(state))
 
     def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """The prediction of ``z_{t+1}``, ``[*B, T, m]``."""
+        """The prediction of ``z_{t+1}``.
+
+        Args:
+            lifted (Tensor): lifted states ``z_t``, ``[*B, T, m]``.
+            latent_action (Tensor): latent actions ``u_t``, ``[*B, T, m]``.
+
+        Returns:
+            Tensor: ``[*B, T, m]``.
+        """
         return self.dynamics(torch.cat([lifted, latent_action], -1))
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Latent actions ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
+        """Latent actions of a window of raw states.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), m]``.
+        """
         return self.reader.infer(self.reader.gather(self.normalize_state(state), frames))

@@ -87,7 +87,15 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         self.dynamics = MLP((num_past + 1) * state_dim + latent_dim, state_dim, **layers)
 
     def read(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """What the inverse model reads, ``[*B, T, num_features]``, of raw states ``[*B, T, d]``."""
+        """What the inverse model reads.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to read for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), num_features]``, in the networks' units.
+        """
         return self.reader(self.normalize_state(state), frames)
 
     def split(self, read: Tensor) -> tuple[Tensor, Tensor]:
@@ -104,13 +112,37 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         return self.quantizer(self.encoder(read))
 
     def predict_step(self, past: Tensor, latent: Tensor) -> Tensor:
-        """The next step ``[*B, T, d]``, at unit scale."""
+        """The next step, at unit scale.
+
+        Args:
+            past (Tensor): what the forward model may read (:meth:`split`), ``[*B, T, (num_past + 1) * d]``.
+            latent (Tensor): quantised latents ``[*B, T, m]``.
+
+        Returns:
+            Tensor: ``[*B, T, d]``.
+        """
         return self.dynamics(torch.cat([past, latent], -1))
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Quantised latents ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
+        """Quantised latents of a window of raw states.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), m]``.
+        """
         return self.quantized(self.read(state, frames))
 
     def code_indices(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Numbers of the codes, int64 ``[*B, T, num_codebooks]``: how many are in use tells how rich the latent is."""
+        """Numbers of the codes: how many are in use tells how rich the latent is.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: int64 ``[*B, len(frames), num_codebooks]``.
+        """
         return self.quantizer.codes_to_indices(self.quantizer.encode(self.encoder(self.read(state, frames))))

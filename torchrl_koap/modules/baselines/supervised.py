@@ -19,7 +19,15 @@ class _Supervised(InverseDynamics):
     """States to actions in one step; what is predicted is the subclass's."""
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Normalised actions ``[*B, T, act]`` of raw states ``[*B, T, d]``, or of some of the window's ``frames``."""
+        """Normalised actions of a window of raw states.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to predict for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), act]``.
+        """
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -73,7 +81,15 @@ class SupervisedInverseDynamics(_Supervised):
         self.network = MLP(self.reader.num_features, action_dim, num_cells=hidden_dims, activation_class=nn.ReLU)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Normalised actions ``[*B, T, act]``; frames near the ends read a clamped window."""
+        """Normalised actions; frames near the ends read a clamped window.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to predict for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), act]``.
+        """
         return self.network(self.reader(self.normalize_state(state), frames))
 
 
@@ -129,7 +145,15 @@ class RecurrentInverseDynamics(_Supervised):
         return range(1, num_frames - 1)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Normalised actions ``[*B, T, act]``."""
+        """Normalised actions; the last frame repeats the one before it, for it has no successor.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to predict for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), act]``.
+        """
         action = self.network(self.normalize_state(state))[..., 1:, :]
         action = torch.cat([action, action[..., -1:, :]], -2)
         return action if frames is None else action[..., frames.start : frames.stop, :]

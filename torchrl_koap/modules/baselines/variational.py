@@ -75,7 +75,15 @@ class VariationalInverseDynamics(LatentInverseDynamics):
         self.decoder = MLP(latent_dim + state_dim, reader.num_features - state_dim, **layers)
 
     def read(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """What the encoder reads, ``[*B, T, num_features]``, of raw states ``[*B, T, d]``."""
+        """What the encoder reads.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to read for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), num_features]``, in the networks' units.
+        """
         return self.reader(self.normalize_state(state), frames)
 
     def split(self, read: Tensor) -> tuple[Tensor, Tensor]:
@@ -90,9 +98,25 @@ class VariationalInverseDynamics(LatentInverseDynamics):
         return mean, log_variance.clamp(-10.0, 10.0)  # one odd window must not overflow the exponential
 
     def reconstruct(self, latent: Tensor, present: Tensor) -> Tensor:
-        """Steps ``[*B, T, num_features - d]`` from latents and the present state alone."""
+        """Steps around a state, from latents and the present state alone.
+
+        Args:
+            latent (Tensor): ``[*B, T, m]``.
+            present (Tensor): present states ``[*B, T, d]`` (:meth:`split`).
+
+        Returns:
+            Tensor: ``[*B, T, num_features - d]``.
+        """
         return self.decoder(torch.cat([latent, present], -1))
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Means ``[*B, T, m]`` of the latents of a window of raw states ``[*B, T, d]``, or of some ``frames`` of it."""
+        """Means of the latents of a window of raw states.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), m]``.
+        """
         return self.posterior(self.read(state, frames))[0]

@@ -46,6 +46,13 @@ class ConditionedDiffusion(TensorDictModuleBase):
 
     Raises:
         ValueError: for sizes below 1, several in- or out-keys, an unknown or unfit solver.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet  # a subclass, of states
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, horizon=14)
+        >>> planner.sample_shape, planner.sample(torch.zeros(3, 2, 2)).shape
+        ((14, 2), torch.Size([3, 14, 2]))
     """
 
     width_name = "state_dim"
@@ -159,7 +166,15 @@ class ConditionedDiffusion(TensorDictModuleBase):
         return condition if self.features is None else torch.cat([condition, self.features(history)], -1)
 
     def draw_noise(self, history: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Start noise ``[*B, H, width]`` for histories ``[*B, h, d]``."""
+        """Start noise, standard normal.
+
+        Args:
+            history (Tensor): histories ``[*B, h, d]``, for shape, type and device.
+            generator (torch.Generator, optional): source of the numbers.
+
+        Returns:
+            Tensor: ``[*B, H, width]``.
+        """
         shape = (*history.shape[:-2], *self.sample_shape)
         return torch.randn(shape, dtype=history.dtype, device=history.device, generator=generator)
 
@@ -181,7 +196,15 @@ class ConditionedDiffusion(TensorDictModuleBase):
         return (self.denoiser(noisy, time, condition) - target).square()
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """Raw plans or actions ``[*B, H, width]`` of normalised sequences, given raw histories ``[*B, h, d]``."""
+        """Raw plans or actions of normalised sequences; a subclass says how.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): normalised sequences ``[*B, H, width]``.
+
+        Returns:
+            Tensor: ``[*B, H, width]`` in raw units.
+        """
         raise NotImplementedError
 
     def sample(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:

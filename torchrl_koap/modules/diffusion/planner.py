@@ -125,18 +125,45 @@ class StatePlanner(ConditionedDiffusion):
         self.plan_normalizer = Normalizer.fit(plan, mode=mode).to(example)
 
     def encode_plan(self, history: Tensor, plan: Tensor) -> Tensor:
-        """Raw plan ``[*B, H, d]`` to the normalised sequence that noise is added to."""
+        """Raw plans to the normalised sequences that noise is added to.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            plan (Tensor): raw plans ``[*B, H, d]``.
+
+        Returns:
+            Tensor: normalised sequences ``[*B, H, d]``.
+
+        Raises:
+            ValueError: for plans of another shape.
+        """
         self._check_sequence(plan)
         plan = plan - history[..., -1:, :] if self.relative else plan
         return self.plan_normalizer(plan.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
 
     def decode_plan(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """Inverse of :meth:`encode_plan`."""
+        """Inverse of :meth:`encode_plan`.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): normalised sequences ``[*B, H, d]``.
+
+        Returns:
+            Tensor: raw plans ``[*B, H, d]``.
+        """
         plan = self.plan_normalizer.inverse(sequence.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
         return plan + history[..., -1:, :] if self.relative else plan
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """:meth:`decode_plan`."""
+        """Raw plans of normalised sequences: :meth:`decode_plan`.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): normalised sequences ``[*B, H, d]``.
+
+        Returns:
+            Tensor: raw plans ``[*B, H, d]``.
+        """
         return self.decode_plan(history, sequence)
 
     def plan(

@@ -137,5 +137,13 @@ class DiffusionPolicy(ConditionedDiffusion):
         return self.action_normalizer.inverse(sequence)
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """:meth:`decode_actions`; actions do not depend on where the state is."""
+        """Raw actions of normalised sequences: :meth:`decode_actions`, which do not depend on where the state is.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``; not looked at.
+            sequence (Tensor): normalised sequences ``[*B, H, act]``.
+
+        Returns:
+            Tensor: raw actions ``[*B, H, act]``.
+        """
         return self.decode_actions(sequence)

@@ -70,7 +70,18 @@ Denoise = Callable[[Tensor, Node], tuple[Tensor, Tensor]]
 
 
 def ddpm(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Ancestral sampling with the posterior's variance (Ho et al. 2020, eq. 7); step i adds ``draws[i]``."""
+    """Ancestral sampling with the posterior's variance (Ho et al. 2020, eq. 7); step i adds ``draws[i]``.
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): standard normal noise ``[*B, H, d]``, one per step.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     for index, (node, after) in enumerate(zip(nodes[:-1], nodes[1:], strict=True)):
         sample, _ = denoise(x, node)
         keep = (node.signal / after.signal) ** 2
@@ -82,7 +93,18 @@ def ddpm(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
 
 
 def ddim(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0)."""
+    """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0).
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): not looked at: the solver is deterministic.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     for node, after in zip(nodes[:-1], nodes[1:], strict=True):
         sample, epsilon = denoise(x, node)
         x = sample * after.signal + epsilon * after.noise
@@ -90,7 +112,18 @@ def ddim(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
 
 
 def dpm_solver_2m(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2)."""
+    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2).
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): not looked at: the solver is deterministic.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     previous, previous_step = None, 0.0
     for node, after in zip(nodes[:-1], nodes[1:], strict=True):
         sample, _ = denoise(x, node)
@@ -106,7 +139,18 @@ def dpm_solver_2m(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Seq
 
 
 def euler(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Straight steps along the velocity ``eps - x_0``."""
+    """Straight steps along the velocity ``eps - x_0``.
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): not looked at: the solver is deterministic.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     for node, after in zip(nodes[:-1], nodes[1:], strict=True):
         sample, epsilon = denoise(x, node)
         x = x + (epsilon - sample) * (after.noise - node.noise)
@@ -114,7 +158,18 @@ def euler(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Te
 
 
 def heun(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Trapezoidal steps: two network calls each, one in the last step (no velocity is defined at zero noise)."""
+    """Trapezoidal steps: two network calls each, one in the last step (no velocity is defined at zero noise).
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): not looked at: the solver is deterministic.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     for node, after in zip(nodes[:-1], nodes[1:], strict=True):
         sample, epsilon = denoise(x, node)
         velocity, step = epsilon - sample, after.noise - node.noise
@@ -159,8 +214,7 @@ class NoiseSchedule(nn.Module):
 
     Raises:
         ValueError: for an unknown schedule or prediction (the nearest name is suggested), and for ``"epsilon"`` on a
-        flow
-            path, whose start holds no signal, so that the plan cannot be computed from the noise.
+            flow path, whose start holds no signal, so that the plan cannot be computed from the noise.
 
     Examples:
         >>> import torch
@@ -200,7 +254,15 @@ class NoiseSchedule(nn.Module):
         return f"schedule={self.schedule!r}, prediction={self.prediction!r}, num_train_steps={self.num_train_steps}"
 
     def sample_time(self, like: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Draws training times, shape ``[*B]`` for ``like`` of shape ``[*B, H, d]``."""
+        """Draws training times.
+
+        Args:
+            like (Tensor): sequences ``[*B, H, d]``, for shape, type and device.
+            generator (torch.Generator, optional): source of the numbers.
+
+        Returns:
+            Tensor: ``[*B]`` in training steps.
+        """
         shape, options = like.shape[:-2], {"device": like.device, "generator": generator}
         if self.path == "flow":
             return (1 - torch.rand(shape, dtype=like.dtype, **options)) * self.num_train_steps  # never exactly zero
@@ -215,12 +277,30 @@ class NoiseSchedule(nn.Module):
         return self.signal[index].to(time.dtype), self.noise[index].to(time.dtype)
 
     def add_noise(self, sample: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """The noisy plan ``signal(t) x_0 + noise(t) eps``; plans ``[*B, H, d]``, time ``[*B]``."""
+        """The noisy plan ``signal(t) x_0 + noise(t) eps``.
+
+        Args:
+            sample (Tensor): clean plans ``x_0``, ``[*B, H, d]``.
+            noise (Tensor): noise ``eps``, ``[*B, H, d]``.
+            time (Tensor): ``[*B]`` in training steps.
+
+        Returns:
+            Tensor: ``[*B, H, d]``.
+        """
         signal, amplitude = self.levels(time)
         return signal[..., None, None] * sample + amplitude[..., None, None] * noise
 
     def target(self, sample: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """What the network should predict for the clean plan ``sample`` and the noise added to it."""
+        """What the network should predict: the noise, the clean plan or the velocity.
+
+        Args:
+            sample (Tensor): clean plans ``x_0``, ``[*B, H, d]``.
+            noise (Tensor): noise ``eps``, ``[*B, H, d]``.
+            time (Tensor): ``[*B]`` in training steps.
+
+        Returns:
+            Tensor: ``[*B, H, d]``.
+        """
         if self.prediction == "epsilon":
             return noise
         if self.prediction == "sample":

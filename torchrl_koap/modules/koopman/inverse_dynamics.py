@@ -99,7 +99,12 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
         self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
 
     def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
-        """Renames the entries read and written (:meth:`InverseDynamics.set_keys`)."""
+        """Renames the entries read and written.
+
+        Keyword Args:
+            state (NestedKey, optional): new entry of the window of raw states.
+            action (NestedKey, optional): new entry of the raw actions.
+        """
         if state is not None:
             self.module[0].in_keys = [state]
         if action is not None:
@@ -116,7 +121,15 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
         return self.lifting.encode(self.normalize_state(state))
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Latent actions ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
+        """Latent actions of a window of raw states.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), m]``.
+        """
         return self.latent_action.infer(self.latent_action.gather(self.normalize_state(state), frames))
 
     def decode(self, latent_action: Tensor) -> Tensor:
@@ -124,7 +137,15 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
         return self.raw_action(self.action_decoder.linear(latent_action))
 
     def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """``K z_t + u_t``, the prediction of ``z_{t+1}``."""
+        """``K z_t + u_t``, the prediction of ``z_{t+1}``.
+
+        Args:
+            lifted (Tensor): lifted states ``z_t``, ``[*B, T, m]``.
+            latent_action (Tensor): latent actions ``u_t``, ``[*B, T, input_dim]`` of the operator.
+
+        Returns:
+            Tensor: ``[*B, T, m]``.
+        """
         return self.operator.step(lifted, latent_action)
 
     def rollout_latent(self, lifted: Tensor, latent_action: Tensor) -> Tensor:

@@ -35,6 +35,17 @@ class LatentActionModule(FrameGatherer, TensorDictModuleBase):
         clamped (bool): let frames whose look-ahead is cut at the window's end count in the losses.
         in_key (NestedKey): window of states ``[*B, T, d]``. Defaults to ``"state"``.
         out_key (NestedKey): latent actions ``[*B, T, m]``. Defaults to ``"latent_action"``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules.koopman.latent_action import LatentActionModule
+        >>> class Difference(LatentActionModule):  # u_t = x_{t+2} - x_t
+        ...     def infer(self, frames):  # [*B, T, F, d]
+        ...         return frames[..., -1, :] - frames[..., 0, :]
+        >>> network = Difference(1, 1, num_past=0, look_ahead=2)
+        >>> network(TensorDict({"state": torch.arange(4.0)[:, None]}))["latent_action"].flatten().tolist()
+        [2.0, 2.0, 1.0, 0.0]
     """
 
     def __init__(

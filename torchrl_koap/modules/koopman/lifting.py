@@ -219,7 +219,15 @@ class KoopmanOperator(TensorDictModuleBase):
         return torch.einsum("nij,...nj->...ni", weight, blocks).flatten(-2)
 
     def step(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """One step ``K z + u`` (or ``K z + B u``) for lifted states and latent actions ``[*B, T, .]``."""
+        """One step ``K z + u``, or ``K z + B u`` where the operator has an input matrix.
+
+        Args:
+            lifted (Tensor): lifted states ``z``, ``[*B, T, m]``.
+            latent_action (Tensor): latent actions ``u``, ``[*B, T, input_dim]``.
+
+        Returns:
+            Tensor: lifted states one step later, ``[*B, T, m]``.
+        """
         return self.propagate(lifted) + (latent_action if self.input is None else latent_action @ self.input.mT)
 
     def forward(self, tensordict):

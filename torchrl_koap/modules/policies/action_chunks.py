@@ -83,11 +83,27 @@ class ChunkedPolicy(RecedingHorizonPolicy):
         )
 
     def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Samples the actions of the next steps ``[*B, interval, act]``, see the base class."""
+        """Samples the actions of the next steps.
+
+        Args:
+            observations (Tensor): ``[*B, history, obs]``, raw units.
+            noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
+
+        Returns:
+            Tensor: ``[*B, replan_interval, act]``.
+        """
         return self.make_chunk(self.state_of(observations), noise)
 
     def make_chunk(self, history: Tensor, noise: Tensor | None) -> Tensor:
-        """Samples actions and keeps those that are executed, ``[*B, interval, act]``."""
+        """Samples actions and keeps those that are executed.
+
+        Args:
+            history (Tensor): observed states ``[*B, history, d]``, raw units.
+            noise (Tensor, optional): ``[*B, *planner.noise_shape]``, standard normal. Default: random.
+
+        Returns:
+            Tensor: ``[*B, replan_interval, act]``.
+        """
         state = history[..., -self.planner.history :, :]
         if self.controller_columns is not None:
             state = state[..., self.controller_columns]

@@ -62,6 +62,13 @@ class Exportable:
         module (nn.Module): takes and returns tensors.
         inputs (dict): an example of every input, by name.
         output (str): name of the output.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.policies.export import Exportable
+        >>> part = Exportable(torch.nn.Linear(2, 1), {"states": torch.zeros(1, 2)}, "actions")
+        >>> part.module(*part.inputs.values()).shape
+        torch.Size([1, 1])
     """
 
     module: nn.Module

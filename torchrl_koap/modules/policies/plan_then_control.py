@@ -110,17 +110,42 @@ class PlanThenControl(RecedingHorizonPolicy):
         self.controller = controller
 
     def make_chunk(self, history: Tensor, noise: Tensor | None) -> Tensor:
-        """Plans, and gives what remains of the plan in each of the next steps, or decodes their actions."""
+        """Plans, and gives what remains of the plan in each of the next steps, or decodes their actions.
+
+        Args:
+            history (Tensor): observed states ``[*B, history, d]``, raw units.
+            noise (Tensor, optional): ``[*B, *planner.noise_shape]``, standard normal. Default: random.
+
+        Returns:
+            Tensor: ``[*B, replan_interval, H, d]`` with feedback, ``[*B, replan_interval, act]`` in open loop.
+        """
         plan = self.planner.plan(history[..., -self.planner.history :, :], noise)
         return self._remaining_plans(plan) if self.execution == "feedback" else self._decode_chunk(history, plan)
 
     def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Plans and decodes the actions of the next steps ``[*B, interval, act]``, see the base class."""
+        """Plans and decodes the actions of the next steps.
+
+        Args:
+            observations (Tensor): ``[*B, history, obs]``, raw units.
+            noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
+
+        Returns:
+            Tensor: ``[*B, replan_interval, act]``.
+        """
         history = self.state_of(observations)
         return self._decode_chunk(history, self.planner.plan(history[..., -self.planner.history :, :], noise))
 
     def act(self, history: Tensor, cached: Tensor) -> Tensor:
-        """Decodes the action from what remains of the plan, or hands out the one decoded before."""
+        """Decodes the action from what remains of the plan, or hands out the one decoded before.
+
+        Args:
+            history (Tensor): observed states ``[B, history, d]``, raw units.
+            cached (Tensor): entry of the chunk that is in force: what remains of the plan ``[B, H, d]``, or the action
+                ``[B, act]``.
+
+        Returns:
+            Tensor: ``[B, act]``, raw units.
+        """
         return self._actions(history, cached)[..., self.history - 1, :] if self.execution == "feedback" else cached
 
     def _actions(self, history: Tensor, plan: Tensor) -> Tensor:

@@ -71,6 +71,14 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         ValueError: for a history shorter than the planner's, or an interval longer than the horizon. At the first call
             for a history of another length.
         KeyError: at the first call, if the environment lacks :func:`policy_transforms`.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import ChunkedPolicy, DiffusionPolicy, TemporalUnet  # a subclass
+        >>> sampler = DiffusionPolicy(TemporalUnet(3, 4), state_dim=2, action_dim=3)
+        >>> policy = ChunkedPolicy(sampler, state_columns=(2, 3), history=2, replan_interval=4)
+        >>> policy.plan_and_decode(torch.zeros(5, 2, 4), torch.randn(5, *sampler.noise_shape)).shape
+        torch.Size([5, 4, 3])
     """
 
     def __init__(
@@ -112,7 +120,15 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         )
 
     def make_chunk(self, history: Tensor, noise: Tensor | None) -> Tensor:
-        """What is in force in each of the next steps ``[B, interval, ...]``, for states ``[B, history, d]``."""
+        """What is in force in each of the next steps; a subclass says how it is made.
+
+        Args:
+            history (Tensor): observed states ``[*B, history, d]``, raw units.
+            noise (Tensor, optional): ``[*B, *planner.noise_shape]``, standard normal. Default: random.
+
+        Returns:
+            Tensor: ``[*B, replan_interval, ...]``, an entry per step.
+        """
         raise NotImplementedError
 
     def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
@@ -130,7 +146,15 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         raise NotImplementedError
 
     def act(self, history: Tensor, cached: Tensor) -> Tensor:
-        """The action ``[B, act]`` in states ``[B, history, d]`` under the entry of the chunk that is in force."""
+        """The action under the entry of the chunk that is in force; by default that entry itself.
+
+        Args:
+            history (Tensor): observed states ``[B, history, d]``, raw units.
+            cached (Tensor): entry of the chunk that is in force: ``[B, ...]``.
+
+        Returns:
+            Tensor: ``[B, act]``, raw units.
+        """
         return cached
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
