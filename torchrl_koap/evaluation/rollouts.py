@@ -39,6 +39,8 @@ def make_policy(
     joining: float = 0.8,
     controller_columns: Sequence[int] | None = None,
     gripper: tuple[int, int] | None = None,
+    candidates: int = 1,
+    choice: str = "quarter",
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two."""
     return PlanThenControl(
@@ -51,6 +53,8 @@ def make_policy(
         joining=joining,
         controller_columns=controller_columns,
         gripper=gripper,
+        candidates=candidates,
+        choice=choice,
     )
 
 
@@ -102,7 +106,8 @@ def roll_out(
         if futures is not None:
             noise = RecordedFutures(futures[begin : begin + size])
         else:
-            draws = (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
+            draws = (policy.candidates,) if getattr(policy, "candidates", 1) > 1 else ()
+            draws += (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
             noise = EpisodeNoise(part, (*draws, *planner.sample_shape), num_steps=max_steps)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:

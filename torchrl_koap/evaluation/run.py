@@ -47,6 +47,9 @@ class Eval:
         solver_steps: another number of solver steps.
         replan_interval: control steps per plan.
         joining: how slowly plans are joined to the present state; 0 turns it off.
+        candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
+            the one in force (default: as the run says, else 1).
+        choice: rule of that choice: "quarter", "half", "typical" or "nearest".
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
         task: refuse a run of another task than this.
@@ -65,6 +68,8 @@ class Eval:
     solver_steps: int | None = None
     replan_interval: int = REPLAN_INTERVAL
     joining: float = 0.8
+    candidates: int | None = None
+    choice: str = "quarter"
     batch_size: int | None = None
     contexts_file: Path | None = None
     task: str | None = None
@@ -147,12 +152,17 @@ def run_eval(options: Eval) -> dict[str, Any]:
         sampler.solver = options.solver
     if options.solver_steps is not None:
         sampler.num_steps = options.solver_steps
+    candidates = options.candidates
+    if candidates is None:
+        candidates = run.read_json("config.json").get("candidates") or 1
     if planner is None:
         policy = ChunkedPolicy(
             controller,
             state_columns=task.state_of,
             history=controller.history,
             replan_interval=options.replan_interval,
+            candidates=candidates,
+            choice=options.choice,
         )
     else:
         policy = make_policy(
@@ -164,6 +174,8 @@ def run_eval(options: Eval) -> dict[str, Any]:
             joining=options.joining,
             controller_columns=columns_of(run, task),
             gripper=task.gripper,
+            candidates=candidates,
+            choice=options.choice,
         )
     policy = policy.to(options.device)
     seeds = list(range(options.seed, options.seed + options.episodes))
@@ -194,6 +206,7 @@ def run_eval(options: Eval) -> dict[str, Any]:
         "solver_steps": sampler.num_steps,
         "replan_interval": options.replan_interval,
         "joining": options.joining,
+        "candidates": candidates,
         "episode": rows,
     }
     rollouts = rollouts_to_tensors(

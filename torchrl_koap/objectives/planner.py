@@ -34,6 +34,8 @@ class PlannerLoss(LossModule):
         create_target_params (bool): keep an averaged copy of the weights in ``target_planner_params``, to be moved by
             :class:`torchrl.objectives.SoftUpdate` and used for planning. Defaults to True.
         reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, d]``. Defaults to ``"mean"``.
+        first_steps_weight (float): weight of the first planned step against that of the last; it falls geometrically
+            in between, and the mean weight is 1. Defaults to 1.
 
     Raises:
         KeyError: if an entry is missing.
@@ -91,11 +93,19 @@ class PlannerLoss(LossModule):
         window: bool = True,
         create_target_params: bool = True,
         reduction: Literal["none", "mean", "sum"] | None = None,
+        first_steps_weight: float = 1.0,
     ):
         super().__init__()
         reduction = "mean" if reduction is None else reduction
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
+        if first_steps_weight <= 0:
+            raise ValueError(f"first_steps_weight must be > 0, got {first_steps_weight}")
+        self.step_weights = None
+        if first_steps_weight != 1:
+            share = torch.linspace(1, 0, planner.horizon)[:, None]
+            weights = first_steps_weight**share  # [H, 1]
+            self.step_weights = weights / weights.mean()
         self._in_keys = None
         self.window, self.reduction = window, reduction
         self.convert_to_functional(planner, "planner", create_target_params=create_target_params)
@@ -140,6 +150,8 @@ class PlannerLoss(LossModule):
                 sample = self.planner.encode_plan(history, plan)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
             error = self.planner.denoising_error(condition, sample, noise, time)  # [*B, H, d]
+        if self.step_weights is not None:
+            error = error * self.step_weights.to(error)
 
         if mask is None:
             loss = self._reduce_loss(error)

@@ -45,8 +45,17 @@ class Train:
         controller_batch_size: windows per controller update.
         planner_learning_rate: peak learning rate of the planner.
         controller_learning_rate: peak learning rate of the controller.
-        denoiser: "unet", "mlp", "transformer" or "released" (11.9 M parameters).
+        denoiser: "unet", "mlp", "film" (an mlp that the condition also scales and shifts), "transformer" or "released"
+            (11.9 M parameters).
         channels: widths of the U-Net's levels (default: the task's).
+        denoiser_width: hidden width of "mlp" and "transformer" (default: 256 and 64).
+        denoiser_depth: their number of residual layers (default: 3).
+        condition_octaves: octaves of the Fourier features of what was observed (default: 4).
+        dropout: share of the hidden units of "mlp" dropped in training (default: 0).
+        planner_weight_decay: decoupled weight decay of the planner (default: 1e-4).
+        first_steps_weight: weight of the first planned step in the planner's loss against the last one's (default: 1).
+        precision: "float32", or "bfloat16" for the matrix products of the planner's training: several times quicker
+            where the processor has them (default: float32).
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
         relative: plan displacements from the current state instead of states (default: the task's).
@@ -58,6 +67,7 @@ class Train:
         exchange: exchange objects that are alike.
         solver: solver used at evaluation unless told otherwise.
         solver_steps: its number of steps.
+        candidates: plans sampled whenever one is due at evaluation, unless told otherwise there (default: 1).
         planner_from: run directory whose planner is taken over instead of training one.
         episodes: number of scripted demonstrations (default: that of the task).
         threads: torch threads.
@@ -90,6 +100,13 @@ class Train:
     controller_learning_rate: float = 1e-3
     denoiser: str = "unet"
     channels: tuple[int, ...] | None = None
+    denoiser_width: int | None = None
+    denoiser_depth: int | None = None
+    condition_octaves: int | None = None
+    dropout: float | None = None
+    planner_weight_decay: float | None = None
+    first_steps_weight: float | None = None
+    precision: str | None = None
     schedule: str = "squared_cosine"
     prediction: str = "sample"
     relative: bool | None = None
@@ -101,6 +118,7 @@ class Train:
     exchange: bool = True
     solver: str = "dpm++2m"
     solver_steps: int = 10
+    candidates: int | None = None
     planner_from: Path | None = None
     episodes: int | None = None
     threads: int = 1
@@ -198,6 +216,14 @@ def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
         "solver_steps": options.solver_steps,
         "clip": 1.2 if options.prediction == "sample" else 1.0,
     }
+    sizes = {
+        "width": options.denoiser_width,
+        "depth": options.denoiser_depth,
+        "frequencies": options.condition_octaves,
+        "dropout": options.dropout,
+    }
+    # what was left out is left out here too, so that a run of before can be resumed
+    config["planner"] |= {name: value for name, value in sizes.items() if value is not None}
     if options.planner_from is not None:
         config["planner"] = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     method = method_of(options)

@@ -13,6 +13,7 @@ from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_koap.keys import ACTION
 from torchrl_koap.modules.diffusion.policy import ACTION_CHUNK, DiffusionPolicy
+from torchrl_koap.modules.policies.candidates import check_candidates, sample_coherent
 from torchrl_koap.modules.policies.plan_then_control import NOISE, OBSERVATION_HISTORY
 
 STATE_HISTORY = "state_history"
@@ -43,6 +44,9 @@ class ChunkedPolicy(TensorDictModuleBase):
         replan_interval (int): steps executed per chunk. Defaults to ``4``.
         controller_columns (sequence of int, optional): columns of the state that the Diffusion Policy reads: its mask.
             Default: all.
+        candidates (int): chunks sampled whenever one is due, of which one that goes on with the chunk in force is taken
+            (:mod:`torchrl_koap.modules.policies.candidates`). Defaults to ``1``.
+        choice (str): the rule by which it is taken. Defaults to ``"quarter"``.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -71,6 +75,8 @@ class ChunkedPolicy(TensorDictModuleBase):
         history: int,
         replan_interval: int = 4,
         controller_columns: Sequence[int] | None = None,
+        candidates: int = 1,
+        choice: str = "quarter",
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -88,10 +94,14 @@ class ChunkedPolicy(TensorDictModuleBase):
             self._state_of = self._select
         self.in_keys, self.out_keys = [history_key, "is_init"], [action_key, ACTION_CHUNK]
         self.history, self.replan_interval = history, replan_interval
-        self.planner = planner
+        check_candidates(candidates, choice)
+        self.planner, self.candidates = planner, candidates
+        # the rest of a chunk is kept only where the next one is compared with it
+        kept = replan_interval if candidates == 1 else planner.horizon
         self.receding = MultiStepActorWrapper(
-            _Chunk(planner, replan_interval),
-            n_steps=replan_interval,
+            _Chunk(planner, replan_interval, kept, candidates, choice),
+            n_steps=kept,
+            replan_interval=replan_interval,
             action_keys=[action_key],
             chunk_keys=[ACTION_CHUNK],
             init_key="is_init",
@@ -119,11 +129,26 @@ class ChunkedPolicy(TensorDictModuleBase):
 class _Chunk(TensorDictModuleBase):
     """The part that runs only when a new chunk is due."""
 
-    def __init__(self, planner: DiffusionPolicy, num_steps: int):
+    def __init__(self, planner: DiffusionPolicy, interval: int, kept: int, candidates: int, choice: str):
         super().__init__()
-        self.planner, self.num_steps = planner, num_steps
+        self.planner, self.interval, self.kept = planner, interval, kept
+        self.candidates, self.choice = candidates, choice
         self.in_keys, self.out_keys = [STATE_HISTORY], [ACTION_CHUNK]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        actions = self.planner.sample(tensordict.get(STATE_HISTORY), tensordict.get(NOISE, None))
-        return tensordict.set(ACTION_CHUNK, actions[..., : self.num_steps, :])
+        history, noise = tensordict.get(STATE_HISTORY), tensordict.get(NOISE, None)
+        if self.candidates == 1:
+            actions = self.planner.sample(history, noise)
+        else:
+            chunk = tensordict.get(ACTION_CHUNK, None)
+            actions = sample_coherent(
+                self.planner.sample,
+                lambda _, actions: self.planner.encode_actions(actions),
+                history,
+                noise,
+                number=self.candidates,
+                rule=self.choice,
+                in_force=None if chunk is None or self.interval == self.kept else chunk[..., self.interval :, :],
+                fresh=tensordict.get("is_init").squeeze(-1),
+            )
+        return tensordict.set(ACTION_CHUNK, actions[..., : self.kept, :])

@@ -15,6 +15,7 @@ from torchrl.modules import MultiStepActorWrapper
 from torchrl_koap.keys import ACTION, OBSERVATION, PLAN
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.diffusion.planner import StatePlanner
+from torchrl_koap.modules.policies.candidates import check_candidates, sample_coherent
 from torchrl_koap.tasks.gripper import PLANNED_OPEN_ABOVE, gripper_number
 
 EXECUTIONS = ("feedback", "open_loop")
@@ -75,12 +76,15 @@ class PlanThenControl(TensorDictModuleBase):
             Default: all.
         gripper (tuple of int, optional): action entry and state column of a gripper whose number is read off the
             planned widths (:mod:`torchrl_koap.tasks.gripper`).
+        candidates (int): plans sampled whenever one is due, of which one that goes on with the plan in force is taken
+            (:mod:`torchrl_koap.modules.policies.candidates`). Defaults to ``1``.
+        choice (str): the rule by which it is taken. Defaults to ``"quarter"``.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
     Raises:
-        ValueError: for an unknown execution, a history shorter than the planner's, or an interval longer than the
-            horizon. At the first call for a history of another length.
+        ValueError: for an unknown execution or rule, several candidates in open loop, a history shorter than the
+            planner's, or an interval longer than the horizon. At the first call for a history of another length.
         KeyError: at the first call, if the environment lacks :func:`policy_transforms`.
 
     Examples:
@@ -108,6 +112,8 @@ class PlanThenControl(TensorDictModuleBase):
         joining: float = 0.8,
         controller_columns: Sequence[int] | None = None,
         gripper: tuple[int, int] | None = None,
+        candidates: int = 1,
+        choice: str = "quarter",
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -119,7 +125,10 @@ class PlanThenControl(TensorDictModuleBase):
             raise ValueError(f"replan_interval must be in 1..{planner.horizon} (the horizon), got {replan_interval}")
         if not 0 <= joining < 1:
             raise ValueError(f"joining must be in [0, 1), got {joining}")
-        self.joining = joining
+        check_candidates(candidates, choice)
+        if candidates > 1 and execution != "feedback":
+            raise ValueError(f"several candidates need execution 'feedback', which keeps its plan; got {execution!r}")
+        self.joining, self.candidates = joining, candidates
         columns = None if controller_columns is None else torch.as_tensor(controller_columns)
         self.register_buffer("controller_columns", columns, persistent=False)
         self.gripper = gripper
@@ -136,7 +145,13 @@ class PlanThenControl(TensorDictModuleBase):
         chunk = "remaining_plan_chunk" if execution == "feedback" else "action_chunk"
         self.out_keys = [action_key, chunk]
         self.receding = MultiStepActorWrapper(
-            _Chunk(planner, self._remaining_plans if execution == "feedback" else self._decode_chunk, chunk),
+            _Chunk(
+                planner,
+                self._remaining_plans if execution == "feedback" else self._decode_chunk,
+                chunk,
+                candidates=candidates,
+                choice=choice,
+            ),
             n_steps=replan_interval,
             action_keys=cached,
             chunk_keys=[chunk],
@@ -221,14 +236,30 @@ def join_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
 class _Chunk(TensorDictModuleBase):
     """The part that runs only when a new plan is due."""
 
-    def __init__(self, planner: StatePlanner, make_chunk, chunk_key: str):
+    def __init__(self, planner: StatePlanner, make_chunk, chunk_key: str, *, candidates: int, choice: str):
         super().__init__()
         self.planner, self.make_chunk = planner, make_chunk
+        self.candidates, self.choice = candidates, choice
         self.in_keys, self.out_keys = ["state_history"], [PLAN, chunk_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         history = tensordict.get("state_history")
-        plan = self.planner.plan(history[..., -self.planner.history :, :], tensordict.get(NOISE, None))
+        seen, noise = history[..., -self.planner.history :, :], tensordict.get(NOISE, None)
+        if self.candidates == 1:
+            plan = self.planner.plan(seen, noise)
+        else:
+            chunk = tensordict.get(self.out_keys[1], None)  # [*B, interval, H, d], the plan as it was and shortened
+            interval = 0 if chunk is None else chunk.shape[-3]
+            plan = sample_coherent(
+                self.planner.plan,
+                self.planner.encode_plan,
+                seen,
+                noise,
+                number=self.candidates,
+                rule=self.choice,
+                in_force=None if chunk is None or interval == chunk.shape[-2] else chunk[..., 0, interval:, :],
+                fresh=tensordict.get("is_init").squeeze(-1),
+            )
         tensordict.set(PLAN, plan)
         return tensordict.set(self.out_keys[1], self.make_chunk(history, plan))
 

@@ -1,0 +1,148 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Plans that keep their word: several are sampled, and one that goes on with the plan in force is taken.
+
+A generative planner draws a mode anew at every plan. Between two gaps of equal merit a robot can so be sent towards one
+and, a few steps later, towards the other. Sampling several candidates and preferring those near the plan in force
+(Liu et al. 2024, "Bidirectional Decoding", backward coherence) avoids that. To take the nearest of many is too much
+faith in the old plan, though: it hardly reacts to what was observed since, and the more so the more candidates there
+are. The rules other than ``"nearest"`` converge to a distribution of plans as the number of candidates grows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchrl_koap.lookup import lookup
+
+MOST_CANDIDATES = 256
+
+
+def nearest(apart: Tensor, among: Tensor) -> Tensor:
+    """The candidate nearest to the plan in force."""
+    return apart.argmin(-1)
+
+
+def quarter(apart: Tensor, among: Tensor) -> Tensor:
+    """Any one of the nearest quarter: the first that was drawn."""
+    kept = _nearest_share(apart, 0.25)
+    return kept.int().argmax(-1)
+
+
+def half(apart: Tensor, among: Tensor) -> Tensor:
+    """Any one of the nearer half: the first that was drawn."""
+    return _nearest_share(apart, 0.5).int().argmax(-1)
+
+
+def typical(apart: Tensor, among: Tensor) -> Tensor:
+    """Of the nearer half the one in its middle, with the least mean distance to the rest of that half."""
+    kept = _nearest_share(apart, 0.5)
+    total = (among * kept.unsqueeze(-2)).sum(-1)
+    return torch.where(kept, total, torch.inf).argmin(-1)
+
+
+RULES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "nearest": nearest,
+    "quarter": quarter,
+    "half": half,
+    "typical": typical,
+}
+
+
+def _nearest_share(apart: Tensor, share: float) -> Tensor:
+    """Which candidates are among the nearest share, at least one, bool ``[*B, N]``."""
+    number = max(1, round(share * apart.shape[-1]))
+    last = apart.kthvalue(number, -1, keepdim=True).values
+    return apart <= last
+
+
+def check_candidates(number: int, rule: str) -> None:
+    """Raises a ``ValueError`` for an unknown rule or a number of candidates out of range."""
+    lookup(RULES, rule, "rule of choice")
+    if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= MOST_CANDIDATES:
+        raise ValueError(f"candidates must be an integer in 1..{MOST_CANDIDATES}, got {number!r}")
+
+
+def choose(candidates: Tensor, in_force: Tensor | None, fresh: Tensor | None, rule: str) -> Tensor:
+    """Chooses one of several plans.
+
+    Args:
+        candidates (Tensor): plans ``[*B, N, H, d]``, every entry in units of its own spread.
+        in_force (Tensor, optional): what is left of the plan in force, ``[*B, K, d]`` with ``K <= H``, in the same
+            units. Default: there is none, and the first candidate is taken.
+        fresh (Tensor, optional): where an episode begins, bool ``[*B]``: the first candidate is taken there too, so
+            that the choice of a mode stays the planner's.
+        rule (str): a name in ``RULES``.
+
+    Returns:
+        Tensor: index of the chosen candidate, ``[*B]``.
+
+    Raises:
+        ValueError: for an unknown rule, or a plan in force of another shape.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.policies.candidates import choose
+        >>> plans = torch.tensor([[0.0, 0.0], [5.0, 9.0], [5.0, 6.0], [1.0, 1.0]]).unsqueeze(-1)
+        >>> choose(plans, torch.tensor([[5.0]]), None, "half").item()
+        1
+    """
+    choice = lookup(RULES, rule, "rule of choice")
+    batch, number = candidates.shape[:-3], candidates.shape[-3]
+    first = torch.zeros(batch, dtype=torch.long, device=candidates.device)
+    if in_force is None or number == 1:
+        return first
+    length = in_force.shape[-2]
+    if in_force.shape != (*batch, length, candidates.shape[-1]) or not 1 <= length <= candidates.shape[-2]:
+        raise ValueError(
+            f"the plan in force must be {[*batch, 'K', candidates.shape[-1]]} with K in 1..{candidates.shape[-2]},"
+            f" got {list(in_force.shape)}"
+        )
+    apart = (candidates[..., :length, :] - in_force.unsqueeze(-3)).square().mean((-2, -1))  # [*B, N]
+    flat = candidates.flatten(-2)
+    chosen = choice(apart, torch.cdist(flat, flat))
+    return chosen if fresh is None else torch.where(fresh, first, chosen)
+
+
+def sample_coherent(
+    sample: Callable[[Tensor, Tensor | None], Tensor],
+    encode: Callable[[Tensor, Tensor], Tensor],
+    history: Tensor,
+    noise: Tensor | None,
+    *,
+    number: int,
+    rule: str,
+    in_force: Tensor | None,
+    fresh: Tensor | None,
+) -> Tensor:
+    """Samples plans (or action chunks) and returns the chosen one of each environment.
+
+    Args:
+        sample (callable): ``sample(history [*B, h, d], noise) -> [*B, H, w]``.
+        encode (callable): ``encode(history, plan [*B, H, w])`` to units of the entries' spread.
+        history (Tensor): observed states ``[*B, h, d]``.
+        noise (Tensor, optional): start noise ``[*B, number, ...]``; without that axis if ``number`` is 1.
+
+    Keyword Args:
+        number (int): candidates.
+        rule (str): a name in ``RULES``.
+        in_force (Tensor, optional): what is left of the plan in force ``[*B, K, w]``.
+        fresh (Tensor, optional): where an episode begins, bool ``[*B]``.
+
+    Returns:
+        Tensor: ``[*B, H, w]``.
+    """
+    if number == 1:
+        return sample(history, noise)
+    repeated = history.unsqueeze(-3).expand(*history.shape[:-2], number, *history.shape[-2:])
+    plans = sample(repeated, noise)  # [*B, N, H, w]
+    encoded = encode(repeated, plans)
+    if in_force is not None:
+        length, surplus = in_force.shape[-2], plans.shape[-2] - in_force.shape[-2]
+        padded = torch.cat([in_force, in_force[..., -1:, :].expand(*in_force.shape[:-2], surplus, -1)], -2)
+        in_force = encode(history, padded)[..., :length, :]
+    index = choose(encoded, in_force, fresh, rule)
+    index = index[..., None, None, None].expand(*index.shape, 1, *plans.shape[-2:])
+    return plans.gather(-3, index).squeeze(-3)
