@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from torchrl_koap.data import save_ted
 from torchrl_koap.envs.experts.demonstrations import (
+    BATCH_SIZE,
     RecordingReport,
     episodes_to_ted,
     record_episodes,
@@ -28,6 +29,7 @@ class Demos:
         episodes: number of demonstrations, spread evenly over the modes (default: that of the task).
         seed: seed of the players' variation.
         threads: simulator threads.
+        batch_size: episodes played at once; the demonstrations do not depend on it.
     """
 
     out: Path
@@ -35,6 +37,7 @@ class Demos:
     episodes: int | None = None
     seed: int = 0
     threads: int = 2
+    batch_size: int = BATCH_SIZE
 
 
 def run_demos(options: Demos) -> RecordingReport:
@@ -55,6 +58,7 @@ def run_demos(options: Demos) -> RecordingReport:
             options.seed,
             options.threads,
             lambda recorded, wanted: bar.update(recorded - bar.n),
+            batch_size=options.batch_size,
         )
     data = episodes_to_ted(raw, task.name)
     save_ted(data, options.out / "ted", task=task.source, notes={"seed": options.seed, "modes": list(report.modes)})

@@ -30,6 +30,7 @@ from torchrl_koap.training.builders import (
     set_up_torch,
 )
 from torchrl_koap.training.checkpoints import load_weights, save_tensors
+from torchrl_koap.training.pretrained import PREFIX, copy_run, find_run
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 
@@ -38,7 +39,8 @@ class Eval:
     """Evaluate a trained run in closed loop and write its report.
 
     Attributes:
-        run: run directory of `koap train`.
+        run: run directory of `koap train`, or pretrained:NAME for a trained policy of the repository.
+        out: folder to evaluate in instead of the run's own; what the run is made of is copied there.
         episodes: number of rollouts; tasks with contexts take the fixed ones of the evaluation table in turn.
         rollouts_per_context: rollouts in each context; from 2 on the entropy of the modes per context is known.
         seed: seed of the first rollout; the others count on from it.
@@ -60,6 +62,7 @@ class Eval:
     """
 
     run: tyro.conf.Positional[Path]
+    out: Path | None = None
     episodes: int = 60
     rollouts_per_context: int = 1
     seed: int = 100
@@ -145,7 +148,12 @@ def run_eval(options: Eval) -> dict[str, Any]:
             raise ValueError(f"{name} must be >= 1, got {value}")
     lookup(EXECUTIONS, options.execution, "execution")
     set_up_torch(options.threads, options.device)
-    run = RunDirectory(options.run)
+    source = find_run(options.run)
+    if options.out is None and str(options.run).startswith(PREFIX):
+        raise ValueError(f"{options.run} is evaluated in a folder of your own: name it with --out")
+    if options.task is not None:  # before anything is copied
+        load_run(RunDirectory(source), options.task)
+    run = RunDirectory(source if options.out is None else copy_run(source, options.out))
     task, planner, controller = load_run(run, options.task)
     sampler = controller if planner is None else planner
     if options.solver is not None:

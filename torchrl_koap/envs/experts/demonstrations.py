@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recording demonstrations: scripted experts play the library's own environments, all episodes in one batch.
+"""Recording demonstrations: scripted experts play the library's own environments, a batch of episodes at a time.
 
 An attempt that touches what it must not, takes another mode than asked for, does not finish, or is unlike any human one
 (all but touches, takes too long) is played again with other random draws, after four attempts from another context;
@@ -24,6 +24,7 @@ from torchrl_koap.envs.experts.recording import FAULTS, RECIPES, Recipe, play
 from torchrl_koap.tasks import get_task
 
 MAX_ATTEMPTS = 20
+BATCH_SIZE = 50  # episodes that are played at once: few enough that the first are over within seconds
 _PER_CONTEXT = 4  # attempts before an episode gets another context
 _CONTEXT_STREAM = 1  # keeps the draws of contexts apart from those of the players
 
@@ -80,6 +81,7 @@ def record_demonstrations(
     progress: Callable[[int, int], None] | None = None,
     *,
     dtype: torch.dtype = torch.float32,
+    batch_size: int = BATCH_SIZE,
 ) -> tuple[TensorDict, RecordingReport]:
     """Records demonstrations of a scripted expert as flat TED data, every action labelled.
 
@@ -93,6 +95,7 @@ def record_demonstrations(
         num_threads (int): threads that advance the physics.
         progress (callable, optional): called with the number of demonstrations recorded and wanted.
         dtype (torch.dtype): floating type of the entries; everything is computed in float64.
+        batch_size (int): episodes played at once. The demonstrations do not depend on it.
 
     Returns:
         tuple: flat data ``[N]`` in the storage layout of :mod:`torchrl_koap.keys`, and the :class:`RecordingReport`.
@@ -107,7 +110,7 @@ def record_demonstrations(
         >>> data["action"].shape[1], data["has_action"].all().item(), len(report.modes)
         (2, True, 3)
     """
-    raw, report = record_episodes(task, episodes, seed, num_threads, progress)
+    raw, report = record_episodes(task, episodes, seed, num_threads, progress, batch_size=batch_size)
     return episodes_to_ted(raw, task, dtype=dtype), report
 
 
@@ -117,6 +120,8 @@ def record_episodes(
     seed: int = 0,
     num_threads: int = 2,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    batch_size: int = BATCH_SIZE,
 ) -> tuple[list[RawEpisode], RecordingReport]:
     """Records demonstrations with everything D3IL's recorder logs; arguments as in :func:`record_demonstrations`.
 
@@ -124,10 +129,17 @@ def record_episodes(
         tuple: the episodes, for :func:`episodes_to_ted` and :func:`write_raw_episodes`, and the report.
     """
     name = get_task(task).source
-    for option, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_threads", num_threads, 1)):
+    limits = (
+        ("episodes", episodes, 1),
+        ("seed", seed, 0),
+        ("num_threads", num_threads, 1),
+        ("batch_size", batch_size, 1),
+    )
+    for option, value, least in limits:
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{option} must be an integer of at least {least}, got {value!r}")
-    return _record(name, RECIPES[name](), episodes, seed, num_threads, progress or (lambda done, total: None))
+    progress = progress or (lambda done, total: None)
+    return _record(name, RECIPES[name](), episodes, seed, num_threads, progress, batch_size)
 
 
 def episodes_to_ted(raw: Sequence[RawEpisode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:
@@ -190,35 +202,52 @@ def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
 
 
 def _record(
-    task: str, recipe: Recipe, episodes: int, seed: int, num_threads: int, progress: Callable[[int, int], None]
+    task: str,
+    recipe: Recipe,
+    episodes: int,
+    seed: int,
+    num_threads: int,
+    progress: Callable[[int, int], None],
+    batch_size: int,
 ) -> tuple[list[RawEpisode], RecordingReport]:
     start = time.perf_counter()
     modes = balanced_modes(episodes, recipe.num_modes, seed)
-    env = recipe.make_env(episodes, num_threads=num_threads, dtype=torch.float64)
+    size = min(batch_size, episodes)
+    env = recipe.make_env(size, num_threads=num_threads, dtype=torch.float64)
     raw: list[RawEpisode | None] = [None] * episodes
     attempts = [0] * episodes
     failures = dict.fromkeys(FAULTS, 0)
+    shown = 0
+
+    def show(over: int) -> None:  # attempts that turn out bad are played again: the bar waits for them
+        nonlocal shown
+        shown = max(shown, over)
+        progress(shown, episodes)
+
     try:
         for attempt in range(MAX_ATTEMPTS):
+            # drawn for all episodes, so that none depends on how many are played at once
             if attempt % _PER_CONTEXT == 0 and env.task.objects:
                 contexts = draw_contexts(env.task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
-            rows = np.array([index for index in range(episodes) if raw[index] is None])
-            already = episodes - len(rows)
-            results = play(
-                env,
-                recipe,
-                task,
-                rows,
-                [modes[row] for row in rows],
-                contexts[rows] if env.task.objects else None,
-                [(seed, int(row), attempt) for row in rows],
-                lambda over, already=already: progress(already + over, episodes),
-            )
-            for row, (episode, fault) in zip(rows, results, strict=True):
-                attempts[row] += 1
-                raw[row] = episode
-                if fault:
-                    failures[fault] += 1
+            left = np.array([index for index in range(episodes) if raw[index] is None])
+            for begin in range(0, len(left), size):
+                rows = left[begin : begin + size]
+                already = sum(episode is not None for episode in raw)
+                results = play(
+                    env,
+                    recipe,
+                    task,
+                    np.arange(len(rows)),
+                    [modes[row] for row in rows],
+                    contexts[rows] if env.task.objects else None,
+                    [(seed, int(row), attempt) for row in rows],
+                    lambda over, already=already: show(already + over),
+                )
+                for row, (episode, fault) in zip(rows, results, strict=True):
+                    attempts[row] += 1
+                    raw[row] = episode
+                    if fault:
+                        failures[fault] += 1
             if all(episode is not None for episode in raw):
                 break
     finally:
