@@ -51,7 +51,7 @@ class Eval:
         joining: how slowly plans are joined to the present state; 0 turns it off.
         candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
             the one in force (default: as the run says, else 1).
-        choice: rule of that choice: "quarter", "half", "typical" or "nearest".
+        choice: rule of that choice: "quarter", "typical" or "nearest".
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
         task: refuse a run of another task than this.

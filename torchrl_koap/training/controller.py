@@ -23,6 +23,7 @@ from torchrl_koap.training.closed_form import fit_closed_form
 from torchrl_koap.training.config import Train, method_of
 from torchrl_koap.training.loop import moving_average, train
 from torchrl_koap.training.methods import METHODS, Method, Phase
+from torchrl_koap.training.planner import training_dtype
 from torchrl_koap.training.progress import progress_bar, show_progress
 from torchrl_koap.training.released_settings import epochs_of, get_released
 from torchrl_koap.training.run_directory import RunDirectory
@@ -171,6 +172,7 @@ def _train_policy(
         pad_after=HORIZON - 1,
         labelled_share=_LABELLED_SHARE["labelled"],
     )
+    policy.training_dtype = training_dtype(options.precision)
     loss = DiffusionPolicyLoss(policy)
     table = WindowTable.build(data, WINDOW, pad_before=1, pad_after=HORIZON - 1)
     phase = Phase("policy", DiffusionPolicyLoss, "labelled")
@@ -181,7 +183,7 @@ def _train_policy(
         buffer.sample,
         num_steps=num_steps,
         learning_rate=options.planner_learning_rate,
-        weight_decay=1e-4,
+        weight_decay=1e-4 if options.planner_weight_decay is None else options.planner_weight_decay,
         target_update=moving_average(loss, num_steps),
     )
     loss.target_policy_params.to_module(policy)

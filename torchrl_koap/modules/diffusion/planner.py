@@ -153,6 +153,10 @@ class StatePlanner(ConditionedDiffusion):
         plan = self.plan_normalizer.inverse(sequence.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
         return plan + history[..., -1:, :] if self.relative else plan
 
+    def scale_columns(self, plan: Tensor) -> Tensor:
+        """Raw plan ``[*B, H, d]`` in units of the columns' spread, the same for all its steps."""
+        return plan / self.plan_normalizer.scale.unflatten(-1, (self.horizon, self.state_dim)).mean(0)
+
     def plan(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
         """Samples plans ``[*B, H, d]`` for histories ``[*B, h, d]``, both in raw units; see the class for ``noise``."""
         return self.decode_plan(history, self.solve(history, noise, generator))

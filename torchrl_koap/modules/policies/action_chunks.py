@@ -143,7 +143,7 @@ class _Chunk(TensorDictModuleBase):
             chunk = tensordict.get(ACTION_CHUNK, None)
             actions = sample_coherent(
                 self.planner.sample,
-                lambda _, actions: self.planner.encode_actions(actions),
+                self.planner.action_normalizer,
                 history,
                 noise,
                 number=self.candidates,

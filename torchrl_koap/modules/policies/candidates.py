@@ -31,11 +31,6 @@ def quarter(apart: Tensor, among: Tensor) -> Tensor:
     return kept.int().argmax(-1)
 
 
-def half(apart: Tensor, among: Tensor) -> Tensor:
-    """Any one of the nearer half: the first that was drawn."""
-    return _nearest_share(apart, 0.5).int().argmax(-1)
-
-
 def typical(apart: Tensor, among: Tensor) -> Tensor:
     """Of the nearer half the one in its middle, with the least mean distance to the rest of that half."""
     kept = _nearest_share(apart, 0.5)
@@ -46,7 +41,6 @@ def typical(apart: Tensor, among: Tensor) -> Tensor:
 RULES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "nearest": nearest,
     "quarter": quarter,
-    "half": half,
     "typical": typical,
 }
 
@@ -65,7 +59,33 @@ def check_candidates(number: int, rule: str) -> None:
         raise ValueError(f"candidates must be an integer in 1..{MOST_CANDIDATES}, got {number!r}")
 
 
-def choose(candidates: Tensor, in_force: Tensor | None, fresh: Tensor | None, rule: str) -> Tensor:
+def steps_apart(candidates: Tensor, in_force: Tensor) -> Tensor:
+    """Mean square distance of candidates ``[*B, N, H, w]`` to what is left of a plan ``[*B, K, w]``, step by step."""
+    if in_force.shape[-2] > candidates.shape[-2]:
+        raise ValueError(
+            f"the plan in force has {in_force.shape[-2]} steps, the candidates only {candidates.shape[-2]}"
+        )
+    return (candidates[..., : in_force.shape[-2], :] - in_force.unsqueeze(-3)).square().mean((-2, -1))
+
+
+def paths_apart(candidates: Tensor, in_force: Tensor) -> Tensor:
+    """Mean square distance of the first ``K`` states of candidates ``[*B, N, H, w]`` to a whole plan ``[*B, L, w]``.
+
+    Each state is compared with the nearest one of the plan, at whatever time it was meant: a robot that lags behind
+    its plan goes on with it by going the same way, not by being where the plan is. ``K`` is half of ``H``, so that a
+    candidate does not reach beyond the end of the plan.
+    """
+    first = candidates[..., : (candidates.shape[-2] + 1) // 2, :]  # [*B, N, K, w]
+    return torch.cdist(first, in_force.unsqueeze(-3)).amin(-1).square().mean(-1)
+
+
+def choose(
+    candidates: Tensor,
+    in_force: Tensor | None,
+    fresh: Tensor | None,
+    rule: str,
+    apart: Callable[[Tensor, Tensor], Tensor] = steps_apart,
+) -> Tensor:
     """Chooses one of several plans.
 
     Args:
@@ -75,6 +95,8 @@ def choose(candidates: Tensor, in_force: Tensor | None, fresh: Tensor | None, ru
         fresh (Tensor, optional): where an episode begins, bool ``[*B]``: the first candidate is taken there too, so
             that the choice of a mode stays the planner's.
         rule (str): a name in ``RULES``.
+        apart (callable): distances ``[*B, N]`` of the candidates to the plan in force. Defaults to
+            :func:`steps_apart`.
 
     Returns:
         Tensor: index of the chosen candidate, ``[*B]``.
@@ -86,7 +108,7 @@ def choose(candidates: Tensor, in_force: Tensor | None, fresh: Tensor | None, ru
         >>> import torch
         >>> from torchrl_koap.modules.policies.candidates import choose
         >>> plans = torch.tensor([[0.0, 0.0], [5.0, 9.0], [5.0, 6.0], [1.0, 1.0]]).unsqueeze(-1)
-        >>> choose(plans, torch.tensor([[5.0]]), None, "half").item()
+        >>> choose(plans, torch.tensor([[5.0]]), None, "quarter").item()
         1
     """
     choice = lookup(RULES, rule, "rule of choice")
@@ -94,21 +116,16 @@ def choose(candidates: Tensor, in_force: Tensor | None, fresh: Tensor | None, ru
     first = torch.zeros(batch, dtype=torch.long, device=candidates.device)
     if in_force is None or number == 1:
         return first
-    length = in_force.shape[-2]
-    if in_force.shape != (*batch, length, candidates.shape[-1]) or not 1 <= length <= candidates.shape[-2]:
-        raise ValueError(
-            f"the plan in force must be {[*batch, 'K', candidates.shape[-1]]} with K in 1..{candidates.shape[-2]},"
-            f" got {list(in_force.shape)}"
-        )
-    apart = (candidates[..., :length, :] - in_force.unsqueeze(-3)).square().mean((-2, -1))  # [*B, N]
+    if in_force.shape[:-2] != batch or in_force.shape[-1] != candidates.shape[-1]:
+        raise ValueError(f"the plan in force must be {[*batch, 'K', candidates.shape[-1]]}, got {list(in_force.shape)}")
     flat = candidates.flatten(-2)
-    chosen = choice(apart, torch.cdist(flat, flat))
+    chosen = choice(apart(candidates, in_force), torch.cdist(flat, flat))
     return chosen if fresh is None else torch.where(fresh, first, chosen)
 
 
 def sample_coherent(
     sample: Callable[[Tensor, Tensor | None], Tensor],
-    encode: Callable[[Tensor, Tensor], Tensor],
+    scale: Callable[[Tensor], Tensor],
     history: Tensor,
     noise: Tensor | None,
     *,
@@ -116,12 +133,13 @@ def sample_coherent(
     rule: str,
     in_force: Tensor | None,
     fresh: Tensor | None,
+    apart: Callable[[Tensor, Tensor], Tensor] = steps_apart,
 ) -> Tensor:
     """Samples plans (or action chunks) and returns the chosen one of each environment.
 
     Args:
         sample (callable): ``sample(history [*B, h, d], noise) -> [*B, H, w]``.
-        encode (callable): ``encode(history, plan [*B, H, w])`` to units of the entries' spread.
+        scale (callable): ``scale(plan [*B, H, w])`` to units of the columns' spread.
         history (Tensor): observed states ``[*B, h, d]``.
         noise (Tensor, optional): start noise ``[*B, number, ...]``; without that axis if ``number`` is 1.
 
@@ -130,6 +148,7 @@ def sample_coherent(
         rule (str): a name in ``RULES``.
         in_force (Tensor, optional): what is left of the plan in force ``[*B, K, w]``.
         fresh (Tensor, optional): where an episode begins, bool ``[*B]``.
+        apart (callable): see :func:`choose`.
 
     Returns:
         Tensor: ``[*B, H, w]``.
@@ -138,11 +157,6 @@ def sample_coherent(
         return sample(history, noise)
     repeated = history.unsqueeze(-3).expand(*history.shape[:-2], number, *history.shape[-2:])
     plans = sample(repeated, noise)  # [*B, N, H, w]
-    encoded = encode(repeated, plans)
-    if in_force is not None:
-        length, surplus = in_force.shape[-2], plans.shape[-2] - in_force.shape[-2]
-        padded = torch.cat([in_force, in_force[..., -1:, :].expand(*in_force.shape[:-2], surplus, -1)], -2)
-        in_force = encode(history, padded)[..., :length, :]
-    index = choose(encoded, in_force, fresh, rule)
+    index = choose(scale(plans), None if in_force is None else scale(in_force), fresh, rule, apart)
     index = index[..., None, None, None].expand(*index.shape, 1, *plans.shape[-2:])
     return plans.gather(-3, index).squeeze(-3)

@@ -15,7 +15,7 @@ from torchrl.modules import MultiStepActorWrapper
 from torchrl_koap.keys import ACTION, OBSERVATION, PLAN
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.diffusion.planner import StatePlanner
-from torchrl_koap.modules.policies.candidates import check_candidates, sample_coherent
+from torchrl_koap.modules.policies.candidates import check_candidates, paths_apart, sample_coherent
 from torchrl_koap.tasks.gripper import PLANNED_OPEN_ABOVE, gripper_number
 
 EXECUTIONS = ("feedback", "open_loop")
@@ -249,16 +249,16 @@ class _Chunk(TensorDictModuleBase):
             plan = self.planner.plan(seen, noise)
         else:
             chunk = tensordict.get(self.out_keys[1], None)  # [*B, interval, H, d], the plan as it was and shortened
-            interval = 0 if chunk is None else chunk.shape[-3]
             plan = sample_coherent(
                 self.planner.plan,
-                self.planner.encode_plan,
+                self.planner.scale_columns,
                 seen,
                 noise,
                 number=self.candidates,
                 rule=self.choice,
-                in_force=None if chunk is None or interval == chunk.shape[-2] else chunk[..., 0, interval:, :],
+                in_force=None if chunk is None else chunk[..., 0, :, :],
                 fresh=tensordict.get("is_init").squeeze(-1),
+                apart=paths_apart,
             )
         tensordict.set(PLAN, plan)
         return tensordict.set(self.out_keys[1], self.make_chunk(history, plan))
