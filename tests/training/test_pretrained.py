@@ -12,7 +12,7 @@ from tiny_runs import TINY, koap, write_demonstrations
 from torchrl_koap.evaluation.run import load_run
 from torchrl_koap.training import pretrained
 from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.pretrained import copy_run, find_run, half_weights, publish
+from torchrl_koap.training.pretrained import copy_run, find_run, publish
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 
@@ -49,29 +49,22 @@ def test_an_installed_wheel_has_none(tmp_path, monkeypatch):
         find_run("pretrained:aligning")
 
 
-def test_a_published_policy_is_half_the_size_and_plans_the_same(run, policies):
-    tensors, about = load_tensors(policies / "avoiding" / "planner.safetensors")
-    original, _ = load_tensors(run / "planner.safetensors")
-    assert about["task"] == "avoiding" and tensors.keys() == original.keys()
-    halved = [name for name, tensor in tensors.items() if tensor.dtype == torch.float16]
-    assert halved and all(original[name].ndim >= 2 for name in halved)
-    assert not any("normalizer" in name for name in halved)
+def test_a_published_policy_is_small_and_plans_the_same(run, policies):
+    tensors, about = load_tensors(policies / "avoiding" / "controller.safetensors")
+    assert about["task"] == "avoiding"
+    small = {name.rpartition(".")[-1] for name, tensor in tensors.items() if tensor.dtype == torch.int8}
+    assert small == {"covariance_root"}  # frequencies stay as the decoder knows them
+    small, whole = ((folder / "planner.safetensors").stat().st_size for folder in (policies / "avoiding", run))
+    assert small < 0.6 * whole
     _, planner, _ = load_run(RunDirectory(policies / "avoiding"))
     _, exact, _ = load_run(RunDirectory(run))
     history, noise = torch.rand(20, 2, 2), torch.randn(20, 14, 2)
     with torch.no_grad():
-        assert torch.allclose(planner.plan(history, noise), exact.plan(history, noise), atol=2e-3)
+        gap = (planner.plan(history, noise) - exact.plan(history, noise)).abs().mean()
+        spread = exact.plan(history, noise).std(0).mean()
+    assert 0 < gap < 0.05 * spread
     assert next(planner.denoiser.parameters()).dtype == torch.float32
     assert not (policies / "avoiding" / "checkpoints").exists()
-
-
-def test_statistics_are_not_rounded():
-    tensors = {"a.weight": torch.rand(64, 64), "plan_normalizer.scale": torch.rand(2000), "bias": torch.rand(64)}
-    halved = half_weights(tensors)
-    assert halved["a.weight"].dtype == torch.float16
-    assert all(
-        (halved[name] == tensors[name]).all() and halved[name].dtype == torch.float32 for name in list(tensors)[1:]
-    )
 
 
 def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
@@ -80,7 +73,7 @@ def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
     assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--candidates", "3") == 0
     result = json.loads((out / "eval.json").read_text())
     assert result["episodes"] == 2 and result["candidates"] == 3
-    assert (out / "report.html").exists() and not (policies / "avoiding" / "eval.json").exists()
+    assert (out / "index.html").exists() and not (policies / "avoiding" / "eval.json").exists()
     assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--no-report") == 0  # again, into the same folder
 
 

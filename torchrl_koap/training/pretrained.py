@@ -6,11 +6,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from torchrl_koap.lookup import lookup
 from torchrl_koap.training.checkpoints import load_tensors, save_tensors
+from torchrl_koap.training.compact_weights import compact
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 PREFIX = "pretrained:"
@@ -68,24 +66,8 @@ def copy_run(source: str | Path, target: str | Path) -> Path:
     return target
 
 
-def half_weights(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Weight matrices in half precision; statistics, biases and whatever else is small stay as they are.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.training.pretrained import half_weights
-        >>> halved = half_weights({"layer.weight": torch.ones(64, 64), "normalizer.scale": torch.ones(64)})
-        >>> halved["layer.weight"].dtype, halved["normalizer.scale"].dtype
-        (torch.float16, torch.float32)
-    """
-    return {
-        name: tensor.half() if tensor.ndim >= 2 and tensor.dtype == torch.float32 and tensor.numel() >= 1024 else tensor
-        for name, tensor in tensors.items()
-    }
-
-
 def publish(run: str | Path, folder: str | Path, card: str) -> Path:
-    """Writes a trained policy as the repository holds it: weights in half precision, options, a model card.
+    """Writes a trained policy as the repository holds it: compact weights, options, a model card.
 
     Args:
         run (str or Path): run directory of ``koap train``.
@@ -96,6 +78,8 @@ def publish(run: str | Path, folder: str | Path, card: str) -> Path:
     for name in WEIGHTS:
         if (folder / name).exists():
             tensors, about = load_tensors(folder / name)
-            save_tensors(folder / name, half_weights(tensors), about)
+            # a closed-form decoder was fitted to features of exactly these frequencies: of them nothing is rounded
+            only = ("covariance_root",) if name == "controller.safetensors" and (folder / WEIGHTS[0]).exists() else ()
+            save_tensors(folder / name, compact(tensors, only=only), about)
     (folder / "README.md").write_text(card)
     return folder
