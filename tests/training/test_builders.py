@@ -86,7 +86,7 @@ def test_reading_raw_folders_leaves_them_alone(tmp_path):
     assert pickle.loads(before["env_000_00.pkl"])["robot"]["c_pos"].shape == (30, 3)
 
 
-@pytest.mark.parametrize("denoiser", ["unet", "mlp", "transformer"])
+@pytest.mark.parametrize("denoiser", ["unet", "mlp", "film", "transformer"])
 @pytest.mark.parametrize("relative", [True, False])
 def test_every_denoiser_plans(denoiser, relative):
     planner = build_planner(PLANNER | {"denoiser": denoiser, "relative": relative}, 2)
@@ -98,7 +98,7 @@ def test_every_denoiser_plans(denoiser, relative):
 def test_the_released_denoiser_has_the_published_size():
     planner = build_planner(PLANNER | {"denoiser": "released"}, 2)
     assert sum(p.numel() for p in planner.parameters()) == pytest.approx(11.9e6, rel=0.01)
-    assert set(DENOISERS) == {"unet", "mlp", "transformer", "released"}
+    assert set(DENOISERS) == {"unet", "mlp", "film", "transformer", "released"}
 
 
 @pytest.mark.parametrize(

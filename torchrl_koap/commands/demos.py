@@ -9,6 +9,7 @@ from pathlib import Path
 from torchrl_koap.commands.command import Command
 from torchrl_koap.data import save_ted
 from torchrl_koap.envs.experts.demonstrations import (
+    BATCH_SIZE,
     RecordingReport,
     episodes_to_ted,
     record_episodes,
@@ -29,6 +30,7 @@ class Demos(Command):
         episodes: number of demonstrations, spread evenly over the modes (default: that of the task).
         seed: seed of the players' variation.
         threads: simulator threads.
+        batch_size: episodes played at once; the demonstrations do not depend on it.
         plugins: modules that register tasks; imported before anything else.
     """
 
@@ -37,6 +39,7 @@ class Demos(Command):
     episodes: int | None = None
     seed: int = 0
     threads: int = 2
+    batch_size: int = BATCH_SIZE
     plugins: Plugins = ()
 
     def __call__(self) -> RecordingReport:
@@ -56,7 +59,9 @@ class Demos(Command):
                 raise FileExistsError(f"{self.out / name} exists already; choose another --out")
         episodes = task.defaults.demonstrations if self.episodes is None else self.episodes
         with progress_bar(episodes, "recording", unit="episode") as bar:
-            raw, report = record_episodes(task.name, episodes, self.seed, self.threads, count_up_to(bar))
+            raw, report = record_episodes(
+                task.name, episodes, self.seed, self.threads, count_up_to(bar), batch_size=self.batch_size
+            )
         data = episodes_to_ted(raw, task.name)
         save_ted(data, self.out / "ted", task=task.source, notes={"seed": self.seed, "modes": list(report.modes)})
         if task.converter is not None:

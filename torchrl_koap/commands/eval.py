@@ -20,13 +20,13 @@ class Eval(Command):
     """Evaluate a trained run, in closed loop or, without an environment, on recorded data, and write its report.
 
     Attributes:
-        run: run directory of `koap train`.
+        run: run directory of `koap train`, or pretrained:NAME, a trained policy of the repository.
         config: all options of the rollouts.
         report: draw the pictures and write the report.
         animate: make an animation of the rollouts for the report.
     """
 
-    run: tyro.conf.Positional[Path]
+    run: tyro.conf.Positional[str]
     config: Options[EvalConfig]
     report: bool = True
     animate: bool = True
@@ -35,5 +35,5 @@ class Eval(Command):
         """Evaluates and reports; the figures of an evaluation without an environment come in words."""
         result = evaluate(self.run, self.config)
         if self.report:
-            write_report(self.run, animation=self.animate)
+            write_report(Path(self.run) if self.config.out is None else self.config.out, animation=self.animate)
         return describe_offline(result) if result.get("kind") == KIND else result

@@ -33,6 +33,8 @@ def make_policy(
     blend_decay: float = 0.8,
     controller_columns: Sequence[int] | None = None,
     action_rule: Callable[[Tensor, Tensor], Tensor] | None = None,
+    candidates: int = 1,
+    choice: str = "quarter",
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two.
 
@@ -48,6 +50,8 @@ def make_policy(
         blend_decay (float): share of the distance to the plan that remains after each frame.
         controller_columns (sequence of int, optional): columns of the state that the controller reads.
         action_rule (callable, optional): has the last word on actions, such as ``task.action_rule``.
+        candidates (int): plans sampled whenever one is due.
+        choice (str): the rule by which one of them is taken.
     """
     return PlanThenControl(
         planner,
@@ -59,6 +63,8 @@ def make_policy(
         blend_decay=blend_decay,
         controller_columns=controller_columns,
         action_rule=action_rule,
+        candidates=candidates,
+        choice=choice,
     )
 
 
@@ -99,7 +105,7 @@ def roll_out(
         raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
     if contexts is not None and len(contexts) != len(seeds):
         raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
-    planner, device = policy.planner, _device_of(policy)
+    device = _device_of(policy)
     size, episodes = batch_size or len(seeds), []
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
@@ -110,7 +116,7 @@ def roll_out(
         if futures is not None:
             noise = RecordedFutures(futures[begin : begin + size])
         else:
-            noise = EpisodeNoise(part, planner.noise_shape, num_steps=max_steps)
+            noise = EpisodeNoise(part, policy.noise_shape, num_steps=max_steps)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(

@@ -25,6 +25,7 @@ from torchrl_koap.training.checkpoints import load_weights, save_tensors
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.methods import Method
 from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.training.pretrained import PREFIX, copy_run, find_run
 from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
@@ -42,6 +43,10 @@ class EvalConfig:
         solver_steps: another number of solver steps.
         replan_interval: control steps per plan.
         blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are.
+        candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
+            the one in force (default: as the run says, else 1).
+        choice: rule of that choice: "quarter", "typical" or "nearest".
+        out: folder to evaluate in instead of the run's own; what the run is made of is copied there.
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
         task: refuse a run of another task than this.
@@ -64,6 +69,9 @@ class EvalConfig:
     solver_steps: int | None = None
     replan_interval: int = REPLAN_INTERVAL
     blend_decay: float = 0.8
+    candidates: int | None = None
+    choice: str = "quarter"
+    out: Path | None = None
     batch_size: int | None = None
     contexts_file: Path | None = None
     task: str | None = None
@@ -172,12 +180,15 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     if config.solver_steps is not None:
         sampler.num_steps = config.solver_steps
     task = trained.task
+    candidates = config.candidates or trained.config.get("candidates") or 1
     if trained.planner is None:
         policy = ChunkedPolicy(
             trained.controller,
             state_columns=task.state_of,
             history=trained.controller.history,
             replan_interval=config.replan_interval,
+            candidates=candidates,
+            choice=config.choice,
         )
     else:
         policy = make_policy(
@@ -189,6 +200,8 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             blend_decay=config.blend_decay,
             controller_columns=trained.columns,
             action_rule=task.action_rule,
+            candidates=candidates,
+            choice=config.choice,
         )
     return policy.to(config.device)
 
@@ -235,7 +248,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     (:func:`~torchrl_koap.evaluation.offline.evaluate_offline`), and there is ``eval.json`` alone.
 
     Args:
-        run (str or Path): a run directory.
+        run (str or Path): a run directory, or ``pretrained:NAME``, a trained policy of the repository.
         config (EvalConfig, optional): how many rollouts, and how. Default: 60 as in training.
 
     Returns:
@@ -254,7 +267,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     lookup(EXECUTIONS, config.execution, "execution")
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
-    trained = load_run(run, task=config.task)
+    trained = load_run(_folder(run, config), task=config.task)
     directory, task = trained.directory, trained.task
     if task.env is None:
         return _judge_offline(trained, config)
@@ -290,6 +303,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         "solver_steps": sampler.num_steps,
         "replan_interval": config.replan_interval,
         "blend_decay": config.blend_decay,
+        "candidates": policy.candidates,
         "episode": rows,
     }
     rollouts = rollouts_to_tensors(
@@ -305,6 +319,18 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     save_tensors(directory.path / "rollouts.safetensors", rollouts, {"task": task.name})
     directory.write_json("eval.json", result)
     return result
+
+
+def _folder(run: str | Path, config: EvalConfig) -> Path:
+    """The folder to evaluate in: the run's own, or a copy of what it is made of."""
+    source = find_run(run)
+    if config.out is None:
+        if str(run).startswith(PREFIX):
+            raise ValueError(f"{run} is evaluated in a folder of your own: name it with --out")
+        return source
+    if config.task is not None:  # before anything is copied
+        load_run(source, task=config.task)
+    return copy_run(source, config.out)
 
 
 def _judge_offline(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:

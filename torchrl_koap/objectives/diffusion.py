@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -63,6 +63,7 @@ class DenoisingLoss(LossModule):
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         self.reduction = reduction
+        self.step_weights: Tensor | None = None  # [H, 1], of mean 1
         self.convert_to_functional(network, self.name, create_target_params=create_target_params)
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -114,6 +115,8 @@ class DenoisingLoss(LossModule):
                 sample = self.encode(history, sequence, counts)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
             error = network.denoising_error(condition, sample, noise, time)  # [*B, H, width]
+            if self.step_weights is not None:
+                error = error * self.step_weights.to(error)
 
         result = TensorDict({f"loss_{self.name}": self._reduce(error, counts)}, batch_size=[])
         self._clear_weakrefs(tensordict, result, f"{self.name}_params", f"target_{self.name}_params")
@@ -143,6 +146,8 @@ class PlannerLoss(DenoisingLoss):
     Keyword Args:
         window (bool): read whole windows ``[*B, history + horizon, d]`` from the entry ``state`` and cut them (True),
             or read the entries ``history`` and ``plan`` (False). Defaults to True.
+        first_steps_weight (float): weight of the first planned step against that of the last; it falls geometrically
+            in between, and the mean weight is 1. Defaults to 1.
         create_target_params (bool): keep an averaged copy of the weights in ``target_planner_params``, to be moved by
             :class:`torchrl.objectives.SoftUpdate` and used for planning. Defaults to True.
         reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, d]``. Defaults to ``"mean"``.
@@ -196,9 +201,15 @@ class PlannerLoss(DenoisingLoss):
     planner_params: TensorDictParams
     target_planner_params: TensorDictParams
 
-    def __init__(self, planner: StatePlanner, *, window: bool = True, **options):
+    def __init__(self, planner: StatePlanner, *, window: bool = True, first_steps_weight: float = 1.0, **options: Any):
         super().__init__(planner, **options)
+        if first_steps_weight <= 0:
+            raise ValueError(f"first_steps_weight must be > 0, got {first_steps_weight}")
         self.window = window
+        if first_steps_weight != 1:
+            share = torch.linspace(1, 0, planner.horizon)[:, None]
+            weights = first_steps_weight**share  # [H, 1]
+            self.step_weights = weights / weights.mean()
         super().set_keys(history=planner.in_keys[0], plan=planner.out_keys[0])
 
     def set_keys(self, **kwargs) -> None:

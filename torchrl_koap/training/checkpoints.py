@@ -14,6 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from torchrl_koap.files import replacing_file
+from torchrl_koap.training.compact_weights import expand
 
 
 class CheckpointError(ValueError):
@@ -50,7 +51,7 @@ def load_weights(path: str | Path, module: nn.Module, *, task: str) -> dict[str,
     if about.get("task") != task:
         raise CheckpointError(f"{path} was trained on task {about.get('task')!r}, not on {task!r}")
     try:
-        module.load_state_dict(tensors)
+        module.load_state_dict(expand(tensors))
     except RuntimeError as error:
         problems = " ".join(str(error).split("\n", 1)[-1].split())
         raise CheckpointError(f"{path} does not fit the model: {problems}") from error

@@ -54,7 +54,17 @@ class TrainConfig:
         controller_batch_size: windows per controller update.
         planner_learning_rate: peak learning rate of the planner.
         controller_learning_rate: peak learning rate of the controller.
-        denoiser: "unet", "mlp", "transformer" or "released" (11.9 M parameters).
+        denoiser: "unet", "mlp", "film" (an mlp that the condition also scales and shifts), "transformer" or "released"
+            (11.9 M parameters).
+        denoiser_width: hidden width of "mlp" and "transformer" (default: 256 and 64).
+        denoiser_depth: their number of residual layers (default: 3).
+        condition_octaves: octaves of the Fourier features of what was observed (default: 4).
+        dropout: share of the hidden units of "mlp" dropped in training (default: 0).
+        planner_weight_decay: decoupled weight decay of the planner (default: 1e-4).
+        first_steps_weight: weight of the first planned step in the planner's loss against the last one's (default: 1).
+        precision: "float32", or "bfloat16" for the matrix products of the planner's training: several times quicker
+            where the processor has them (default: float32).
+        candidates: plans sampled whenever one is due at evaluation, unless told otherwise there (default: 1).
         channels: widths of the U-Net's levels (default: the task's).
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
@@ -107,6 +117,14 @@ class TrainConfig:
     planner_learning_rate: float = 3e-3
     controller_learning_rate: float = 1e-3
     denoiser: str = "unet"
+    denoiser_width: int | None = None
+    denoiser_depth: int | None = None
+    condition_octaves: int | None = None
+    dropout: float | None = None
+    planner_weight_decay: float | None = None
+    first_steps_weight: float | None = None
+    precision: str | None = None
+    candidates: int | None = None
     channels: tuple[int, ...] | None = None
     schedule: str = "squared_cosine"
     prediction: str = "sample"
@@ -289,7 +307,14 @@ def _budget(options: TrainConfig) -> LabelBudget:
 
 
 def _planner_entry(options: TrainConfig) -> dict[str, Any]:
-    return {
+    sizes = {
+        "width": options.denoiser_width,
+        "depth": options.denoiser_depth,
+        "frequencies": options.condition_octaves,
+        "dropout": options.dropout,
+    }
+    # what was left out is left out here too, so that a run of before can be resumed
+    return {name: value for name, value in sizes.items() if value is not None} | {
         "denoiser": options.denoiser,
         "channels": list(options.channels),
         "schedule": options.schedule,

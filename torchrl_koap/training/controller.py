@@ -22,6 +22,7 @@ from torchrl_koap.training.closed_form import fit_closed_form
 from torchrl_koap.training.config import ResolvedConfig
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.methods import LABELLED_SHARES, Method, Phase
+from torchrl_koap.training.planner import planner_weight_decay, training_dtype
 from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.run_directory import RunDirectory
 
@@ -154,6 +155,7 @@ def _train_policy(
     states = cut_windows(extrapolate_ends(seen, HORIZON - 1), WINDOW, select=["state"], pad_before=1)["state"]
     policy.fit_normalizers(states, data["action"][has_action])
     policy.to(options.device)
+    policy.training_dtype = training_dtype(options.precision)
     # at the end of a demonstration only the steps that were recorded count
     buffer = make_window_buffer(
         data,
@@ -173,7 +175,7 @@ def _train_policy(
         buffer.sample,
         num_steps=num_steps,
         learning_rate=options.planner_learning_rate,
-        weight_decay=1e-4,
+        weight_decay=planner_weight_decay(options),
         target_update=moving_average(loss, num_steps),
     )
     loss.target_policy_params.to_module(policy)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from torch import nn
@@ -19,23 +20,42 @@ from torchrl_koap.modules import (
 )
 
 
+def _sizes(options: Mapping[str, Any], denoiser: str, *names: str) -> dict[str, Any]:
+    """Those of the denoiser's own sizes that were chosen."""
+    chosen = {name: options[name] for name in ("width", "depth", "frequencies", "dropout") if name in options}
+    unfit = sorted(set(chosen) - set(names))
+    if unfit:
+        has = ", ".join(names) or "none"
+        raise ValueError(f"denoiser {denoiser!r} has no {', '.join(unfit)} to choose, only {has}")
+    return chosen
+
+
 def _unet(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    return TemporalUnet(width, condition_dim, channels=tuple(options["channels"]))
+    sizes = _sizes(options, "unet", "frequencies")
+    return TemporalUnet(width, condition_dim, channels=tuple(options["channels"]), **sizes)
 
 
-def _mlp(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    return MLPDenoiser(width, condition_dim, horizon=options["horizon"])
+def _mlp(width: int, condition_dim: int, options: Mapping[str, Any], film: bool = False) -> nn.Module:
+    sizes = _sizes(options, "film" if film else "mlp", "width", "depth", "frequencies", "dropout")
+    return MLPDenoiser(width, condition_dim, horizon=options["horizon"], film=film, **sizes)
 
 
 def _transformer(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    return TransformerDenoiser(width, condition_dim)
+    return TransformerDenoiser(width, condition_dim, **_sizes(options, "transformer", "width", "depth", "frequencies"))
 
 
 def _released(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    _sizes(options, "released")
     return TemporalUnet.released(width, condition_dim)
 
 
-DENOISERS = {"unet": _unet, "mlp": _mlp, "transformer": _transformer, "released": _released}
+DENOISERS = {
+    "unet": _unet,
+    "mlp": _mlp,
+    "film": partial(_mlp, film=True),
+    "transformer": _transformer,
+    "released": _released,
+}
 
 
 def build_planner(options: Mapping[str, Any], state_dim: int, features: nn.Module | None = None) -> StatePlanner:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
@@ -17,6 +18,7 @@ from torchrl_koap.data import (
     extrapolate_ends,
     make_window_buffer,
 )
+from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
@@ -56,7 +58,9 @@ def train_planner(
     planner.to(options.device)
     buffer = make_window_buffer(extended, WINDOW, options.batch_size, select=["state"], pad_before=1)
     augment = _augmentation(options, task)
-    loss = PlannerLoss(planner)
+    planner.training_dtype = training_dtype(options.precision)
+    weight = 1.0 if options.first_steps_weight is None else options.first_steps_weight
+    loss = PlannerLoss(planner, first_steps_weight=weight)
     with progress_bar(options.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
         values = train_phase(
             "planner",
@@ -64,7 +68,7 @@ def train_planner(
             lambda: augment(buffer.sample()),
             num_steps=options.steps,
             learning_rate=options.planner_learning_rate,
-            weight_decay=1e-4,
+            weight_decay=planner_weight_decay(options),
             target_update=moving_average(loss, options.steps),
             run=run,
             logger=logger,
@@ -75,6 +79,20 @@ def train_planner(
     loss.target_planner_params.to_module(planner)
     save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
     return planner, values
+
+
+def training_dtype(precision: str | None) -> torch.dtype | None:
+    """Type of the denoiser's matrix products in training; None leaves them as they are.
+
+    Raises:
+        ValueError: for another name than ``"float32"`` or ``"bfloat16"``.
+    """
+    return lookup({"float32": None, "bfloat16": torch.bfloat16}, precision or "float32", "precision")
+
+
+def planner_weight_decay(options: TrainConfig) -> float:
+    """Decoupled weight decay of a planner, or of a policy of its own."""
+    return 1e-4 if options.planner_weight_decay is None else options.planner_weight_decay
 
 
 def _augmentation(options: TrainConfig, task: Task) -> TensorDictSequential:

@@ -165,3 +165,31 @@ def test_attempts_unlike_human_ones_are_discarded(monkeypatch, limit, reason):
 def test_bad_arguments(arguments, message):
     with pytest.raises(ValueError, match=message):
         record_demonstrations(**arguments)
+
+
+@pytest.mark.parametrize(("task", "batch_size"), [("avoiding", 2), ("aligning", 3)])
+def test_demonstrations_do_not_depend_on_how_many_are_played_at_once(task, batch_size):
+    data, report = record_demonstrations(task, 5, seed=3)
+    calls = []
+    parts, other = record_demonstrations(
+        task, 5, seed=3, batch_size=batch_size, progress=lambda done, total: calls.append(done)
+    )
+    assert (data == parts).all() and (report.modes, report.attempts) == (other.modes, other.attempts)
+    assert calls == sorted(calls) and calls[-1] == 5 and 1 in calls
+
+
+def test_no_more_environments_than_the_batch_are_made(monkeypatch):
+    made, make = [], demonstrations.make_env
+
+    def make_env(task, count, **options):
+        made.append(count)
+        return make(task, count, **options)
+
+    monkeypatch.setattr(demonstrations, "make_env", make_env)
+    record_episodes("avoiding", 7, batch_size=4)
+    assert made == [4]
+
+
+def test_a_batch_of_nothing():
+    with pytest.raises(ValueError, match="batch_size must be an integer of at least 1, got 0"):
+        record_episodes("avoiding", 2, batch_size=0)

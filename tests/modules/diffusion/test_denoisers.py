@@ -128,3 +128,26 @@ def test_wrong_input_is_explained(denoiser):
         denoiser(x, time, condition[:, :5])
     with pytest.raises(ValueError, match="must have 14 steps"):
         MAKERS["mlp"]()(x[:, :12], time, condition)
+
+
+@pytest.mark.parametrize("film", [False, True])
+def test_dropout_acts_in_training_alone(film):
+    torch.manual_seed(0)
+    network = MLPDenoiser(3, 5, horizon=4, width=16, depth=2, dropout=0.5, film=film)
+    inputs = torch.randn(6, 4, 3), torch.rand(6), torch.randn(6, 5)
+    assert not torch.equal(network(*inputs), network(*inputs))
+    network.eval()
+    assert torch.equal(network(*inputs), network(*inputs))
+    with pytest.raises(ValueError, match=r"dropout must be in \[0, 1\), got 1"):
+        MLPDenoiser(3, 5, horizon=4, dropout=1.0)
+
+
+def test_film_begins_as_the_plain_network_and_then_conditions_every_layer():
+    torch.manual_seed(0)
+    plain = MLPDenoiser(3, 5, horizon=4, width=16, depth=2)
+    film = MLPDenoiser(3, 5, horizon=4, width=16, depth=2, film=True)
+    film.load_state_dict(plain.state_dict(), strict=False)
+    inputs = torch.randn(6, 4, 3), torch.rand(6), torch.randn(6, 5)
+    assert torch.allclose(film(*inputs), plain(*inputs), atol=1e-6)
+    film(*inputs).square().sum().backward()
+    assert (film.film.weight.grad.abs().sum(-1) > 0).float().mean() > 0.9

@@ -25,6 +25,7 @@ from torchrl_koap.envs.registry import make_env
 from torchrl_koap.tasks import Task, get_task
 
 MAX_ATTEMPTS = 20
+BATCH_SIZE = 50  # episodes that are played at once: few enough that the first are over within seconds
 _PER_CONTEXT = 4  # attempts before an episode gets another context
 _CONTEXT_STREAM = 1  # keeps the draws of contexts apart from those of the players
 
@@ -87,6 +88,7 @@ def record_demonstrations(
     progress: Callable[[int, int], None] | None = None,
     *,
     dtype: torch.dtype = torch.float32,
+    batch_size: int = BATCH_SIZE,
 ) -> tuple[TensorDict, RecordingReport]:
     """Records demonstrations of a scripted expert as flat TED data, every action labelled.
 
@@ -100,6 +102,7 @@ def record_demonstrations(
         num_threads (int): threads that advance the physics.
         progress (callable, optional): called with the number of demonstrations recorded and wanted.
         dtype (torch.dtype): floating type of the entries; everything is computed in float64.
+        batch_size (int): episodes played at once. The demonstrations do not depend on it.
 
     Returns:
         tuple: flat data ``[N]`` in the storage layout of :mod:`torchrl_koap.keys`, and the :class:`RecordingReport`.
@@ -114,7 +117,7 @@ def record_demonstrations(
         >>> data["action"].shape[1], data["has_action"].all().item(), len(report.modes)
         (2, True, 3)
     """
-    raw, report = record_episodes(task, episodes, seed, num_threads, progress)
+    raw, report = record_episodes(task, episodes, seed, num_threads, progress, batch_size=batch_size)
     return episodes_to_ted(raw, task, dtype=dtype), report
 
 
@@ -124,6 +127,8 @@ def record_episodes(
     seed: int = 0,
     num_threads: int = 2,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    batch_size: int = BATCH_SIZE,
 ) -> tuple[list[Episode], RecordingReport]:
     """Records demonstrations with everything D3IL's recorder logs.
 
@@ -133,6 +138,9 @@ def record_episodes(
         seed (int): seed of modes and players. Same seed, same demonstrations, whatever the number of threads.
         num_threads (int): threads that advance the physics.
         progress (callable, optional): called with the number of demonstrations recorded and wanted.
+
+    Keyword Args:
+        batch_size (int): episodes played at once: what memory holds. The demonstrations do not depend on it.
 
     Returns:
         tuple: the episodes, for :func:`episodes_to_ted` and, of a task of D3IL, :func:`write_raw_episodes`, and the
@@ -144,10 +152,17 @@ def record_episodes(
     """
     facts = get_task(get_task(task).source)
     expert_of(facts)
-    for option, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_threads", num_threads, 1)):
+    limits = (
+        ("episodes", episodes, 1),
+        ("seed", seed, 0),
+        ("num_threads", num_threads, 1),
+        ("batch_size", batch_size, 1),
+    )
+    for option, value, least in limits:
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{option} must be an integer of at least {least}, got {value!r}")
-    return _record(facts, episodes, seed, num_threads, progress or (lambda done, total: None), None)
+    progress = progress or (lambda done, total: None)
+    return _record(facts, episodes, seed, num_threads, progress, None, batch_size)
 
 
 def episodes_to_ted(raw: Sequence[Episode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:
@@ -231,35 +246,46 @@ def _record(
     num_threads: int,
     progress: Callable[[int, int], None],
     rules: RecordingRules | None,
+    batch_size: int = BATCH_SIZE,
 ) -> tuple[list[Episode], RecordingReport]:
     start = time.perf_counter()
     modes = balanced_modes(episodes, task.num_modes, seed)
-    env = make_env(task, episodes, num_threads=num_threads, max_steps=task.max_steps, dtype=torch.float64)
+    size, shown = min(batch_size, episodes), 0
+    env = make_env(task, size, num_threads=num_threads, max_steps=task.max_steps, dtype=torch.float64)
     raw: list[Episode | None] = [None] * episodes
     attempts = [0] * episodes
     failures = dict.fromkeys(FAULTS, 0)
     contexts = None
+
+    def show(over: int) -> None:  # attempts that turn out bad are played again: the bar waits for them
+        nonlocal shown
+        shown = max(shown, over)
+        progress(shown, episodes)
+
     try:
         for attempt in range(MAX_ATTEMPTS):
+            # drawn for all episodes, so that none depends on how many are played at once
             if attempt % _PER_CONTEXT == 0 and task.bodies:
                 contexts = draw_contexts(task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
-            rows = np.array([index for index in range(episodes) if raw[index] is None])
-            already = episodes - len(rows)
-            results = play(
-                env,
-                task,
-                rows,
-                [modes[row] for row in rows],
-                contexts,
-                [(seed, int(row), attempt) for row in rows],
-                lambda over, already=already: progress(already + over, episodes),
-                rules=rules,
-            )
-            for row, (episode, fault) in zip(rows, results, strict=True):
-                attempts[row] += 1
-                raw[row] = episode
-                if fault:
-                    failures[fault] += 1
+            left = np.array([index for index in range(episodes) if raw[index] is None])
+            for begin in range(0, len(left), size):
+                rows = left[begin : begin + size]
+                already = sum(episode is not None for episode in raw)
+                results = play(
+                    env,
+                    task,
+                    np.arange(len(rows)),
+                    [modes[row] for row in rows],
+                    None if contexts is None else contexts[np.resize(rows, size)],  # the rest of the batch idles
+                    [(seed, int(row), attempt) for row in rows],
+                    lambda over, already=already: show(already + over),
+                    rules=rules,
+                )
+                for row, (episode, fault) in zip(rows, results, strict=True):
+                    attempts[row] += 1
+                    raw[row] = episode
+                    if fault:
+                        failures[fault] += 1
             if all(episode is not None for episode in raw):
                 break
     finally:

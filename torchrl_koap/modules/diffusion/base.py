@@ -90,6 +90,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
         self.schedule = NoiseSchedule() if schedule is None else schedule
         self.state_dim, self.history, self.horizon, self.relative = state_dim, history, horizon, relative
         self.clip, self.noise_key = clip, noise_key
+        self.training_dtype: torch.dtype | None = None  # of the denoiser's matrix products in denoising_error
         self.features = features
         self.condition_normalizer = identity_normalizer(
             history * state_dim + (0 if features is None else features.num_features)
@@ -193,7 +194,9 @@ class ConditionedDiffusion(TensorDictModuleBase):
             noise = torch.randn_like(sample) if noise is None else noise
             time = self.schedule.sample_time(sample) if time is None else time.to(sample.dtype)
             noisy, target = self.schedule.add_noise(sample, noise, time), self.schedule.target(sample, noise, time)
-        return (self.denoiser(noisy, time, condition) - target).square()
+        with torch.autocast(sample.device.type, self.training_dtype, enabled=self.training_dtype is not None):
+            predicted = self.denoiser(noisy, time, condition)
+        return (predicted - target).square()
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Raw plans or actions of normalised sequences; a subclass says how.

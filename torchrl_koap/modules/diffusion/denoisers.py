@@ -121,6 +121,9 @@ class MLPDenoiser(nn.Module):
         depth (int): number of residual layers. Defaults to 3.
         embedding_dim (int): width of the step embedding. Defaults to 32.
         frequencies (int): octaves of the condition's Fourier features. Defaults to 4.
+        dropout (float): share of the hidden units that are dropped in training. Defaults to 0.
+        film (bool): also scale and shift the input of every residual layer by a linear function of step embedding and
+            condition (Peebles and Xie 2023). Defaults to False: they enter once, beside the plan.
 
     Examples:
         >>> import torch
@@ -140,8 +143,12 @@ class MLPDenoiser(nn.Module):
         depth: int = 3,
         embedding_dim: int = 32,
         frequencies: int = 4,
+        dropout: float = 0.0,
+        film: bool = False,
     ):
         super().__init__()
+        if not 0 <= dropout < 1:
+            raise ValueError(f"dropout must be in [0, 1), got {dropout}")
         self.state_dim, self.condition_dim, self.horizon = state_dim, condition_dim, horizon
         self.step_embedding = StepEmbedding(embedding_dim)
         self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=width)
@@ -151,6 +158,12 @@ class MLPDenoiser(nn.Module):
             for _ in range(depth)
         )
         self.last = nn.Linear(width, horizon * state_dim)
+        self.dropout = nn.Dropout(dropout)
+        self.film = None
+        if film:  # starts as the identity
+            self.film = nn.Linear(width + embedding_dim, 2 * depth * width)
+            nn.init.zeros_(self.film.weight)
+            nn.init.zeros_(self.film.bias)
 
     def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
         """Predicts what the schedule asks for, from noisy sequences.
@@ -171,9 +184,18 @@ class MLPDenoiser(nn.Module):
             raise ValueError(f"sequence must have {self.horizon} steps (horizon) on axis -2, got {sequence.shape[-2]}")
         x = sequence.reshape(-1, self.horizon * self.state_dim)
         condition = self.encoder(condition.reshape(-1, self.condition_dim))
-        x = self.first(torch.cat([x, condition, self.step_embedding(time.reshape(-1))], -1))
-        for layer in self.layers:
-            x = x + layer(x)
+        context = torch.cat([condition, self.step_embedding(time.reshape(-1))], -1)
+        x = self.first(torch.cat([x, context], -1))
+        films = (
+            [None] * len(self.layers) if self.film is None else self.film(F.silu(context)).chunk(len(self.layers), -1)
+        )
+        for layer, film in zip(self.layers, films, strict=True):
+            norm, first, activation, second = layer
+            hidden = norm(x)
+            if film is not None:
+                scale, shift = film.chunk(2, -1)
+                hidden = torch.addcmul(hidden + shift, hidden, scale)
+            x = x + second(self.dropout(activation(first(hidden))))
         return self.last(x).reshape(sequence.shape)
 
 

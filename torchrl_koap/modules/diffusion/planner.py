@@ -166,6 +166,10 @@ class StatePlanner(ConditionedDiffusion):
         """
         return self.decode_plan(history, sequence)
 
+    def scale_columns(self, plan: Tensor) -> Tensor:
+        """Raw plan ``[*B, H, d]`` in units of the columns' spread, the same for all its steps."""
+        return plan / self.plan_normalizer.scale.unflatten(-1, (self.horizon, self.state_dim)).mean(0)
+
     def plan(
         self,
         history: Tensor,

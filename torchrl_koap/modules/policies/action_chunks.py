@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchrl_koap.keys import ACTION
 from torchrl_koap.modules.diffusion.policy import ACTION_CHUNK, DiffusionPolicy
+from torchrl_koap.modules.policies.candidates import sample_coherent
 from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
 
 
@@ -38,6 +39,9 @@ class ChunkedPolicy(RecedingHorizonPolicy):
         replan_interval (int): steps executed per chunk. Defaults to ``4``.
         controller_columns (sequence of int, optional): columns of the state that the Diffusion Policy reads: its mask.
             Default: all.
+        candidates (int): chunks sampled whenever one is due, of which one that goes on with the chunk in force is taken
+            (:mod:`torchrl_koap.modules.policies.candidates`). Defaults to ``1``.
+        choice (str): the rule by which it is taken. Defaults to ``"quarter"``.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -66,6 +70,8 @@ class ChunkedPolicy(RecedingHorizonPolicy):
         history: int,
         replan_interval: int = 4,
         controller_columns: Sequence[int] | None = None,
+        candidates: int = 1,
+        choice: str = "quarter",
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -80,6 +86,10 @@ class ChunkedPolicy(RecedingHorizonPolicy):
             cached_key=action_key,
             chunk_key=ACTION_CHUNK,
             reader="policy",
+            candidates=candidates,
+            choice=choice,
+            # the rest of a chunk is kept only where the next one is compared with it
+            kept_steps=planner.horizon if candidates > 1 else None,
         )
 
     def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
@@ -92,19 +102,38 @@ class ChunkedPolicy(RecedingHorizonPolicy):
         Returns:
             Tensor: ``[*B, replan_interval, act]``.
         """
-        return self.make_chunk(self.state_of(observations), noise)
+        return self.planner.sample(self._read(self.state_of(observations)), noise)[..., : self.replan_interval, :]
 
-    def make_chunk(self, history: Tensor, noise: Tensor | None) -> Tensor:
-        """Samples actions and keeps those that are executed.
+    def make_chunk(
+        self, history: Tensor, noise: Tensor | None, in_force: Tensor | None = None, fresh: Tensor | None = None
+    ) -> Tensor:
+        """Samples actions and keeps those that are executed, or all where the next chunk is compared with them.
 
         Args:
             history (Tensor): observed states ``[*B, history, d]``, raw units.
-            noise (Tensor, optional): ``[*B, *planner.noise_shape]``, standard normal. Default: random.
+            noise (Tensor, optional): ``[*B, *noise_shape]``, standard normal. Default: random.
+            in_force (Tensor, optional): the chunk of before ``[*B, H, act]``.
+            fresh (Tensor, optional): where an episode begins, bool ``[*B]``.
 
         Returns:
-            Tensor: ``[*B, replan_interval, act]``.
+            Tensor: ``[*B, replan_interval, act]``; ``[*B, H, act]`` for several candidates.
         """
+        state = self._read(history)
+        if self.candidates == 1:
+            return self.planner.sample(state, noise)[..., : self.replan_interval, :]
+        left = None if in_force is None else in_force[..., self.replan_interval :, :]
+        return sample_coherent(
+            self.planner.sample,
+            self.planner.action_normalizer,
+            state,
+            noise,
+            number=self.candidates,
+            rule=self.choice,
+            in_force=None if left is None or not left.shape[-2] else left,
+            fresh=fresh,
+        )
+
+    def _read(self, history: Tensor) -> Tensor:
+        """The states that the policy reads, of those observed."""
         state = history[..., -self.planner.history :, :]
-        if self.controller_columns is not None:
-            state = state[..., self.controller_columns]
-        return self.planner.sample(state, noise)[..., : self.replan_interval, :]
+        return state if self.controller_columns is None else state[..., self.controller_columns]

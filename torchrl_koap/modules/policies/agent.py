@@ -123,7 +123,7 @@ class Agent:
         """Start noise of a plan ``[n, *noise_shape]``, from a stream per robot."""
         if not self._generators:
             self._generators = [torch.Generator().manual_seed(self.seed + robot) for robot in range(robots)]
-        shape = self.policy.planner.noise_shape
+        shape = self.policy.noise_shape
         draws = [torch.randn(*shape, generator=generator) for generator in self._generators]
         return torch.stack(draws).to(self.device, self.dtype)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_koap.keys import ACTION
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.diffusion.planner import StatePlanner
+from torchrl_koap.modules.policies.candidates import paths_apart, sample_coherent
 from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
 
 EXECUTIONS = ("feedback", "open_loop")
@@ -54,12 +55,15 @@ class PlanThenControl(RecedingHorizonPolicy):
         action_rule (callable, optional): ``action_rule(states [B, T, d], actions [B, T, act]) -> actions`` has the last
             word on the actions of a window of observed and planned states; such as the gripper's number, which is read
             off the planned widths (:func:`~torchrl_koap.tasks.gripper.command_gripper`).
+        candidates (int): plans sampled whenever one is due, of which one that goes on with the plan in force is taken
+            (:mod:`torchrl_koap.modules.policies.candidates`). Defaults to ``1``.
+        choice (str): the rule by which it is taken. Defaults to ``"quarter"``.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
     Raises:
-        ValueError: for an unknown execution, a history shorter than the planner's, or an interval longer than the
-            horizon. At the first call for a history of another length.
+        ValueError: for an unknown execution or rule, several candidates in open loop, a history shorter than the
+            planner's, or an interval longer than the horizon. At the first call for a history of another length.
         KeyError: at the first call, if the environment lacks :func:`policy_transforms`.
 
     Examples:
@@ -87,6 +91,8 @@ class PlanThenControl(RecedingHorizonPolicy):
         blend_decay: float = 0.8,
         controller_columns: Sequence[int] | None = None,
         action_rule: Callable[[Tensor, Tensor], Tensor] | None = None,
+        candidates: int = 1,
+        choice: str = "quarter",
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -103,23 +109,45 @@ class PlanThenControl(RecedingHorizonPolicy):
             action_key=action_key,
             cached_key="remaining_plan" if feedback else action_key,
             chunk_key="remaining_plan_chunk" if feedback else "action_chunk",
+            candidates=candidates,
+            choice=choice,
         )
+        if candidates > 1 and not feedback:
+            raise ValueError(f"several candidates need execution 'feedback', which keeps its plan; got {execution!r}")
         if not 0 <= blend_decay < 1:
             raise ValueError(f"blend_decay must be in [0, 1), got {blend_decay}")
         self.execution, self.blend_decay, self.action_rule = execution, blend_decay, action_rule
         self.controller = controller
 
-    def make_chunk(self, history: Tensor, noise: Tensor | None) -> Tensor:
+    def make_chunk(
+        self, history: Tensor, noise: Tensor | None, in_force: Tensor | None = None, fresh: Tensor | None = None
+    ) -> Tensor:
         """Plans, and gives what remains of the plan in each of the next steps, or decodes their actions.
 
         Args:
             history (Tensor): observed states ``[*B, history, d]``, raw units.
-            noise (Tensor, optional): ``[*B, *planner.noise_shape]``, standard normal. Default: random.
+            noise (Tensor, optional): ``[*B, *noise_shape]``, standard normal. Default: random.
+            in_force (Tensor, optional): the chunk of before ``[*B, replan_interval, H, d]``, its first entry the plan.
+            fresh (Tensor, optional): where an episode begins, bool ``[*B]``.
 
         Returns:
             Tensor: ``[*B, replan_interval, H, d]`` with feedback, ``[*B, replan_interval, act]`` in open loop.
         """
-        plan = self.planner.plan(history[..., -self.planner.history :, :], noise)
+        seen = history[..., -self.planner.history :, :]
+        if self.candidates == 1:
+            plan = self.planner.plan(seen, noise)
+        else:
+            plan = sample_coherent(
+                self.planner.plan,
+                self.planner.scale_columns,
+                seen,
+                noise,
+                number=self.candidates,
+                rule=self.choice,
+                in_force=None if in_force is None else in_force[..., 0, :, :],
+                fresh=fresh,
+                apart=paths_apart,
+            )
         return self._remaining_plans(plan) if self.execution == "feedback" else self._decode_chunk(history, plan)
 
     def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from torchrl.envs.transforms import CatFrames, Compose, InitTracker, UnsqueezeTr
 from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_koap.keys import ACTION, OBSERVATION
+from torchrl_koap.modules.policies.candidates import check_candidates
 
 OBSERVATION_HISTORY = "observation_history"
 STATE_HISTORY = "state_history"
@@ -66,6 +67,10 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         cached_key (NestedKey): entry of a chunk that is in force at the current step.
         chunk_key (NestedKey): the chunk.
         reader (str): what reads the last frames, in error messages.
+        candidates (int): plans or chunks sampled whenever one is due, of which one is taken that goes on with the one
+            in force (:mod:`torchrl_koap.modules.policies.candidates`).
+        choice (str): the rule by which it is taken.
+        kept_steps (int, optional): entries of a chunk that are kept. Default: those that are executed.
 
     Raises:
         ValueError: for a history shorter than the planner's, or an interval longer than the horizon. At the first call
@@ -94,8 +99,12 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         cached_key: NestedKey,
         chunk_key: NestedKey,
         reader: str = "planner",
+        candidates: int = 1,
+        choice: str = "quarter",
+        kept_steps: int | None = None,
     ):
         super().__init__()
+        check_candidates(candidates, choice)
         if history < planner.history:
             raise ValueError(f"the {reader} reads {planner.history} observed frames, history is only {history}")
         if not 1 <= replan_interval <= planner.horizon:
@@ -109,22 +118,32 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
             self.state_of = self._select
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self.history, self.replan_interval = history, replan_interval
-        self.planner = planner
+        self.planner, self.candidates, self.choice = planner, candidates, choice
         self._written: TensorDictBase | None = None
         self.receding = MultiStepActorWrapper(
             _Chunk(self.make_chunk, planner.noise_key, chunk_key),
-            n_steps=replan_interval,
+            n_steps=kept_steps or replan_interval,
+            replan_interval=replan_interval,
             action_keys=[cached_key],
             chunk_keys=[chunk_key],
             init_key=IS_INIT,
         )
 
-    def make_chunk(self, history: Tensor, noise: Tensor | None) -> Tensor:
+    @property
+    def noise_shape(self) -> tuple[int, ...]:
+        """Shape of everything that is drawn for one environment whenever a plan is due."""
+        return (*((self.candidates,) if self.candidates > 1 else ()), *self.planner.noise_shape)
+
+    def make_chunk(
+        self, history: Tensor, noise: Tensor | None, in_force: Tensor | None = None, fresh: Tensor | None = None
+    ) -> Tensor:
         """What is in force in each of the next steps; a subclass says how it is made.
 
         Args:
             history (Tensor): observed states ``[*B, history, d]``, raw units.
-            noise (Tensor, optional): ``[*B, *planner.noise_shape]``, standard normal. Default: random.
+            noise (Tensor, optional): ``[*B, *noise_shape]``, standard normal. Default: random.
+            in_force (Tensor, optional): the chunk of before, which several candidates are compared with.
+            fresh (Tensor, optional): where an episode begins, bool ``[*B]``.
 
         Returns:
             Tensor: ``[*B, replan_interval, ...]``, an entry per step.
@@ -206,5 +225,7 @@ class _Chunk(TensorDictModuleBase):
         self.in_keys, self.out_keys = [STATE_HISTORY], [chunk_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        noise = tensordict.get(self.noise_key, None)
-        return tensordict.set(self.out_keys[0], self.make_chunk(tensordict.get(STATE_HISTORY), noise))
+        noise, in_force = tensordict.get(self.noise_key, None), tensordict.get(self.out_keys[0], None)
+        fresh = tensordict.get(IS_INIT).squeeze(-1)
+        chunk = self.make_chunk(tensordict.get(STATE_HISTORY), noise, in_force, fresh)
+        return tensordict.set(self.out_keys[0], chunk)

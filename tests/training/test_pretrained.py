@@ -1,0 +1,95 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Trained policies of the repository: found by name, written small, evaluated in a folder of one's own."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from tiny_runs import TINY, koap, write_demonstrations
+
+from torchrl_koap.evaluation.run import load_run
+from torchrl_koap.training import pretrained
+from torchrl_koap.training.checkpoints import load_tensors
+from torchrl_koap.training.pretrained import copy_run, find_run, publish
+from torchrl_koap.training.run_directory import RunDirectoryError
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pretrained")
+    data = write_demonstrations(folder / "data")
+    out = folder / "run"
+    arguments = ("--task", "avoiding", "--dataset", data, "--controller-steps", "5", "--no-analysis")
+    assert koap("train", "--out", out, *arguments, *TINY) == 0
+    return out
+
+
+@pytest.fixture
+def policies(run, tmp_path, monkeypatch):
+    """A present folder with the trained policies ``avoiding`` and ``aligning``; both are the tiny run."""
+    for name in ("avoiding", "aligning"):
+        publish(run, tmp_path / "pretrained" / name, f"# {name}\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "pretrained"
+
+
+def test_names(policies):
+    assert find_run("runs/mine") == pretrained.Path("runs/mine")
+    assert find_run("pretrained:avoiding").resolve() == policies / "avoiding"
+    with pytest.raises(ValueError, match="unknown pretrained policy 'algning'; did you mean 'aligning'"):
+        find_run("pretrained:algning")
+
+
+def test_an_installed_wheel_has_none(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(pretrained, "__file__", str(tmp_path / "site-packages" / "torchrl_koap" / "training" / "x.py"))
+    with pytest.raises(RunDirectoryError, match="no folder 'pretrained' here or beside the package"):
+        find_run("pretrained:aligning")
+
+
+def test_a_published_policy_is_small_and_plans_the_same(run, policies):
+    tensors, about = load_tensors(policies / "avoiding" / "controller.safetensors")
+    assert about["task"] == "avoiding"
+    small = {name.rpartition(".")[-1] for name, tensor in tensors.items() if tensor.dtype == torch.int8}
+    assert small == {"covariance_root"}  # frequencies stay as the decoder knows them
+    small, whole = ((folder / "planner.safetensors").stat().st_size for folder in (policies / "avoiding", run))
+    assert small < 0.6 * whole
+    planner, exact = load_run(policies / "avoiding").planner, load_run(run).planner
+    history, noise = torch.rand(20, 2, 2), torch.randn(20, 14, 2)
+    with torch.no_grad():
+        gap = (planner.plan(history, noise) - exact.plan(history, noise)).abs().mean()
+        spread = exact.plan(history, noise).std(0).mean()
+    assert 0 < gap < 0.05 * spread
+    assert next(planner.denoiser.parameters()).dtype == torch.float32
+    assert not (policies / "avoiding" / "checkpoints").exists()
+
+
+def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
+    out = tmp_path / "mine"
+    rolled = ("--episodes", "2", "--threads", "1", "--no-animate")
+    assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--candidates", "3") == 0
+    result = json.loads((out / "eval.json").read_text())
+    assert result["episodes"] == 2 and result["candidates"] == 3
+    assert (out / "index.html").exists() and not (policies / "avoiding" / "eval.json").exists()
+    assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--no-report") == 0  # again, into the same folder
+
+
+def test_wrong_calls(policies, tmp_path, capfd):
+    assert koap("eval", "pretrained:avoiding") == 1
+    assert "name it with --out" in capfd.readouterr().err
+    assert koap("eval", "pretrained:avoiding", "--out", tmp_path / "a", "--task", "sorting") == 1
+    assert "trained on task 'avoiding', not on 'sorting'" in capfd.readouterr().err
+    assert not (tmp_path / "a").exists()
+    assert koap("eval", "pretrained:evoiding", "--out", tmp_path / "a") == 1
+    assert "did you mean 'avoiding'?" in capfd.readouterr().err
+
+
+def test_another_run_is_not_overwritten(run, tmp_path):
+    copy_run(run, tmp_path / "mine")
+    config = json.loads((run / "config.json").read_text())
+    (tmp_path / "mine" / "config.json").write_text(json.dumps(config | {"seed": 9}))
+    with pytest.raises(RunDirectoryError, match="holds another run than"):
+        copy_run(run, tmp_path / "mine")
+    assert json.loads((tmp_path / "mine" / "config.json").read_text())["seed"] == 9

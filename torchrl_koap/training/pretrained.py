@@ -1,0 +1,85 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Trained policies that the repository holds, and runs that are evaluated in another folder than their own."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from torchrl_koap.lookup import lookup
+from torchrl_koap.training.checkpoints import load_tensors, save_tensors
+from torchrl_koap.training.compact_weights import compact
+from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+
+PREFIX = "pretrained:"
+# what a run is made of; evaluations, reports and checkpoints are made from it
+WEIGHTS = ("planner.safetensors", "controller.safetensors")
+FILES = ("config.json", "summary.json", "metrics.csv", "eigenvalues.safetensors", *WEIGHTS)
+
+
+def pretrained_folders() -> dict[str, Path]:
+    """Names and folders of the trained policies: those of the checkout, or below the present folder.
+
+    Examples:
+        >>> from torchrl_koap.training.pretrained import pretrained_folders
+        >>> all((folder / "config.json").exists() for folder in pretrained_folders().values())
+        True
+    """
+    roots = [Path("pretrained"), Path(__file__).resolve().parents[2] / "pretrained"]
+    folders = [folder for root in roots if root.is_dir() for folder in sorted(root.iterdir())]
+    return {folder.name: folder for folder in reversed(folders) if (folder / "config.json").exists()}
+
+
+def find_run(name: str | Path) -> Path:
+    """The folder of a run: a path as it is, ``pretrained:NAME`` looked up.
+
+    Raises:
+        ValueError: if there is no trained policy of that name; the message suggests the nearest.
+        RunDirectoryError: if there are none at all: the library was installed without its repository.
+    """
+    name = str(name)
+    if not name.startswith(PREFIX):
+        return Path(name)
+    folders = pretrained_folders()
+    if not folders:
+        raise RunDirectoryError(
+            f"{name!r} was asked for, but there is no folder 'pretrained' here or beside the package: it is part of the"
+            " repository, not of an installed wheel"
+        )
+    return lookup(folders, name.removeprefix(PREFIX), "pretrained policy")
+
+
+def copy_run(source: str | Path, target: str | Path) -> Path:
+    """Copies what a run is made of, and nothing that an evaluation wrote, to a folder that is new or holds that run.
+
+    Raises:
+        RunDirectoryError: if the source is no run, or the target holds another one.
+    """
+    source, target = Path(source), Path(target)
+    config = RunDirectory(source).read_json("config.json")
+    if (target / "config.json").exists() and RunDirectory(target).read_json("config.json") != config:
+        raise RunDirectoryError(f"{target} holds another run than {source}; choose another --out")
+    target.mkdir(parents=True, exist_ok=True)
+    for name in FILES:
+        if (source / name).exists():
+            shutil.copyfile(source / name, target / name)
+    return target
+
+
+def publish(run: str | Path, folder: str | Path, card: str) -> Path:
+    """Writes a trained policy as the repository holds it: compact weights, options, a model card.
+
+    Args:
+        run (str or Path): run directory of ``koap train``.
+        folder (str or Path): folder to write; its name is that of the policy.
+        card (str): text of the ``README.md``: data, updates, success, command.
+    """
+    folder = copy_run(run, folder)
+    for name in WEIGHTS:
+        if (folder / name).exists():
+            tensors, about = load_tensors(folder / name)
+            # a closed-form decoder was fitted to features of exactly these frequencies: of them nothing is rounded
+            only = ("covariance_root",) if name == "controller.safetensors" and (folder / WEIGHTS[0]).exists() else ()
+            save_tensors(folder / name, compact(tensors, only=only), about)
+    (folder / "README.md").write_text(card)
+    return folder
