@@ -40,6 +40,7 @@ def save_arm(
         folder,
         states,
         [action if number < labelled else None for number, action in enumerate(actions)],
+        name="arm",
         control_hz=30,
         state_names=[f"q{joint}" for joint in range(joints)] + [f"goal{joint}" for joint in range(joints)],
         state_units=units if isinstance(units, str) else [*units, *units],

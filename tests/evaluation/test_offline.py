@@ -62,7 +62,8 @@ def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):
 
 def test_latent_space_and_suggestions(run):
     verdict = inspect(run, InspectConfig(latent_only=True, threads=1)).result["verdict"]
-    assert "mrad" in verdict and " mm" not in verdict.replace("mrad", "")
+    assert "mrad" in verdict and " mm" not in verdict
+    assert "On labels of the budget, which the run's decoder was fitted on: a linear probe" in verdict
     assert {row["episode"] for row in suggest(run, SuggestConfig(count=7)).suggestions} == set(range(3, 10))
     with pytest.raises(ValueError, match="task 'arm' has no environment to make experiments in: --latent-only"):
         inspect(run)

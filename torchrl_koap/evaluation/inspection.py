@@ -210,16 +210,27 @@ def _latent_says(latent: dict[str, Any], task: Task) -> str:
     shown, factor = error_unit(part, task)
     ahead = {model: f"{factor * errors[model][part][-1]:.3g} {shown}".rstrip() for model in MODELS}
     outside = latent[OUTSIDE_THE_BUDGET]
-    shared = outside["judged_trajectories_in_budget"]
-    reservation = f" ({shared} of these {errors['judged_trajectories']} have labels in the budget)" if shared else ""
-    probe, own = (min(outside[name]) for name in ("probe_r2", "decoder_r2"))
     faults = judge_latent_model(errors)
     said = f"A fault to look into: {'; '.join(faults)}. " if faults else ""
     return said + (
         f"{errors['steps']} steps ahead the latent dynamics miss the {part.replace('_', ' ')} by {ahead['koopman']}"
         f" ({ahead['reconstruction']} of mapping back alone), a linear model on raw states by {ahead['linear']},"
-        f" standing still by {ahead['copy_last']}. Outside the budget,"
-        f" for analysis only: a linear probe on all labels explains {probe:.1%} of the hardest action dimension on"
+        f" standing still by {ahead['copy_last']}. {_probe_says(outside)}"
+    )
+
+
+def _probe_says(outside: dict[str, Any]) -> str:
+    if "note" in outside:
+        return outside["note"].capitalize()
+    shared, judged = (outside.get(name, 0) for name in ("judged_trajectories_in_budget", "judged_trajectories"))
+    probe, own = (min(outside[name]) for name in ("probe_r2", "decoder_r2"))
+    head, reservation = "Outside the budget, for analysis only", ""
+    if shared and shared == judged:
+        head = "On labels of the budget, which the run's decoder was fitted on"
+    elif shared:
+        reservation = f" ({shared} of these {judged} have labels in the budget)"
+    return (
+        f"{head}: a linear probe on all labels explains {probe:.1%} of the hardest action dimension on"
         f" held-out trajectories, the run's own decoder {own:.1%}{reservation}"
     )
 

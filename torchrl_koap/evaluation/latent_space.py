@@ -271,7 +271,7 @@ def analyse_latent(
 
     Args:
         controller (KoopmanInverseDynamics): the model, in evaluation mode, on the device of the data.
-        data (TensorDictBase): flat ``[N]``, fully labelled, as the controller sees them.
+        data (TensorDictBase): flat ``[N]`` with all labels that there are, as the controller sees them.
         labelled (Tensor): steps labelled in the budget, bool ``[N]``.
         parts (mapping): columns of the state by name.
 
@@ -281,7 +281,9 @@ def analyse_latent(
 
     Returns:
         dict: ``eigenvalues`` (where the operator is a matrix), ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET`
-        the probe, the number of labels it read and the ``R^2`` of the model's own decoder on the same steps.
+        the probe, the number of labels it read and the ``R^2`` of the model's own decoder on the same steps; or a
+        ``note`` where fewer than two trajectories have labels. Of data that lack labels the probe takes half of the
+        labelled trajectories.
     """
     result: dict[str, Any] = {}
     if hasattr(controller.operator, "eigenvalues"):
@@ -294,6 +296,15 @@ def analyse_latent(
     sizes = {"steps": horizon, "fitted_trajectories": len(fit_on), "judged_trajectories": held_out}
     result["multi_step"] = sizes | errors
     steps = infer_steps(controller, data)
+    known = steps[HAS_ACTION]
+    if not known.all():  # the data lack labels themselves
+        steps = steps[known]
+        if len(steps[EPISODE].unique()) < 2:
+            result[OUTSIDE_THE_BUDGET] = {
+                "note": "fewer than two trajectories have labels to probe latent actions with"
+            }
+            return result
+        fit_on = split_trajectories(steps[EPISODE], torch.zeros(len(steps), dtype=torch.bool), seed=seed)
     latent, action, fit = steps["latent_action"], steps[ACTION], torch.isin(steps[EPISODE], fit_on)
     budget = data[EPISODE][labelled].unique()
     with torch.no_grad():
@@ -301,6 +312,7 @@ def analyse_latent(
     result[OUTSIDE_THE_BUDGET] = {
         "labels_read": len(steps),
         "steps_judged": int((~fit).sum()),
+        "judged_trajectories": len(steps[EPISODE][~fit].unique()),
         "judged_trajectories_in_budget": int((~torch.isin(budget, fit_on)).sum()),
         "probe_r2": probe(latent, action, steps[EPISODE], fit),
         "decoder_r2": own,

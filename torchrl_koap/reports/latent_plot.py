@@ -83,16 +83,22 @@ def plot_latent(latent: Mapping[str, Any], path: str | Path, *, task: Task, eige
         'latent.png'
     """
     outside = latent[OUTSIDE_THE_BUDGET]
-    panels = (["spectrum"] if eigenvalues is not None else []) + ["errors", "probe"]
+    panels = (["spectrum"] if eigenvalues is not None else []) + ["errors"] + ([] if "note" in outside else ["probe"])
     figure = Figure(figsize=(4.6 * len(panels) + 0.8, 4.1), layout="constrained")
-    axes = dict(zip(panels, figure.subplots(1, len(panels)), strict=True))
+    axes = dict(zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True))
     if eigenvalues is not None:
         values = as_array("eigenvalues", eigenvalues, [None])
         draw_spectrum(axes["spectrum"], as_spectrum(values.real, values.imag))
     _draw_errors(axes["errors"], latent["multi_step"], task)
-    _draw_probe(axes["probe"], outside, list(task.action_names))
+    if "probe" in axes:
+        _draw_probe(axes["probe"], outside, list(task.action_names))
+    if "note" in outside:
+        return save_figure(figure, path)
+    shared = outside.get("judged_trajectories_in_budget")
+    inside = bool(shared) and shared == outside.get("judged_trajectories")
+    which = "of the budget, which the decoder has seen" if inside else "outside the budget"
     figure.suptitle(
-        f"probe and decoder: for analysis only, reads {outside['labels_read']:,} labels, outside the budget",
+        f"probe and decoder: for analysis only, reads {outside['labels_read']:,} labels, {which}",
         fontsize=10,
         color=WARNING,
         x=0.99,

@@ -200,7 +200,7 @@ def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, An
         "eval_seconds": done["eval_seconds"],
     }
     if result.get("kind") == KIND:
-        return common | {"action_error": _own_error(result)} | {name: result[name] for name in _ERRORS}
+        return common | {"kind": KIND, "action_error": _own_error(result)} | {name: result[name] for name in _ERRORS}
     entropy = result["mode_entropy"]
     return common | {
         "episodes": result["episodes"],

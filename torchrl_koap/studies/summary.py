@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from torchrl_koap.evaluation.offline import KIND
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.lookup import lookup
 
@@ -120,7 +121,8 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
         cells = groups.setdefault(key, {})
         if row["seed"] in cells:
             raise ValueError(f"the cell {cell_name(row)} occurs twice")
-        if row["status"] == "done" and any(row.get(name) in (None, "") for name in needed_when_done(row)):
+        needed = needed_when_done(row) if row["status"] == "done" else ()
+        if needed and (not row.get("episodes") or row.get("successes") is None):
             raise ValueError(f"the cell {cell_name(row)} is done but has no 'episodes' or 'successes'")
         cells[row["seed"]] = row
     return [
@@ -176,14 +178,17 @@ def _values(rows: Sequence[Mapping[str, Any]], name: str) -> list[float]:
 
 
 def needed_when_done(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Columns that a cell which is done must have: of its rollouts, or errors where it has no environment.
+    """Columns that a cell which is done must have: those of its rollouts, none where it has no environment.
 
     Args:
-        row (mapping): the cell.
+        row (mapping): the cell; its ``kind`` is ``"offline"`` where there was no environment.
+
+    Examples:
+        >>> from torchrl_koap.studies.summary import needed_when_done
+        >>> needed_when_done({"kind": "offline"}), needed_when_done({})
+        ((), ('episodes', 'successes'))
     """
-    errors = ("relative_action_error", "relative_plan_error")
-    judged_offline = any(row.get(name) is not None for name in errors) and not row.get("episodes")
-    return () if judged_offline else ("episodes", "successes")
+    return () if row.get("kind") == KIND else ("episodes", "successes")
 
 
 def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float | None:

@@ -38,6 +38,7 @@ _KINDS = {
     "action_error": float,
     "relative_action_error": float,
     "relative_plan_error": float,
+    "kind": str,
     "controller_updates": int,
     "train_seconds": float,
     "eval_seconds": float,
@@ -45,7 +46,7 @@ _KINDS = {
 }
 CELL_COLUMNS = tuple(_KINDS)
 _ALWAYS = ("task", "method", "fraction", "observations", "seed", "status")
-_LATER = ("relative_action_error", "relative_plan_error")  # columns that files of before do not have
+_LATER = ("relative_action_error", "relative_plan_error", "kind")  # columns that files of before do not have
 _WORDS = {int: "a whole number", float: "a finite number"}
 
 
