@@ -9,19 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torchrl_koap.data import LabelBudget
-from torchrl_koap.evaluation.rollouts import make_policy, measure_latency, roll_out, rollouts_to_tensors
+from torchrl_koap.evaluation.policy_files import PolicyDescription, assemble_policy, build_networks, read_policy
+from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import ChunkedPolicy, StatePlanner
+from torchrl_koap.modules import RecedingHorizonPolicy, StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
-from torchrl_koap.training.builders import build_controller, method_named, set_up_torch
-from torchrl_koap.training.checkpoints import load_weights, save_tensors
-from torchrl_koap.training.diffusion_builders import build_planner
+from torchrl_koap.training.builders import method_named, set_up_torch
+from torchrl_koap.training.checkpoints import CheckpointError, load_weights, save_tensors
 from torchrl_koap.training.methods import Method
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
@@ -121,60 +120,50 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
     config = directory.read_json("config.json")
     load_plugins(config.get("plugins") or ())
     facts, method = task_of(config), method_named(entry)
-    columns = facts.controller_columns(entry.get("state", "all"))
-    if method.has_planner:
-        planner = build_planner(planner_entry, facts.state_dim, facts.planner_features())
-        controller = build_controller(entry, len(columns), facts.action_dim, method=method)
-    else:
-        planner = None
-        controller = method.build(facts.state_dim, facts.action_dim, facts.planner_features(), planner_entry)
+    planner, controller, columns = build_networks(facts, method, planner_entry, entry)
     for name, module in {"planner": planner, "controller": controller}.items():
         if module is not None:
-            load_weights(directory.path / f"{name}.safetensors", module.eval(), task=facts.name)
+            load_weights(directory.path / f"{name}.safetensors", module, task=facts.name)
     return TrainedRun(directory, config, facts, method, planner, controller, columns)
 
 
-def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) -> TensorDictModuleBase:
-    """A run as a policy: observations in, an action per control step out.
+def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) -> RecedingHorizonPolicy:
+    """A run, or a file of :func:`~torchrl_koap.save_policy`, as a policy: observations in, an action per step out.
 
     An environment needs :func:`~torchrl_koap.modules.policy_transforms` of ``policy.history`` for it, which hand it the
-    last observations.
+    last observations; an :class:`~torchrl_koap.modules.Agent` keeps them itself.
 
     Args:
-        run (str, Path or TrainedRun): a run directory, or what :func:`load_run` made of one.
-        config (EvalConfig, optional): execution, solver, interval between plans and device; the rest is not used.
+        run (str, Path or TrainedRun): a run directory, what :func:`load_run` made of one, or a file.
+        config (EvalConfig, optional): execution, solver, interval between plans, device and plugins; the rest is not
+            used. Default: as ``koap eval`` has them, for a file as it was saved.
 
     Raises:
         ValueError: for an unknown execution or solver, or an interval out of range.
-        RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`.
+        RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`; a :class:`CheckpointError` names the file.
     """
-    config = EvalConfig() if config is None else config
+    given, config = config, EvalConfig() if config is None else config
     lookup(EXECUTIONS, config.execution, "execution")
-    trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
-    sampler = trained.controller if trained.planner is None else trained.planner
-    if config.solver is not None:
-        sampler.solver = config.solver
-    if config.solver_steps is not None:
-        sampler.num_steps = config.solver_steps
-    task = trained.task
-    if trained.planner is None:
-        policy = ChunkedPolicy(
-            trained.controller,
-            state_columns=task.state_of,
-            history=trained.controller.history,
-            replan_interval=config.replan_interval,
-        )
+    options = {name: getattr(config, name) for name in ("execution", "replan_interval", "blend_decay")}
+    if isinstance(run, (str, Path)) and Path(run).is_file():
+        policy = read_policy(run, plugins=config.plugins, **({} if given is None else options))
+        trained_on = policy.description.task.name
+        if config.task not in (None, trained_on):
+            raise CheckpointError(f"{run} was trained on task {trained_on!r}, not on {config.task!r}")
     else:
-        policy = make_policy(
-            trained.planner,
-            trained.controller,
-            state_columns=task.state_of,
-            execution=config.execution,
-            replan_interval=config.replan_interval,
-            blend_decay=config.blend_decay,
-            controller_columns=trained.columns,
-            action_rule=task.action_rule,
+        trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
+        description = PolicyDescription(
+            trained.task,
+            trained.config["planner"],
+            trained.config["controller"],
+            trained.columns,
+            tuple(trained.config.get("plugins") or ()),
         )
+        policy = assemble_policy(trained.planner, trained.controller, description, **options)
+    if config.solver is not None:
+        policy.planner.solver = config.solver
+    if config.solver_steps is not None:
+        policy.planner.num_steps = config.solver_steps
     return policy.to(config.device)
 
 
