@@ -94,7 +94,7 @@ def test_files_that_cannot_be_used_are_named(own_policy, trained_run, tmp_path):
     cut = tmp_path / "cut.safetensors"
     cut.write_bytes(good.read_bytes()[:1000])
     half = {name: value for name, value in tensors.items() if not name.startswith("controller.")}
-    wide = about | {"planner": about["planner"] | {"channels": [4, 8]}}
+    wide = about | {"planner": about["planner"] | {"channels": [16, 8]}}
     lost = {name: value for name, value in about.items() if name != "columns"}
     code = about | {"task_definition": about["task_definition"] | {"env": "os:system"}}
     wrong = {

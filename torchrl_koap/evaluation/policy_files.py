@@ -116,7 +116,7 @@ def assemble_policy(
             action_rule=task.action_rule,
         )
     policy.description = description
-    return policy
+    return policy.eval()
 
 
 def build_policy(planner: StatePlanner, controller: nn.Module, task: Task | None = None, **options: Any):

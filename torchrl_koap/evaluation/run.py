@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,9 @@ class EvalConfig:
         blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are.
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
+        env: id of a Gymnasium environment to roll out in instead of the task's own, such as "my_package:Reach-v0".
+        success_key: entry of its info that says whether the task is done (default: "is_success" or "success" where it
+            has one of them, else an episode that terminates with a positive reward).
         task: refuse a run of another task than this.
         threads: torch and simulator threads.
         device: "cpu" or "cuda".
@@ -58,6 +63,8 @@ class EvalConfig:
     blend_decay: float = 0.8
     batch_size: int | None = None
     contexts_file: Path | None = None
+    env: str | None = None
+    success_key: str | None = None
     task: str | None = None
     threads: int = 2
     device: str = "cpu"
@@ -202,6 +209,46 @@ def choose_contexts(
     return numbers, table[numbers]
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where a run is rolled out."""
+
+    make_env: Callable[[int], Any]
+    max_steps: int
+    mode_index: Callable[[torch.Tensor], torch.Tensor]
+    num_modes: int
+    numbers: list[int] | None = None
+    contexts: np.ndarray | None = None
+
+
+def _place(task: Task, config: EvalConfig) -> _Place:
+    """The task's own environment, or the one of Gymnasium that was asked for."""
+    if config.env is None:
+        if config.success_key is not None:
+            raise ValueError("success_key was given, but no env: the task's own environment says what success is")
+        numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
+        from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
+
+        make_env = make_env_of(task, num_threads=config.threads)
+        return _Place(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
+    for name, unfit in {
+        "contexts_file": config.contexts_file is not None,
+        "rollouts_per_context": config.rollouts_per_context != 1,
+    }.items():
+        if unfit:
+            raise ValueError(f"{name} was given, but an environment of Gymnasium has no contexts")
+    from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
+
+    make_env = partial(GymnasiumBatch, config.env, task, success_key=config.success_key)
+    probe = make_env(1)
+    probe.close()
+    return _Place(make_env, probe.max_steps, _only_mode, 1)
+
+
+def _only_mode(mode: torch.Tensor) -> torch.Tensor:
+    return mode[..., 0]
+
+
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
     """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
 
@@ -229,25 +276,28 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     policy = load_policy(trained, config)
     sampler = trained.controller if trained.planner is None else trained.planner
     seeds = list(range(config.seed, config.seed + config.episodes))
-    numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
-    from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
-
-    mode_index = mode_index_of(task)
+    place = _place(task, config)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
         episodes = roll_out(
             policy,
-            make_env_of(task, num_threads=config.threads),
+            place.make_env,
             seeds,
-            max_steps=task.max_steps,
+            max_steps=place.max_steps,
             batch_size=config.batch_size,
-            contexts=contexts,
+            contexts=place.contexts,
             progress=count_up_to(bar),
         )
     unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
     result = score(
-        episodes, seeds, num_modes=task.num_modes, mode_index=mode_index, contexts=numbers, unsolved=unsolved
+        episodes,
+        seeds,
+        num_modes=place.num_modes,
+        mode_index=place.mode_index,
+        contexts=place.numbers,
+        unsolved=unsolved,
     )
-    result |= task_scores(task, result, episodes, numbers)
+    if config.env is None:
+        result |= task_scores(task, result, episodes, place.numbers)
     rows = result.pop("episode")
     result |= measure_latency(policy, task.observation_dim)
     result |= {
@@ -258,16 +308,18 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         "blend_decay": config.blend_decay,
         "episode": rows,
     }
+    if config.env is not None:
+        result |= {"env": config.env, "success_key": config.success_key}
     rollouts = rollouts_to_tensors(
         [episode.cpu() for episode in episodes],
         position=task.observation[task.position],
-        mode_index=mode_index,
+        mode_index=place.mode_index,
         interval=config.replan_interval,
-        objects=[task.observation[part] for part in task.plotted.values()],
+        objects=[task.observation[part] for part in task.plotted.values()] if config.env is None else (),
         plans_position=task.plans_position,
     )
-    if contexts is not None:  # in full precision: a film of the same episode starts from it
-        rollouts["context"] = torch.from_numpy(contexts)
+    if place.contexts is not None:  # in full precision: a film of the same episode starts from it
+        rollouts["context"] = torch.from_numpy(place.contexts)
     save_tensors(directory.path / "rollouts.safetensors", rollouts, {"task": task.name})
     directory.write_json("eval.json", result)
     return result
