@@ -20,10 +20,11 @@ PUSH = 0.1
 def run(env, steps, seeds=None):
     if seeds is not None:
         env.seed_episodes(seeds)
-    data, frames = env.reset(), []
+    env.reset()
+    frames = []
     for _ in range(steps):
-        data = env.step(data.set("action", torch.full((len(env.envs), 2), PUSH)))["next"]
-        frames.append(data)
+        action = torch.full((len(env.envs), 2), PUSH)
+        frames.append(env.step(TensorDict({"action": action}, [len(env.envs)]))["next"])
     return torch.stack(frames, 1)
 
 
@@ -66,7 +67,7 @@ def test_who_is_done_waits():
     rollout = run(env, 6, [0, 1])
     assert rollout["truncated"][0].flatten().tolist() == [False] * 3 + [True] * 3
     assert torch.equal(rollout["observation"][:, 3], rollout["observation"][:, 5])
-    again = env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+    again = env.reset(rollout[:, -1].exclude("reward").set("_reset", torch.tensor([[True], [False]])))
     assert again["done"].flatten().tolist() == [False, True]
     assert torch.equal(again["observation"][1], rollout["observation"][1, 5])
     assert not torch.equal(again["observation"][0], rollout["observation"][0, 5])
