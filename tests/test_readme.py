@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 import shlex
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,11 @@ def test_python_runs(code, tmp_path, monkeypatch):
 
     monkeypatch.setattr(torchrl_koap, "train", train_shortly, raising=False)
     monkeypatch.setattr(torchrl_koap, "evaluate", evaluate_shortly, raising=False)
+    for name, fit in {
+        "fit_planner": partial(torchrl_koap.fit_planner, steps=1, batch_size=2, channels=(8, 16)),
+        "fit_controller": partial(torchrl_koap.fit_controller, steps=0),
+    }.items():
+        monkeypatch.setattr(torchrl_koap, name, fit, raising=False)
     monkeypatch.setattr(pictures, "_PICTURES", dict(pictures.all_pictures()))
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {"__name__": "readme"})

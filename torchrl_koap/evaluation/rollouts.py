@@ -110,7 +110,7 @@ def roll_out(
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
-        _seed_noise(env, part)
+        _seed_episodes(env, part)
         transforms = policy_transforms(policy.history)
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
         if futures is not None:
@@ -144,8 +144,11 @@ def _device_of(policy: PlanThenControl) -> torch.device:
     return next(itertools.chain(policy.parameters(), policy.buffers()), torch.empty(0)).device
 
 
-def _seed_noise(env: EnvBase, seeds: Sequence[int]) -> None:
-    """Observation noise that an episode meets depends on its own seed alone."""
+def _seed_episodes(env: EnvBase, seeds: Sequence[int]) -> None:
+    """What is random in an episode depends on its own seed alone, where the environment can see to that."""
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    if hasattr(base, "seed_episodes"):
+        base.seed_episodes(seeds)
     transforms = env.transform if isinstance(env, TransformedEnv) else ()
     for transform in transforms if isinstance(transforms, Iterable) else (transforms,):
         if hasattr(transform, "seed_episodes"):

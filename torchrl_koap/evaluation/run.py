@@ -3,26 +3,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.evaluation.offline import evaluate_offline
-from torchrl_koap.evaluation.rollouts import make_policy, measure_latency, roll_out, rollouts_to_tensors
+from torchrl_koap.evaluation.policy_files import PolicyDescription, assemble_policy, build_networks, read_policy
+from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import ChunkedPolicy, StatePlanner
+from torchrl_koap.modules import RecedingHorizonPolicy, StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
-from torchrl_koap.training.builders import build_controller, method_named, set_up_torch
-from torchrl_koap.training.checkpoints import load_weights, save_tensors
-from torchrl_koap.training.diffusion_builders import build_planner
+from torchrl_koap.training.builders import method_named, set_up_torch
+from torchrl_koap.training.checkpoints import CheckpointError, load_weights, save_tensors
 from torchrl_koap.training.methods import Method
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.pretrained import PREFIX, copy_run, find_run
@@ -49,6 +50,9 @@ class EvalConfig:
         out: folder to evaluate in instead of the run's own; what the run is made of is copied there.
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
+        env: id of a Gymnasium environment to roll out in instead of the task's own, such as "my_package:Reach-v0".
+        success_key: entry of its info that says whether the task is done (default: "is_success" or "success" where it
+            has one of them, else an episode that terminates with a positive reward).
         task: refuse a run of another task than this.
         dataset: for a task without an environment: where the data set of the training is now (default: where it was).
         samples: for a task without an environment: plans that are sampled in each recorded situation.
@@ -74,6 +78,8 @@ class EvalConfig:
     out: Path | None = None
     batch_size: int | None = None
     contexts_file: Path | None = None
+    env: str | None = None
+    success_key: str | None = None
     task: str | None = None
     dataset: str | None = None
     samples: int = 16
@@ -144,65 +150,53 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
     config = directory.read_json("config.json")
     load_plugins(config.get("plugins") or ())
     facts, method = task_of(config), method_named(entry)
-    columns = facts.controller_columns(entry.get("state", "all"))
-    if method.has_planner:
-        planner = build_planner(planner_entry, facts.state_dim, facts.planner_features())
-        controller = build_controller(entry, len(columns), facts.action_dim, method=method)
-    else:
-        planner = None
-        controller = method.build(facts.state_dim, facts.action_dim, facts.planner_features(), planner_entry)
+    planner, controller, columns = build_networks(facts, method, planner_entry, entry)
     for name, module in {"planner": planner, "controller": controller}.items():
         if module is not None:
-            load_weights(directory.path / f"{name}.safetensors", module.eval(), task=facts.name)
+            load_weights(directory.path / f"{name}.safetensors", module, task=facts.name)
     return TrainedRun(directory, config, facts, method, planner, controller, columns)
 
 
-def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) -> TensorDictModuleBase:
-    """A run as a policy: observations in, an action per control step out.
+def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) -> RecedingHorizonPolicy:
+    """A run, or a file of :func:`~torchrl_koap.save_policy`, as a policy: observations in, an action per step out.
 
     An environment needs :func:`~torchrl_koap.modules.policy_transforms` of ``policy.history`` for it, which hand it the
-    last observations.
+    last observations; an :class:`~torchrl_koap.modules.Agent` keeps them itself.
 
     Args:
-        run (str, Path or TrainedRun): a run directory, or what :func:`load_run` made of one.
-        config (EvalConfig, optional): execution, solver, interval between plans and device; the rest is not used.
+        run (str, Path or TrainedRun): a run directory, what :func:`load_run` made of one, or a file.
+        config (EvalConfig, optional): execution, solver, interval between plans, device and plugins; the rest is not
+            used. Default: as ``koap eval`` has them, for a file as it was saved.
 
     Raises:
         ValueError: for an unknown execution or solver, or an interval out of range.
-        RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`.
+        RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`; a :class:`CheckpointError` names the file.
     """
-    config = EvalConfig() if config is None else config
+    given, config = config, EvalConfig() if config is None else config
     lookup(EXECUTIONS, config.execution, "execution")
-    trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
-    sampler = trained.controller if trained.planner is None else trained.planner
-    if config.solver is not None:
-        sampler.solver = config.solver
-    if config.solver_steps is not None:
-        sampler.num_steps = config.solver_steps
-    task = trained.task
-    candidates = config.candidates or trained.config.get("candidates") or 1
-    if trained.planner is None:
-        policy = ChunkedPolicy(
-            trained.controller,
-            state_columns=task.state_of,
-            history=trained.controller.history,
-            replan_interval=config.replan_interval,
-            candidates=candidates,
-            choice=config.choice,
-        )
+    names = ("execution", "replan_interval", "blend_decay", "choice")
+    options = {name: getattr(config, name) for name in names}
+    options |= {} if config.candidates is None else {"candidates": config.candidates}
+    if isinstance(run, (str, Path)) and Path(run).is_file():
+        policy = read_policy(run, plugins=config.plugins, **({} if given is None else options))
+        trained_on = policy.description.task.name
+        if config.task not in (None, trained_on):
+            raise CheckpointError(f"{run} was trained on task {trained_on!r}, not on {config.task!r}")
     else:
-        policy = make_policy(
-            trained.planner,
-            trained.controller,
-            state_columns=task.state_of,
-            execution=config.execution,
-            replan_interval=config.replan_interval,
-            blend_decay=config.blend_decay,
-            controller_columns=trained.columns,
-            action_rule=task.action_rule,
-            candidates=candidates,
-            choice=config.choice,
+        trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
+        description = PolicyDescription(
+            trained.task,
+            trained.config["planner"],
+            trained.config["controller"],
+            trained.columns,
+            tuple(trained.config.get("plugins") or ()),
         )
+        kept = {"candidates": trained.config.get("candidates") or 1}
+        policy = assemble_policy(trained.planner, trained.controller, description, **kept | options)
+    if config.solver is not None:
+        policy.planner.solver = config.solver
+    if config.solver_steps is not None:
+        policy.planner.num_steps = config.solver_steps
     return policy.to(config.device)
 
 
@@ -241,6 +235,46 @@ def choose_contexts(
     return numbers, table[numbers]
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where a run is rolled out."""
+
+    make_env: Callable[[int], Any]
+    max_steps: int
+    mode_index: Callable[[torch.Tensor], torch.Tensor]
+    num_modes: int
+    numbers: list[int] | None = None
+    contexts: np.ndarray | None = None
+
+
+def _place(task: Task, config: EvalConfig) -> _Place:
+    """The task's own environment, or the one of Gymnasium that was asked for."""
+    if config.env is None:
+        if config.success_key is not None:
+            raise ValueError("success_key was given, but no env: the task's own environment says what success is")
+        numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
+        from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
+
+        make_env = make_env_of(task, num_threads=config.threads)
+        return _Place(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
+    for name, unfit in {
+        "contexts_file": config.contexts_file is not None,
+        "rollouts_per_context": config.rollouts_per_context != 1,
+    }.items():
+        if unfit:
+            raise ValueError(f"{name} was given, but an environment of Gymnasium has no contexts")
+    from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
+
+    make_env = partial(GymnasiumBatch, config.env, task, success_key=config.success_key)
+    probe = make_env(1)
+    probe.close()
+    return _Place(make_env, probe.max_steps, _only_mode, 1)
+
+
+def _only_mode(mode: torch.Tensor) -> torch.Tensor:
+    return mode[..., 0]
+
+
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
     """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
 
@@ -276,25 +310,28 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     policy = load_policy(trained, config)
     sampler = trained.controller if trained.planner is None else trained.planner
     seeds = list(range(config.seed, config.seed + config.episodes))
-    numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
-    from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
-
-    mode_index = mode_index_of(task)
+    place = _place(task, config)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
         episodes = roll_out(
             policy,
-            make_env_of(task, num_threads=config.threads),
+            place.make_env,
             seeds,
-            max_steps=task.max_steps,
+            max_steps=place.max_steps,
             batch_size=config.batch_size,
-            contexts=contexts,
+            contexts=place.contexts,
             progress=count_up_to(bar),
         )
     unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
     result = score(
-        episodes, seeds, num_modes=task.num_modes, mode_index=mode_index, contexts=numbers, unsolved=unsolved
+        episodes,
+        seeds,
+        num_modes=place.num_modes,
+        mode_index=place.mode_index,
+        contexts=place.numbers,
+        unsolved=unsolved,
     )
-    result |= task_scores(task, result, episodes, numbers)
+    if config.env is None:
+        result |= task_scores(task, result, episodes, place.numbers)
     rows = result.pop("episode")
     result |= measure_latency(policy, task.observation_dim)
     result |= {
@@ -306,16 +343,18 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         "candidates": policy.candidates,
         "episode": rows,
     }
+    if config.env is not None:
+        result |= {"env": config.env, "success_key": config.success_key}
     rollouts = rollouts_to_tensors(
         [episode.cpu() for episode in episodes],
         position=task.observation[task.position],
-        mode_index=mode_index,
+        mode_index=place.mode_index,
         interval=config.replan_interval,
-        objects=[task.observation[part] for part in task.plotted.values()],
+        objects=[task.observation[part] for part in task.plotted.values()] if config.env is None else (),
         plans_position=task.plans_position,
     )
-    if contexts is not None:  # in full precision: a film of the same episode starts from it
-        rollouts["context"] = torch.from_numpy(contexts)
+    if place.contexts is not None:  # in full precision: a film of the same episode starts from it
+        rollouts["context"] = torch.from_numpy(place.contexts)
     save_tensors(directory.path / "rollouts.safetensors", rollouts, {"task": task.name})
     directory.write_json("eval.json", result)
     return result

@@ -28,6 +28,7 @@ from torchrl_koap.modules.policies.action_chunks import ChunkedPolicy
 from torchrl_koap.modules.policies.agent import Agent
 from torchrl_koap.modules.policies.asynchronous import AsynchronousAgent
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
+from torchrl_koap.modules.policies.policy_env import PolicyEnv, SeededNoise
 from torchrl_koap.modules.policies.receding_horizon import RecedingHorizonPolicy, policy_transforms
 from torchrl_koap.modules.policies.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
 from torchrl_koap.modules.time_alignment import FrameGatherer
@@ -57,12 +58,14 @@ __all__ = [
     "NonlinearInverseDynamics",
     "Normalizer",
     "PlanThenControl",
+    "PolicyEnv",
     "QuantizedInverseDynamics",
     "RecedingHorizonPolicy",
     "RecordedFutures",
     "RecordedPlanner",
     "RecurrentInverseDynamics",
     "RidgeFit",
+    "SeededNoise",
     "StatePlanner",
     "SupervisedInverseDynamics",
     "TemporalUnet",

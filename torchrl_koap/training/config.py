@@ -200,11 +200,12 @@ class ResolvedConfig:
         return replace(self, options=options, budget=_budget(options))
 
 
-def resolve(config: TrainConfig) -> ResolvedConfig:
+def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     """Looks every name up and fills every default in, once; plugins must have been imported.
 
     Args:
         config (TrainConfig): what is asked for.
+        task (Task, optional): the task, registered or not. Default: the one of the data set.
 
     Raises:
         ValueError: for unknown names, numbers out of range, and options that exclude each other.
@@ -217,7 +218,7 @@ def resolve(config: TrainConfig) -> ResolvedConfig:
         >>> resolved.options.steps, resolved.method.closed_form, resolved.columns
         (5000, True, (0, 1))
     """
-    task = find_task_of(config.dataset, config.task)
+    task = find_task_of(config.dataset, config.task) if task is None else task
     options = replace(_with_task_defaults(config, task), task=task.name)
     released = _released(options)
     method = _method(options) if released is None else released.method

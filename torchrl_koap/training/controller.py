@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch import nn
 from torchrl_koap.data import WindowTable, cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.tasks import HORIZON, WINDOW
+from torchrl_koap.tasks import HORIZON, WINDOW, Task
 from torchrl_koap.training import released_settings
 from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.checkpoints import save_tensors, save_weights
@@ -43,7 +43,32 @@ def train_controller(
     Returns:
         tuple: the module, what was found by a closed form (empty if there is none), and the last losses.
     """
-    method, task = resolved.method, resolved.task
+    controller, fit, values = learn_actions(resolved, data, run=run, logger=logger)
+    about = {"task": resolved.task.name, "kind": "controller"}
+    save_weights(run.path / "controller.safetensors", controller, about)
+    if isinstance(controller, KoopmanInverseDynamics):
+        eigenvalues = controller.operator.eigenvalues()
+        save_tensors(run.path / "eigenvalues.safetensors", {"real": eigenvalues.real, "imag": eigenvalues.imag})
+    return controller, fit, values
+
+
+def learn_actions(
+    resolved: ResolvedConfig, data: TensorDictBase, *, run: RunDirectory | None = None, logger: Any = None
+) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
+    """Builds and trains what turns states into actions, without writing it.
+
+    Args:
+        resolved (ResolvedConfig): all options.
+        data (TensorDictBase): flat data after the label budget was applied, with the whole ``state``.
+
+    Keyword Args:
+        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
+        logger (optional): a TorchRL logger.
+
+    Returns:
+        tuple: as :func:`train_controller`.
+    """
+    method = resolved.method
     train_one = _Training(run, resolved, logger)
     fit: dict[str, Any] = {}
     if method.has_planner:
@@ -54,17 +79,13 @@ def train_controller(
             data = _relabelled(train_one, resolved, data)
         controller, values = _train_policy(train_one, resolved, data)
     values["updates"] = train_one.updates
-    save_weights(run.path / "controller.safetensors", controller, {"task": task.name, "kind": "controller"})
-    if isinstance(controller, KoopmanInverseDynamics):
-        eigenvalues = controller.operator.eigenvalues()
-        save_tensors(run.path / "eigenvalues.safetensors", {"real": eigenvalues.real, "imag": eigenvalues.imag})
     return controller, fit, values
 
 
 class _Training:
     """Runs phases with the options of a run."""
 
-    def __init__(self, run: RunDirectory, resolved: ResolvedConfig, logger: Any):
+    def __init__(self, run: RunDirectory | None, resolved: ResolvedConfig, logger: Any):
         self.run, self.options, self.logger, self.task = run, resolved.options, logger, resolved.task
         self.released = resolved.released
         self.epochs = resolved.task.defaults.released_epochs
@@ -139,8 +160,19 @@ def _train_network(
             weight_decay=1e-3,
         )
     controller.eval()
-    fit = fit_closed_form(controller, data, shared_axes=task.actuated) if method.closed_form else {}
+    fit: dict[str, Any] = {}
+    if method.closed_form:
+        columns = task.controller_columns(options.controller_state)
+        fit = fit_closed_form(controller, data, shared_axes=task.actuated, guessed_axes=_likely_axes(task, columns))
     return controller, fit, values
+
+
+def _likely_axes(task: Task, columns: Sequence[int]) -> list[int]:
+    """The column that each action is likely to move, for a robot that came with data alone, which does not say it."""
+    moved = task.action_targets or task.robot
+    if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
+        return []
+    return [list(columns).index(column) for column in moved]
 
 
 def _train_policy(

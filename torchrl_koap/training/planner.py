@@ -52,6 +52,35 @@ def train_planner(
         if options.planner_from is not None:
             save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
         return planner, run.last_metrics("planner")
+    values = learn_states(planner, data, task, options, run=run, logger=logger)
+    save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
+    return planner, values
+
+
+def learn_states(
+    planner: StatePlanner,
+    data: TensorDictBase,
+    task: Task,
+    options: TrainConfig,
+    *,
+    run: RunDirectory | None = None,
+    logger: Any = None,
+) -> dict[str, float]:
+    """Fits a planner's statistics and trains it; it is left with the average of its parameters.
+
+    Args:
+        planner (StatePlanner): the planner; it is trained in place.
+        data (TensorDictBase): flat data with the whole ``state``; no action is looked at.
+        task (Task): whose data they are.
+        options (TrainConfig): updates, batch size, learning rate, augmentation, with the task's defaults filled in.
+
+    Keyword Args:
+        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
+        logger (optional): a TorchRL logger.
+
+    Returns:
+        dict: its last losses.
+    """
     # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
     extended = extrapolate_ends(data, HORIZON - 1)
     planner.fit_normalizers(cut_windows(extended, WINDOW, select=["state"], pad_before=1)["state"])
@@ -77,8 +106,7 @@ def train_planner(
             progress=show_losses(bar),
         )
     loss.target_planner_params.to_module(planner)
-    save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
-    return planner, values
+    return values
 
 
 def training_dtype(precision: str | None) -> torch.dtype | None:
