@@ -92,6 +92,36 @@ def pivot(rows: Sequence[Mapping[str, str]], cell: Any, *, by: str = "label_frac
     return table([head, *map(share, places)], body)
 
 
+def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """A row per trained planner and way to run it."""
+    head = [
+        "labels",
+        "method",
+        "planner",
+        "updates x batch",
+        "seed",
+        "candidates",
+        "success in % (95 %), entropy",
+        "steps",
+        "",
+    ]
+    body = [
+        [
+            row["labels"],
+            f"`{row['method']}`",
+            row["denoiser"],
+            f"{row['updates']} x {row['batch']}",
+            row["training_seed"],
+            row["candidates"] if row["candidates"] == "1" else f"{row['candidates']}, {row['choice']}",
+            success(row),
+            row["mean_steps"],
+            row["note"],
+        ]
+        for row in rows
+    ]
+    return table(head, body)
+
+
 def difference(row: Mapping[str, str]) -> str:
     """A difference in percentage points with its interval."""
     return f"{float(row['difference']):+.1f} ({int(row['low']):+d} to {int(row['high']):+d})"
@@ -239,7 +269,7 @@ def pages() -> dict[Path, str]:
     environment = Environment(
         loader=FileSystemLoader(SOURCE), undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
-    helpers = (read_rows, percent, success, share, table, pivot, difference, fact, commands, *_HELPERS)
+    helpers = (read_rows, percent, success, share, table, pivot, planner_table, difference, fact, commands, *_HELPERS)
     environment.globals.update({helper.__name__: helper for helper in helpers} | {"int": int, "float": float})
     made = {}
     for template in sorted(SOURCE.glob("*.md.jinja")):

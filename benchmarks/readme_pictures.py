@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
@@ -99,7 +100,8 @@ def draw_pipeline(path: Path) -> Path:
         48, 5.4, "environment: four actions of every plan are executed, then a new plan is made", ha="center", size=9
     )
     options = {"Date": None} if path.suffix == ".svg" else {"Software": None}
-    figure.savefig(path, dpi=130, facecolor="white", metadata=options)
+    with rc_context({"svg.hashsalt": "torchrl_koap"}):  # the same file at every call
+        figure.savefig(path, dpi=130, facecolor="white", metadata=options)
     return path
 
 
