@@ -59,6 +59,7 @@ _MANY = 6  # from here on names of columns are turned
     " columns of that unit together.",
     command="koap eval {run}",
     place=15,
+    recorded=True,
 )
 def _draw_plan_errors(result: Mapping[str, Any], path: Path, *, control_hz: float | None = None) -> Path:
     plan = _part(result, "plan_errors")
@@ -120,6 +121,7 @@ def plot_plan_errors(plan: Mapping[str, Any], path: str | Path, *, control_hz: f
     " here; planned ones are not as good.",
     command="koap eval {run}",
     place=16,
+    recorded=True,
 )
 def _draw_action_errors(result: Mapping[str, Any], path: Path) -> Path:
     errors = _part(result, "action_errors")
