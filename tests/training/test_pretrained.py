@@ -113,7 +113,7 @@ def test_options_of_the_planner_are_written_and_trained_with(tmp_path):
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     chosen = {name: config["planner"][name] for name in ("width", "depth", "frequencies", "dropout")}
     assert chosen == {"width": 32, "depth": 2, "frequencies": 1, "dropout": 0.1}
-    _, planner, _ = load_run(RunDirectory(tmp_path / "run"))
+    planner = load_run(tmp_path / "run").planner
     assert planner.denoiser.film is not None and not planner.training
     assert koap("train", "--out", tmp_path / "no", *arguments, "--precision", "float8") == 1
     assert koap("train", "--out", tmp_path / "run", "--resume") == 0  # with all of these options, none named again
