@@ -287,3 +287,33 @@ def test_forward_and_plan_compile_without_a_graph_break(network):
     history, noise = windows(4)[:, :2], torch.randn(4, 6, 2)
     with torch.no_grad():
         torch.testing.assert_close(plan(history, noise), loss.planner.plan(history, noise))
+
+
+def test_first_steps_weigh_more_and_the_mean_weight_stays():
+    torch.manual_seed(0)
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8,)), state_dim=2)
+    windows = TensorDict({"state": torch.randn(6, 16, 2)}, [6])
+    windows["planner_noise"], windows["planner_time"] = torch.randn(6, 14, 2), torch.full((6,), 20.0)
+    plain = PlannerLoss(planner, reduction="none")(windows)["loss_planner"]
+    weighted = PlannerLoss(planner, reduction="none", first_steps_weight=10.0)(windows)["loss_planner"]
+    weights = (weighted / plain).detach().mean((0, 2))
+    assert weights[0] / weights[-1] == pytest.approx(10, rel=1e-4) and weights.mean() == pytest.approx(1, rel=1e-4)
+    assert (weights.diff() < 0).all()
+    with pytest.raises(ValueError, match="first_steps_weight must be > 0, got 0"):
+        PlannerLoss(planner, first_steps_weight=0)
+
+
+def test_half_precision_products_leave_weights_and_gradients_in_float32():
+    torch.manual_seed(0)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=32), state_dim=2)
+    windows = TensorDict({"state": torch.randn(64, 16, 2)}, [64])
+    windows["planner_noise"], windows["planner_time"] = torch.randn(64, 14, 2), torch.full((64,), 20.0)
+    exact = PlannerLoss(planner)(windows)["loss_planner"]
+    planner.training_dtype = torch.bfloat16
+    loss = PlannerLoss(planner)
+    rounded = loss(windows)["loss_planner"]
+    assert rounded.dtype == torch.float32
+    assert rounded.item() != exact.item() and rounded.item() == pytest.approx(exact.item(), rel=0.01)
+    rounded.backward()
+    gradients = [parameter.grad for parameter in loss.parameters() if parameter.grad is not None]
+    assert gradients and all(gradient.dtype == torch.float32 and gradient.isfinite().all() for gradient in gradients)

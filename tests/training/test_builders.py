@@ -177,3 +177,16 @@ def test_threads_and_device_are_checked(threads, device, message):
 def test_a_missing_gpu_is_said():
     with pytest.raises(ValueError, match="'cuda:1' was asked for, but torch finds no CUDA here"):
         set_up_torch(1, "cuda:1")
+
+
+def test_sizes_of_the_denoiser_are_options():
+    planner = build_planner(PLANNER | {"denoiser": "mlp", "width": 48, "depth": 5, "frequencies": 1, "dropout": 0.1}, 2)
+    assert planner.denoiser.first.out_features == 48 and len(planner.denoiser.layers) == 5
+    assert planner.denoiser.encoder.frequencies.tolist() == pytest.approx([torch.pi])
+    assert planner.denoiser.dropout.p == 0.1
+    unet = build_planner(PLANNER | {"denoiser": "unet", "frequencies": 2}, 2)
+    assert len(unet.denoiser.encoder.frequencies) == 2
+    with pytest.raises(ValueError, match="denoiser 'unet' has no width to choose, only frequencies"):
+        build_planner(PLANNER | {"denoiser": "unet", "width": 64}, 2)
+    with pytest.raises(ValueError, match="denoiser 'released' has no depth to choose, only none"):
+        build_planner(PLANNER | {"denoiser": "released", "depth": 2}, 2)

@@ -94,3 +94,35 @@ def test_another_run_is_not_overwritten(run, tmp_path):
     with pytest.raises(RunDirectoryError, match="holds another run than"):
         copy_run(run, tmp_path / "mine")
     assert json.loads((tmp_path / "mine" / "config.json").read_text())["seed"] == 9
+
+
+def test_options_of_the_planner_are_written_and_trained_with(tmp_path):
+    data = write_demonstrations(tmp_path / "data")
+    arguments = ("--task", "avoiding", "--dataset", data, "--controller-steps", "5", "--no-analysis", *TINY)
+    sizes = ("--denoiser", "film", "--denoiser-width", "32", "--denoiser-depth", "2", "--condition-octaves", "1")
+    ways = (
+        "--dropout",
+        "0.1",
+        "--planner-weight-decay",
+        "1e-3",
+        "--first-steps-weight",
+        "4",
+        "--precision",
+        "bfloat16",
+    )
+    assert koap("train", "--out", tmp_path / "run", *arguments, *sizes, *ways) == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    chosen = {name: config["planner"][name] for name in ("width", "depth", "frequencies", "dropout")}
+    assert chosen == {"width": 32, "depth": 2, "frequencies": 1, "dropout": 0.1}
+    _, planner, _ = load_run(RunDirectory(tmp_path / "run"))
+    assert planner.denoiser.film is not None and not planner.training
+    assert koap("train", "--out", tmp_path / "no", *arguments, "--precision", "float8") == 1
+    assert koap("train", "--out", tmp_path / "run", "--resume") == 0  # with all of these options, none named again
+
+
+def test_a_run_from_before_these_options_can_be_resumed(run):
+    config = json.loads((run / "config.json").read_text())
+    new = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "precision", "candidates")
+    assert all(config.pop(name) is None for name in new) and not set(config["planner"]) & {"width", "depth", "dropout"}
+    (run / "config.json").write_text(json.dumps(config))
+    assert koap("train", "--out", run, "--resume") == 0
