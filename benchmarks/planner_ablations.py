@@ -105,6 +105,7 @@ def main() -> None:
     parser.add_argument("--choice", default="quarter")
     parser.add_argument("--replan-interval", type=int, default=4)
     parser.add_argument("--joining", type=float, default=0.8)
+    parser.add_argument("--tempo", type=float, default=1.0)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--note", default="")
     parser.add_argument("--table", type=Path, default=TABLE)
@@ -117,7 +118,7 @@ def main() -> None:
     }
     results = []
     for seed in options.seeds:
-        settings = {**choices, "choice": options.choice}
+        settings = {**choices, "choice": options.choice, "tempo": options.tempo}
         results.append(
             run_eval(
                 Eval(
@@ -125,7 +126,8 @@ def main() -> None:
                 )
             )
         )
-    row = row_of(options.run, results, choices, options.note)
+    note = options.note if options.tempo == 1 else f"tempo={options.tempo:g} {options.note}".strip()
+    row = row_of(options.run, results, choices, note)
     append(row, options.table)
     keys = ("candidates", "choice", "successes", "n", "success", "low", "high", "by_seed", "entropy", "mean_steps")
     print(options.run.name, {key: row[key] for key in keys})

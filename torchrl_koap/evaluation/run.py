@@ -49,6 +49,7 @@ class Eval:
         solver_steps: another number of solver steps.
         replan_interval: control steps per plan.
         joining: how slowly plans are joined to the present state; 0 turns it off.
+        tempo: how much quicker than planned plans are executed; 1 leaves them as they are.
         candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
             the one in force (default: as the run says, else 1).
         choice: rule of that choice: "quarter", "typical" or "nearest".
@@ -71,6 +72,7 @@ class Eval:
     solver_steps: int | None = None
     replan_interval: int = REPLAN_INTERVAL
     joining: float = 0.8
+    tempo: float = 1.0
     candidates: int | None = None
     choice: str = "quarter"
     batch_size: int | None = None
@@ -180,6 +182,7 @@ def run_eval(options: Eval) -> dict[str, Any]:
             execution=options.execution,
             replan_interval=options.replan_interval,
             joining=options.joining,
+            tempo=options.tempo,
             controller_columns=columns_of(run, task),
             gripper=task.gripper,
             candidates=candidates,
@@ -214,6 +217,7 @@ def run_eval(options: Eval) -> dict[str, Any]:
         "solver_steps": sampler.num_steps,
         "replan_interval": options.replan_interval,
         "joining": options.joining,
+        "tempo": options.tempo,
         "candidates": candidates,
         "episode": rows,
     }

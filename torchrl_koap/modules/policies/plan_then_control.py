@@ -72,6 +72,8 @@ class PlanThenControl(TensorDictModuleBase):
         replan_interval (int): steps per plan. Defaults to ``4``.
         joining (float): share of the distance to the plan that remains after each frame. Defaults to ``0.8``; ``0``
             leaves plans as they are.
+        tempo (float): how much quicker than planned a plan is executed (:func:`quicken_plan`); ``1`` leaves plans as
+            they are. Defaults to ``1``.
         controller_columns (sequence of int, optional): columns of the state that the controller reads: its mask.
             Default: all.
         gripper (tuple of int, optional): action entry and state column of a gripper whose number is read off the
@@ -110,6 +112,7 @@ class PlanThenControl(TensorDictModuleBase):
         execution: str = "feedback",
         replan_interval: int = 4,
         joining: float = 0.8,
+        tempo: float = 1.0,
         controller_columns: Sequence[int] | None = None,
         gripper: tuple[int, int] | None = None,
         candidates: int = 1,
@@ -125,6 +128,8 @@ class PlanThenControl(TensorDictModuleBase):
             raise ValueError(f"replan_interval must be in 1..{planner.horizon} (the horizon), got {replan_interval}")
         if not 0 <= joining < 1:
             raise ValueError(f"joining must be in [0, 1), got {joining}")
+        if not 0.5 <= tempo <= 2:
+            raise ValueError(f"tempo must be in [0.5, 2], got {tempo}")
         check_candidates(candidates, choice)
         if candidates > 1 and execution != "feedback":
             raise ValueError(f"several candidates need execution 'feedback', which keeps its plan; got {execution!r}")
@@ -151,6 +156,7 @@ class PlanThenControl(TensorDictModuleBase):
                 chunk,
                 candidates=candidates,
                 choice=choice,
+                tempo=tempo,
             ),
             n_steps=replan_interval,
             action_keys=cached,
@@ -233,13 +239,43 @@ def join_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
     return plan + behind.unsqueeze(-2) * (decay**frames).unsqueeze(-1)
 
 
+def quicken_plan(history: Tensor, plan: Tensor, tempo: float) -> Tensor:
+    """Goes through a plan quicker (or slower), by linear interpolation between its states.
+
+    A policy that lags a little behind its plans observes a lower speed than planned, plans the next ones at that speed,
+    and so takes longer than the demonstrations.
+
+    Args:
+        history (Tensor): observed states ``[*B, h, d]``, the present one last.
+        plan (Tensor): planned states ``[*B, H, d]``. The last one is repeated where a quicker plan is over.
+        tempo (float): planned steps per executed step.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.policies.plan_then_control import quicken_plan
+        >>> plan = torch.tensor([[1.0], [2.0], [3.0], [5.0]])
+        >>> quicken_plan(torch.tensor([[0.0]]), plan, 1.5).flatten().tolist()
+        [1.5, 3.0, 5.0, 5.0]
+    """
+    if tempo == 1:
+        return plan
+    states = torch.cat([history[..., -1:, :], plan], -2)
+    last = plan.shape[-2]
+    times = (tempo * torch.arange(1, last + 1, device=plan.device, dtype=plan.dtype)).clamp_max(last)
+    before = times.floor().clamp_max(last - 1).long()
+    share = (times - before).unsqueeze(-1)
+    return states[..., before, :] * (1 - share) + states[..., before + 1, :] * share
+
+
 class _Chunk(TensorDictModuleBase):
     """The part that runs only when a new plan is due."""
 
-    def __init__(self, planner: StatePlanner, make_chunk, chunk_key: str, *, candidates: int, choice: str):
+    def __init__(
+        self, planner: StatePlanner, make_chunk, chunk_key: str, *, candidates: int, choice: str, tempo: float
+    ):
         super().__init__()
         self.planner, self.make_chunk = planner, make_chunk
-        self.candidates, self.choice = candidates, choice
+        self.candidates, self.choice, self.tempo = candidates, choice, tempo
         self.in_keys, self.out_keys = ["state_history"], [PLAN, chunk_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -260,6 +296,7 @@ class _Chunk(TensorDictModuleBase):
                 fresh=tensordict.get("is_init").squeeze(-1),
                 apart=paths_apart,
             )
+        plan = quicken_plan(history, plan, self.tempo)
         tensordict.set(PLAN, plan)
         return tensordict.set(self.out_keys[1], self.make_chunk(history, plan))
 
