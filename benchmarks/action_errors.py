@@ -20,25 +20,22 @@ from scipy.stats import t as student
 
 from torchrl_koap.data import LabelBudget, controller_view
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training import RunDirectory, TrainConfig, load_demonstrations, resolve
 from torchrl_koap.training.action_errors import UNITS, hidden_action_errors, rmse_mm
-from torchrl_koap.training.builders import load_demonstrations, set_up_torch
-from torchrl_koap.training.config import Train, configure, with_task_defaults
+from torchrl_koap.training.builders import set_up_torch
 from torchrl_koap.training.controller import train_controller
-from torchrl_koap.training.run_directory import RunDirectory
 
 
 def action_error(task, data, method: str, fraction: float, seed: int, updates: int) -> float:
     """Error of one controller, trained as ``koap train`` does."""
-    labelled, _ = LabelBudget(fraction, seed=seed).apply(data, command=task.observation[task.command])
+    labelled, _ = LabelBudget(fraction, seed=seed).apply(data, command=task.command_columns)
     with tempfile.TemporaryDirectory() as folder:
-        options = Train(out=Path(folder), task=task.name, method=method, seed=seed, controller_steps=updates)
-        options = with_task_defaults(options, task)
-        run = RunDirectory(folder)
+        config = TrainConfig(out=Path(folder), task=task.name, method=method, seed=seed, controller_steps=updates)
+        resolved = resolve(config)
         torch.manual_seed(seed)
-        controller, _, _ = train_controller(run, options, configure(run, options), task, labelled, None)
-    columns = task.controller_columns(options.controller_state)
-    predicted, true = hidden_action_errors(controller, controller_view(data, columns), labelled)
-    same = slice(task.same_unit)  # a gripper's number has no unit
+        controller, _, _ = train_controller(RunDirectory(folder), resolved, labelled)
+    predicted, true = hidden_action_errors(controller, controller_view(data, resolved.columns), labelled)
+    same = task.action_columns()  # a gripper's number has no unit
     return rmse_mm(predicted[:, same], true[:, same])
 
 

@@ -5,7 +5,7 @@
 
 All presets in one run; the ratio is against the released architecture in our modules. "default, widened" is our default
 with as many parameters as that, so that the ratio is not one of sizes. The first public code made 3.35 updates per
-second on one core of such a machine (issue 2). ``--profile`` prints where the time of a preset goes.
+second on one core of such a machine. ``--profile`` prints where the time of a preset goes.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """How human-like are the scripted demonstrations of Avoiding? Prints a table and draws both sets over the obstacles.
 
-    python benchmarks/demonstration_statistics.py --human ../shared/d3il_avoiding_human --picture demonstrations.png
+    python benchmarks/demonstration_statistics.py --human d3il_avoiding_human --picture demonstrations.png
 
 Each quantity is computed per demonstration; the table shows the median and the range from the 5th to the 95th
 percentile over demonstrations. Commands are changes of the commanded xy per control step (mm).

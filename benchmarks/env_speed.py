@@ -2,7 +2,7 @@
 """Control steps per second of the environments, per core and over threads, against the original simulator.
 
     python benchmarks/env_speed.py --task avoiding --num-envs 60 --steps 40 --threads 1 2
-    python benchmarks/env_speed.py --task aligning --num-envs 30 --steps 150 --recordings ../shared/d3il_reference
+    python benchmarks/env_speed.py --task aligning --num-envs 30 --steps 150 --recordings d3il_reference
 
 The original (one environment, one core, Python controller) makes 19 to 80 control steps per second, depending on the
 task; ratios are against that. With ``--recordings`` every environment plays the first recorded episode of the task,
@@ -23,9 +23,9 @@ import numpy as np
 import torch
 
 from torchrl_koap.envs import ManipulationEnv
-from torchrl_koap.envs.registry import ENVIRONMENTS
+from torchrl_koap.envs.registry import make_env
 
-# control steps per second of the original (specification, section 12)
+# control steps per second of the original on one core (docs/d3il.md, Repeatability)
 ANCHORS = {"avoiding": 26.0, "aligning": 27.5, "sorting": 19.0, "stacking": 80.5}
 
 
@@ -34,7 +34,7 @@ def straight_on(env: ManipulationEnv):
     generator = torch.Generator().manual_seed(0)
     spec = env.action_spec
     aim = torch.rand(spec.shape, generator=generator) * (spec.high - spec.low) / 2 + spec.low / 2
-    if env.task.action_unit == "rad":
+    if env.task.tool_kinematics is not None:
         aim = aim * 0.1
     else:
         aim[:, 1] = aim[:, 1].abs()
@@ -52,7 +52,7 @@ def recorded(env: ManipulationEnv, file: Path):
     if env.task.objects:
         rows = data["ep0_context"][: len(env.task.objects), :3] * (1, 1, math.pi / 180)
         context = np.repeat(rows[None], env.batch_size[0], 0)
-    columns = 7 if env.task.action_unit == "rad" else env.task.action_dim
+    columns = 7 if env.task.tool_kinematics is not None else env.task.action_dim
     steps = itertools.count()
 
     def policy(tensordict):
@@ -80,7 +80,7 @@ def rollout_speed(env: ManipulationEnv, steps: int, repeats: int, file: Path | N
 def shares(env: ManipulationEnv, steps: int) -> dict[str, float]:
     """Microseconds per substep spent in the physics alone and in physics with controller (one thread)."""
     env.reset()
-    if env.task.action_unit == "rad":
+    if env.task.tool_kinematics is not None:
         return {}
     rows = np.arange(env.batch_size[0])
     substeps = steps * env.substeps
@@ -108,13 +108,12 @@ def main() -> None:
 
     base, anchor = None, ANCHORS[options.task]
     file = None if options.recordings is None else options.recordings / f"{options.task}.npz"
-    make = ENVIRONMENTS[options.task]
     head = "control steps/s (min / median / max) | per thread, over the original's"
     print(f"| {options.task}, batch | threads | {head} {anchor} | scaling |")
     print("|---|---|---|---|---|")
     for num_envs in (1, options.num_envs):
         for threads in options.threads if num_envs > 1 else [1]:
-            env = make(num_envs, num_threads=threads, max_steps=10**6)
+            env = make_env(options.task, num_envs, num_threads=threads, max_steps=10**6)
             speeds = rollout_speed(env, options.steps, options.repeats, file)
             median = statistics.median(speeds)
             base = median if threads == 1 else base
@@ -122,7 +121,7 @@ def main() -> None:
                 f"| {num_envs} | {threads} | {min(speeds):.0f} / {median:.0f} / {max(speeds):.0f}"
                 f" | {median / threads / anchor:.0f}x | {median / base:.2f}x |"
             )
-    env = make(options.num_envs, max_steps=10**6)
+    env = make_env(options.task, options.num_envs, max_steps=10**6)
     print()
     for name, value in shares(env, options.steps).items():
         print(f"{name}: {value:.1f} us per substep")

@@ -17,8 +17,10 @@ import numpy as np
 import torch
 
 from torchrl_koap.envs.contexts import evaluation_contexts
-from torchrl_koap.envs.experts.recording import RECIPES, play
+from torchrl_koap.envs.experts.recording import play
+from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.tasks import get_task
 
 
 def main() -> None:
@@ -31,23 +33,23 @@ def main() -> None:
     options = parser.parse_args()
     print("| task | first attempts that succeed | % (95 %) | per mode | control steps, median (range) | seconds |")
     print("|---|---|---|---|---|---|")
-    for task in options.tasks:
-        recipe, contexts = RECIPES[task](), evaluation_contexts(task, options.contexts)
+    for name in options.tasks:
+        task, contexts = get_task(name), evaluation_contexts(name, options.contexts)
         rows = np.arange(len(contexts))
-        modes = [int(row) % recipe.num_modes for row in rows]
-        env = recipe.make_env(len(rows), num_threads=options.threads, dtype=torch.float64)
+        modes = [int(row) % task.num_modes for row in rows]
+        env = make_env(task, len(rows), num_threads=options.threads, dtype=torch.float64)
         start = time.perf_counter()
         seeds = [(options.seed, int(row)) for row in rows]
-        results = play(env, recipe, task, rows, modes, contexts, seeds, lambda over: None)
+        results = play(env, task, rows, modes, contexts, seeds, lambda over: None)
         env.close()
         good = [episode is not None for episode, _ in results]
         low, high = wilson_interval(sum(good), len(good))
-        share = [sum(g for g, m in zip(good, modes, strict=True) if m == mode) for mode in range(recipe.num_modes)]
+        share = [sum(g for g, m in zip(good, modes, strict=True) if m == mode) for mode in range(task.num_modes)]
         lengths = [len(episode) for episode, _ in results if episode is not None]
         steps = f"{statistics.median(lengths):.0f} ({min(lengths)}-{max(lengths)})"
         rate = f"{100 * sum(good) / len(good):.1f} ({100 * low:.1f}-{100 * high:.1f})"
         seconds = time.perf_counter() - start
-        print(f"| {task} | {sum(good)}/{len(good)} | {rate} | {share} | {steps} | {seconds:.0f} |", flush=True)
+        print(f"| {name} | {sum(good)}/{len(good)} | {rate} | {share} | {steps} | {seconds:.0f} |", flush=True)
 
 
 if __name__ == "__main__":

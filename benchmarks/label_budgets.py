@@ -14,9 +14,9 @@ import json
 import statistics
 from pathlib import Path
 
-from torchrl_koap.evaluation.run import Eval, run_eval
+from torchrl_koap.evaluation.run import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import mode_entropy, wilson_interval
-from torchrl_koap.training.run import Train, run_train
+from torchrl_koap.training import TrainConfig, train
 
 
 def run_cell(arguments: argparse.Namespace, method: str, count: int, seed: int) -> dict:
@@ -24,8 +24,8 @@ def run_cell(arguments: argparse.Namespace, method: str, count: int, seed: int) 
     out = arguments.out / f"{method.replace(':', '-')}-{count}-{seed}"
     name, _, preset = method.partition(":")
     if not (out / "summary.json").exists():
-        run_train(
-            Train(
+        train(
+            TrainConfig(
                 out=out,
                 dataset=arguments.dataset,
                 label_count=count,
@@ -38,7 +38,7 @@ def run_cell(arguments: argparse.Namespace, method: str, count: int, seed: int) 
             )
         )
     if arguments.episodes and not (out / "eval.json").exists():
-        run_eval(Eval(run=out, episodes=arguments.episodes, seed=1000 * seed, threads=arguments.threads, animate=False))
+        evaluate(out, EvalConfig(episodes=arguments.episodes, seed=1000 * seed, threads=arguments.threads))
     cell = json.loads((out / "summary.json").read_text())
     if arguments.episodes:
         cell["eval"] = json.loads((out / "eval.json").read_text())

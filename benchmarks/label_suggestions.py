@@ -28,9 +28,10 @@ from torchrl_koap.modules import KoopmanInverseDynamics, Normalizer
 from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.tasks import WINDOW, Task, get_task
 from torchrl_koap.training.action_errors import rmse_mm
-from torchrl_koap.training.builders import NORMALIZATION, build_controller, load_demonstrations, set_up_torch
+from torchrl_koap.training.builders import NORMALIZATION, build_controller, set_up_torch
 from torchrl_koap.training.closed_form import DEFAULT_PENALTY, fit_closed_form
-from torchrl_koap.training.loop import train
+from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.training.loop import train_phase
 
 CHOICES = (*CRITERIA, "longest")
 
@@ -49,12 +50,12 @@ def train_unlabelled(data: TensorDictBase, task: Task, preset: str, updates: int
     # the action normaliser is replaced before every fit; nothing else of the first trajectory's labels is used
     controller = build_controller(options, data["state"].shape[-1], task.action_dim, within(data, [0]))
     window = max(WINDOW, controller.num_window_frames)
-    history = controller.history
+    history = controller.num_past
     controller.fit_scales(cut_windows(data, window, select=["state"], pad_before=history)["state"])
     keys = ["state", "action", "has_action"]
     buffer = make_window_buffer(within(data, []), window, 256, select=keys, pad_before=history)
     loss = KOAPLoss(controller, action_coeff=0.0)
-    train("controller", loss, buffer.sample, num_steps=updates, learning_rate=1e-3, weight_decay=1e-3)
+    train_phase("controller", loss, buffer.sample, num_steps=updates, learning_rate=1e-3, weight_decay=1e-3)
     return controller.eval()
 
 

@@ -15,7 +15,7 @@ import statistics
 from collections import defaultdict
 from pathlib import Path
 
-from torchrl_koap.evaluation.run import Eval, run_eval
+from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.run_directory import RunDirectory
@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=1)
     parser.add_argument("--choice", default="quarter")
     parser.add_argument("--replan-interval", type=int, default=4)
-    parser.add_argument("--joining", type=float, default=0.8)
+    parser.add_argument("--blend-decay", type=float, default=0.8)
     parser.add_argument("--tempo", type=float, default=1.0)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--note", default="")
@@ -114,18 +114,13 @@ def main() -> None:
         "candidates": options.candidates,
         "choice": options.choice if options.candidates > 1 else "",
         "replan_interval": options.replan_interval,
-        "joining": options.joining,
+        "blend_decay": options.blend_decay,
     }
     results = []
     for seed in options.seeds:
         settings = {**choices, "choice": options.choice, "tempo": options.tempo}
-        results.append(
-            run_eval(
-                Eval(
-                    options.run, episodes=options.episodes, seed=seed, threads=options.threads, report=False, **settings
-                )
-            )
-        )
+        config = EvalConfig(episodes=options.episodes, seed=seed, threads=options.threads, **settings)
+        results.append(evaluate(options.run, config))
     note = options.note if options.tempo == 1 else f"tempo={options.tempo:g} {options.note}".strip()
     row = row_of(options.run, results, choices, note)
     append(row, options.table)

@@ -24,7 +24,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.unet import TemporalUnet
-from torchrl_koap.objectives.planner import PlannerLoss
+from torchrl_koap.objectives import PlannerLoss
 
 ANCHORS = {"train_it_s": 1.19, "plan_1_ms": 309.0, "plan_60_ms": 3300.0}
 

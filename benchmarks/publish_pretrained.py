@@ -15,7 +15,7 @@ from pathlib import Path
 
 from planner_ablations import labels_of, planner_of, row_of
 
-from torchrl_koap.evaluation.run import Eval, run_eval
+from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.training.pretrained import publish
 from torchrl_koap.training.run_directory import RunDirectory
 
@@ -69,7 +69,7 @@ def main() -> None:
     RunDirectory(folder).write_json("config.json", config)
     with tempfile.TemporaryDirectory() as out:
         results = [
-            run_eval(Eval(folder, out=Path(out) / "run", episodes=60, seed=seed, threads=1, report=False))
+            evaluate(folder, EvalConfig(out=Path(out) / "run", episodes=60, seed=seed, threads=1))
             for seed in options.seeds
         ]
     choices = {"candidates": options.candidates}

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How well a controller follows a perfect plan: the recorded future of demonstrations, with and without joining.
+"""How well a controller follows a perfect plan: the recorded future of demonstrations, with and without blending.
 
     python benchmarks/tracking.py RUN --dataset DIR
 
@@ -17,16 +17,18 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from torchrl_koap.data import trajectory_lengths
+from torchrl_koap.envs.registry import make_env_of
 from torchrl_koap.evaluation.run import load_run
-from torchrl_koap.modules import join_plan, policy_transforms
-from torchrl_koap.training.builders import load_demonstrations, make_env_of
-from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.modules import blend_plan, policy_transforms
+from torchrl_koap.training.datasets import load_demonstrations
 
 
 @torch.no_grad()
-def follow(task, controller, paths: list[torch.Tensor], joining: float, steps: int, horizon: int = 14) -> list[float]:
+def follow(
+    task, controller, paths: list[torch.Tensor], blend_decay: float, steps: int, horizon: int = 14
+) -> list[float]:
     """Mean distance (mm) to the demonstration after each step, over the episodes that still run."""
-    history = controller.history + 1
+    history = controller.num_past + 1
     env = TransformedEnv(make_env_of(task)(len(paths)), policy_transforms(history))
     td, running, errors = env.reset(), torch.ones(len(paths), dtype=torch.bool), []
     columns = list(task.state_columns)
@@ -35,7 +37,7 @@ def follow(task, controller, paths: list[torch.Tensor], joining: float, steps: i
         # the state seen before step t is row t - 1 of a demonstration (row 0 repeats the start)
         rows = torch.arange(step, step + horizon)
         plan = torch.stack([path[rows.clamp_max(len(path) - 1)] for path in paths])
-        window = torch.cat([observed, join_plan(observed, plan, joining)], 1)
+        window = torch.cat([observed, blend_plan(observed, plan, blend_decay)], 1)
         action = controller(TensorDict({"state": window}, batch_size=[len(paths)]))["action"]
         td = env.step(td.set("action", action[:, history - 1]))
         running &= ~td["next", "done"].squeeze(-1)
@@ -55,14 +57,15 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=24)
     parser.add_argument("--steps", type=int, nargs="+", default=[12, 30, 48])
     arguments = parser.parse_args()
-    print(f"{'run':<20}{'joining':>8}" + "".join(f"{f'step {step}':>12}" for step in arguments.steps) + "   (mm)")
+    print(f"{'run':<20}{'blend_decay':>12}" + "".join(f"{f'step {step}':>12}" for step in arguments.steps) + "   (mm)")
     for run in arguments.runs:
-        task, _, controller = load_run(RunDirectory(run))
+        trained = load_run(run)
+        task, controller = trained.task, trained.controller
         data = load_demonstrations(arguments.dataset, task)
         paths = data["state"].split(trajectory_lengths(data).tolist())[: arguments.episodes]
-        for joining in (0.0, 0.8):
-            errors = follow(task, controller, list(paths), joining, max(arguments.steps) + 1)
-            print(f"{run.name:<20}{joining:>8}" + "".join(f"{errors[step]:>12.1f}" for step in arguments.steps))
+        for blend_decay in (0.0, 0.8):
+            errors = follow(task, controller, list(paths), blend_decay, max(arguments.steps) + 1)
+            print(f"{run.name:<20}{blend_decay:>12}" + "".join(f"{errors[step]:>12.1f}" for step in arguments.steps))
 
 
 if __name__ == "__main__":

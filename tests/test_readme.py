@@ -5,16 +5,22 @@ from __future__ import annotations
 
 import re
 import shlex
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
 import tyro
 
-from torchrl_koap.commands.cli import Command
+import torchrl_koap
+from torchrl_koap.commands.cli import Subcommand
+from torchrl_koap.reports import pictures
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "RESULTS.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TEXT = "".join(page.read_text() for page in PAGES if "results" not in page.parts)
+BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
 SHELL = [
     shlex.split(line, comments=True)
     for language, block in BLOCKS
@@ -43,7 +49,7 @@ def test_targets_exist(target):
 
 @pytest.mark.parametrize("arguments", CALLS, ids=" ".join)
 def test_commands_parse(arguments):
-    options = tyro.cli(Command, args=arguments, prog="koap")
+    options = tyro.cli(Subcommand, args=arguments, prog="koap")
     assert type(options).__name__.lower() == arguments[0]
 
 
@@ -54,33 +60,70 @@ def test_every_command_is_shown():
 
 def test_the_demo_is_the_contract():
     """`make demo` trains on 2 % of the trajectories and rolls out 60 times."""
-    train, evaluation = (tyro.cli(Command, args=words[1:], prog="koap") for words in RECIPES)
-    assert (train.label_fraction, train.label_unit, train.dataset) == (0.02, "trajectory", "scripted")
-    assert (evaluation.run, evaluation.episodes, train.out) == (train.out, 60, evaluation.run)
+    train, evaluation = (tyro.cli(Subcommand, args=words[1:], prog="koap") for words in RECIPES)
+    assert (train.config.label_fraction, train.config.label_unit, train.config.dataset) == (
+        0.02,
+        "trajectory",
+        "scripted",
+    )
+    assert (evaluation.run, evaluation.config.episodes) == (train.config.out, 60)
 
 
 @pytest.mark.parametrize("code", [block for language, block in BLOCKS if language == "python"])
 def test_python_runs(code, tmp_path, monkeypatch):
+    """Everything runs, with fewer demonstrations, updates and rollouts than the text asks for."""
+    train, evaluate, called = torchrl_koap.train, torchrl_koap.evaluate, []
+
+    def train_shortly(config):
+        called.append(config)
+        return train(replace(config, label_fraction=0.2, episodes=8, steps=8, channels=(8, 16), batch_size=8))
+
+    def evaluate_shortly(run, config):
+        called.append(config)
+        return evaluate(run, replace(config, episodes=2))
+
+    monkeypatch.setattr(torchrl_koap, "train", train_shortly, raising=False)
+    monkeypatch.setattr(torchrl_koap, "evaluate", evaluate_shortly, raising=False)
+    for name, fit in {
+        "fit_planner": partial(torchrl_koap.fit_planner, steps=1, batch_size=2, channels=(8, 16)),
+        "fit_controller": partial(torchrl_koap.fit_controller, steps=0),
+    }.items():
+        monkeypatch.setattr(torchrl_koap, name, fit, raising=False)
+    monkeypatch.setattr(pictures, "_PICTURES", dict(pictures.all_pictures()))
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
+    assert "train(" not in code or [type(config).__name__ for config in called] == ["TrainConfig", "EvalConfig"]
 
 
-LINKS = [link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
-PATHS = re.findall(r"`((?:torchrl_koap|tutorials|benchmarks|tests)/[\w./]*)`", README)
+PATHS = re.findall(r"`((?:torchrl_koap|tutorials|benchmarks|tests|docs)/[\w./]*)`", TEXT)
 
 
-@pytest.mark.parametrize("path", sorted({path for path in (*LINKS, *PATHS) if path}))
-def test_links_lead_somewhere(path):
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    links = [link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", page.read_text()) if "://" not in link]
+    for link in filter(None, links):
+        assert (page.parent / link).exists(), link
+
+
+@pytest.mark.parametrize("path", sorted(set(PATHS)))
+def test_paths_named_in_the_text_exist(path):
     assert (ROOT / path).exists()
+
+
+def test_usage_comes_before_any_figure():
+    """The first screen says what it is and how it is used; results follow."""
+    shell, plot = README.index("koap train"), README.index("success_and_entropy.png")
+    assert README.index("docs/pictures/pipeline.svg") < README.index("import") < shell < plot
+    assert len(README[:plot].splitlines()) < 50
 
 
 def test_options_named_in_the_text_exist():
     """Every ``--option`` in running text is one of some command."""
-    text = re.sub(r"^```.*?^```", "", README, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^```.*?^```", "", TEXT, flags=re.MULTILINE | re.DOTALL)
     sources = "".join(path.read_text() for path in (ROOT / "torchrl_koap").rglob("*.py"))
     for option in re.findall(r"`--([a-z][a-z-]*)", text):
         assert re.search(rf"^    {option.replace('-', '_')}:", sources, re.MULTILINE), option
 
 
 def test_nothing_is_left_to_fill_in():
-    assert not re.findall(r"@@|TODO|XXX|FIXME", README)
+    assert not re.findall(r"@@|TODO|XXX|FIXME", TEXT)

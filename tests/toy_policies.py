@@ -18,7 +18,8 @@ class CountingPlanner(nn.Module):
     """Planned frame ``i`` of a plan made at state ``x`` is ``(x + 1000 (i + 1), x)``."""
 
     history, horizon, num_steps, solver, state_dim = 2, 6, 1, "ddim", 2
-    sample_shape = (6, 2)
+    sample_shape = noise_shape = (6, 2)
+    noise_key = "noise"
 
     def __init__(self):
         super().__init__()
@@ -35,9 +36,9 @@ class CountingPlanner(nn.Module):
 class EchoController(TensorDictModuleBase):
     """The action of frame ``t`` is what the window holds: ``x_{t-1}``, ``x_t`` and both columns of ``x_{t+1}``."""
 
-    def __init__(self, history=1, in_key="state", out_key="action"):
+    def __init__(self, num_past=1, in_key="state", out_key="action"):
         super().__init__()
-        self.in_keys, self.out_keys, self.history = [in_key], ["something_else", out_key], history
+        self.in_keys, self.out_keys, self.num_past = [in_key], ["something_else", out_key], num_past
 
     def forward(self, tensordict):
         state = tensordict.get(self.in_keys[0])
@@ -126,7 +127,7 @@ class PlannedStep(TensorDictModuleBase):
 
     def __init__(self):
         super().__init__()
-        self.in_keys, self.out_keys, self.history = ["state"], ["action"], 1
+        self.in_keys, self.out_keys, self.num_past = ["state"], ["action"], 1
 
     def forward(self, tensordict):
         state = tensordict["state"]

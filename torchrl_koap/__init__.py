@@ -1,4 +1,61 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """TorchRL components for imitation learning with few action labels."""
 
+from __future__ import annotations
+
+from torchrl_koap.lookup import exports
+
 __version__ = "0.1.0"
+
+# imported when first asked for: a network or a task costs no simulator, a version no torch
+_LAZY = {
+    "Agent": "torchrl_koap.modules",
+    "AsynchronousAgent": "torchrl_koap.modules",
+    "CurveConfig": "torchrl_koap.studies",
+    "EvalConfig": "torchrl_koap.evaluation",
+    "Task": "torchrl_koap.tasks",
+    "TrainConfig": "torchrl_koap.training",
+    "build_policy": "torchrl_koap.evaluation",
+    "evaluate": "torchrl_koap.evaluation",
+    "fit_controller": "torchrl_koap.training",
+    "fit_planner": "torchrl_koap.training",
+    "get_task": "torchrl_koap.tasks",
+    "load_policy": "torchrl_koap.evaluation",
+    "make_demonstrations": "torchrl_koap.data",
+    "register_method": "torchrl_koap.training",
+    "register_task": "torchrl_koap.tasks",
+    "run_curve": "torchrl_koap.studies",
+    "save_demonstrations": "torchrl_koap.data",
+    "save_policy": "torchrl_koap.evaluation",
+    "train": "torchrl_koap.training",
+}
+
+__all__ = [  # noqa: F822 - __getattr__ finds them
+    "Agent",
+    "AsynchronousAgent",
+    "CurveConfig",
+    "EvalConfig",
+    "Task",
+    "TrainConfig",
+    "__version__",
+    "build_policy",
+    "evaluate",
+    "fit_controller",
+    "fit_planner",
+    "get_task",
+    "load_policy",
+    "make_demonstrations",
+    "register_method",
+    "register_task",
+    "run_curve",
+    "save_demonstrations",
+    "save_policy",
+    "train",
+]
+
+
+__getattr__ = exports(__name__, _LAZY)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})

@@ -7,12 +7,13 @@ A full disk or an interrupt in the middle of a save leaves what was there before
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+
+import filelock
 
 
 @contextlib.contextmanager
@@ -83,14 +84,24 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
         raise
 
 
-@contextlib.contextmanager
-def one_at_a_time(path: str | Path) -> Iterator[None]:
-    """Lets one process, or thread, at a time into the block; the others wait.
+class LockedError(RuntimeError):
+    """A folder or file that another process works on."""
 
-    Where the system has no ``fcntl`` (Windows) nobody waits.
+
+@contextlib.contextmanager
+def one_at_a_time(path: str | Path, *, busy: str | None = None) -> Iterator[None]:
+    """Lets one process, or thread, at a time into the block; the others wait, or are refused.
+
+    The lock is the system's: it is free again however its process ends.
 
     Args:
-        path (str or Path): the lock file; it stays.
+        path (str or Path): the lock file; it stays. Missing parent folders are created.
+
+    Keyword Args:
+        busy (str, optional): refuse with this message instead of waiting.
+
+    Raises:
+        LockedError: if somebody else is in the block and ``busy`` was given.
 
     Examples:
         >>> import tempfile
@@ -100,16 +111,17 @@ def one_at_a_time(path: str | Path) -> Iterator[None]:
         ...         "alone"
         'alone'
     """
-    if importlib.util.find_spec("fcntl") is None:
-        yield
-        return
-    import fcntl
-
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a") as file:  # closing the file gives the lock back
-        fcntl.flock(file, fcntl.LOCK_EX)
+    lock = filelock.FileLock(path, timeout=-1 if busy is None else 0, thread_local=False)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        raise LockedError(busy) from None
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def _exchange(new: Path, path: Path) -> None:

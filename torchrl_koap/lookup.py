@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Mapping
+import importlib
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 
@@ -34,3 +35,24 @@ def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) 
     near = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5) if isinstance(name, str) else []
     hint = f"did you mean {lowered[near[0]]!r}?" if near else f"known: {', '.join(table)}"
     raise ValueError(f"unknown {what} {name!r}; {hint}")
+
+
+def exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+    """The ``__getattr__`` of a package whose public names are imported when they are first asked for.
+
+    Args:
+        package (str): its name.
+        modules (mapping): public name to the module that defines it.
+
+    Examples:
+        >>> from torchrl_koap.lookup import exports
+        >>> exports("my_package", {"sqrt": "math"})("sqrt")(4)
+        2.0
+    """
+
+    def get(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(modules[name]), name)
+
+    return get

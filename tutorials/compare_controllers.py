@@ -46,7 +46,7 @@ demonstrations = select_state(demonstrations, task.state_columns)
 
 
 def budget(count):
-    data, _ = LabelBudget(count, seed=1).apply(demonstrations, command=task.observation[task.command])
+    data, _ = LabelBudget(count, seed=1).apply(demonstrations, command=task.command_columns)
     return data
 
 
@@ -77,16 +77,16 @@ def train(loss, data, history, *, labelled_share, updates=300):
 
 def koap(data):
     model = make_koopman_inverse_dynamics(2, 2, **normalizers(data))
-    model.fit_scales(cut_windows(data, 16, select=["state"], pad_before=model.history)["state"])
-    train(KOAPLoss(model, action_coeff=0.0), data, model.history, labelled_share=None)
+    model.fit_scales(cut_windows(data, 16, select=["state"], pad_before=model.num_past)["state"])
+    train(KOAPLoss(model, action_coeff=0.0), data, model.num_past, labelled_share=None)
     fit_closed_form(model, data, shared_axes=task.actuated)
     return model
 
 
 def supervised(data):
     model = SupervisedInverseDynamics(2, 2, look_ahead=(1, 2, 3, 4, 5), **normalizers(data))
-    model.fit_scales(cut_windows(data, 16, select=["state"], pad_before=model.history)["state"])
-    train(InverseDynamicsLoss(model), data, model.history, labelled_share=1.0)
+    model.fit_scales(cut_windows(data, 16, select=["state"], pad_before=model.num_past)["state"])
+    train(InverseDynamicsLoss(model), data, model.num_past, labelled_share=1.0)
     return model
 
 
@@ -105,7 +105,7 @@ def ridge(data):
 
 class Proportional(TensorDictModuleBase):
     in_keys, out_keys = ["state"], ["action"]
-    history, num_window_frames = 0, 4
+    num_past, num_window_frames = 0, 4
 
     def __init__(self):
         super().__init__()
@@ -153,11 +153,11 @@ data = budget(1)
 model = koap(data)
 steps = infer_steps(model, data)
 chosen = rank_trajectories(
-    steps["latent_action"], steps["episode"], steps["has_action"], penalty=0.15, criterion="gain", count=4
+    steps["latent_action"], steps["episode"], steps["has_action"], penalty=0.15, criterion="a_optimal", count=4
 )
 first = data["episode"][data["has_action"].squeeze(-1)][:1].tolist()
 asked = LabelBudget.of_episodes([*first, *(choice.episode for choice in chosen)])
-data, _ = asked.apply(demonstrations, command=task.observation[task.command])
+data, _ = asked.apply(demonstrations, command=task.command_columns)
 suggested = rmse_mm(*hidden_action_errors(koap(data).eval(), demonstrations, data))
 
 # %%

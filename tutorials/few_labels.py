@@ -30,7 +30,7 @@ from torchrl_koap.data import (
     make_window_buffer,
     select_state,
 )
-from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs import AvoidingEnv, mode_index_of
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.evaluation.rollouts import make_policy, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
@@ -44,7 +44,7 @@ torch.manual_seed(0)
 task = get_task("avoiding")
 demonstrations, _ = record_demonstrations("avoiding", episodes=48)
 demonstrations = select_state(demonstrations, task.state_columns)
-data, report = LabelBudget(2, unit="trajectory").apply(demonstrations, command=task.observation[task.command])
+data, report = LabelBudget(2, unit="trajectory").apply(demonstrations, command=task.command_columns)
 
 # %%
 # Latent actions from states alone
@@ -58,7 +58,7 @@ inverse_dynamics = make_koopman_inverse_dynamics(
     state_normalizer=Normalizer.fit(data["state"], mode="standard"),
     action_normalizer=Normalizer.fit(data["action"], mode="rms", mask=data["has_action"]),
 )
-history = inverse_dynamics.history
+history = inverse_dynamics.num_past
 inverse_dynamics.fit_scales(cut_windows(data, 16, select=["state"], pad_before=history)["state"])
 loss = KOAPLoss(inverse_dynamics, action_coeff=0.0)
 buffer = make_window_buffer(data, 16, 256, select=["state", "action", "has_action"], pad_before=history)
@@ -104,6 +104,7 @@ planner_loss.target_planner_params.to_module(planner)
 policy = make_policy(planner, inverse_dynamics, state_columns=task.state_columns)
 seeds = list(range(24))
 episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
+mode_index = mode_index_of(task)
 result = score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index)
 rollouts = rollouts_to_tensors(episodes, position=task.observation[task.position], mode_index=mode_index, interval=4)
 plot_rollouts(rollouts, "few_labels.png", task="avoiding", num_modes=task.num_modes)

@@ -19,11 +19,14 @@ import pytest
 import torch
 from tiny_runs import TINY, grid, koap, write_demonstrations
 
+import torchrl_koap
+from torchrl_koap.commands.cli import HINT
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import checkpoints
-from torchrl_koap.training.builders import build_controller, load_demonstrations
+from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.checkpoints import load_tensors, save_tensors
+from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.run_directory import RunDirectory
 
 TASK = get_task("avoiding")
@@ -55,7 +58,7 @@ def copied_run(trained_run, tmp_path):
 @pytest.fixture
 def no_report(monkeypatch):
     """Rollouts without pictures, which have tests of their own."""
-    monkeypatch.setattr("torchrl_koap.evaluation.run.write_report", lambda *arguments, **options: None)
+    monkeypatch.setattr("torchrl_koap.commands.eval.write_report", lambda *arguments, **options: None)
 
 
 # koap train
@@ -70,7 +73,7 @@ def test_what_a_training_writes(trained_run, demonstrations):
     assert summary["labels"]["selected_units"] == 2 and summary["labels"]["trajectories_touched"] == 2
     assert summary["labels"]["total_transitions"] == sum(29 + index for index in range(8))
     controller = build_controller(config["controller"], 2, 2)
-    unseen = 2 * (controller.num_window_frames - 1 - controller.history)  # the ends of two trajectories
+    unseen = 2 * (controller.num_window_frames - 1 - controller.num_past)  # the ends of two trajectories
     assert summary["decoder_fit"]["labels_used"] == summary["labels"]["labelled_transitions"] - unseen
     assert summary["action_error_mm"]["controller"] > 0 and summary["action_error_mm"]["ridge"] > 0
     rows = RunDirectory(trained_run).read_metrics()
@@ -506,7 +509,8 @@ def test_a_full_disk_damages_no_earlier_evaluation(copied_run, monkeypatch, caps
     before = contents(copied_run)
     monkeypatch.setattr(os, "replace", full_disk)
     assert koap("eval", copied_run, "--episodes", 2, "--threads", 1) == 1
-    assert capsys.readouterr().err.strip().splitlines()[-1] == "koap: [Errno 28] No space left on device"
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line == f"koap: [Errno 28] No space left on device ({HINT})"
     assert contents(copied_run) == before
 
 
@@ -544,10 +548,8 @@ def test_as_a_program(tmp_path):
     command = [str(program)] if program.exists() else [sys.executable, "-m", "torchrl_koap.commands.cli"]
     wrong = subprocess.run([*command, "eval", str(tmp_path / "none")], capture_output=True, text=True)
     assert wrong.returncode == 1 and wrong.stdout == ""
-    assert (
-        wrong.stderr
-        == f"koap: {tmp_path}/none/config.json is missing: is {tmp_path}/none the folder of a finished `koap train`?\n"
-    )
+    missing = f"{tmp_path}/none/config.json is missing: is {tmp_path}/none the folder of a finished `koap train`?"
+    assert wrong.stderr == f"koap: {missing} ({HINT})\n"
 
 
 def test_doctor_lists_versions(capsys):
@@ -598,3 +600,48 @@ def test_wandb_that_is_not_installed_names_the_extra(demonstrations, tmp_path, m
     command = ["train", "--out", tmp_path / "run", "--dataset", demonstrations, *TINY, "--logger", "wandb"]
     assert "pip install 'torchrl_koap[wandb]'" in fails(capsys, *command)
     assert not (tmp_path / "run").exists()
+
+
+# what every command has
+
+
+def test_version(capsys):
+    assert koap("--version") == 0
+    assert capsys.readouterr().out == f"koap {torchrl_koap.__version__}\n"
+
+
+def test_quiet_says_nothing_but_what_went_wrong(demonstrations, tmp_path, capsys):
+    command = ("train", "--out", tmp_path / "run", "--dataset", demonstrations, *TINY, "--quiet")
+    assert koap(*command) == 0
+    assert capsys.readouterr() == ("", "")
+    assert "holds a run already" in fails(capsys, *command)
+
+
+def test_two_trainings_in_one_folder(copied_run, capsys):
+    """The second one is refused while the first one works, and leaves the folder alone."""
+    with RunDirectory(copied_run).locked("koap train"):
+        before = contents(copied_run)
+        line = fails(capsys, "train", "--out", copied_run, "--resume")
+        assert f"another `koap train` is working in {copied_run}" in line
+        assert contents(copied_run) == before
+
+
+def test_two_trainings_that_begin_together(demonstrations, tmp_path, capsys, monkeypatch):
+    """Both found a new folder; while one reads its demonstrations the other one begins, or is through."""
+    from torchrl_koap.training import run
+
+    out, load = tmp_path / "run", run.load_demonstrations
+    command = ("train", "--out", out, "--dataset", demonstrations, *TINY, "--quiet")
+
+    def meanwhile(*arguments, **options):
+        monkeypatch.setattr(run, "load_demonstrations", load)
+        assert koap(*command) == 0
+        return load(*arguments, **options)
+
+    monkeypatch.setattr(run, "load_demonstrations", meanwhile)
+    assert "holds a run already" in fails(capsys, *command)
+    assert (out / "summary.json").exists()
+
+
+def test_every_error_line_says_how_to_see_more(capsys, tmp_path):
+    assert fails(capsys, "eval", tmp_path).endswith("(KOAP_TRACEBACK=1 shows where)")

@@ -10,9 +10,9 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import (
-    ExchangeAugmentation,
+    ObjectPermutation,
+    RandomPlanarTransform,
     RecoveryAugmentation,
-    SceneAugmentation,
     cut_windows,
     extrapolate_ends,
     make_window_buffer,
@@ -115,7 +115,7 @@ def windows(count=64, width=8):
 def test_a_moved_scene_keeps_every_distance_and_angle():
     state = windows()
     state[..., 4:6] /= state[..., 4:6].norm(dim=-1, keepdim=True)
-    augment = SceneAugmentation([(0, 1), (2, 3)], [(4, 5)], shift=0.3, turn=0.8)
+    augment = RandomPlanarTransform([(0, 1), (2, 3)], [(4, 5)], shift=0.3, turn=0.8)
     moved = augment(TensorDict({"state": state}, [64]))["state"]
 
     def seen_from_tool(values):
@@ -134,15 +134,15 @@ def test_a_moved_scene_keeps_every_distance_and_angle():
 
 def test_a_scene_may_stay_where_it_is():
     state = windows()
-    same = SceneAugmentation([(0, 1)], [(4, 5)], shift=0.0, turn=0.0)(TensorDict({"state": state}, [64]))["state"]
+    same = RandomPlanarTransform([(0, 1)], [(4, 5)], shift=0.0, turn=0.0)(TensorDict({"state": state}, [64]))["state"]
     torch.testing.assert_close(same, state)
     with pytest.raises(ValueError, match="shift and turn must be >= 0, got -1"):
-        SceneAugmentation([(0, 1)], [], shift=-1, turn=0)
+        RandomPlanarTransform([(0, 1)], [], shift=-1, turn=0)
 
 
 def test_alike_objects_are_exchanged_whole_and_all_the_time_of_a_window():
     state = windows(count=400)
-    augment = ExchangeAugmentation([[(1, 2), (3, 4)], [(5,), (6,), (7,)]])
+    augment = ObjectPermutation([[(1, 2), (3, 4)], [(5,), (6,), (7,)]])
     found = augment(TensorDict({"state": state}, [400]))["state"]
     assert torch.equal(found[..., 0], state[..., 0])
     kept = (found[..., 1:5] == state[..., 1:5]).all(-1).all(-1)
@@ -162,11 +162,11 @@ def test_shifted_columns_may_be_chosen():
 def test_a_tool_follows_the_joints_and_comes_back_with_them():
     joints = torch.rand(30, 16, 7, dtype=torch.float64) - 0.5
     state = torch.cat([joints, torch.rand(30, 16, 1).double(), tool_position(joints)], -1)
-    augment = RecoveryAugmentation(0.02, columns=range(7), tool=(8, 9, 10))
+    augment = RecoveryAugmentation(0.02, columns=range(7), tool=(8, 9, 10), kinematics=tool_position)
     found = augment(TensorDict({"state": state.clone()}, [30]))["state"]
     torch.testing.assert_close(found[..., 8:], tool_position(found[..., :7]))
     assert torch.equal(found[..., 7], state[..., 7])
     away = (found - state)[..., 8:].norm(dim=-1)
     assert 0.002 < away[:, 1].mean() < 0.05 and away[:, 15].mean() < 0.02 * away[:, 1].mean()
-    with pytest.raises(ValueError, match="follows the arm's seven joints"):
+    with pytest.raises(ValueError, match="wanted columns and kinematics"):
         RecoveryAugmentation(0.02, columns=(0, 1), tool=(2, 3, 4))

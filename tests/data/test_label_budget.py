@@ -55,6 +55,7 @@ def test_the_account_is_right(lengths, unit, amount, seed):
     assert report.total_transitions == sum(lengths)
     assert report.trajectories_touched == len(data["episode"][kept].unique())
     assert report.total_trajectories == len(lengths)
+    assert (report.available_units, report.available_transitions) == (totals[unit], sum(lengths))
     same_bits(labelled["action"][kept], data["action"][kept])
     assert labelled["action"][~kept].isnan().all()
     if unit == "trajectory":
@@ -155,8 +156,6 @@ def test_wrong_options():
         LabelBudget(9).apply(demonstrations())
     with pytest.raises(ValueError, match="longest: 12"):
         LabelBudget(1, "window").apply(demonstrations((12, 3)))
-    with pytest.raises(ValueError, match="fully labelled data; "):
-        LabelBudget(1).apply(LabelBudget(1).apply(demonstrations())[0])
 
 
 def test_commands_hide_with_the_actions():
@@ -234,3 +233,65 @@ def test_given_episodes_are_labelled_and_no_others():
             LabelBudget.of_episodes(wrong)
     with pytest.raises(ValueError, match="without an amount or a unit"):
         LabelBudget(3, episodes=(1, 2))
+
+
+def partly(lengths, shown, seed=0):
+    """Demonstrations of which only some trajectories have actions."""
+    data = demonstrations(lengths, seed)
+    kept = torch.isin(data["episode"], torch.tensor(shown)).unsqueeze(-1)
+    return data.set("has_action", kept).set("action", torch.where(kept, data["action"], math.nan))
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_smaller_budget_of_the_same_draw_is_what_it_would_have_been(unit):
+    data = demonstrations((20, 33, 16, 40, 25, 18))
+    some, _ = LabelBudget(4, unit, seed=3).apply(data)
+    again, report = LabelBudget(2, unit, seed=3).apply(some)
+    direct, plain = LabelBudget(2, unit, seed=3).apply(data)
+    if unit != "window":  # overlapping windows share labels: others can have some, too
+        assert report.selected_units == 2 and report.available_units == 4
+        assert torch.equal(again["has_action"], direct["has_action"])
+        same_bits(again["action"], direct["action"])
+    assert report.available_transitions == int(some["has_action"].sum()) and plain.available_transitions == 152
+    assert (some["has_action"] | ~again["has_action"]).all()
+    validate(again)
+
+
+def test_missing_labels_are_the_budget():
+    data = partly((20, 33, 16, 40), shown=(1, 3))
+    everything, report = LabelBudget(1.0).apply(data)
+    assert torch.equal(everything["has_action"], data["has_action"])
+    assert str(report).endswith("2 of 4 trajectories touched; the data came with 73 labels, on 2 trajectories")
+    assert {int(LabelBudget(1, seed=s).apply(data)[0]["has_action"].sum()) for s in range(8)} == {33, 40}
+    assert LabelBudget(0.25).apply(data)[1].selected_units == 1  # of all four
+    assert LabelBudget(5, "transition").apply(data)[1].labelled_transitions == 5
+    windows, report = LabelBudget(1.0, "window").apply(data)
+    assert report.available_units == report.selected_units == 18 + 25 and report.labelled_transitions == 31 + 38
+    episodes, _ = LabelBudget.of_episodes([3]).apply(data)
+    assert int(episodes["has_action"].sum()) == 40
+    holes = data.clone()
+    holes["has_action"][25], holes["action"][25] = False, math.nan
+    assert LabelBudget(2).apply(holes)[1].labelled_transitions == 72
+
+
+def test_a_budget_above_what_there_is_is_named():
+    data = partly((20, 33, 16, 40), shown=(1, 3))
+    with pytest.raises(ValueError, match="3 labelled trajectories asked for, only 2 of 4 have a label"):
+        LabelBudget(3).apply(data)
+    with pytest.raises(ValueError, match=r"fraction of 0.75 is 3 of 4 trajectories, but only 2 have a label \(0.5\)"):
+        LabelBudget(0.75).apply(data)
+    with pytest.raises(ValueError, match=r"episodes \[2\] are to be labelled, but the data hold no action of them"):
+        LabelBudget.of_episodes([2, 3]).apply(data)
+    with pytest.raises(ValueError, match="none of the 109 steps has an action: there are no labels to spend"):
+        LabelBudget(1).apply(partly((20, 33, 16, 40), shown=()))
+    with pytest.raises(ValueError, match="no entry 'action', and thus no labels"):
+        LabelBudget(1).apply(data.exclude("has_action", "action"))
+
+
+def test_labels_that_are_no_numbers_are_named():
+    data = demonstrations()
+    data["action"][7] = math.nan
+    with pytest.raises(ValueError, match="'action' is not finite in 1 labelled steps, first at step 7"):
+        LabelBudget(1).apply(data)
+    found, report = LabelBudget(1.0).apply(data.exclude("has_action"))  # without the column NaN means no label
+    assert report.available_transitions == 108 and not found["has_action"][7]

@@ -18,8 +18,8 @@ LENGTHS = (1, 3, 20, 7)
 class WindowController(EchoController):
     """The action of every frame is its whole window, so that a test sees which one was read."""
 
-    def __init__(self, history=1, window=6):
-        super().__init__(history)
+    def __init__(self, num_past=1, window=6):
+        super().__init__(num_past)
         self.num_window_frames, self.batches = window, []
         self.dropout = torch.nn.Dropout(0.5)
 

@@ -368,3 +368,21 @@ def test_without_replacement_is_shuffled_anew():
     torch.manual_seed(0)
     buffer = make_window_buffer(demonstrations(), 16, 49, replacement=False)
     assert seen(buffer.sample()) != seen(buffer.sample())
+
+
+@pytest.mark.parametrize("padding", [{}, {"pad_before": 1}])
+def test_threads_may_draw_ahead(padding):
+    data = flatten_trajectories([torch.rand(21, 4)] * 3, [torch.rand(20, 2)] * 3)
+    buffer = make_window_buffer(data, 16, 5, prefetch=2, select=["episode", "step_count"], **padding)
+    for _ in range(8):
+        batch = buffer.sample()
+        assert batch.shape == (5, 16) and (batch["episode"] == batch["episode"][:, :1]).all()
+        assert (batch["step_count"].diff(dim=-1)[:, 1:] == 1).all()
+
+
+def test_epochs_are_not_drawn_ahead():
+    data = flatten_trajectories([torch.rand(21, 4)] * 3, [torch.rand(20, 2)] * 3)
+    with pytest.raises(ValueError, match=r"an epoch \(replacement=False\) cannot be prefetched, got prefetch=2"):
+        make_window_buffer(data, 16, 5, prefetch=2, replacement=False)
+    with pytest.raises(ValueError, match="prefetch must be >= 1, got prefetch=0"):
+        make_window_buffer(data, 16, 5, prefetch=0)

@@ -16,8 +16,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import StepCounter
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_koap.envs import AvoidingEnv, mode_index
-from torchrl_koap.envs.avoiding import OBSTACLES
+from torchrl_koap.envs.avoiding import OBSTACLES, AvoidingEnv, mode_index
 
 RECORDINGS = SHARED / "d3il_reference" / "avoiding.npz"
 needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")

@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 from torchrl_koap.envs import AvoidingEnv, ManipulationGymEnv
 from torchrl_koap.envs.contexts import evaluation_contexts
-from torchrl_koap.envs.registry import ENVIRONMENTS
+from torchrl_koap.envs.registry import make_env
 
 NAMES = ("Avoiding", "Aligning", "Sorting2", "Sorting4", "Sorting6", "Stacking")
 
@@ -58,7 +58,7 @@ def test_a_context_that_is_asked_for(name):
     context = evaluation_contexts(env.task)[7]
     observation, info = env.reset(options={"context": context})
     np.testing.assert_array_equal(info["context"], context)
-    wanted = ENVIRONMENTS[env.task.name](1).reset(contexts=context[None])
+    wanted = make_env(env.task).reset(contexts=context[None])
     np.testing.assert_array_equal(observation, wanted["observation"][0])
     info = env.step(env.action_space.sample() * 0)[4]
     np.testing.assert_array_equal(info["context"], context)

@@ -16,7 +16,7 @@ from torchrl_koap.tasks import get_task
 
 def test_po_sorting_is_sorting_plus_transforms():
     env = TransformedEnv(
-        SortingEnv(2, seed=0), Compose(EndEffectorNoise("sorting", sigma=0.002), PartialObservation("sorting"))
+        SortingEnv(2, seed=0), Compose(EndEffectorNoise("po_sorting", sigma=0.002), PartialObservation("po_sorting"))
     )
     check_env_specs(env)
     assert env.observation_spec["observation"].shape == (2, 10)
@@ -27,7 +27,7 @@ def test_po_sorting_is_sorting_plus_transforms():
 def test_what_remains_is_what_the_task_shows_its_planner():
     """KOAP's ten columns: measured xy and the boxes' xy."""
     observation = torch.randn(7, 16)
-    partial = PartialObservation("sorting")(TensorDict({"observation": observation.clone()}, [7]))["observation"]
+    partial = PartialObservation("po_sorting")(TensorDict({"observation": observation.clone()}, [7]))["observation"]
     assert torch.equal(partial, observation[:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]])
     assert torch.equal(partial, get_task("po_sorting").state_of(observation))
 

@@ -10,9 +10,8 @@ import pytest
 import torch
 from tiny_runs import TINY, koap
 
-from torchrl_koap.commands import suggest
-from torchrl_koap.commands.suggest import Suggest, run_suggest
-from torchrl_koap.evaluation.active_labelling import rank_trajectories
+from torchrl_koap.evaluation import active_labelling
+from torchrl_koap.evaluation.active_labelling import SuggestConfig, rank_trajectories, suggest
 from torchrl_koap.modules import LinearActionDecoder
 
 EPISODE = torch.arange(7).repeat_interleave(torch.tensor([5, 3, 6, 4, 5, 2, 5]))
@@ -31,7 +30,7 @@ def mean_leverage(latent, rows, scale, where=slice(None)):
     return ((latent @ precision.inverse()) * latent).sum(-1)[where].mean().item()
 
 
-def test_greedy_gain_equals_brute_force():
+def test_a_optimal_greedy_choice_equals_brute_force():
     latent, penalty = latents(), 0.05
     scale = penalty * latent[KNOWN].square().sum(-1).mean()
     rows, wanted = KNOWN.clone(), []
@@ -50,10 +49,10 @@ def test_greedy_gain_equals_brute_force():
     assert [choice.score for choice in found] == pytest.approx([gain for _, gain in wanted])
 
 
-def test_variance_counts_what_was_chosen_before_as_labelled():
+def test_uncertainty_counts_what_was_chosen_before_as_labelled():
     latent, penalty = latents(), 0.05
     scale = penalty * latent[KNOWN].square().sum(-1).mean()
-    found = rank_trajectories(latent, EPISODE, KNOWN, penalty=penalty, criterion="variance", count=3)
+    found = rank_trajectories(latent, EPISODE, KNOWN, penalty=penalty, criterion="uncertainty", count=3)
     rows = KNOWN.clone()
     for choice in found:
         left = {name: mean_leverage(latent, rows, scale, name == EPISODE) for name in set(EPISODE[~rows].tolist())}
@@ -68,7 +67,7 @@ def test_scores_are_the_decoder_s_own_uncertainty(bias, tolerance):
     action = torch.randn(len(latent), 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     decoder.fit_ridge(latent, action, KNOWN, penalties=(0.05,), bias=bias)
     relative = (decoder.predictive_variance(latent) / decoder.noise_variance - 1).squeeze(-1)
-    chosen = rank_trajectories(latent, EPISODE, KNOWN, penalty=0.05, criterion="variance", count=1, bias=bias)[0]
+    chosen = rank_trajectories(latent, EPISODE, KNOWN, penalty=0.05, criterion="uncertainty", count=1, bias=bias)[0]
     assert chosen.score == pytest.approx(relative[chosen.episode == EPISODE].mean().item(), rel=tolerance)
 
 
@@ -76,7 +75,7 @@ def test_only_unlabelled_steps_are_offered_and_counted():
     latent = latents()
     labelled = EPISODE != 0
     labelled[1:5] = True  # of trajectory 0 the first step is left
-    chosen = rank_trajectories(latent, EPISODE, labelled, penalty=0.1, criterion="variance", count=1)[0]
+    chosen = rank_trajectories(latent, EPISODE, labelled, penalty=0.1, criterion="uncertainty", count=1)[0]
     scale = 0.1 * latent[labelled].square().sum(-1).mean()
     assert chosen.episode == 0
     assert chosen.score == pytest.approx(mean_leverage(latent, labelled, scale, slice(0, 1)))
@@ -102,7 +101,7 @@ def test_random_choices_are_seeded():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"criterion": "gian"}, "unknown criterion 'gian'; did you mean 'gain'"),
+        ({"criterion": "a_optmal"}, "unknown criterion 'a_optmal'; did you mean 'a_optimal'"),
         ({"count": 0}, "count must be in 1..6"),
         ({"count": 7}, "count must be in 1..6, the trajectories that are not labelled yet, got 7"),
         ({"penalty": 0.0}, "penalty must be positive"),
@@ -127,7 +126,7 @@ def run(trained_run, tmp_path):
 def test_suggest_from_the_shell(run, capsys):
     assert koap("suggest", run, "--count", "3") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["rank", "episode", "steps", "gain"] and len(lines) == 5
+    assert lines[0].split() == ["rank", "episode", "steps", "a_optimal"] and len(lines) == 5
     written = json.loads((run / "suggestions.json").read_text())
     rows = written["suggestions"]
     labels = json.loads((run / "summary.json").read_text())["labels"]
@@ -144,23 +143,25 @@ def test_suggest_from_the_shell(run, capsys):
     assert len(written["labelled_episodes"]) == labels["trajectories_touched"]
     assert koap("suggest", run, "--count", "7") == 1  # 2 of 8 are labelled
     assert "count must be in 1..6" in capsys.readouterr().err
-    assert koap("suggest", run, "--criterion", "variants") == 1
-    assert "did you mean 'variance'" in capsys.readouterr().err
+    assert koap("suggest", run, "--criterion", "uncertain") == 1
+    assert "did you mean 'uncertainty'" in capsys.readouterr().err
 
 
 def test_no_hidden_label_has_a_say(run, monkeypatch):
-    load = suggest.load_demonstrations
-    first = run_suggest(Suggest(run, count=6))
+    load = active_labelling.load_demonstrations
+    first = suggest(run, SuggestConfig(count=6))
 
     def other_labels(*arguments, **options):
         data = load(*arguments, **options)
         return data.set("action", torch.randn_like(data["action"]) * 1e3)
 
-    monkeypatch.setattr(suggest, "load_demonstrations", other_labels)
-    assert run_suggest(Suggest(run, count=6)) == first
-    seen, infer = [], suggest.infer_steps
-    monkeypatch.setattr(suggest, "infer_steps", lambda controller, data: seen.append(data) or infer(controller, data))
-    run_suggest(Suggest(run, count=1))
+    monkeypatch.setattr(active_labelling, "load_demonstrations", other_labels)
+    assert suggest(run, SuggestConfig(count=6)) == first
+    seen, infer = [], active_labelling.infer_steps
+    monkeypatch.setattr(
+        active_labelling, "infer_steps", lambda controller, data: seen.append(data) or infer(controller, data)
+    )
+    suggest(run, SuggestConfig(count=1))
     assert seen[0]["action"].isnan().all(-1).equal(~seen[0]["has_action"].squeeze(-1))
 
 
@@ -168,11 +169,11 @@ def test_no_hidden_label_has_a_say(run, monkeypatch):
 def test_the_choice_is_made_for_the_decoder_of_the_run(demonstrations, tmp_path, monkeypatch, preset, bias):
     out = tmp_path / "run"
     assert koap("train", "--out", out, "--dataset", demonstrations, *TINY, "--preset", preset) == 0
-    seen, rank = {}, suggest.rank_trajectories
+    seen, rank = {}, active_labelling.rank_trajectories
     monkeypatch.setattr(
-        suggest, "rank_trajectories", lambda *args, **options: seen.update(options) or rank(*args, **options)
+        active_labelling, "rank_trajectories", lambda *args, **options: seen.update(options) or rank(*args, **options)
     )
-    run_suggest(Suggest(out, count=1))
+    suggest(out, SuggestConfig(count=1))
     fit = json.loads((out / "summary.json").read_text())["decoder_fit"]
     assert seen["bias"] is bias and seen["penalty"] == fit["penalty"]
 
@@ -181,10 +182,12 @@ def test_other_demonstrations_than_those_of_the_training_are_refused(run, monkey
     def without_last(data):
         return data[data["episode"] < 7]
 
-    load = suggest.load_demonstrations
-    monkeypatch.setattr(suggest, "load_demonstrations", lambda *args, **options: without_last(load(*args, **options)))
+    load = active_labelling.load_demonstrations
+    monkeypatch.setattr(
+        active_labelling, "load_demonstrations", lambda *args, **options: without_last(load(*args, **options))
+    )
     with pytest.raises(ValueError, match="are not those that"):
-        run_suggest(Suggest(run))
+        suggest(run)
 
 
 @pytest.mark.parametrize(

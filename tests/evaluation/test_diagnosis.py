@@ -12,9 +12,8 @@ import torch
 from tensordict import TensorDict
 from tiny_runs import koap
 
-from torchrl_koap.commands.inspect import verdict
 from torchrl_koap.envs.contexts import evaluation_contexts
-from torchrl_koap.envs.registry import ENVIRONMENTS
+from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.diagnosis import (
     contexts_of,
     coverage,
@@ -25,6 +24,7 @@ from torchrl_koap.evaluation.diagnosis import (
     recorded_futures,
     tracking_errors,
 )
+from torchrl_koap.evaluation.inspection import verdict
 from torchrl_koap.tasks import get_task
 
 AVOIDING = get_task("avoiding")
@@ -54,7 +54,7 @@ def test_an_imagined_episode_goes_on_from_its_own_plans():
 @pytest.mark.parametrize("name", ["aligning", "sorting", "stacking"])
 def test_contexts_are_found_again_in_the_first_observation(name):
     task, contexts = get_task(name), evaluation_contexts(name, 3)
-    env = ENVIRONMENTS[name](3, dtype=torch.float64)
+    env = make_env(name, 3, dtype=torch.float64)
     found = contexts_of(task, env.reset(contexts=contexts)["observation"]).numpy()
     assert abs(found[..., :2] - contexts[..., :2]).max() < 1e-3  # the reset lasts 1 ms
     turn = found[..., 2] - contexts[..., 2]

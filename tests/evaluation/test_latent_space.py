@@ -12,8 +12,8 @@ import torch
 from tiny_runs import TINY, koap
 from torch import nn
 
-from torchrl_koap.commands.inspect import verdict
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+from torchrl_koap.evaluation.inspection import verdict
 from torchrl_koap.evaluation.latent_space import (
     OUTSIDE_THE_BUDGET,
     analyse_latent,
@@ -59,7 +59,7 @@ def knowing(normalizer=None):
     operator.double().weight.data.copy_(DRIFT)
     decoder = LinearActionDecoder(2, 2).double()
     nn.init.eye_(decoder.linear.weight), nn.init.zeros_(decoder.linear.bias)
-    infer = KnowsTheWind(2, 2, history=0, look_ahead=2)
+    infer = KnowsTheWind(2, 2, num_past=0, look_ahead=2)
     return KoopmanInverseDynamics(infer, decoder, lifting=lifting, operator=operator, state_normalizer=normalizer)
 
 
@@ -125,7 +125,7 @@ def test_every_preset_can_be_analysed(preset):
     controller = make_koopman_inverse_dynamics(2, 2, preset=preset, state_normalizer=Normalizer.fit(data["state"]))
     before = {name: value.clone() for name, value in controller.state_dict().items()}
     result = analyse_latent(controller.eval(), data, data["episode"] == 3, PARTS, horizon=50)
-    shortest = 30 - (controller.num_window_frames - 1 - controller.history)  # steps that all see their look-ahead
+    shortest = 30 - (controller.num_window_frames - 1 - controller.num_past)  # steps that all see their look-ahead
     assert result["multi_step"]["steps"] == shortest == len(result["multi_step"]["koopman"]["whole"])
     counted = sum(result["eigenvalues"][where] for where in ("inside", "on", "outside"))
     assert counted == controller.operator.latent_dim

@@ -11,7 +11,7 @@ from torchrl.envs import TransformedEnv
 from toy_episodes import episode_of, number
 from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength, PlannedStep, wandering_planner
 
-from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.transforms import EndEffectorNoise
 from torchrl_koap.evaluation.rollouts import (
     make_policy,
@@ -126,8 +126,8 @@ def test_nothing_to_roll_out_is_refused(seeds, size):
 
 
 def test_history_is_that_of_the_longer_sighted():
-    short = make_policy(CountingPlanner(), EchoController(history=0), state_columns=(1, 2))
-    long = make_policy(CountingPlanner(), EchoController(history=4), state_columns=(1, 2))
+    short = make_policy(CountingPlanner(), EchoController(num_past=0), state_columns=(1, 2))
+    long = make_policy(CountingPlanner(), EchoController(num_past=4), state_columns=(1, 2))
     assert (short.history, long.history) == (2, 5)
 
 

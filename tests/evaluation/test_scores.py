@@ -7,7 +7,7 @@ import pytest
 import torch
 from toy_episodes import episode_of, number
 
-from torchrl_koap.evaluation.scores import STACKING_PRIOR, d3il_score, divergence, outcome_of, score, stacking_scores
+from torchrl_koap.evaluation.scores import first_box_scores, outcome_of, score, stacking_scores, task_scores
 from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, mode_entropy, wilson_interval
 from torchrl_koap.tasks import get_task
 
@@ -86,7 +86,7 @@ def test_stacked_boxes_by_hand():
         stack_of((1, 0, 2), False),
         stack_of((), False),
     ]
-    result = stacking_scores(episodes, [0, 0, 1, 1])
+    result = stacking_scores({}, episodes, [0, 0, 1, 1])
     rates = [result[f"stacked_{count}_rate"] for count in (1, 2, 3)]
     assert rates == [0.75, 0.75, 0.5]
     assert result["stacked_3_low"], result["stacked_3_high"] == wilson_interval(2, 4)
@@ -95,7 +95,7 @@ def test_stacked_boxes_by_hand():
     assert result["stacked_1_entropy"] == 0
     assert result["stacked_2_entropy"] == pytest.approx(two / 2)
     assert result["stacked_3_entropy"] == pytest.approx(two)
-    assert set(stacking_scores(episodes, [0, 0, 1, 1], complete=False)) == {
+    assert set(first_box_scores({}, episodes, [0, 0, 1, 1])) == {
         "stacked_1_rate",
         "stacked_1_low",
         "stacked_1_high",
@@ -103,23 +103,37 @@ def test_stacked_boxes_by_hand():
     }
 
 
-def test_the_figure_that_d3il_ranks_by():
-    assert d3il_score(get_task("avoiding"), {"success_rate": 0.5, "mode_entropy": 1.0})["d3il_score"] == pytest.approx(
-        0.6
-    )
-    assert d3il_score(get_task("aligning"), {"success_rate": 0.5, "mode_entropy": 1.0}) == {"d3il_score": 0.75}
-    assert d3il_score(get_task("sorting"), {"success_rate": 0.5, "mode_entropy": 0.75}) == {"d3il_score": 0.25}
-    assert d3il_score(get_task("aligning"), {"success_rate": 0.5, "mode_entropy": None}) == {}
-    rates = {f"stacked_{count}_rate": rate for count, rate in ((1, 0.9), (2, 0.5), (3, 0.1))}
-    values = {"success_rate": 0.1, "mode_entropy": None, **rates}
-    assert d3il_score(get_task("stacking"), values)["d3il_score"] == pytest.approx(1.5)
+@pytest.mark.parametrize(
+    ("task", "success", "entropy", "wanted"),
+    [
+        ("avoiding", 0.5, 1.0, 0.6),
+        ("aligning", 0.5, 1.0, 0.75),
+        ("sorting", 0.5, 0.75, 0.25),
+        ("po_sorting", 0.5, 0.75, 0.25),
+        ("aligning", 0.5, None, None),
+        ("sorting_6", 0.5, None, None),
+    ],
+)
+def test_the_figure_that_d3il_ranks_by(task, success, entropy, wanted):
+    found = task_scores(get_task(task), {"success_rate": success, "mode_entropy": entropy}, [], [])
+    assert found == ({} if wanted is None else {"d3il_score": pytest.approx(wanted)})
 
 
-def test_divergence_from_the_prior_of_the_demonstrations():
-    prior = list(STACKING_PRIOR.values())
-    assert sum(prior) == pytest.approx(1.0)
-    assert divergence([3] * 10, prior) == pytest.approx(0.6966, abs=1e-4)  # -log6 0.287
-    assert divergence([0, 1, 2, 3, 4, 5], [1 / 6] * 6) == pytest.approx(0.0)
+def test_the_figure_of_stacking_is_the_sum_of_its_rates():
+    episodes = [stack_of((0, 1, 2), True), stack_of((0, 2), False), stack_of((1,), False), stack_of((), False)]
+    found = task_scores(get_task("stacking"), {}, episodes, [0, 0, 1, 1])
+    assert found["d3il_score"] == pytest.approx(0.75 + 0.5 + 0.25)
+    assert set(task_scores(get_task("stacking_1"), {}, episodes, [0, 0, 1, 1])) == {
+        "stacked_1_rate",
+        "stacked_1_low",
+        "stacked_1_high",
+        "stacked_1_entropy",
+    }
+
+
+def test_without_modes_there_is_no_entropy():
+    result = score([episode_of(4, success=True)], [0], num_modes=1, mode_index=number)
+    assert result["success_rate"] == 1.0 and result["mode_entropy"] is None
 
 
 @pytest.mark.parametrize("unsolved", ["Zero", ""])

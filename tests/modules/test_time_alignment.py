@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The time picture of the design: which frames are read, which count, replayed on a known linear system."""
+"""Time alignment: which frames are read, which count, replayed on a known linear system."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ T = 16
 CASES = [(1, 8), (0, 2), (4, (2, 3, 4, 6, 8)), (2, (5, 3)), (1, 7)]
 
 
-def offsets(history, look_ahead):
+def offsets(num_past, look_ahead):
     ahead = [look_ahead] if isinstance(look_ahead, int) else sorted(look_ahead)
-    return [*range(-history, 1), *ahead]
+    return [*range(-num_past, 1), *ahead]
 
 
 # the table
 
 
-def test_table_of_the_design():
-    """Section 3: f for a_1 reads x_0, x_1 and x_{1+k}; the last index is clamped to the window's end."""
+def test_frames_read_for_each_action():
+    """f for a_1 reads x_0, x_1 and x_{1+k}; the last index is clamped to the window's end."""
     index = frame_index(range(T), T, 1, 8)
     assert index.dtype == torch.int64
     assert index[1].tolist() == [0, 1, 9]
@@ -45,43 +45,43 @@ def test_table_of_the_design():
 
 
 @pytest.mark.parametrize("num_frames", [11, 14, 16])
-@pytest.mark.parametrize(("history", "look_ahead"), CASES)
-def test_clamping_and_spans_by_brute_force(history, look_ahead, num_frames):
-    rows = frame_index(range(num_frames), num_frames, history, look_ahead).tolist()
-    wanted = offsets(history, look_ahead)
+@pytest.mark.parametrize(("num_past", "look_ahead"), CASES)
+def test_clamping_and_spans_by_brute_force(num_past, look_ahead, num_frames):
+    rows = frame_index(range(num_frames), num_frames, num_past, look_ahead).tolist()
+    wanted = offsets(num_past, look_ahead)
     unclamped, clamped = [], []
     for t, row in enumerate(rows):
         assert row == [min(max(t + offset, 0), num_frames - 1) for offset in wanted]
         whole = all(0 <= t + offset < num_frames for offset in wanted)
-        ahead = row[history + 1 :]
+        ahead = row[num_past + 1 :]
         if whole:
             unclamped.append(t)
-        if t - history >= 0 and t + 1 < num_frames and all(frame > t + 1 for frame in ahead):
+        if t - num_past >= 0 and t + 1 < num_frames and all(frame > t + 1 for frame in ahead):
             clamped.append(t)
     if unclamped:
-        assert list(frame_span(num_frames, history, look_ahead)) == unclamped
-    assert list(frame_span(num_frames, history, look_ahead, clamped=True)) == clamped
+        assert list(frame_span(num_frames, num_past, look_ahead)) == unclamped
+    assert list(frame_span(num_frames, num_past, look_ahead, clamped=True)) == clamped
     part = range(2, 6)
-    assert frame_index(part, num_frames, history, look_ahead).tolist() == rows[2:6]
+    assert frame_index(part, num_frames, num_past, look_ahead).tolist() == rows[2:6]
 
 
-@pytest.mark.parametrize(("history", "look_ahead"), CASES)
-def test_the_next_state_is_read_in_no_frame_that_counts(history, look_ahead):
+@pytest.mark.parametrize(("num_past", "look_ahead"), CASES)
+def test_the_next_state_is_read_in_no_frame_that_counts(num_past, look_ahead):
     for clamped in (False, True):
-        for t in frame_span(T, history, look_ahead, clamped=clamped):
-            assert t + 1 not in frame_index(range(t, t + 1), T, history, look_ahead).flatten().tolist()
-    leak = frame_index(range(T - 2, T - 1), T, history, look_ahead).flatten().tolist()
-    assert T - 1 in leak and T - 2 not in frame_span(T, history, look_ahead, clamped=True)
+        for t in frame_span(T, num_past, look_ahead, clamped=clamped):
+            assert t + 1 not in frame_index(range(t, t + 1), T, num_past, look_ahead).flatten().tolist()
+    leak = frame_index(range(T - 2, T - 1), T, num_past, look_ahead).flatten().tolist()
+    assert T - 1 in leak and T - 2 not in frame_span(T, num_past, look_ahead, clamped=True)
 
 
 @pytest.mark.parametrize("clamped", [False, True])
-@pytest.mark.parametrize(("history", "look_ahead"), CASES)
-def test_the_shortest_window_holds_one_frame_and_one_less_is_an_error(history, look_ahead, clamped):
-    needed = history + 1 + (2 if clamped else max(offsets(history, look_ahead)))
-    assert frame_span(needed, history, look_ahead, clamped=clamped) == range(history, history + 1)
+@pytest.mark.parametrize(("num_past", "look_ahead"), CASES)
+def test_the_shortest_window_holds_one_frame_and_one_less_is_an_error(num_past, look_ahead, clamped):
+    needed = num_past + 1 + (2 if clamped else max(offsets(num_past, look_ahead)))
+    assert frame_span(needed, num_past, look_ahead, clamped=clamped) == range(num_past, num_past + 1)
     for number in (needed - 1, 1, 0):
         with pytest.raises(ValueError, match=f"a window of {number} frames is too short .* at least {needed} frames"):
-            frame_span(number, history, look_ahead, clamped=clamped)
+            frame_span(number, num_past, look_ahead, clamped=clamped)
 
 
 @pytest.mark.parametrize("look_ahead", [1, 0, -3, (8, 1), ()])
@@ -90,9 +90,9 @@ def test_offsets_that_would_read_the_answer_are_refused(look_ahead):
         check_offsets(1, look_ahead)
 
 
-def test_history_must_not_be_negative():
-    with pytest.raises(ValueError, match="history must be >= 0 frames, got -1"):
-        LatentActionMLP(2, 2, history=-1)
+def test_num_past_must_not_be_negative():
+    with pytest.raises(ValueError, match="num_past must be >= 0 frames, got -1"):
+        LatentActionMLP(2, 2, num_past=-1)
     assert check_offsets(0, [8, 2, 4]) == (2, 4, 8)
 
 
@@ -104,26 +104,26 @@ def test_history_must_not_be_negative():
     [(LatentActionMLP, False), (LatentActionMLP, True), (LatentActionLSTM, False), (LatentActionLSTM, True)]
     + [(LatentActionFourier, True)],
 )
-@pytest.mark.parametrize(("history", "look_ahead"), CASES)
-def test_gradients_reach_the_documented_frames_and_no_others(kind, history, look_ahead, relative):
+@pytest.mark.parametrize(("num_past", "look_ahead"), CASES)
+def test_gradients_reach_the_documented_frames_and_no_others(kind, num_past, look_ahead, relative):
     torch.manual_seed(0)
     more = {} if kind is LatentActionFourier else {"relative": relative}
-    network = kind(2, 6, history=history, look_ahead=look_ahead, **more)
+    network = kind(2, 6, num_past=num_past, look_ahead=look_ahead, **more)
     state = torch.randn(T, 2, requires_grad=True)
     latent = network(TensorDict({"state": state}))["latent_action"]
     weights = torch.randn(latent.shape[-1])
-    index = frame_index(range(T), T, history, look_ahead)
+    index = frame_index(range(T), T, num_past, look_ahead)
     for t in range(T):
         (gradient,) = torch.autograd.grad(latent[t] @ weights, state, retain_graph=True)
         read = {frame for frame in range(T) if gradient[frame].abs().max() > 0}
         assert read == set(index[t].tolist())
-        if t in frame_span(T, history, look_ahead, clamped=True):
+        if t in frame_span(T, num_past, look_ahead, clamped=True):
             assert (gradient[t + 1] == 0).all()
 
 
 @pytest.mark.parametrize("kind", [LatentActionMLP, LatentActionLSTM, LatentActionFourier])
 def test_gathering_some_frames_is_a_slice_of_gathering_all(kind):
-    network = kind(2, 6, history=2, look_ahead=(2, 5))
+    network = kind(2, 6, num_past=2, look_ahead=(2, 5))
     state = torch.randn(3, 4, T, 2)
     every, some = network.gather(state), network.gather(state, range(3, 9))
     assert every.shape == (3, 4, T, 5, 2)
@@ -156,11 +156,11 @@ def replay(k, *batch, num_frames=T):
     return TensorDict({**data, "has_action": torch.ones(*batch, num_frames, 1, dtype=torch.bool)}, batch)
 
 
-def exact_model(k, *, history=1, clamped=False):
+def exact_model(k, *, num_past=1, clamped=False):
     """Identity lifting, ``K = A``, ``f = B a_t`` written down from the system and ``D`` the pseudo-inverse of ``B``."""
     transition, entry = linear_system(k)
     d = 2 * k
-    network = LatentActionMLP(d, d, hidden_dims=(), history=history, look_ahead=k, clamped=clamped)
+    network = LatentActionMLP(d, d, hidden_dims=(), num_past=num_past, look_ahead=k, clamped=clamped)
     model = KoopmanInverseDynamics(
         network,
         LinearActionDecoder(d, 2),
@@ -170,8 +170,8 @@ def exact_model(k, *, history=1, clamped=False):
     # x_{t+k} = A^k x_t + sum_j A^{k-1-j} B a_{t+j}: the first two rows of the inverse reach back to a_t
     reach = np.concatenate([np.linalg.matrix_power(transition, k - 1 - j) @ entry for j in range(k)], 1)
     first = entry @ np.linalg.inv(reach)[:2]
-    weight = np.zeros((d, history + 2, d))
-    weight[:, history] = -first @ np.linalg.matrix_power(transition, k)
+    weight = np.zeros((d, num_past + 2, d))
+    weight[:, num_past] = -first @ np.linalg.matrix_power(transition, k)
     weight[:, -1] = first
     with torch.no_grad():
         layer = network.network[0]
@@ -183,12 +183,12 @@ def exact_model(k, *, history=1, clamped=False):
     return model
 
 
-@pytest.mark.parametrize("history", [0, 1, 3])
+@pytest.mark.parametrize("num_past", [0, 1, 3])
 @pytest.mark.parametrize("k", [2, 4, 8])
-def test_a_known_linear_system_gives_its_own_actions_back(k, history):
+def test_a_known_linear_system_gives_its_own_actions_back(k, num_past):
     data = replay(k, 3, 2)
-    model = exact_model(k, history=history)
-    span = frame_span(T, history, k)
+    model = exact_model(k, num_past=num_past)
+    span = frame_span(T, num_past, k)
     action = model(data.select("state"))["action"]
     frames = slice(span.start, span.stop)
     torch.testing.assert_close(action[..., frames, :], data["action"][..., frames, :], rtol=1e-6, atol=1e-6)
@@ -226,7 +226,7 @@ def test_a_decoder_fitted_in_closed_form_finds_the_actions_of_a_linear_system(k)
         layer = torch.nn.Linear(6 * k, 6 * k).double()
         layer.weight.copy_(torch.eye(6 * k))
         layer.bias.zero_()
-    network = LatentActionMLP(2 * k, 6 * k, hidden_dims=(), history=1, look_ahead=k).double()
+    network = LatentActionMLP(2 * k, 6 * k, hidden_dims=(), num_past=1, look_ahead=k).double()
     network.network[0] = layer
     model = KoopmanInverseDynamics(
         network,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from loss_test_base import LossTestBase
+from denoising_test_base import KINDS, DenoisingLossTestBase, noised_and_target
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
@@ -14,7 +14,6 @@ from torchrl_koap.modules import DiffusionPolicy, MLPDenoiser, NoiseSchedule
 from torchrl_koap.objectives import DiffusionPolicyLoss
 
 HORIZON, ACT = 6, 3
-KINDS = [("squared_cosine", "epsilon"), ("squared_cosine", "sample"), ("flow", "velocity")]
 
 
 def make_policy(schedule="squared_cosine", prediction=None, history=2, **options):
@@ -55,7 +54,8 @@ def batch_of(*batch, history=2):
     )
 
 
-class TestDiffusionPolicyLoss(LossTestBase):
+class TestDiffusionPolicyLoss(DenoisingLossTestBase):
+    name = "policy"
     default_keys = {
         "state": "state",
         "action": "action",
@@ -91,15 +91,9 @@ def test_value_in_closed_form(schedule, prediction, dtype, history):
     clean = clean.nan_to_num(0.0)
     condition = data["state"][:, :history].flatten(1)
     condition = (condition - policy.condition_normalizer.offset) / policy.condition_normalizer.scale
-    if schedule == "flow":
-        noise_level = (time / 50)[:, None, None]
-        signal = 1 - noise_level
-    else:
-        signal = policy.schedule.signal.to(dtype)[time.long()][:, None, None]
-        noise_level = (1 - signal**2).sqrt()
-    target = {"epsilon": noise, "sample": clean, "velocity": noise - clean}[prediction]
+    noisy, target = noised_and_target(policy, schedule, prediction, clean, noise, time)
     with loss.policy_params.to_module(policy):
-        output = policy.denoiser(signal * clean + noise_level * noise, time, condition)
+        output = policy.denoiser(noisy, time, condition)
     torch.testing.assert_close(value, torch.where(counts, (output - target) ** 2, 0.0), atol=1e-4, rtol=1e-4)
     assert value.dtype == dtype and 0 < counts.sum() < counts.numel()
 
@@ -165,26 +159,6 @@ def test_the_future_states_are_not_read():
     assert not torch.equal(loss(data)["loss_policy"], loss(other)["loss_policy"])
 
 
-def test_average_of_the_weights_follows_the_formula():
-    loss = make_loss()
-    average = SoftUpdate(loss, eps=0.9)
-    optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
-    expected = {name: value.clone() for name, value in loss.policy_params.flatten_keys(".").items()}
-    loss(batch_of(8))["loss_policy"].backward()
-    optimizer.step()
-    average.step()
-    target = loss.target_policy_params.flatten_keys(".")
-    for name, value in loss.policy_params.flatten_keys(".").items():
-        wanted = 0.9 * expected[name] + 0.1 * value.detach() if value.requires_grad else expected[name]
-        torch.testing.assert_close(target[name], wanted)
-    history, noise = batch_of(3)["state"][:, :2], torch.randn(3, HORIZON, ACT)
-    trained = loss.policy.sample(history, noise)
-    with loss.target_policy_params.to_module(loss.policy):
-        assert not torch.allclose(trained, loss.policy.sample(history, noise))
-    assert any("target" in name for name in loss.state_dict())
-    assert not any("target" in name for name in make_loss(create_target_params=False).state_dict())
-
-
 def test_training_recovers_a_linear_law_from_few_labels():
     """Actions are ``A x``; with 10 of 60 trajectories labelled, each entry of a chunk belongs to its own step."""
     torch.manual_seed(0)
@@ -234,5 +208,3 @@ def test_bad_input_is_explained():
         loss(data.clone().set("action", data["action"][:, 1:-1]))
     with pytest.raises(ValueError, match=r"'has_action' must be bool \[4, 8, 1\], got torch.float32"):
         loss(data.clone().set("has_action", data["has_action"].float()))
-    with pytest.raises(RuntimeError, match="use set_keys"):
-        loss.in_keys = ["x"]

@@ -27,7 +27,7 @@ NETWORKS = ("mlp", "lstm", "fourier")
 
 def make_network(kind="mlp", *, clamped=False, normalizers=True, dropout=0.0, seed=0):
     torch.manual_seed(seed)
-    frames = {"history": HISTORY, "look_ahead": K, "clamped": clamped}
+    frames = {"num_past": HISTORY, "look_ahead": K, "clamped": clamped}
     if kind == "mlp":
         latent_action = LatentActionMLP(3, 4, hidden_dims=(16,), dropout=dropout, **frames)
     elif kind == "lstm":
@@ -190,7 +190,7 @@ def test_single_losses_are_the_terms_of_the_sum():
 
 @pytest.mark.parametrize("kind", NETWORKS)
 def test_gradients_in_plain_loops(kind):
-    """Also of the target g(x_{t+1}), which is not detached (koap_release_notes 3.1)."""
+    """Also of the target g(x_{t+1}), which is not detached, as in KOAP's first public code."""
     network, batch = make_network(kind), make_batch(3)
     parameters = dict(network.named_parameters())
     expected = in_plain_loops(network, batch, False)
@@ -309,7 +309,7 @@ def test_keys_of_the_network_are_taken_over_and_renaming_reaches_it():
     assert network.in_keys == ["x"] and network.out_keys[-1] == "a"
     assert network(TensorDict({"x": renamed["window"]}, [3]))["a"].shape == (3, T, 2)
     loss.set_keys(state=None)
-    assert network.in_keys == ["state"] and network.state_key == "state"
+    assert network.in_keys == ["state"] and network.in_key == "state"
 
 
 @pytest.mark.parametrize("entry", ["has_action", "padded"])

@@ -13,13 +13,14 @@ import torch
 from run_files import make_demonstrations, make_object_rollouts, make_rollouts, write_run
 from safetensors.torch import save_file
 
-from torchrl_koap.reports import pictures
+from torchrl_koap.reports import animation, pictures
 from torchrl_koap.reports.html import definition, interval_bar
 from torchrl_koap.reports.mode_plots import even_entropy
-from torchrl_koap.reports.pictures import PICTURES, draw_pictures
-from torchrl_koap.reports.run_report import CAPTIONS, write_report
+from torchrl_koap.reports.pictures import all_pictures, draw_pictures
+from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.tasks import get_task
 
+PICTURES = list(all_pictures().values())
 _VOID = {"meta", "img", "rect", "br"}
 
 
@@ -45,7 +46,7 @@ class Page(HTMLParser):
             assert self.open.pop() == tag
 
     def handle_data(self, data):
-        if self.open and self.open[-1] != "style":
+        if self.open and self.open[-1] not in ("style", "script"):
             self.words.append(data)
 
 
@@ -81,14 +82,16 @@ def test_order_headline_labels_pictures_commands(run):
 
 def test_pictures_are_there_with_captions_and_no_outside_resource(run):
     page = Page(run / "index.html")
-    expected = [picture for picture in PICTURES if picture.name != "film.gif"]  # this run has kept no actions
+    left_out = ("film.gif", "latent.png", "inspect.png")  # this run has kept no actions and was not inspected
+    expected = [picture for picture in PICTURES if picture.name not in left_out]
     assert {f"plots/{picture.name}" for picture in expected} <= set(page.links)
     for link in page.links:
         assert (run / link).is_file()
     for picture in expected:
-        assert CAPTIONS[picture.name][0] in page.text
-    assert "http" not in page.source and "script" not in page.tags
-    assert "Not drawn" not in page.text and 'class="warning"' not in page.source
+        assert picture.title in page.text
+    assert "http" not in page.source and page.tags.count("script") == 1 and "<script>" in page.source
+    assert page.text.count("Not drawn") == 1 and f"Which part fails. Made by koap inspect {run} ." in page.text
+    assert 'class="warning"' not in page.source
 
 
 def test_no_key_is_dropped(tmp_path):
@@ -115,7 +118,8 @@ def test_everything_from_files_is_escaped(tmp_path):
     evaluation["episode"] = [{"seed": evil, evil: evil}]
     (tmp_path / "eval.json").write_text(json.dumps(evaluation))
     page = Page(write_report(tmp_path))
-    assert "script" not in page.tags and "<script" not in page.source
+    assert page.tags.count("script") == 1 and page.source.count("<script") == 1
+    assert "alert(" not in page.source.split("<script>")[1]
     assert page.source.count("&lt;script&gt;") > 12
 
 
@@ -221,7 +225,11 @@ def test_report_of_a_task_with_objects(task, tmp_path, monkeypatch):
     (tmp_path / "plots" / "plans.png").write_bytes(b"of an earlier evaluation")
     page = Page(write_report(write_object_run(tmp_path, task)))
     plans = get_task(task).plans_position
-    expected = {picture.name for picture in PICTURES} - {"film.gif"} - (set() if plans else {"plans.png"})
+    expected = (
+        {picture.name for picture in PICTURES}
+        - {"film.gif", "latent.png", "inspect.png"}
+        - (set() if plans else {"plans.png"})
+    )
     assert {link.removeprefix("plots/") for link in page.links} == expected
     assert (tmp_path / "plots" / "plans.png").exists() is plans
     assert ("the rollouts hold no plans of positions" in page.text) is not plans
@@ -242,8 +250,9 @@ def test_film_of_the_first_success(task, tmp_path, monkeypatch):
         path.write_bytes(b"GIF89a")
         return path
 
-    monkeypatch.setattr(pictures, "render_rollout", render)
-    monkeypatch.setattr(pictures, "PICTURES", [picture for picture in PICTURES if picture.name == "film.gif"])
+    monkeypatch.setattr(animation, "render_rollout", render)
+    film = {picture.name: picture for picture in PICTURES if picture.name == "film.gif"}
+    monkeypatch.setattr(pictures, "all_pictures", lambda: film)
     if task == "avoiding":
         write_run(tmp_path)
         rollouts = make_rollouts() | {"action": torch.rand(4, 20, 2)}
@@ -274,4 +283,4 @@ def test_interval_bar_is_to_scale():
 
 
 def test_long_lists_are_cut_and_counted():
-    assert definition("a", list(range(100))).endswith("39 … (100 in all)")
+    assert str(definition("a", list(range(100)))).endswith("39 … (100 in all)")

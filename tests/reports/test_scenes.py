@@ -11,19 +11,28 @@ from matplotlib.figure import Figure
 
 from torchrl_koap.reports import objects, scenes
 from torchrl_koap.tasks import TASKS
+from torchrl_koap.tasks.avoiding import OBSTACLES
 
 
 @pytest.fixture(scope="module")
 def models():
     """Compiled scenes of the environments."""
     registry = pytest.importorskip("torchrl_koap.envs.registry")
-    return {name: registry.ENVIRONMENTS[name](1).sims.model for name in scenes.SCENES}
+    return {name: registry.make_env(name).sims.model for name in TASKS}
 
 
-def test_avoiding_is_that_of_the_environment():
-    avoiding = pytest.importorskip("torchrl_koap.envs.avoiding")
-    assert [(x, y, radius) for _, x, y, radius, _ in avoiding.OBSTACLES] == list(scenes.AVOIDING_CYLINDERS)
-    assert avoiding.FINISH_Y == scenes.AVOIDING_FINISH
+def shapes(task, role):
+    return [shape for shape in TASKS[task].scene.shapes if shape.role == role]
+
+
+def test_avoiding_is_that_of_the_environment(models):
+    model = models["avoiding"]
+    for shape, (name, *_) in zip(shapes("avoiding", "obstacle"), OBSTACLES, strict=True):
+        geom = model.geom(name)
+        np.testing.assert_allclose(model.body(name).pos[:2], shape.center)
+        assert geom.size[0] == shape.half[0]
+    (finish,) = shapes("avoiding", "finish")
+    assert model.geom("finish_line").pos[1] == finish.center[1]
 
 
 def test_scene_has_true_radii():
@@ -43,35 +52,39 @@ def test_sorting_is_that_of_the_environment(task, models):
     model = models[task]
     platform = model.body("platform")
     centre, half = platform.pos[:2], model.geom_size[platform.geomadr[0]][:2]
-    np.testing.assert_allclose(np.transpose(scenes.SORTING_PLATFORM), [centre - half, centre + half])
-    for (color, *place), name in zip(scenes.SORTING_BINS, ("red", "blue"), strict=True):
+    (drawn,) = shapes(task, "platform")
+    np.testing.assert_allclose([drawn.center, drawn.half], [centre, half], atol=1e-12)
+    for name in ("red", "blue"):
         body = model.body(f"{name}_bin")
-        np.testing.assert_allclose(body.pos[:2], place)
         geoms = range(int(body.geomadr[0]), int(body.geomadr[0] + body.geomnum[0]))
-        walls = [(*model.geom_pos[geom][:2], *model.geom_size[geom][:2]) for geom in geoms]
-        np.testing.assert_allclose(sorted(walls), sorted(scenes.SORTING_WALLS), atol=1e-12)
-        assert to_rgb(color)[0 if name == "red" else 2] == max(to_rgb(color))
+        walls = [(*body.pos[:2] + model.geom_pos[geom][:2], *model.geom_size[geom][:2]) for geom in geoms]
+        found = [(*shape.center, *shape.half) for shape in shapes(task, "wall") if shape.color == name]
+        np.testing.assert_allclose(sorted(walls), sorted(found), atol=1e-12)
+    colors = {patch.get_facecolor()[:3] for patch in scenes.draw_scene(Figure().add_subplot(), task).patches[1:]}
+    assert colors == {to_rgb(scenes.RED), to_rgb(scenes.BLUE)}
 
 
-def test_stacking_is_that_of_the_environment(models):
+@pytest.mark.parametrize("task", ["stacking", "stacking_1"])
+def test_stacking_is_that_of_the_environment(task, models):
     stacking = pytest.importorskip("torchrl_koap.envs.stacking")
-    site = models["stacking"].site("target")
-    np.testing.assert_allclose(site.pos[:2], scenes.STACKING_TARGET)
-    np.testing.assert_allclose(site.size[:2], scenes.STACKING_HALF)
-    assert (stacking.TARGET, stacking.ZONE_RADIUS) == (scenes.STACKING_TARGET, scenes.STACKING_RADIUS)
+    site = models[task].site("target")
+    (target,), (zone,) = shapes(task, "target"), shapes(task, "zone")
+    np.testing.assert_allclose([site.pos[:2], site.size[:2]], [target.center, target.half])
+    assert (zone.center, zone.half[0]) == (stacking.TARGET, stacking.ZONE_RADIUS)
 
 
 def test_regions_of_aligning_are_those_of_the_contexts():
     contexts = pytest.importorskip("torchrl_koap.envs.contexts").draw_contexts("aligning", 4000, 0)
-    regions = np.array(scenes.ALIGNING_REGIONS)  # [objects, axes, ends]
-    np.testing.assert_allclose(contexts[..., :2].min(0), regions[..., 0], atol=1e-3)
-    np.testing.assert_allclose(contexts[..., :2].max(0), regions[..., 1], atol=1e-3)
+    for index, shape in enumerate(shapes("aligning", "region")):
+        low, high = np.array(shape.center) - shape.half, np.array(shape.center) + shape.half
+        np.testing.assert_allclose(contexts[:, index, :2].min(0), low, atol=1e-3)
+        np.testing.assert_allclose(contexts[:, index, :2].max(0), high, atol=1e-3)
 
 
 @pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].objects])
 def test_bodies_have_the_sizes_and_colours_of_the_environment(task, models):
     model, looks = models[task], objects.object_looks(task, len(TASKS[task].objects))
-    assert len(looks) == len(TASKS[task].objects) == len(TASKS[task].drawn)
+    assert len(looks) == len(TASKS[task].objects)
     for name, look in zip(TASKS[task].objects, looks, strict=True):
         if name == "target":
             assert look.still
@@ -84,7 +97,7 @@ def test_bodies_have_the_sizes_and_colours_of_the_environment(task, models):
             assert np.argmax(to_rgb(look.color)) == np.argmax(model.geom_rgba[geom][:3])
 
 
-@pytest.mark.parametrize("task", scenes.SCENES)
+@pytest.mark.parametrize("task", TASKS)
 def test_every_start_lies_inside_the_picture(task):
     axes = scenes.draw_scene(Figure().add_subplot(), task)
     if TASKS[task].objects:
@@ -109,7 +122,7 @@ def test_outlines_turn_with_the_body():
 @pytest.mark.parametrize("number", [3, 21])
 def test_orientation_is_drawn(number):
     """Outlines with a thick far side, of many the centre and a line to the far side."""
-    axes, looks = Figure().add_subplot(), objects.OBJECTS["aligning"]
+    axes, looks = Figure().add_subplot(), objects.object_looks("aligning", 2)
     contexts = np.tile([[0.5, -0.2, 0.0], [0.5, 0.3, np.pi / 2]], (number, 1, 1))
     objects.draw_starts(axes, contexts, looks)
     lines = [line for item in axes.collections if hasattr(item, "get_segments") for line in item.get_segments()]
@@ -130,4 +143,4 @@ def test_objects_of_an_unknown_task_are_grey():
 
 def test_bad_contexts():
     with pytest.raises(ValueError, match=r"'context' must have shape \[any, 2, 3\], got \[4, 2\]"):
-        objects.draw_starts(Figure().add_subplot(), np.zeros((4, 2)), objects.OBJECTS["aligning"])
+        objects.draw_starts(Figure().add_subplot(), np.zeros((4, 2)), objects.object_looks("aligning", 2))

@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 from run_files import make_demonstrations, make_object_rollouts, make_rollouts
 
+from torchrl_koap.evaluation.latent_space import spectrum
 from torchrl_koap.reports import mode_plots, objects, rollout_plots, training_plots
-from torchrl_koap.tasks import modes
+from torchrl_koap.reports.mode_colors import mode_colors
 
 
 @pytest.fixture
@@ -135,11 +136,27 @@ def test_eigenvalues_outside_the_circle_are_counted(figures, tmp_path):
     training_plots.plot_eigenvalues(
         torch.tensor([0.5, 0.6, 0.0]), torch.tensor([0.0, 0.9, 1.0]), tmp_path / "a.png", control_hz=28.6
     )
-    assert titles(figures[0])[:2] == ["3 eigenvalues, 1 outside the unit circle", "largest magnitude 1.0817"]
+    assert titles(figures[0])[0] == "3 eigenvalues, radius 1.0817\n1 inside, 1 on, 1 outside the unit circle"
     rank = figures[0].axes[1]
-    inside, outside = (item.get_offsets() for item in rank.collections)
-    np.testing.assert_allclose(inside, [[2, 1.0], [3, 0.5]])
-    np.testing.assert_allclose(outside, [[1, math.hypot(0.6, 0.9)]])
+    inside, on, outside = (item.get_offsets() for item in rank.collections)
+    np.testing.assert_allclose(inside, [[3, -0.5]])
+    np.testing.assert_allclose(on, [[2, 0.0]], atol=1e-7)
+    np.testing.assert_allclose(outside, [[1, math.hypot(0.6, 0.9) - 1]], rtol=1e-6)
+
+
+def test_eigenvalues_near_the_circle_are_counted_as_in_the_text(figures, tmp_path):
+    """Eigenvalues within 2 % of 1, some nearer than the tolerance: figure, legend and `koap inspect` agree."""
+    size = torch.tensor([1.006, 1.0009, 1.00001, 0.9995, 0.995, 0.981])
+    training_plots.plot_eigenvalues(size, torch.zeros(6), tmp_path / "a.png", control_hz=28.6)
+    facts = spectrum(size.to(torch.complex128))
+    counted = {name: facts[name] for name in ("inside", "on", "outside")}
+    assert counted == {"inside": 2, "on": 3, "outside": 1}
+    assert titles(figures[0])[0].endswith("2 inside, 3 on, 1 outside the unit circle")
+    legend = [text.get_text() for text in figures[0].axes[1].get_legend().get_texts()]
+    assert legend == [f"{name} the circle: {number}" for name, number in counted.items()]
+    places = figures[0].axes[1].transData.transform([(0, value - 1) for value in size])[:, 1]
+    height = figures[0].axes[1].get_window_extent().height
+    assert places[0] - places[1] > 0.1 * height and places[3] - places[4] > 0.1 * height  # told apart by eye
 
 
 @pytest.mark.parametrize("real", [[math.nan, 1.0], []])
@@ -152,8 +169,9 @@ def test_actions_tell_the_error_and_the_broken_budget(figures, tmp_path):
     true = torch.zeros(50, 2)
     predicted = torch.tensor([0.003, 0.004]).expand(50, 2).clone()
     predicted[0] = torch.nan  # left out
-    training_plots.plot_actions(predicted.requires_grad_(), true, tmp_path / "a.png")
-    wanted = ["x: RMSE 3.00 mm", "y: RMSE 4.00 mm", "all: RMSE 3.54 mm, median 3.50"]
+    columns = {"names": ["x", "y"], "units": ["m", "m"]}
+    training_plots.plot_actions(predicted.requires_grad_(), true, tmp_path / "a.png", **columns)
+    wanted = ["x: RMSE 3 mm", "y: RMSE 4 mm", "all: RMSE 3.54 mm, median 3.5"]
     assert titles(figures[0]) == wanted
     assert figures[0].get_suptitle() == (
         "49 steps of unlabelled demonstrations - for analysis only: reads labels outside the budget"
@@ -166,15 +184,26 @@ def test_actions_in_two_units(figures, tmp_path):
     predicted = torch.tensor([0.002] * 7 + [0.08]).expand(50, 8)
     names = [*(f"joint {index}" for index in range(1, 8)), "gripper"]
     training_plots.plot_actions(
-        predicted, true, tmp_path / "a.png", names=names, unit="mrad", absolute={"gripper": "mm"}
+        predicted, true, tmp_path / "a.png", names=names, units=["rad"] * 7 + ["m"], absolute=["gripper"]
     )
     said = titles(figures[0])
-    assert said[0] == "joint 1: RMSE 2.00 mrad" and said[7] == "gripper: RMSE 80.00 mm"
-    assert said[8] == "all but gripper: RMSE 2.00 mrad, median 2.00"
+    assert said[0] == "joint 1: RMSE 2 mrad" and said[7] == "gripper: RMSE 80 mm"
+    assert said[8] == "all but gripper: RMSE 2 mrad, median 2"
     panels = figures[0].axes
     assert panels[6].get_xlabel() == "recorded joint 7 (mrad per step)"
     assert panels[7].get_xlabel() == "recorded gripper (mm)"
     assert [text.get_text() for text in panels[8].get_legend().get_texts()] == names[:7]
+
+
+def test_actions_of_another_robot(figures, tmp_path):
+    """Seven joint torques: names and units as given, nothing speaks of x, y or mm."""
+    true, names = torch.rand(30, 7), [f"torque {index}" for index in range(7)]
+    training_plots.plot_actions(true + 0.5, true, tmp_path / "a.png", names=names, units=["N m"] * 7)
+    assert titles(figures[0])[6:] == ["torque 6: RMSE 0.5 N m", "all: RMSE 0.5 N m, median 0.5"]
+    training_plots.plot_actions(true + 0.5, true, tmp_path / "b.png")
+    assert titles(figures[1])[0] == "action 1: RMSE 0.5" and figures[1].axes[0].get_xlabel().endswith("(per step)")
+    with pytest.raises(ValueError, match="'units' must be one per action column, 7 in all, got 1"):
+        training_plots.plot_actions(true, true, tmp_path / "c.png", units=["m"])
 
 
 @pytest.mark.parametrize(
@@ -202,7 +231,7 @@ def test_modes_histogram(figures, tmp_path):
     assert titles(figures[0])[0].endswith("; 1 without a mode")
     levels = [line[0][1] for line in drawn_lines(axes)]
     assert levels[5] == pytest.approx(4 * 2 / 3) and sum(levels) == pytest.approx(4)
-    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], modes.mode_colors("avoiding"))
+    np.testing.assert_allclose([bar.get_facecolor()[:3] for bar in axes.patches], mode_colors("avoiding"))
 
 
 def test_rollouts_are_cut_coloured_and_counted(figures, tmp_path):
@@ -211,7 +240,7 @@ def test_rollouts_are_cut_coloured_and_counted(figures, tmp_path):
     assert titles(figures[0])[0] == "2 of 4 rollouts succeed, out of time: 1, collision: 1"
     lines = axes.collections[0]
     np.testing.assert_allclose(lines.get_segments(), ROLLOUTS["position"][:2])
-    np.testing.assert_allclose(lines.get_colors()[:, :3], modes.mode_colors("avoiding")[:2])
+    np.testing.assert_allclose(lines.get_colors()[:, :3], mode_colors("avoiding")[:2])
     late, hit = axes.lines[1:]  # the first line is the finish
     assert len(late.get_xdata()) == 20 and len(hit.get_xdata()) == 10
     np.testing.assert_allclose(axes.collections[-1].get_offsets()[0], ROLLOUTS["position"][3, 9])
@@ -248,7 +277,7 @@ def test_objects_get_a_panel(task, figures, tmp_path):
             np.testing.assert_allclose(found[0], wanted[0])
     entries = [text.get_text() for text in figures[0].axes[2].get_legend().get_texts()]
     assert entries[:2] == ["out of time", "collision"] and entries[-2:] == ["end", "end of a failure"]
-    assert entries[2:-2] == list(dict.fromkeys(look.name for look in looks))
+    assert entries[2:-2] == list(dict.fromkeys(look.label for look in looks))
 
 
 def test_plans_of_a_task_with_objects(figures, tmp_path):

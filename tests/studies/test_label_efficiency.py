@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap.studies.label_efficiency import Curve, run_curve
+from torchrl_koap.studies.label_efficiency import CurveConfig, run_curve
 from torchrl_koap.studies.table import read_cells
 
 DP, LINEAR = "cells/dp-0.25-1-seed0", "cells/linear-0.25-1-seed0"
@@ -27,7 +27,7 @@ def options_of(out, dataset, /, **options):
 
 
 def run(out, dataset, /, **options):
-    return run_curve(Curve(**options_of(out, dataset, **options)))
+    return run_curve(CurveConfig(**options_of(out, dataset, **options)))
 
 
 def command_of(out, dataset, /, **options):

@@ -192,7 +192,6 @@ def test_jobs_do_not_outlive_a_parent_that_is_killed(tmp_path):
         f"import sys; sys.path[:0] = {[str(Path(__file__).parent)]}\n"
         "from torchrl_koap.studies import launchers\n"
         "from test_launchers import sleep\n"
-        "launchers._PRELOAD = ()\n"
         "if __name__ == '__main__':\n"
         f"    jobs = [launchers.Job(name, sleep, {{'file': {str(tmp_path)!r} + '/' + name}}) for name in 'ab']\n"
         "    list(launchers.launch(jobs))\n"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from torchrl_koap.studies import paper_tables
-from torchrl_koap.studies.paper_tables import PRESETS, Bench, run_bench
+from torchrl_koap.studies.paper_tables import PRESETS, BenchConfig, run_bench
 from torchrl_koap.studies.table import read_cells, write_cells
 from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.training.methods import METHODS
@@ -41,7 +41,7 @@ def test_presets_name_methods_tasks_and_levels_that_exist(preset):
 
 
 def test_a_table_is_a_curve_per_task_at_the_papers_levels(asked, tmp_path):
-    result = run_bench(Bench(tmp_path / "t", table=1, tasks="aligning,sorting", seeds=2, steps=7, episodes=10))
+    result = run_bench(BenchConfig(tmp_path / "t", table=1, tasks="aligning,sorting", seeds=2, steps=7, episodes=10))
     assert [(curve.task, curve.out) for curve in asked] == [
         ("aligning", tmp_path / "t/aligning"),
         ("sorting", tmp_path / "t/sorting"),
@@ -61,25 +61,25 @@ def test_a_table_is_a_curve_per_task_at_the_papers_levels(asked, tmp_path):
 
 
 def test_the_observation_study_varies_what_is_known_at_fixed_labels(asked, tmp_path):
-    run_bench(Bench(tmp_path / "s", study="observations"))
+    run_bench(BenchConfig(tmp_path / "s", study="observations"))
     (curve,) = asked
     assert (curve.task, curve.fractions, curve.observations) == ("avoiding", "0.02", "0.1,0.25,0.5,1")
     assert curve.units == "trajectory"  # 2 % of the windows would touch most trajectories, and those must stay
 
 
 def test_a_folder_holds_one_comparison(asked, tmp_path):
-    run_bench(Bench(tmp_path / "t", study="observations"))
+    run_bench(BenchConfig(tmp_path / "t", study="observations"))
     with pytest.raises(RunDirectoryError, match="holds another comparison than 'table 1'"):
-        run_bench(Bench(tmp_path / "t", table=1))
+        run_bench(BenchConfig(tmp_path / "t", table=1))
     assert len(asked) == 1
 
 
 def test_wrong_calls_are_explained_before_any_work(asked, tmp_path):
-    for options in (Bench(tmp_path), Bench(tmp_path, table=1, study="observations")):
+    for options in (BenchConfig(tmp_path), BenchConfig(tmp_path, table=1, study="observations")):
         with pytest.raises(ValueError, match="exactly one of --table and --study"):
             run_bench(options)
     with pytest.raises(ValueError, match="unknown comparison 'table 3'"):
-        run_bench(Bench(tmp_path, table=3))
+        run_bench(BenchConfig(tmp_path, table=3))
     with pytest.raises(ValueError, match="unknown task 'sortin'; did you mean 'sorting'"):
-        run_bench(Bench(tmp_path, table=1, tasks="aligning,sortin"))
+        run_bench(BenchConfig(tmp_path, table=1, tasks="aligning,sortin"))
     assert not asked

@@ -85,7 +85,7 @@ def test_no_state_shows_the_command(name):
 @pytest.mark.parametrize("name", TASKS)
 def test_facts_fit_each_other(name):
     task = get_task(name)
-    assert set(task.drawn) == set(task.objects) and set(task.drawn.values()) <= set(task.observation)
+    assert set(task.plotted.values()) <= set(task.observation)
     assert {*task.state, *task.hidden, task.command, task.position} <= set(task.observation)
     assert all(0 <= column < task.state_dim for column in (*task.actuated, *task.robot))
     assert len(task.actuated) in (0, task.action_dim)

@@ -11,11 +11,12 @@ import pytest
 import torch
 from matplotlib import colors as matplotlib_colors
 
+from torchrl_koap.reports.mode_colors import mode_colors
 from torchrl_koap.tasks import TASKS, modes
 
 
 def test_mode_colors_are_distinct_with_hue_by_last_row_and_lightness_by_the_others():
-    colors = modes.mode_colors("avoiding")
+    colors = mode_colors("avoiding")
     apart = np.abs(colors[:, None] - colors[None]).sum(-1) + 10 * np.eye(24)
     assert apart.min() > 0.08 and colors.min() >= 0 and colors.max() <= 1
     hue = matplotlib_colors.rgb_to_hsv(colors)[:, 0].reshape(6, 4)
@@ -39,10 +40,10 @@ def test_mode_names_follow_the_flags(mode):
 
 
 def test_modes_of_a_task_without_choices():
-    assert modes.mode_colors(None, 6).shape == (6, 3)
+    assert mode_colors(None, 6).shape == (6, 3)
     assert modes.mode_name(3, None, 6) == "3"
     with pytest.raises(ValueError, match="wanted num_modes"):
-        modes.mode_colors("juggling")
+        mode_colors("juggling")
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -51,7 +52,7 @@ def test_every_task_has_as_many_names_and_colors_as_modes(task):
     assert math.prod(len(names) for _, names in modes.mode_choices(task)) == number
     names = {modes.mode_name(mode, task) for mode in range(number)}
     assert len(names) == number and modes.mode_name(number, task) == "no mode"
-    colors = modes.mode_colors(task)
+    colors = mode_colors(task)
     apart = np.abs(colors[:, None] - colors[None]).sum(-1) + 10 * np.eye(number)
     assert colors.shape == (number, 3) and apart.min() > 0.08
 
@@ -68,8 +69,8 @@ def test_names_of_stacking_and_aligning():
     registry = pytest.importorskip("torchrl_koap.envs.registry")
     letters = ("red", "green", "blue")
     for order in itertools.permutations(range(3)):
-        mode = int(registry.MODE_INDEX["stacking"](torch.tensor(order)))
+        mode = int(registry.mode_index_of("stacking")(torch.tensor(order)))
         assert modes.mode_name(mode, "stacking") == ", ".join(letters[letter] for letter in order)
-        first = int(registry.MODE_INDEX["stacking_1"](torch.tensor(order)))
+        first = int(registry.mode_index_of("stacking_1")(torch.tensor(order)))
         assert modes.mode_name(first, "stacking_1") == letters[order[0]]
     assert [modes.mode_name(mode, "aligning") for mode in (0, 1)] == ["inside", "outside"]

@@ -1,17 +1,22 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Facts of the tasks are consistent with each other and with the specification."""
+"""Facts of the tasks are consistent with each other and with docs/d3il.md."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import subprocess
+import sys
 
 import pytest
 
-from torchrl_koap.tasks import TASKS, Task, get_task
+import torchrl_koap
+from torchrl_koap.tasks import TASKS, Modes, Task, get_task, register_task
+from torchrl_koap.tasks import registry as registry_module
 
 
-def test_avoiding_follows_the_specification():
+def test_facts_of_avoiding():
     task = get_task("avoiding")
     assert task.observation_dim == 4
     assert task.action_dim == 2
@@ -36,17 +41,14 @@ def test_columns_of_every_task(name):
 def test_hidden_parts_are_no_state():
     task = Task(
         name="toy",
-        observation={"desired": slice(0, 1), "measured": slice(1, 3), "yaw": slice(3, 4), "box": slice(4, 6)},
+        observation_parts={"desired": 1, "measured": 2, "yaw": 1, "box": 2},
         command="desired",
         position="measured",
-        action_dim=1,
-        max_steps=1,
-        control_hz=1.0,
-        num_modes=1,
+        actions={"x": "m"},
         hidden=("yaw",),
     )
     assert task.state_columns == (1, 2, 4, 5)
-    assert task.observation_dim == 6
+    assert task.observation_dim == 6 and task.num_modes == 1
 
 
 def test_unknown_names_suggest_the_nearest():
@@ -62,3 +64,163 @@ def test_unknown_names_suggest_the_nearest():
 def test_tasks_cannot_be_changed():
     with pytest.raises(dataclasses.FrozenInstanceError):
         get_task("avoiding").max_steps = 3
+
+
+TOY = {
+    "name": "toy",
+    "observation_parts": {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1},
+    "actions": {"x": "m", "y": "m"},
+    "position": "tool",
+    "command": "command",
+}
+
+
+@pytest.fixture
+def tasks(monkeypatch):
+    """The registry, as it was after the test."""
+    known = dict(TASKS)
+    yield TASKS
+    TASKS.clear()
+    TASKS.update(known)
+
+
+def test_a_task_may_be_registered_again_but_no_other_of_its_name(tasks):
+    first = register_task(Task(**TOY))
+    assert register_task(first) is first and register_task(Task(**TOY)) is first and get_task("toy") is first
+    with pytest.raises(ValueError, match="another task named 'toy' is registered already"):
+        register_task(Task(**TOY, max_steps=7))
+    with pytest.raises(TypeError, match="wanted a Task, got dict"):
+        register_task(TOY)
+
+
+def test_observers_see_every_task(tasks):
+    seen = []
+    registry_module.observe_tasks(seen.append)
+    try:
+        assert [task.name for task in seen] == list(TASKS)
+        added = register_task(Task(**TOY))
+        register_task(added)
+        assert seen[-1] is added and seen.count(added) == 1
+    finally:
+        registry_module._observers.remove(seen.append)
+
+
+class Point:
+    name, value = "mine", "my_package.my_task"
+
+    def __init__(self, load):
+        self.load = load
+
+
+def test_entry_points_are_asked_once_and_when_a_name_is_unknown(tasks, monkeypatch):
+    asked = []
+
+    def points(group):
+        asked.append(group)
+        return [Point(lambda: Task(**TOY))]
+
+    monkeypatch.setattr(registry_module, "_loaded", False)
+    monkeypatch.setattr(registry_module, "entry_points", points)
+    get_task("avoiding")
+    assert not asked
+    assert get_task("toy").observation_dim == 7
+    with pytest.raises(ValueError, match="unknown task 'to'"):
+        get_task("to")
+    assert asked == ["torchrl_koap.tasks"]
+
+
+def test_a_broken_entry_point_is_named(tasks, monkeypatch):
+    def fail():
+        raise ImportError("no module named 'my_package'")
+
+    monkeypatch.setattr(registry_module, "_loaded", False)
+    monkeypatch.setattr(registry_module, "entry_points", lambda group: [Point(fail)])
+    with pytest.raises(RuntimeError, match="entry point 'mine' = 'my_package.my_task' .* no module named"):
+        get_task("toy")
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"position": "tol"}, "position: no part 'tol'; parts: command, tool"),
+        ({"command": "order"}, "command: no part 'order'"),
+        ({"actions": {}}, "actions: none"),
+        ({"state": {"tool": "plan"}}, "state: part 'tool' has an unknown feature 'plan'; known: plain, plane"),
+        ({"state": {"command": "plain"}}, "'command' repeats the command, which gives hidden actions away"),
+        ({"hidden": ("tool", "box_xy", "box_tan_yaw")}, "state: nothing remains"),
+        ({"actuated": (0,)}, "actuated: wanted a state column for each of 2 actions"),
+        ({"robot": (0, 9)}, "robot: the state has 5 columns, got 9"),
+        ({"absolute_actions": ("x",)}, r"absolute_actions: wanted the last of x, y, got \('x',\)"),
+        ({"interchangeable": (("box",),)}, "interchangeable: no body 'box'"),
+        ({"relative_positions": (("tool", "command"),)}, "'command' is no part of the state"),
+        ({"observation_parts": {**TOY["observation_parts"], "more": ("tool_0",)}}, "columns named twice: tool_0"),
+        ({"modes": Modes(entropy="some")}, "modes.entropy: wanted one of all, contexts, solved_contexts, got 'some'"),
+    ],
+)
+def test_facts_that_do_not_fit_are_named(change, fault):
+    with pytest.raises(ValueError, match=fault):
+        Task(**(TOY | change))
+
+
+def test_all_faults_are_told_at_once():
+    with pytest.raises(ValueError, match=r"2 fault\(s\) in task 'toy'") as error:
+        Task(**(TOY | {"position": "tol", "hidden": ("bx",)}))
+    assert "no part 'tol'" in str(error.value) and "no part 'bx'" in str(error.value)
+
+
+def test_columns_have_names():
+    task = Task(**(TOY | {"state": {"tool": "plain", "box_tan_yaw": "tan_yaw"}}))
+    assert task.observation_names[:2] == ("command_0", "command_1") and task.observation_names[-1] == "box_tan_yaw"
+    assert task.state_names == ("tool_0", "tool_1", "box_tan_yaw_cos_2yaw", "box_tan_yaw_sin_2yaw")
+    assert task.state_dim == 4 and task.action_names == ("x", "y")
+
+
+def test_units_decide_nothing_but_which_errors_are_averaged():
+    task = Task(**(TOY | {"actions": {"a": "rad", "grip": "N", "b": "rad"}, "absolute_actions": ("b",)}))
+    assert task.action_columns() == [0, 2] and task.action_columns("N") == [1] and task.action_columns("m") == []
+    assert task.num_delta_actions == 2 and task.tool_columns is None and task.gripper is None
+
+
+def test_a_feature_of_ones_own_is_an_import_string():
+    import torch
+
+    task = Task(**(TOY | {"state": {"tool": "plain", "box_xy": "torch:sin"}}))
+    assert task.state_dim == 4 and task.state_names[2:] == ("box_xy_0", "box_xy_1")
+    observation = torch.arange(7.0)[None]
+    torch.testing.assert_close(task.state_of(observation), torch.tensor([[2.0, 3.0, *torch.arange(4.0, 6.0).sin()]]))
+    broken = Task(**(TOY | {"state": {"tool": "torch:sinus"}}))
+    with pytest.raises(ValueError, match="a feature of task 'toy': module 'torch' has no 'sinus'"):
+        broken.state_of(observation)
+
+
+@pytest.mark.parametrize("name", list(TASKS))
+def test_every_task_survives_json(name):
+    task = get_task(name)
+    written = json.dumps(task.to_json())
+    read = Task.from_json(json.loads(written))
+    assert read == task and json.dumps(read.to_json()) == written
+
+
+def test_json_of_another_kind_is_refused():
+    entries = get_task("avoiding").to_json()
+    with pytest.raises(ValueError, match="task: unknown entry 'colour'"):
+        Task.from_json(entries | {"colour": 1})
+    with pytest.raises(ValueError, match=r"scene.shapes: unknown entry 'size'"):
+        Task.from_json(entries | {"scene": {"shapes": [{"size": 1}]}})
+    with pytest.raises(ValueError, match="task: entry 'actions' is missing"):
+        Task.from_json({key: value for key, value in entries.items() if key != "actions"})
+    with pytest.raises(ValueError, match="task: wanted an object, got list"):
+        Task.from_json([])
+    with pytest.raises(TypeError, match="goal cannot be written to JSON: wanted an import string"):
+        Task(**TOY, goal=len).to_json()
+
+
+def test_the_package_alone_loads_neither_torch_nor_a_simulator():
+    code = (
+        "import sys, torchrl_koap; assert torchrl_koap.__version__; assert 'torchrl_koap.tasks' not in sys.modules;"
+        "torchrl_koap.get_task('stacking').state_dim; print([m for m in ('torch', 'mujoco') if m in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert found.stdout.strip() == "[]", found.stderr
+    with pytest.raises(AttributeError, match="has no attribute 'register_tusk'"):
+        torchrl_koap.register_tusk  # noqa: B018

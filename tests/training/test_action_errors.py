@@ -29,9 +29,9 @@ def counting(lengths=LENGTHS):
 class Copy(TensorDictModuleBase):
     """The action of a frame is the state of the frame ``shift`` further on."""
 
-    def __init__(self, history, shift=0):
+    def __init__(self, num_past, shift=0):
         super().__init__()
-        self.in_keys, self.out_keys, self.history, self.shift = ["state"], ["action"], history, shift
+        self.in_keys, self.out_keys, self.num_past, self.shift = ["state"], ["action"], num_past, shift
         self.register_buffer("device_of", torch.zeros(1))
 
     def forward(self, tensordict):
@@ -52,17 +52,17 @@ def hidden_steps(data, labelled):
 
 
 @pytest.mark.parametrize(("amount", "unit"), [(2, "trajectory"), (1, "window"), (3, "transition")])
-@pytest.mark.parametrize("history", [0, 1, 4, 7])
-def test_the_same_hidden_steps_for_every_controller(history, amount, unit):
+@pytest.mark.parametrize("num_past", [0, 1, 4, 7])
+def test_the_same_hidden_steps_for_every_controller(num_past, amount, unit):
     data = counting()
     labelled, report = LabelBudget(amount, unit=unit, seed=2).apply(data)
     assert report.trajectories_touched < 5
-    controller = Copy(history)
+    controller = Copy(num_past)
     predicted, true = hidden_action_errors(controller, data, labelled)
     assert true[:, 0].tolist() == hidden_steps(data, labelled)
     assert torch.equal(predicted, true)  # the action of the current frame, not of a neighbour
-    assert controller.num_frames == min(history, BEFORE) + 1 + AFTER
-    assert rmse_mm(*hidden_action_errors(Copy(history, shift=2), data, labelled)) == pytest.approx(2000)
+    assert controller.num_frames == min(num_past, BEFORE) + 1 + AFTER
+    assert rmse_mm(*hidden_action_errors(Copy(num_past, shift=2), data, labelled)) == pytest.approx(2000)
 
 
 def test_actions_of_the_budget_are_not_even_looked_at():

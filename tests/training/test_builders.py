@@ -12,19 +12,17 @@ from tensordict import TensorDict
 from tiny_runs import demonstration, write_demonstrations
 
 from torchrl_koap.data import LabelBudget, save_ted
+from torchrl_koap.envs.registry import make_env_of, mode_index_of
 from torchrl_koap.keys import validate
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.builders import (
-    DENOISERS,
     NORMALIZATION,
     build_controller,
-    build_planner,
-    load_demonstrations,
-    make_env_of,
-    mode_index_of,
     set_up_torch,
 )
+from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.training.diffusion_builders import DENOISERS, build_planner
 from torchrl_koap.training.methods import METHODS
 
 TASK = get_task("avoiding")
@@ -121,7 +119,7 @@ def test_unknown_planner_options_suggest_the_nearest(option, value, message):
 
 @pytest.mark.parametrize(
     ("preset", "method"),
-    [(preset, name) for name, method in METHODS.items() if not method.acts for preset in method.presets],
+    [(preset, name) for name, method in METHODS.items() if method.has_planner for preset in method.presets],
 )
 def test_every_controller_acts_and_takes_over_weights(method, preset, data):
     labelled, _ = LabelBudget(2).apply(data)

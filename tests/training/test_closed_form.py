@@ -45,7 +45,7 @@ def test_every_label_with_full_look_ahead_is_used_exactly_once(monkeypatch, meth
     monkeypatch.setattr(LinearActionDecoder, "fit_ridge", spy)
     report = fit_closed_form(controller, labelled)
     ((actions, groups),) = seen
-    look_ahead = controller.num_window_frames - 1 - controller.history
+    look_ahead = controller.num_window_frames - 1 - controller.num_past
     left = torch.cat([torch.arange(n, 0, -1) for n in LENGTHS])  # steps that are left in the trajectory, this included
     wanted = labelled["has_action"].squeeze(-1) & (left > look_ahead)
     assert actions[:, 0].round().int().sort().values.tolist() == (wanted.nonzero().flatten() + 1).tolist()

@@ -11,7 +11,7 @@ from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.methods import METHODS, get_method
 
-CONTROLLERS = [name for name, method in METHODS.items() if not method.acts]
+CONTROLLERS = [name for name, method in METHODS.items() if method.has_planner]
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +36,10 @@ def same(first, second):
 def test_an_entry_holds_together(name):
     method = METHODS[name]
     assert method.title and len({other.title for other in METHODS.values()}) == len(METHODS)
-    assert method.acts == (method.build is None)
-    assert not (method.acts and (method.phases or method.closed_form or method.labelled_only))
-    assert not method.teacher or not METHODS[method.teacher].acts
-    if not method.acts:
+    assert method.name == name and method.has_planner == (method.kind == "controller")
+    assert method.has_planner or not (method.closed_form or method.labelled_only)
+    assert not method.teacher or METHODS[method.teacher].has_planner
+    if method.has_planner:
         # every method has at most one controller's budget of updates, whatever it does with it
         assert sum(phase.share for phase in method.phases) == (1 if method.phases else 0)
         assert bool(method.phases) or method.closed_form
@@ -60,7 +60,7 @@ def test_every_phase_trains_what_acts_on_windows_with_and_without_labels(name, d
         window = max(WINDOW, controller.num_window_frames)
         share = {"all": None, "mixed": 0.25, "labelled": 1.0}[phase.windows]
         keys = ["state", "action", "has_action"]
-        buffer = make_window_buffer(data, window, 8, select=keys, pad_before=controller.history, labelled_share=share)
+        buffer = make_window_buffer(data, window, 8, select=keys, pad_before=controller.num_past, labelled_share=share)
         batch = buffer.sample()
         if phase.windows == "labelled":
             assert batch["has_action"].any((1, 2)).all()

@@ -13,7 +13,7 @@ from torchrl_koap.evaluation.run import load_run
 from torchrl_koap.training import pretrained
 from torchrl_koap.training.checkpoints import load_tensors
 from torchrl_koap.training.pretrained import copy_run, find_run, publish
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.training.run_directory import RunDirectoryError
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +56,7 @@ def test_a_published_policy_is_small_and_plans_the_same(run, policies):
     assert small == {"covariance_root"}  # frequencies stay as the decoder knows them
     small, whole = ((folder / "planner.safetensors").stat().st_size for folder in (policies / "avoiding", run))
     assert small < 0.6 * whole
-    _, planner, _ = load_run(RunDirectory(policies / "avoiding"))
-    _, exact, _ = load_run(RunDirectory(run))
+    planner, exact = load_run(policies / "avoiding").planner, load_run(run).planner
     history, noise = torch.rand(20, 2, 2), torch.randn(20, 14, 2)
     with torch.no_grad():
         gap = (planner.plan(history, noise) - exact.plan(history, noise)).abs().mean()
@@ -114,7 +113,7 @@ def test_options_of_the_planner_are_written_and_trained_with(tmp_path):
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     chosen = {name: config["planner"][name] for name in ("width", "depth", "frequencies", "dropout")}
     assert chosen == {"width": 32, "depth": 2, "frequencies": 1, "dropout": 0.1}
-    _, planner, _ = load_run(RunDirectory(tmp_path / "run"))
+    planner = load_run(tmp_path / "run").planner
     assert planner.denoiser.film is not None and not planner.training
     assert koap("train", "--out", tmp_path / "no", *arguments, "--precision", "float8") == 1
     assert koap("train", "--out", tmp_path / "run", "--resume") == 0  # with all of these options, none named again

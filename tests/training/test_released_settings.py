@@ -10,7 +10,7 @@ from tiny_runs import TINY, koap, write_demonstrations
 
 from torchrl_koap.data import D3ILExperienceReplay, LabelBudget, WindowTable
 from torchrl_koap.training.methods import Phase
-from torchrl_koap.training.released_settings import EPOCHS, RELEASED, epochs_of, get_released
+from torchrl_koap.training.released_settings import RELEASED, get_released
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +55,3 @@ def test_what_the_first_code_lacks_is_refused(demonstrations, tmp_path, capsys):
         assert koap("train", "--dataset", demonstrations, "--out", tmp_path / "no", *TINY, *extra) == 1
         assert message in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
-
-
-def test_every_task_has_epochs():
-    assert epochs_of("avoiding") == 500 and epochs_of("stacking_1") == EPOCHS["stacking"]
-    assert epochs_of("po_sorting") == 200 and epochs_of("sorting_6") == 400

@@ -30,7 +30,7 @@ ALL = [("planner", 50), ("planner", 100), ("planner", 150), ("controller", 50), 
 def test_rows_are_read_back(run):
     assert steps_of(run) == ALL
     rows = run.read_metrics()
-    assert tuple(rows[0]) == RunDirectory.COLUMNS
+    assert tuple(rows[0]) == ("phase", "step", "loss_planner", "loss_action")
     assert rows[1]["loss_planner"] == "0.1" and rows[1]["loss_action"] == ""
     assert run.last_metrics("planner") == {"loss_planner": 0.15}
     assert run.last_metrics("controller") == {"loss_action": 0.1}
@@ -123,3 +123,41 @@ def test_content_that_json_cannot_hold_leaves_what_was_there(run):
         run.write_json("config.json", {"task": object()})
     assert run.read_json("config.json") == {"task": "avoiding"}
     assert sorted(file.name for file in run.path.iterdir()) == ["config.json", "metrics.csv"]
+
+
+def test_a_new_value_gets_a_column_and_earlier_rows_stay(tmp_path):
+    run = RunDirectory(tmp_path)
+    run.log("planner", 50, {"loss_planner": 0.5})
+    run.log("controller", 50, {"loss_mine": 0.25, "learning_rate": 1.0})
+    run.log("controller", 100, {"loss_mine": 0.125, "learning_rate": 0.5})
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == [
+        "phase,step,loss_planner,loss_mine,learning_rate",
+        "planner,50,0.5,,",
+        "controller,50,,0.25,1.0",
+        "controller,100,,0.125,0.5",
+    ]
+    assert run.last_metrics("controller") == {"loss_mine": 0.125, "learning_rate": 0.5}
+
+
+def test_a_log_with_the_columns_of_before_is_read_and_goes_on(tmp_path):
+    """Earlier versions had the same columns in every run."""
+    head = "phase,step,loss_planner,loss_reconstruction,loss_koopman,loss_kl,learning_rate\n"
+    (tmp_path / "metrics.csv").write_text(head + "planner,50,0.5,,,,0.001\nplanner,100,0.25,,,,0.0")
+    run = RunDirectory(tmp_path)
+    assert steps_of(run) == [("planner", 50)]  # the second row was cut off
+    run.log("controller", 50, {"loss_mine": 2.0})
+    assert steps_of(run) == [("planner", 50), ("controller", 50)]
+    assert run.last_metrics("planner") == {"loss_planner": 0.5, "learning_rate": 0.001}
+    assert run.last_metrics("controller") == {"loss_mine": 2.0}
+
+
+def test_one_at_a_time_works_in_a_folder(tmp_path):
+    run = RunDirectory(tmp_path / "run")
+    with run.locked("koap train"):
+        with (
+            pytest.raises(RunDirectoryError, match=f"another `koap train` is working in {run.path}"),
+            RunDirectory(run.path).locked("koap train"),
+        ):
+            pytest.fail("both are in")
+    with run.locked("koap train"):
+        assert (run.path / ".lock").exists()

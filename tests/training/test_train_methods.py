@@ -12,14 +12,15 @@ import torch
 from tiny_runs import TINY as TINY_CALL
 from tiny_runs import koap, write_demonstrations
 
+from torchrl_koap.commands.cli import HINT
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import loop
-from torchrl_koap.training.builders import load_demonstrations
 from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.config import Train
+from torchrl_koap.training.config import TrainConfig
+from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.methods import METHODS
-from torchrl_koap.training.run import run_train
+from torchrl_koap.training.run import train
 from torchrl_koap.training.run_directory import RunDirectory
 
 TASK = get_task("avoiding")
@@ -31,15 +32,15 @@ POISON = 1e9
 def planner(tmp_path_factory, demonstrations):
     """A run whose planner is taken over by all others."""
     folder = tmp_path_factory.mktemp("planner") / "run"
-    run_train(Train(out=folder, dataset=str(demonstrations), method="linear", label_count=2, analysis=False, **TINY))
+    train(TrainConfig(out=folder, dataset=str(demonstrations), method="linear", label_count=2, analysis=False, **TINY))
     return folder
 
 
 def train_tiny(out, demonstrations, planner, method, **options):
     options = {**TINY, "label_count": 2, "analysis": False, **options}
-    if not METHODS[method].acts:
+    if METHODS[method].has_planner:
         options["planner_from"] = planner
-    return run_train(Train(out=out, dataset=str(demonstrations), method=method, **options))
+    return train(TrainConfig(out=out, dataset=str(demonstrations), method=method, **options))
 
 
 def poisoned(data, budget, *, inside=False):
@@ -47,7 +48,7 @@ def poisoned(data, budget, *, inside=False):
 
     Of a trajectory with a hidden action all commands are: their differences are its actions.
     """
-    labelled = budget.apply(data, command=TASK.observation[TASK.command])[0]
+    labelled = budget.apply(data, command=TASK.command_columns)[0]
     data = data.clone()
     if inside:
         data["action"] = torch.where(labelled["has_action"], data["action"] * 1.5, data["action"])
@@ -91,7 +92,7 @@ def test_no_weight_of_a_planner_depends_on_any_label(demonstrations, planner, tm
     data = poisoned(poisoned(load_demonstrations(str(demonstrations), TASK), budget), budget, inside=True)
     monkeypatch.setattr("torchrl_koap.training.run.load_demonstrations", lambda *a, **o: data.clone())
     options = {"method": "linear", "label_count": 2, "analysis": False}
-    run_train(Train(out=tmp_path / "run", dataset=str(demonstrations), **options, **TINY))
+    train(TrainConfig(out=tmp_path / "run", dataset=str(demonstrations), **options, **TINY))
     name = "planner.safetensors"
     assert (tmp_path / "run" / name).read_bytes() == (planner / name).read_bytes()
     assert weights(tmp_path / "run") != weights(planner)
@@ -156,7 +157,7 @@ def test_a_method_killed_in_a_phase_or_behind_it_ends_bit_for_bit_like_one_that_
         with pytest.raises(KeyboardInterrupt):
             train_tiny(out, demonstrations, planner, method, checkpoint_every=2, **LONGER)
     assert not (out / "summary.json").exists()
-    run_train(Train(out=out, resume=True))
+    train(TrainConfig(out=out, resume=True))
     assert weights(out) == weights(whole_run(method))
     mine, its = (settled(RunDirectory(folder).read_json("summary.json")) for folder in (out, whole_run(method)))
     assert mine == its
@@ -205,7 +206,7 @@ def test_a_policy_takes_no_planner_over(method, planner, demonstrations, tmp_pat
     command = ("train", "--out", tmp_path / "run", "--dataset", demonstrations, "--method", method)
     assert koap(*command, "--planner-from", planner) == 1
     err = capsys.readouterr().err
-    assert err == f"koap: method '{method}' is a policy of its own and has no planner to take over\n"
+    assert err == f"koap: method '{method}' is a policy of its own and has no planner to take over ({HINT})\n"
     assert not (tmp_path / "run").exists()
 
 

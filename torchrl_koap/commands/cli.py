@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The command line ``koap``: sub-commands are dataclasses, their fields are the options."""
+"""The command line ``koap``: sub-commands are dataclasses, their fields are the options, calling one does the work."""
 
 from __future__ import annotations
 
@@ -7,41 +7,41 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from typing import Annotated, Any
 
 import tyro
 
-from torchrl_koap.commands.demos import Demos, run_demos
-from torchrl_koap.commands.doctor import Doctor, Validate, run_doctor, run_validate
-from torchrl_koap.commands.inspect import Inspect, run_inspect
-from torchrl_koap.commands.suggest import Suggest, run_suggest
-from torchrl_koap.evaluation.run import Eval, run_eval
-from torchrl_koap.studies.label_efficiency import Curve, run_curve
-from torchrl_koap.studies.paper_tables import Bench, run_bench
-from torchrl_koap.training.run import Train, run_train
+from torchrl_koap import __version__
+from torchrl_koap.commands.bench import Bench
+from torchrl_koap.commands.convert import Convert
+from torchrl_koap.commands.curve import Curve
+from torchrl_koap.commands.demos import Demos
+from torchrl_koap.commands.doctor import Doctor, Validate
+from torchrl_koap.commands.eval import Eval
+from torchrl_koap.commands.export import Export
+from torchrl_koap.commands.inspect import Inspect
+from torchrl_koap.commands.latency import Latency
+from torchrl_koap.commands.suggest import Suggest
+from torchrl_koap.commands.train import Train
+from torchrl_koap.training.progress import without_progress_bars
 
-RUNNERS = {
-    Demos: run_demos,
-    Train: run_train,
-    Eval: run_eval,
-    Curve: run_curve,
-    Bench: run_bench,
-    Inspect: run_inspect,
-    Suggest: run_suggest,
-    Doctor: run_doctor,
-    Validate: run_validate,
-}
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, RuntimeError, KeyError, OSError)
+HINT = "KOAP_TRACEBACK=1 shows where"
+DESCRIPTION = "Imitation learning with few action labels. `koap --version` prints the version."
 
-Command = (
-    Annotated[Demos, tyro.conf.subcommand("demos")]
+Subcommand = (
+    Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Curve, tyro.conf.subcommand("curve")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Suggest, tyro.conf.subcommand("suggest")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Latency, tyro.conf.subcommand("latency")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Validate, tyro.conf.subcommand("validate")]
 )
@@ -52,14 +52,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     It is 1 for a job that could not be done, or not all of it, and 130 for one that was interrupted, each with one
     line that says why. A wrong call leaves with 2. ``KOAP_TRACEBACK=1`` shows where an error is from.
+
+    Args:
+        arguments (sequence of str, optional): the words of the command line. Default: those of the process.
     """
-    options = tyro.cli(Command, args=arguments, prog="koap")
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments == ["--version"]:
+        print(f"koap {__version__}")
+        return 0
+    command = tyro.cli(Subcommand, args=arguments, prog="koap", description=DESCRIPTION)
     try:
-        result = RUNNERS[type(options)](options)
+        with without_progress_bars() if command.quiet else nullcontext():
+            result = command()
     except EXPECTED as error:
         if os.environ.get("KOAP_TRACEBACK"):
             raise
-        print(f"koap: {one_line(error)}", file=sys.stderr)
+        print(f"koap: {one_line(error)} ({HINT})", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print(
@@ -67,7 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 130
-    show(result)
+    if not command.quiet:
+        show(result)
     return 1 if isinstance(result, Mapping) and result.get("failed") else 0
 
 

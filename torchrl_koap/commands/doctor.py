@@ -12,30 +12,56 @@ from dataclasses import dataclass
 import torch
 import tyro
 
+from torchrl_koap.commands.command import Command
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.builders import load_demonstrations
+from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.training.plugins import Plugins, load_plugins
 
 
-@dataclass
-class Doctor:
+@dataclass(kw_only=True)
+class Doctor(Command):
     """Print versions, processors, graphics and optional packages: the first thing to attach to a question."""
 
+    def __call__(self) -> dict[str, str]:
+        """Facts about this machine, name to value."""
+        return machine_facts()
 
-@dataclass
-class Validate:
+
+@dataclass(kw_only=True)
+class Validate(Command):
     """Check a folder of demonstrations and report every problem found.
 
     Attributes:
         dataset: folder of D3IL raw pickles, a LeRobot data set, or a folder written by `koap demos`.
         task: name of the task.
+        plugins: modules that register tasks; imported before anything else.
     """
 
     dataset: tyro.conf.Positional[str]
     task: str = "avoiding"
+    plugins: Plugins = ()
+
+    def __call__(self) -> dict[str, str]:
+        """Reads and checks demonstrations.
+
+        Raises:
+            LayoutError, RawFolderError: with all problems.
+        """
+        load_plugins(self.plugins)
+        task = get_task(self.task)
+        data = validate(load_demonstrations(self.dataset, task))
+        lengths = data["episode"].unique(return_counts=True)[1]
+        return {
+            "trajectories": str(len(lengths)),
+            "steps": str(len(data)),
+            "shortest, longest": f"{int(lengths.min())}, {int(lengths.max())}",
+            "observation, action columns": f"{data['observation'].shape[-1]}, {data['action'].shape[-1]}",
+            "verdict": "no problem found",
+        }
 
 
-def run_doctor(options: Doctor) -> dict[str, str]:
+def machine_facts() -> dict[str, str]:
     """Facts about this machine, name to value."""
     facts = {"python": platform.python_version(), "platform": platform.platform()}
     for name in (
@@ -67,21 +93,3 @@ def _rendering() -> str:
 
     usable = backends()
     return ", ".join(usable) if usable else "no OpenGL library (apt install libegl1, then MUJOCO_GL=egl)"
-
-
-def run_validate(options: Validate) -> dict[str, str]:
-    """Reads and checks demonstrations.
-
-    Raises:
-        LayoutError, RawFolderError: with all problems.
-    """
-    task = get_task(options.task)
-    data = validate(load_demonstrations(options.dataset, task))
-    lengths = data["episode"].unique(return_counts=True)[1]
-    return {
-        "trajectories": str(len(lengths)),
-        "steps": str(len(data)),
-        "shortest, longest": f"{int(lengths.min())}, {int(lengths.max())}",
-        "observation, action columns": f"{data['observation'].shape[-1]}, {data['action'].shape[-1]}",
-        "verdict": "no problem found",
-    }

@@ -1,21 +1,21 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What demonstrations do not show: how to come back from a little beside them, and where they were heading."""
+"""Augmentations of windows: recovery from displacements, planar transforms, object permutations, continued ends."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.keys import EPISODE, STATE
-from torchrl_koap.tasks.panda_kinematics import tool_position
 
 
 class RecoveryAugmentation(TensorDictModuleBase):
-    r"""Moves the observed frames of a window aside and lets the future come back.
+    r"""Recovery augmentation: moves the observed frames of a window aside and lets the future come back.
 
     .. math::
         x'_{t-j} = x_{t-j} + \delta, \qquad x'_{t+i} = x_{t+i} + \rho^i \delta, \qquad
@@ -31,8 +31,10 @@ class RecoveryAugmentation(TensorDictModuleBase):
         history (int): observed frames of the window. Defaults to ``2``.
         decay (float): share ``rho`` of the shift that remains after each planned frame. Defaults to ``0.7``.
         columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
-        tool (sequence of int, optional): state columns of the tool's position; they follow the arm's seven joints,
-            which are then ``columns`` (:func:`~torchrl_koap.tasks.panda_kinematics.tool_position`).
+        tool (sequence of int, optional): state columns of the tool's position; they follow the arm's joints, which
+            are then ``columns``.
+        kinematics (callable, optional): the function from joints ``[*B, J]`` to the position of the tool ``[*B, 3]``,
+            needed with ``tool``, such as :func:`~torchrl_koap.tasks.panda_kinematics.tool_position`.
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
 
     Examples:
@@ -52,17 +54,19 @@ class RecoveryAugmentation(TensorDictModuleBase):
         decay: float = 0.7,
         columns: Sequence[int] | None = None,
         tool: Sequence[int] | None = None,
+        kinematics: Callable[[Tensor], Tensor] | None = None,
         key: NestedKey = STATE,
     ):
         super().__init__()
-        if tool is not None and (columns is None or len(columns) != 7):
-            raise ValueError(f"a tool follows the arm's seven joints, got columns {columns}")
+        if tool is not None and (columns is None or kinematics is None):
+            raise ValueError(f"a tool follows joints: wanted columns and kinematics, got {columns} and {kinematics}")
         if sigma < 0 or not 0 <= decay < 1:
             raise ValueError(f"sigma must be >= 0 and decay in [0, 1), got {sigma} and {decay}")
         self.in_keys, self.out_keys = [key], [key]
         self.sigma, self.history, self.decay = sigma, history, decay
         self.columns = None if columns is None else list(columns)
         self.tool = None if tool is None else list(tool)
+        self.kinematics = kinematics
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the windows by shifted ones."""
@@ -77,13 +81,13 @@ class RecoveryAugmentation(TensorDictModuleBase):
         remaining = self.decay ** frames.clamp_min(0).to(state.dtype)
         shifted = state + 2 * self.sigma * size * shift * remaining[:, None]
         if self.tool is not None and self.sigma:
-            moved = tool_position(shifted[..., self.columns]) - tool_position(state[..., self.columns])
+            moved = self.kinematics(shifted[..., self.columns]) - self.kinematics(state[..., self.columns])
             shifted[..., self.tool] = shifted[..., self.tool] + moved
         return tensordict.set(self.in_keys[0], shifted)
 
 
-class SceneAugmentation(TensorDictModuleBase):
-    """Moves and turns the whole scene, tool and objects together, about a vertical axis.
+class RandomPlanarTransform(TensorDictModuleBase):
+    """Random planar transform: moves and turns the whole scene, tool and objects together, about a vertical axis.
 
     How a tool pushes an object does not depend on where on the table that happens. A planner trained on few hundred
     demonstrations does not find that out by itself.
@@ -105,9 +109,9 @@ class SceneAugmentation(TensorDictModuleBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data import SceneAugmentation
+        >>> from torchrl_koap.data import RandomPlanarTransform
         >>> window = torch.rand(8, 16, 4)
-        >>> td = SceneAugmentation([(0, 1), (2, 3)], [], shift=0.1, turn=0.5)(TensorDict({"state": window}, [8]))
+        >>> td = RandomPlanarTransform([(0, 1), (2, 3)], [], shift=0.1, turn=0.5)(TensorDict({"state": window}, [8]))
         >>> distance = lambda state: (state[..., :2] - state[..., 2:]).norm(dim=-1)
         >>> torch.allclose(distance(td["state"]), distance(window), atol=1e-5)
         True
@@ -147,8 +151,8 @@ class SceneAugmentation(TensorDictModuleBase):
         return tensordict.set(self.in_keys[0], moved)
 
 
-class ExchangeAugmentation(TensorDictModuleBase):
-    """Exchanges objects that are alike: which of two red boxes is called the first does not matter.
+class ObjectPermutation(TensorDictModuleBase):
+    """Random permutation of interchangeable objects: which of two red boxes is called the first does not matter.
 
     Args:
         groups (sequence): for each kind of object the state columns of each of its instances, all of the same number.
@@ -157,9 +161,9 @@ class ExchangeAugmentation(TensorDictModuleBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data import ExchangeAugmentation
+        >>> from torchrl_koap.data import ObjectPermutation
         >>> windows = TensorDict({"state": torch.arange(4.0).expand(99, 5, 4)}, [99])
-        >>> td = ExchangeAugmentation([[(0, 1), (2, 3)]])(windows)
+        >>> td = ObjectPermutation([[(0, 1), (2, 3)]])(windows)
         >>> sorted(set(td["state"][:, 0, 0].tolist()))
         [0.0, 2.0]
     """

@@ -21,7 +21,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap import keys
-from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.data.trajectories import mark_labels, trajectory_lengths
 from torchrl_koap.lookup import lookup
 
 Unit = Literal["trajectory", "window", "transition"]
@@ -41,6 +41,15 @@ class LabelReport:
         trajectories_touched (int): trajectories with at least one label.
         total_trajectories (int): all trajectories.
         seed (int): seed of the draw.
+        available_units (int): units with a label in the data as they came; those that could be drawn.
+        available_transitions (int): transitions with a label in the data as they came.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories
+        >>> _, report = LabelBudget(1).apply(flatten_trajectories([torch.rand(6, 2)] * 4, [torch.rand(5, 1)] * 4))
+        >>> report.labelled_transitions, report.total_transitions, report.trajectories_touched
+        (5, 20, 1)
     """
 
     unit: str
@@ -52,6 +61,8 @@ class LabelReport:
     trajectories_touched: int
     total_trajectories: int
     seed: int
+    available_units: int
+    available_transitions: int
 
     def as_dict(self) -> dict[str, Any]:
         """The report as a plain dictionary, for JSON."""
@@ -59,11 +70,14 @@ class LabelReport:
 
     def __str__(self) -> str:
         share = self.labelled_transitions / self.total_transitions
+        had = (
+            f"; the data came with {self.available_transitions} labels, on {self.available_units} {_plural(self.unit)}"
+        )
         return (
             f"{self.selected_units} of {self.total_units} {_plural(self.unit)} drawn: {self.labelled_transitions} of"
             f" {self.total_transitions} transitions labelled ({share:.2%}),"
             f" {self.trajectories_touched} of {self.total_trajectories} trajectories touched"
-        )
+        ) + (had if self.available_transitions < self.total_transitions else "")
 
 
 @dataclass(frozen=True)
@@ -71,6 +85,10 @@ class LabelBudget:
     """Keeps the labels of a few trajectories, windows or single transitions, and hides all others.
 
     The draw depends on the seed alone. With the same seed a larger budget contains every smaller one.
+
+    Data that lack labels already are a budget themselves: units without a label are passed over, units with some keep
+    those they have, and what is drawn cannot be more than there is. Fractions are of all units, labelled or not, but
+    for ``1.0``, which draws every unit that has a label.
 
     * ``"trajectory"``: whole demonstrations. The honest default: a robot records whole demonstrations.
     * ``"window"``: the paper's levels. Windows are drawn without replacement from all windows of all trajectories, and
@@ -143,7 +161,8 @@ class LabelBudget:
         """Hides all labels outside the budget.
 
         Args:
-            data (TensorDictBase): fully labelled flat data ``[N]``; not changed.
+            data (TensorDictBase): flat data ``[N]``, labelled throughout or in part; not changed. Without
+                ``has_action``, actions that are NaN throughout are taken to be missing (:func:`mark_labels`).
             command (slice, optional): columns of the observation that repeat the command; they are blanked where they
                 would give hidden actions away, see :func:`hide_commands`. Default: the observation has none.
 
@@ -152,12 +171,13 @@ class LabelBudget:
 
         Raises:
             LayoutError: if the data do not follow the storage layout.
-            ValueError: if labels are missing already, if the budget selects nothing, or more than there is.
+            ValueError: if there is no label at all, if the budget selects nothing, or more than there is.
         """
+        data = data if keys.HAS_ACTION in data.keys() else mark_labels(data)
         keys.validate(data)
-        missing = int((~data.get(keys.HAS_ACTION)).sum())
-        if missing:
-            raise ValueError(f"a label budget is applied to fully labelled data; {missing} steps have no action")
+        available = data.get(keys.HAS_ACTION).squeeze(-1).cpu().numpy()
+        if not available.any():
+            raise ValueError(f"none of the {len(available)} steps has an action: there are no labels to spend")
         lengths = trajectory_lengths(data).cpu().numpy()
         starts = np.cumsum(lengths) - lengths
 
@@ -174,16 +194,22 @@ class LabelBudget:
             units = np.concatenate([start + np.arange(count) for start, count in zip(starts, counts, strict=True)])
             labels = range(self.history - 1, self.window - 1)
 
-        number = self._number_of(len(units))
-        chosen = np.random.default_rng(self.seed).permutation(len(units))[:number]
+        if labels is None:
+            usable = np.logical_or.reduceat(available, starts)
+        else:
+            usable = available[units[:, None] + np.asarray(labels)].any(1)
+        number = self._number_of(len(units), int(usable.sum()))
+        order = np.random.default_rng(self.seed).permutation(len(units))
+        chosen = order[usable[order]][:number]
         if self.episodes:
-            chosen = _positions(data.get(keys.EPISODE).cpu().numpy()[starts], self.episodes)
+            chosen = _positions(data.get(keys.EPISODE).cpu().numpy()[starts], usable, self.episodes)
         kept = np.zeros(lengths.sum(), dtype=bool)
         if labels is None:
             for index in chosen:
                 kept[starts[index] : starts[index] + lengths[index]] = True
         else:
             kept[units[chosen][:, None] + np.asarray(labels)] = True
+        kept &= available
 
         has_action = torch.from_numpy(kept).to(data.get(keys.ACTION).device).unsqueeze(-1)
         labelled = data.clone()
@@ -202,15 +228,21 @@ class LabelBudget:
             trajectories_touched=int(touched.sum()),
             total_trajectories=len(lengths),
             seed=self.seed,
+            available_units=int(usable.sum()),
+            available_transitions=int(available.sum()),
         )
         return labelled, report
 
-    def _number_of(self, total: int) -> int:
+    def _number_of(self, total: int, usable: int) -> int:
+        """Units to draw, of ``total`` of which ``usable`` have a label."""
         plural = _plural(self.unit)
         if isinstance(self.amount, numbers.Integral):
-            if self.amount > total:
-                raise ValueError(f"{self.amount} labelled {plural} asked for, there are {total}")
+            if self.amount > usable:
+                have = f"there are {total}" if usable == total else f"only {usable} of {total} have a label"
+                raise ValueError(f"{self.amount} labelled {plural} asked for, {have}")
             return int(self.amount)
+        if self.amount == 1:
+            return usable
         # in decimals, so that 0.145 of 100 is 14.5 and not 14.499999999999998
         number = int((Decimal(repr(float(self.amount))) * total).to_integral_value(ROUND_HALF_UP))
         if number == 0:
@@ -219,14 +251,22 @@ class LabelBudget:
                 f"a label fraction of {self.amount} selects none of the {total} {plural};"
                 f" the smallest fraction that selects one is {least}"
             )
+        if number > usable:
+            raise ValueError(
+                f"a label fraction of {self.amount} is {number} of {total} {plural}, but only {usable} have a label"
+                f" ({usable / total:.4g}); 1.0 keeps every label there is"
+            )
         return number
 
 
-def _positions(present: np.ndarray, wanted: Sequence[int]) -> np.ndarray:
+def _positions(present: np.ndarray, usable: np.ndarray, wanted: Sequence[int]) -> np.ndarray:
     """Where the trajectories of some numbers lie."""
     absent = sorted(set(wanted) - set(present.tolist()))
     if absent:
         raise ValueError(f"there are no episodes {absent} to label; the data have {present.min()} to {present.max()}")
+    bare = sorted(set(wanted) - set(present[usable].tolist()))
+    if bare:
+        raise ValueError(f"episodes {bare} are to be labelled, but the data hold no action of them")
     return np.flatnonzero(np.isin(present, wanted))
 
 
@@ -261,6 +301,52 @@ def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
         value[:, command] = torch.where(rows.unsqueeze(-1), math.nan, value[:, command])
         result.set(key, value)
     return result
+
+
+def subsample_trajectories(data: TensorDictBase, fraction: float, *, seed: int = 0) -> TensorDictBase:
+    """Drops whole trajectories without a label until a share of all trajectories is left.
+
+    Trajectories with a label always stay. Of one seed, a smaller share is part of every larger one.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` after the label budget was applied; not changed.
+        fraction (float): share of the trajectories to keep, in ``(0, 1]``.
+
+    Keyword Args:
+        seed (int): seed of the choice.
+
+    Returns:
+        TensorDictBase: flat data in the order of ``data``; ``data`` itself if nothing is dropped.
+
+    Raises:
+        ValueError: if the share is out of range, or smaller than that of the trajectories with labels.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, subsample_trajectories
+        >>> data = flatten_trajectories([torch.zeros(5, 2)] * 10, [torch.zeros(4, 1)] * 10)
+        >>> data, _ = LabelBudget(2).apply(data)
+        >>> kept = subsample_trajectories(data, 0.5)
+        >>> len(kept["episode"].unique()), int(kept["has_action"].sum())
+        (5, 8)
+    """
+    if not 0 < fraction <= 1:
+        raise ValueError(f"observation fraction must be in (0, 1], got {fraction}")
+    lengths = trajectory_lengths(data)
+    number = math.floor(fraction * len(lengths) + 0.5)
+    labelled = torch.stack([part.any() for part in data.get(keys.HAS_ACTION).split(lengths.tolist())]).cpu()
+    if number < max(int(labelled.sum()), 1):
+        raise ValueError(
+            f"an observation fraction of {fraction} keeps {number} of {len(lengths)} trajectories,"
+            f" but {int(labelled.sum())} have labels"
+        )
+    if number == len(lengths):
+        return data
+    order = torch.randperm(len(lengths), generator=torch.Generator().manual_seed(seed))
+    order = torch.cat([order[labelled[order]], order[~labelled[order]]])
+    kept = torch.zeros(len(lengths), dtype=torch.bool)
+    kept[order[:number]] = True
+    return data[kept.to(lengths.device).repeat_interleave(lengths)]
 
 
 def _plural(unit: str) -> str:

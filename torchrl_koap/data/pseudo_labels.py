@@ -24,7 +24,7 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
     :class:`~torchrl_koap.modules.DiffusionPolicy`, learns from all demonstrations. Only states are read: what is stored
     as the action of an unlabelled step cannot reach the outcome.
 
-    An action is read at frame ``controller.history`` of a window, where the controller sees its whole past and
+    An action is read at frame ``controller.num_past`` of a window, where the controller sees its whole past and
     look-ahead. Over the ends of a trajectory the first state is repeated, as at the start of an episode, and the last
     ones go on at their velocity (:func:`~torchrl_koap.data.extrapolate_ends`)::
 
@@ -90,7 +90,7 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
 
 def _predict(controller: nn.Module, data: TensorDictBase, hidden: Tensor, window: int, batch_size: int) -> Tensor:
     """The controller's actions ``[hidden steps, act]``."""
-    now = controller.history
+    now = controller.num_past
     continued = extrapolate_ends(data, window - 1 - now)
     # one window per step of the data, in their order: those that have the step at frame `now`
     table = WindowTable.build(continued, window, history=now + 1, pad_before=now)

@@ -24,7 +24,9 @@ from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import replacing_folder
-from torchrl_koap.tasks import TASKS
+from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.json_format import plain_task_from_json
+from torchrl_koap.tasks.registry import find_task
 
 FORMAT = 1
 _ABOUT = "about.json"
@@ -36,14 +38,15 @@ class DamagedDataError(ValueError):
 
 
 def save_ted(
-    data: TensorDictBase, folder: str | Path, *, task: str | None = None, notes: Mapping[str, Any] | None = None
+    data: TensorDictBase, folder: str | Path, *, task: str | Task | None = None, notes: Mapping[str, Any] | None = None
 ) -> Path:
     """Writes flat TED data into a folder; an earlier data set there is replaced in one step.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout.
         folder (str or Path): folder to create or replace.
-        task (str, optional): name of the task.
+        task (str or Task, optional): name of the task; or the task itself, which is kept with the data, so that they
+            can be used where nobody registered it.
         notes (mapping, optional): anything JSON can hold that should be kept with the data.
 
     Returns:
@@ -66,7 +69,8 @@ def save_ted(
         (torch.Size([8]), [3, 5], {'seed': 0})
     """
     folder = Path(folder)
-    command = TASKS[task].observation[TASKS[task].command] if task in TASKS else None
+    known = task if isinstance(task, Task) else find_task(task)
+    command = known.command_columns if known else None
     keys.validate(data, command=command)
     entries = data.items(True, True, is_leaf=is_leaf_nontensor)
     strange = [key for key, value in entries if not isinstance(value, torch.Tensor)]
@@ -76,7 +80,9 @@ def save_ted(
         raise FileExistsError(f"{folder} exists and holds no data set; it is left as it is")
     about = {
         "format": FORMAT,
-        "task": task,
+        "task": task.name if isinstance(task, Task) else task,
+        "definition": task.to_json() if isinstance(task, Task) else None,
+        "labelled_steps": int(data.get(keys.HAS_ACTION).sum()),
         "trajectories": len(trajectory_lengths(data)),
         "steps": data.shape[0],
         "lengths": trajectory_lengths(data).tolist(),
@@ -109,6 +115,36 @@ def read_about(folder: str | Path) -> dict[str, Any]:
     if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("sha256"), dict):
         raise DamagedDataError(f"{path} is no description of a data set in format {FORMAT}")
     return about
+
+
+def read_task(folder: str | Path) -> Task | None:
+    """The task that a data set holds, None if it only names one.
+
+    A task of a data set is plain facts. One that names code to import (an environment, rules) is refused: a folder that
+    somebody sent must not decide what is run.
+
+    Args:
+        folder (str or Path): folder of the data set.
+
+    Raises:
+        DamagedDataError: if the folder holds no data set, or its task is damaged or names code.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from torchrl_koap.data import read_task, save_demonstrations
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     folder = save_demonstrations(root + "/arm", [np.zeros((9, 2))], control_hz=30, action_dim=7)
+        ...     print(read_task(folder / "ted").action_dim)
+        7
+    """
+    definition = read_about(folder).get("definition")
+    if definition is None:
+        return None
+    try:
+        return plain_task_from_json(definition)
+    except ValueError as error:
+        raise DamagedDataError(f"{Path(folder) / _ABOUT}: {error}") from error
 
 
 def load_ted(folder: str | Path, *, task: str | None = None, memmap: bool = True) -> TensorDict:

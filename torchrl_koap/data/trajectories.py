@@ -12,23 +12,33 @@ from torchrl_koap import keys
 
 
 def flatten_trajectories(
-    observations: Sequence[torch.Tensor], actions: Sequence[torch.Tensor], *, dtype: torch.dtype = torch.float32
+    observations: Sequence[torch.Tensor],
+    actions: Sequence[torch.Tensor | None] | None,
+    *,
+    action_dim: int | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> TensorDict:
     """Lays recorded trajectories one after the other in the storage layout.
 
     ``T`` frames make ``T - 1`` steps: step ``t`` goes from frame ``t`` to frame ``t + 1``. The last step of every
-    trajectory is marked as terminated, and all actions as labelled.
+    trajectory is marked as terminated. Steps have a label where their action is given: ``None`` for a trajectory, or
+    NaN throughout a row, means that it is not.
 
     Args:
         observations (sequence of Tensor): for each trajectory its frames ``[T_i, obs]``.
-        actions (sequence of Tensor): for each trajectory its actions ``[T_i - 1, act]``.
+        actions (sequence of Tensor or None): for each trajectory its actions ``[T_i - 1, act]``, or None. None instead
+            of the sequence: no trajectory has any.
+
+    Keyword Args:
+        action_dim (int, optional): size of an action; needed where no trajectory has one.
         dtype (torch.dtype): floating type of the entries.
 
     Returns:
         TensorDict: flat data ``[sum(T_i - 1)]``.
 
     Raises:
-        ValueError: if the numbers of trajectories, frames, actions or columns do not fit each other.
+        ValueError: if the numbers of trajectories, frames, actions or columns do not fit each other, or an action is
+            infinite, or NaN in some of its entries only.
 
     Examples:
         >>> import torch
@@ -36,19 +46,37 @@ def flatten_trajectories(
         >>> data = flatten_trajectories([torch.arange(8.0).reshape(4, 2)], [torch.ones(3, 1)])
         >>> data["observation"][1], data["next", "observation"][1], data["next", "done"].squeeze(-1)
         (tensor([2., 3.]), tensor([4., 5.]), tensor([False, False,  True]))
+        >>> flatten_trajectories([torch.zeros(3, 2)] * 2, [None, torch.ones(2, 1)])["has_action"].flatten().tolist()
+        [False, False, True, True]
     """
     observations = [torch.as_tensor(frames) for frames in observations]
-    actions = [torch.as_tensor(steps) for steps in actions]
+    actions = [None] * len(observations) if actions is None else list(actions)
     if not observations or len(observations) != len(actions):
         raise ValueError(f"{len(observations)} trajectories of observations, {len(actions)} of actions")
+    actions = [None if steps is None else torch.as_tensor(steps) for steps in actions]
+    given = next((steps for steps in actions if steps is not None and steps.ndim == 2), None)
+    if given is None and action_dim is None:
+        raise ValueError("no trajectory has actions: action_dim is needed")
+    width = given.shape[1] if action_dim is None else action_dim
     for index, (frames, steps) in enumerate(zip(observations, actions, strict=True)):
-        if frames.ndim != 2 or steps.ndim != 2 or len(frames) < 2 or len(steps) != len(frames) - 1:
+        if frames.ndim == 2 and steps is None:
+            actions[index] = steps = torch.full((max(len(frames) - 1, 0), width), torch.nan, dtype=dtype)
+        if frames.ndim != 2 or steps is None or steps.ndim != 2 or len(frames) < 2 or len(steps) != len(frames) - 1:
             raise ValueError(
                 f"trajectory {index}: wanted observations [T, obs] and actions [T - 1, act] with T >= 2,"
-                f" got {list(frames.shape)} and {list(steps.shape)}"
+                f" got {list(frames.shape)} and {None if steps is None else list(steps.shape)}"
             )
-        if frames.shape[1] != observations[0].shape[1] or steps.shape[1] != actions[0].shape[1]:
-            raise ValueError(f"trajectory {index} has other columns than trajectory 0")
+        if frames.shape[1] != observations[0].shape[1] or steps.shape[1] != width:
+            raise ValueError(
+                f"trajectory {index} has {frames.shape[1]} observation and {steps.shape[1]} action columns,"
+                f" wanted {observations[0].shape[1]} and {width}"
+            )
+        bad = steps.isinf().any(-1) | (steps.isnan().any(-1) & ~steps.isnan().all(-1))
+        if bad.any():
+            raise ValueError(
+                f"trajectory {index}: {int(bad.sum())} actions are infinite or NaN in some entries only, first at step"
+                f" {int(bad.nonzero()[0])}; an action without a label is NaN in all of them"
+            )
     lengths = [len(steps) for steps in actions]
     done = torch.zeros(sum(lengths), 1, dtype=torch.bool)
     done[torch.tensor(lengths).cumsum(0) - 1] = True
@@ -56,7 +84,7 @@ def flatten_trajectories(
         {
             keys.OBSERVATION: torch.cat([frames[:-1] for frames in observations]).to(dtype),
             keys.ACTION: torch.cat(actions).to(dtype),
-            keys.HAS_ACTION: torch.ones_like(done),
+            keys.HAS_ACTION: ~torch.cat([steps.isnan().all(-1, keepdim=True) for steps in actions]),
             keys.EPISODE: torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths)),
             keys.STEP_COUNT: torch.cat([torch.arange(length) for length in lengths]),
             "next": {
@@ -68,6 +96,38 @@ def flatten_trajectories(
         },
         [sum(lengths)],
     )
+
+
+def mark_labels(data: TensorDictBase, *, action_dim: int | None = None) -> TensorDictBase:
+    """Adds ``has_action [N, 1]``: where ``action`` is there, and not NaN throughout a row.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]``, with or without ``action [N, act]``; not changed.
+
+    Keyword Args:
+        action_dim (int, optional): size of an action, needed where ``action`` is missing: NaN actions are added.
+
+    Returns:
+        TensorDictBase: a shallow copy of ``data`` with both entries.
+
+    Raises:
+        ValueError: if there is no ``action`` and no ``action_dim``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import mark_labels
+        >>> mark_labels(TensorDict({"action": torch.tensor([[1.0], [torch.nan]])}, [2]))["has_action"].flatten()
+        tensor([ True, False])
+        >>> mark_labels(TensorDict(batch_size=[2]), action_dim=3)["action"].shape
+        torch.Size([2, 3])
+    """
+    data, action = data.copy(), data.get(keys.ACTION, None)
+    if action is None:
+        if action_dim is None:
+            raise ValueError("the data have no entry 'action', and thus no labels; action_dim is needed to go on")
+        action = torch.full((*data.batch_size, action_dim), torch.nan, device=data.device)
+    return data.set(keys.ACTION, action).set(keys.HAS_ACTION, ~action.isnan().all(-1, keepdim=True))
 
 
 def trajectory_lengths(data: TensorDictBase) -> torch.Tensor:
@@ -121,12 +181,18 @@ def select_state(
     return data.copy().set(keys.STATE, data.get(keys.OBSERVATION)[..., columns])
 
 
-def controller_view(data: TensorDictBase, columns: Sequence[int]) -> TensorDictBase:
+def controller_view(
+    data: TensorDictBase, columns: Sequence[int], *, action_targets: Sequence[int] = ()
+) -> TensorDictBase:
     """The same data as a controller with a mask sees them.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` with ``state``; not changed.
         columns (sequence of int): columns of the state to keep.
+
+    Keyword Args:
+        action_targets (sequence of int): for actions that are targets, the state column of each: what is left of an
+            action is the distance to it. Default: actions stay as they are.
 
     Examples:
         >>> import torch
@@ -135,4 +201,7 @@ def controller_view(data: TensorDictBase, columns: Sequence[int]) -> TensorDictB
         >>> controller_view(TensorDict({"state": torch.tensor([[1.0, 2.0, 3.0]])}, [1]), (0, 2))["state"]
         tensor([[1., 3.]])
     """
-    return data.copy().set(keys.STATE, data.get(keys.STATE)[..., list(columns)])
+    state, view = data.get(keys.STATE), data.copy()
+    if action_targets:
+        view.set(keys.ACTION, view.get(keys.ACTION) - state[..., list(action_targets)])
+    return view.set(keys.STATE, state[..., list(columns)])

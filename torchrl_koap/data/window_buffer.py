@@ -23,6 +23,7 @@ def make_window_buffer(
     replacement: bool = True,
     drop_last: bool = True,
     device: torch.device | str | None = None,
+    prefetch: int | None = None,
     **options: Any,
 ) -> ReplayBuffer:
     """A replay buffer of windows over flat data.
@@ -36,6 +37,9 @@ def make_window_buffer(
         replacement (bool): draw with replacement, or in epochs.
         drop_last (bool): see :class:`WindowSamplerWithoutReplacement`.
         device (optional): move the data there first. Default: where they are.
+        prefetch (int, optional): batches that threads draw ahead, with replacement only: they would draw beyond the end
+            of an epoch. The threads share torch's global generator with whatever else draws from it meanwhile, so that
+            a run is not repeated bit for bit. Default: none.
         **options: ``history``, ``labelled_share``, ``pad_before``, ``pad_after``, ``short``: see
             :class:`WindowSampler`.
 
@@ -45,7 +49,8 @@ def make_window_buffer(
 
     Raises:
         KeyError: if a selected entry does not exist.
-        ValueError: if an option is out of range, a trajectory is too short for a window, or labelled windows are asked
+        ValueError: if an option is out of range, prefetching is asked for in epochs, a trajectory is too short for a
+            window, or labelled windows are asked
             for and there are none.
 
     Examples:
@@ -63,6 +68,9 @@ def make_window_buffer(
         data = data.storage.get(slice(None))
     if data.batch_dims != 1:
         raise ValueError(f"windows are cut from flat data [N], got batch size {list(data.batch_size)}")
+    if prefetch is not None and (prefetch < 1 or not replacement):
+        wanted = "prefetch must be >= 1" if prefetch < 1 else "an epoch (replacement=False) cannot be prefetched"
+        raise ValueError(f"{wanted}, got prefetch={prefetch}")
     if device is not None:
         data = data.to(device)
     table_options = {name: options[name] for name in ("history", "pad_before", "pad_after", "short") if name in options}
@@ -85,6 +93,7 @@ def make_window_buffer(
         sample_unit=sampler.unit(),
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
+        prefetch=prefetch,
     )
 
 

@@ -49,7 +49,16 @@ class WindowUnit(SampleUnit):
     def expand(
         self, index: torch.Tensor, info: dict[str, Any], storage: Storage | None
     ) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Gives storage indices ``[B, T]`` for starts ``[B]``."""
+        """Storage indices ``[B, T]`` of windows that begin at ``[B]``.
+
+        Args:
+            index (Tensor): storage index of frame 0 of every window, int64 ``[B]``.
+            info (dict): what the sampler handed over; the bounds of the windows' trajectories are taken out of it.
+            storage (Storage, optional): not looked at.
+
+        Returns:
+            tuple: the indices, and ``info`` with ``padded`` (bool ``[B, T]``) where it held bounds.
+        """
         if self._frames.device != index.device:
             self._frames = self._frames.to(index.device)
         index = index.unsqueeze(-1) + self._frames
@@ -120,7 +129,16 @@ class WindowSampler(Sampler):
         return WindowUnit(self.window)
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Draws where ``batch_size`` windows start."""
+        """Draws where ``batch_size`` windows start.
+
+        Args:
+            storage (Storage): flat data ``[N]``.
+            batch_size (int): number ``B`` of windows.
+
+        Returns:
+            tuple: storage indices of frame 0, int64 ``[B]``, and a dict with the bounds of their trajectories where
+            frames are padded.
+        """
         self._prepare(storage)
         if self.labelled_share is None:
             drawn = self._draw(0, batch_size)
@@ -135,6 +153,10 @@ class WindowSampler(Sampler):
 
     def check(self, storage: Storage, batch_size: int) -> None:
         """Finds out, without drawing, whether batches of this size can be drawn.
+
+        Args:
+            storage (Storage): flat data ``[N]``.
+            batch_size (int): number of windows per batch.
 
         Raises:
             ValueError: if they cannot.
@@ -303,6 +325,10 @@ class WindowSamplerWithoutReplacement(WindowSampler):
     def check(self, storage: Storage, batch_size: int) -> None:
         """Finds out, without drawing, whether batches of this size can be drawn.
 
+        Args:
+            storage (Storage): flat data ``[N]``.
+            batch_size (int): number of windows per batch.
+
         Raises:
             ValueError: if they cannot.
         """
@@ -313,7 +339,18 @@ class WindowSamplerWithoutReplacement(WindowSampler):
             raise ValueError(f"a batch needs {self._needed} different windows, there are {available}")
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Draws where the next ``batch_size`` windows of the epoch start."""
+        """Draws where the next ``batch_size`` windows of the epoch start.
+
+        Args:
+            storage (Storage): flat data ``[N]``.
+            batch_size (int): number ``B`` of windows.
+
+        Returns:
+            tuple: as of :meth:`WindowSampler.sample`.
+
+        Raises:
+            ValueError: as :meth:`check`.
+        """
         self.check(storage, batch_size)
         return super().sample(storage, batch_size)
 

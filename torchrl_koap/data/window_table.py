@@ -32,6 +32,13 @@ class WindowTable:
         labelled (Tensor): bool ``[M]``, whether an inner frame, ``history - 1 .. window - 2``, has an action label and
             neither that frame nor the one after it is padded.
         num_steps (int): number of steps of the data set.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import WindowTable, flatten_trajectories
+        >>> table = WindowTable.build(flatten_trajectories([torch.rand(6, 2)] * 2, [torch.rand(5, 1)] * 2), 4)
+        >>> table.starts.tolist(), table.last.tolist(), table.num_steps
+        ([0, 1, 5, 6], [4, 4, 9, 9], 10)
     """
 
     starts: torch.Tensor
@@ -106,6 +113,13 @@ class WindowTable:
 
 def check_window(window: int, history: int, pad_before: int, pad_after: int, short: str) -> None:
     """Checks the options that describe a window.
+
+    Args:
+        window (int): frames per window.
+        history (int): frames up to and including "now", ``1 .. window - 1``.
+        pad_before (int): frames by which a window may begin before its trajectory, ``0 .. window - 1``.
+        pad_after (int): frames by which it may end after its trajectory, ``0 .. window - 1``.
+        short (str): ``"error"`` or ``"drop"``.
 
     Raises:
         ValueError: if one is out of range.

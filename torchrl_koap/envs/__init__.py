@@ -2,9 +2,10 @@
 """D3IL's manipulation tasks as native-batch TorchRL environments on MuJoCo; importing registers them with Gymnasium."""
 
 from torchrl_koap.envs.aligning import AligningEnv
-from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.gym import AvoidingGymEnv, ManipulationGymEnv, register
+from torchrl_koap.envs.registry import make_env, mode_index_of
 from torchrl_koap.envs.sorting import SortingEnv
 from torchrl_koap.envs.stacking import StackingEnv
 
@@ -16,7 +17,8 @@ __all__ = [
     "ManipulationGymEnv",
     "SortingEnv",
     "StackingEnv",
-    "mode_index",
+    "make_env",
+    "mode_index_of",
 ]
 
 register()

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Aligning: push a tray, from inside or outside its walls, into a target pose (spec section 6.2)."""
+"""Aligning: push a tray, from inside or outside its walls, into a target pose (docs/d3il.md, Aligning)."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco.scene import compile_scene, scene
 from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.aligning import BASE_HALF, DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 
 START_JOINTS = (
     -0.39275835987073354,
@@ -20,10 +21,7 @@ START_JOINTS = (
     2.160344058282072,
     0.144795218196799,
 )
-DISTANCE_TOLERANCE = 0.018  # m, between the centres, height included
-ROTATION_TOLERANCE = 0.048  # of half a turn
 INSIDE_REACH = 0.051  # m; the rod is inside the tray if nearer to its centre than this
-BASE_HALF = 0.05  # half width of the tray (m)
 # name, direction from the centre, colour
 WALLS = (
     ("wall_right", (1, 0), (0, 0, 1, 1)),

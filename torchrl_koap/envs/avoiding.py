@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Avoiding: steer a rod between six cylinders to the finish line, in any of 24 ways (spec section 6.1)."""
+"""Avoiding: steer a rod between six cylinders to the finish line, in any of 24 ways (docs/d3il.md, Avoiding)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.mujoco.scene import PANDA, compile_scene, scene
 from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROW_Y
 
 START_JOINTS = (
     -0.3564086847191448,
@@ -19,18 +20,7 @@ START_JOINTS = (
     2.4807179407013367,
     0.23250675884944516,
 )
-FINISH_Y = 0.35
-ROW_Y = (-0.1, 0.08, 0.26)
 ROW_REACH = 0.03
-# name, x, y, radius, half height
-OBSTACLES = (
-    ("row1", 0.5, ROW_Y[0], 0.03, 0.07),
-    ("row2_left", 0.425, ROW_Y[1], 0.025, 0.1),
-    ("row2_right", 0.575, ROW_Y[1], 0.025, 0.1),
-    ("row3_left", 0.35, ROW_Y[2], 0.025, 0.1),
-    ("row3_mid", 0.5, ROW_Y[2], 0.025, 0.1),
-    ("row3_right", 0.65, ROW_Y[2], 0.025, 0.1),
-)
 ACTION_BOUND = 0.012
 
 

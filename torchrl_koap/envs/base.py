@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The order of events in one control step, shared by all tasks (spec section 3.4): a native-batch TorchRL environment.
+"""Base environment of D3IL's tasks: the order of events in one control step (docs/d3il.md, Simulator).
 
 One control step of the original, kept as it is because a policy experiences it::
 
@@ -27,14 +27,11 @@ from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.mujoco.simulation import SimulationBatch
-from torchrl_koap.envs.snapshots import Snapshots
+from torchrl_koap.envs.raw_log import RawLog
 from torchrl_koap.tasks import Task
 
-# everything about the episodes in progress, a row per environment
-_EPISODE = ("_observation", "_commands", "_mode", "_success", "_collision", "_seen", "_steps", "_ready", "_contexts")
 
-
-class ManipulationEnv(Snapshots, EnvBase):
+class ManipulationEnv(RawLog, EnvBase):
     """Base of the D3IL tasks: a batch of simulations, outcome bookkeeping, partial resets and partial steps.
 
     A task implements four hooks; each receives ``rows``, the indices of the environments concerned:
@@ -71,6 +68,12 @@ class ManipulationEnv(Snapshots, EnvBase):
 
     Raises:
         ValueError: for sizes below 1, a non-floating dtype, or contexts of a wrong shape or out of range.
+
+    Examples:
+        >>> from torchrl_koap.envs import AvoidingEnv  # a task of this base
+        >>> env = AvoidingEnv(num_envs=2)
+        >>> env.task.name, env.reset()["success"].flatten().tolist()
+        ('avoiding', [False, False])
     """
 
     def __init__(
@@ -121,6 +124,9 @@ class ManipulationEnv(Snapshots, EnvBase):
         self._renderer = None
         self._make_specs(action_bound)
         self._set_seed(seed)
+
+    # everything about the episodes in progress, a row per environment
+    _EPISODE = tuple("_observation _commands _mode _success _collision _seen _steps _ready _contexts".split())
 
     def _make_specs(self, action_bound) -> None:
         shape, device = self.batch_size, self.device
@@ -279,6 +285,48 @@ class ManipulationEnv(Snapshots, EnvBase):
 
     def _tensor(self, array: np.ndarray, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.tensor(array, dtype=dtype, device=self.device)  # a copy: the arrays change with the next step
+
+    def get_state(self, index: int) -> dict:
+        """Full state of one environment: simulation, controller, command, mode, outcome and step count.
+
+        Args:
+            index (int): which environment.
+
+        Returns:
+            dict: arrays for :meth:`set_state`; also valid in another environment of the same task.
+        """
+        rows = {name: np.copy(getattr(self, name)[index]) for name in self._EPISODE}
+        return {"simulation": self.sims.get_state(index)} | rows
+
+    def set_state(self, index: int, state: dict) -> None:
+        """Restores what :meth:`get_state` returned; the episode then continues bit for bit.
+
+        Args:
+            index (int): which environment.
+            state (dict): from :meth:`get_state`, of any environment of the same task.
+        """
+        self.sims.set_state(index, state["simulation"])
+        for name, value in state.items():
+            if name != "simulation":
+                getattr(self, name)[index] = value
+
+    def set_physics(self, index: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
+        """Starts a fresh episode of one environment from a given physics state.
+
+        Args:
+            index (int): which environment; its context stays.
+            qpos (array): positions [nq] (m, rad).
+            qvel (array, optional): velocities [nv]; zero if not given.
+            qacc_warmstart (array, optional): warm start of the solver [nv].
+            ctrl (array, optional): motor commands of the substep before [nu].
+            time (float): clock (s).
+
+        Raises:
+            ValueError: if a size is wrong.
+        """
+        self.sims.set_physics(index, qpos, qvel, qacc_warmstart=qacc_warmstart, ctrl=ctrl, time=time)
+        self.sims.widths[index] = controller.FINGER_OPEN
+        self._begin_episode(np.array([index]))
 
     @property
     def commands(self) -> np.ndarray:

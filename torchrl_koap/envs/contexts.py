@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Contexts: where the objects of a task lie when an episode begins (spec section 6).
+"""Contexts: where the objects of a task lie when an episode begins.
 
 A context is ``[objects, 3]``: x, y (m) and yaw (rad) of every object of ``Task.objects``. They come from a seeded
 generator (:func:`draw_contexts`), from the fixed table on which methods are compared (:func:`evaluation_contexts`), or
@@ -16,26 +16,17 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_koap.data.d3il.unpickling import load_pickle
-from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks import StartRegions, Task, get_task
 
 TABLE = Path(__file__).with_name("evaluation_contexts.json")
 NUM_EVALUATION_CONTEXTS = 60
-_YAW = (-90.0, 90.0)  # deg
 _SLACK = 1e-6  # D3IL keeps contexts in float32
 
-# x range, y range (m) of every object; Sorting deals six regions out to its boxes at random
-_SORTING_REGIONS = tuple((x, y) for x in ((0.4, 0.5), (0.55, 0.65)) for y in ((-0.15, -0.1), (-0.05, 0.0), (0.05, 0.1)))
-_REGIONS = {
-    "aligning": (((0.4, 0.6), (-0.25, -0.1)), ((0.4, 0.6), (0.2, 0.35))),
-    "stacking": (((0.35, 0.45), (-0.25, -0.15)), ((0.35, 0.45), (-0.1, 0.0)), ((0.55, 0.6), (-0.2, 0.0))),
-}
 
-
-def _family(task: Task) -> str:
-    """Tasks of one family place their objects alike."""
-    if not task.objects:
+def _starts(task: Task) -> StartRegions:
+    if task.start_regions is None or not task.bodies:
         raise ValueError(f"task {task.name!r} has no contexts: every episode starts the same")
-    return task.name.removeprefix("po_").partition("_")[0]
+    return task.start_regions
 
 
 def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | int | None = None) -> np.ndarray:
@@ -58,17 +49,17 @@ def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | i
         (5, 4, 3)
     """
     task = get_task(task) if isinstance(task, str) else task
-    family = _family(task)
+    starts = _starts(task)
     if num < 1:
         raise ValueError(f"the number of contexts must be at least 1, got {num}")
     generator = np.random.default_rng(generator)
     contexts = np.empty((num, len(task.objects), 3))
     for context in contexts:
-        regions = _REGIONS.get(family)
-        if regions is None:
-            regions = [_SORTING_REGIONS[index] for index in generator.permutation(len(_SORTING_REGIONS))]
+        regions = starts.regions
+        if starts.dealt:
+            regions = [regions[index] for index in generator.permutation(len(regions))]
         for row, (x, y) in zip(context, regions, strict=False):
-            row[:] = generator.uniform(*x), generator.uniform(*y), math.radians(generator.uniform(*_YAW))
+            row[:] = generator.uniform(*x), generator.uniform(*y), math.radians(generator.uniform(*starts.yaw))
     return contexts
 
 
@@ -80,7 +71,8 @@ def _table() -> dict:
 def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) -> np.ndarray:
     """The first contexts of the fixed table on which two methods meet the same situations.
 
-    The table (``evaluation_contexts.json``, with a version number) never changes; a new one gets a new number.
+    The table (``evaluation_contexts.json``, with a version number) never changes; a new one gets a new number. Contexts
+    of a task that is not in it are drawn with a seed that its name alone decides.
 
     Args:
         task (Task or str): the task.
@@ -98,8 +90,11 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
         (60, 2, 3)
     """
     task = get_task(task) if isinstance(task, str) else task
-    _family(task)
-    rows = _table()["contexts"][task.source]
+    _starts(task)
+    rows = _table()["contexts"].get(task.source)
+    if rows is None:  # not D3IL's: the same ones every time
+        seed = [*task.source.encode()]
+        rows = draw_contexts(task, NUM_EVALUATION_CONTEXTS, np.random.default_rng(seed)).tolist()
     if not 1 <= num <= len(rows):
         raise ValueError(f"the table holds {len(rows)} contexts of task {task.name!r}, asked for {num}")
     return np.array(rows[:num])
@@ -108,11 +103,18 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
 def check_contexts(task: Task, contexts) -> np.ndarray:
     """Contexts as an array, or an error that names what is wrong with them.
 
+    Args:
+        task (Task): tells the objects and where each may start.
+        contexts (array): ``[C, objects, 3]``: x, y (m) and yaw (rad).
+
+    Returns:
+        np.ndarray: the contexts, float64.
+
     Raises:
         ValueError: if the task has none, the shape is not ``[C, objects, 3]``, or an object lies where the task never
             puts it.
     """
-    family, contexts = _family(task), np.asarray(contexts, dtype=np.float64)
+    starts, contexts = _starts(task), np.asarray(contexts, dtype=np.float64)
     if contexts.ndim != 3 or contexts.shape[1:] != (len(task.objects), 3) or not len(contexts):
         raise ValueError(
             f"contexts of task {task.name!r} must be [C, {len(task.objects)}, 3] (x, y in m, yaw in rad for"
@@ -121,7 +123,7 @@ def check_contexts(task: Task, contexts) -> np.ndarray:
     if not np.isfinite(contexts).all():
         raise ValueError(f"contexts must be finite; row {int(np.argwhere(~np.isfinite(contexts))[0][0])} is not")
     for index, name in enumerate(task.objects):
-        regions = _REGIONS[family][index : index + 1] if family in _REGIONS else _SORTING_REGIONS
+        regions = starts.of(index)
         low, high = (np.array([[bound[side] for bound in region] for region in regions]) for side in (0, 1))
         xy = contexts[:, None, index, :2]
         inside = ((xy >= low - _SLACK) & (xy <= high + _SLACK)).all(-1).any(-1)
@@ -148,7 +150,7 @@ def load_contexts(file: str | Path, task: Task | str) -> np.ndarray:
         ValueError: if the file does not hold contexts of this task.
     """
     task = get_task(task) if isinstance(task, str) else task
-    _family(task)
+    _starts(task)
     contexts = load_pickle(Path(file))
     if not isinstance(contexts, (list, tuple)) or not contexts:
         raise ValueError(f"{file}: wanted a list of contexts, got {type(contexts).__name__}")
@@ -182,6 +184,14 @@ def yaw_quaternions(yaw: np.ndarray) -> np.ndarray:
 
 
 def poses_of(contexts: np.ndarray, height: float) -> np.ndarray:
-    """Poses ``[..., objects, 7]`` of objects that contexts ``[..., objects, 3]`` place at a height (m)."""
+    """Poses of the objects that contexts place on a level.
+
+    Args:
+        contexts (np.ndarray): x, y (m) and yaw (rad), ``[..., objects, 3]``.
+        height (float): z of all objects (m).
+
+    Returns:
+        np.ndarray: positions (m) and quaternions (w, x, y, z), ``[..., objects, 7]``.
+    """
     level = np.full((*contexts.shape[:-1], 1), height)
     return np.concatenate([contexts[..., :2], level, yaw_quaternions(contexts[..., 2])], -1)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The tasks as single Gymnasium environments, registered under ``torchrl_koap/<Task>-v0``."""
+"""The tasks as single Gymnasium environments, registered under ``Task.gym_id``."""
 
 from __future__ import annotations
 
@@ -12,18 +12,9 @@ from tensordict import TensorDict
 
 from torchrl_koap import keys
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.registry import ENVIRONMENTS, MODE_INDEX
-from torchrl_koap.tasks import get_task
-
-# id of Gymnasium to name of the task
-IDS = {
-    "torchrl_koap/Avoiding-v0": "avoiding",
-    "torchrl_koap/Aligning-v0": "aligning",
-    "torchrl_koap/Sorting2-v0": "sorting_2",
-    "torchrl_koap/Sorting4-v0": "sorting",
-    "torchrl_koap/Sorting6-v0": "sorting_6",
-    "torchrl_koap/Stacking-v0": "stacking",
-}
+from torchrl_koap.envs.registry import make_env, mode_index_of
+from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks.registry import observe_tasks
 
 
 class ManipulationGymEnv(gymnasium.Env):
@@ -81,8 +72,8 @@ class ManipulationGymEnv(gymnasium.Env):
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(facts.control_hz)}
         self.task = facts
-        self.batched = ENVIRONMENTS[task](1, max_steps=facts.max_steps if max_steps is None else max_steps)
-        self._mode_index = MODE_INDEX[task]
+        self.batched = make_env(facts, 1, max_steps=facts.max_steps if max_steps is None else max_steps)
+        self._mode_index = mode_index_of(facts)
         self._picture = {"width": width, "height": height, "camera": camera}
         self._context = None
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (facts.observation_dim,), np.float32)
@@ -155,7 +146,14 @@ class AvoidingGymEnv(ManipulationGymEnv):
 
 
 def register() -> None:
-    """Makes ``gymnasium.make("torchrl_koap/Avoiding-v0")`` work; importing ``torchrl_koap.envs`` calls it."""
-    for name, task in IDS.items():
-        if name not in gymnasium.registry:
-            gymnasium.register(name, entry_point="torchrl_koap.envs.gym:ManipulationGymEnv", kwargs={"task": task})
+    """Registers every task with a ``gym_id`` with Gymnasium, later ones too; importing ``torchrl_koap.envs`` calls it.
+
+    ``gymnasium.make("torchrl_koap.envs:torchrl_koap/Avoiding-v0")`` imports it first.
+    """
+    observe_tasks(_register)
+
+
+def _register(task: Task) -> None:
+    if task.gym_id and task.gym_id not in gymnasium.registry:
+        entry_point = f"{ManipulationGymEnv.__module__}:{ManipulationGymEnv.__name__}"
+        gymnasium.register(task.gym_id, entry_point=entry_point, kwargs={"task": task.name})

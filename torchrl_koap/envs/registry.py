@@ -1,36 +1,107 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which environment and which numbering of modes belong to a task name. Another task is a line in each table."""
+"""The environment of a task, as ``Task.env`` names it.
+
+What an environment has to offer, D3IL's (:class:`~torchrl_koap.envs.ManipulationEnv`) or one's own::
+
+    EnvBase          batch-locked, batch size [num_envs]; __init__(num_envs, num_threads=, max_steps=, dtype=, ...)
+    max_steps        control steps after which an episode is truncated
+    reset            reset(contexts=[n, bodies, 3]) starts the episodes there, where the task has bodies; x, y (m), yaw
+                     (rad). Without it the environment draws them. One call resets all environments
+    set_seed         of the contexts that it draws
+    observation      [n, obs]; success [n, 1] bool, latched until the reset; mode [n, ...], what Task.modes.index reads
+    collision        [n, 1] bool, where Task.collides
+    context          [n, bodies, 3], where the task has bodies
+    reward, done, terminated, truncated
+
+Not needed, but used where it is there: ``raw_log()`` and ``raw_objects()`` for recordings in D3IL's own format,
+``render(index, width, height, camera)``, ``sims`` for films.
+"""
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
+from typing import Any
 
-from torchrl_koap.envs import aligning, avoiding, sorting, stacking
+import torch
+from torchrl.envs import EnvBase, TransformedEnv
 
-ENVIRONMENTS = {
-    "avoiding": avoiding.AvoidingEnv,
-    "aligning": aligning.AligningEnv,
-    "sorting": partial(sorting.SortingEnv, num_boxes=4),
-    "sorting_2": partial(sorting.SortingEnv, num_boxes=2),
-    "sorting_6": partial(sorting.SortingEnv, num_boxes=6),
-    "po_sorting": partial(sorting.SortingEnv, num_boxes=4),
-    "stacking": partial(stacking.StackingEnv, num_boxes=3),
-    "stacking_1": partial(stacking.StackingEnv, num_boxes=1),
-}
+from torchrl_koap.envs.transforms import EndEffectorNoise
+from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks.import_strings import resolve
 
 
-def _first_box(mode):
-    """Mode of a task that is over with the first box: that box."""
-    return mode[..., 0].long()
+def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
+    """The task's environment.
+
+    Args:
+        task (Task or str): the task.
+        num_envs (int): number of parallel episodes.
+        **options: further arguments of the environment, such as ``num_threads``, ``max_steps`` and ``dtype``. They
+            join, and go before, ``Task.env_options``.
+
+    Raises:
+        ValueError: if the task is unknown, or has no environment.
+
+    Examples:
+        >>> from torchrl_koap.envs.registry import make_env
+        >>> make_env("sorting_2", 3).batch_size
+        torch.Size([3])
+    """
+    task = get_task(task) if isinstance(task, str) else task
+    if task.env is None:
+        raise ValueError(
+            f"task {task.name!r} has no environment (Task.env is None): it can be trained on data, but not rolled out,"
+            " recorded or drawn by a simulator. `koap eval --env ID` takes an environment of Gymnasium"
+        )
+    return resolve(task.env, f"env of task {task.name!r}")(num_envs, **(task.env_options | options))
 
 
-MODE_INDEX = {
-    "avoiding": avoiding.mode_index,
-    "aligning": aligning.mode_index,
-    "sorting": sorting.mode_index,
-    "sorting_2": sorting.mode_index,
-    "sorting_6": sorting.mode_index,
-    "po_sorting": sorting.mode_index,
-    "stacking": stacking.mode_index,
-    "stacking_1": _first_box,
-}
+def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
+    """A function that makes an environment of the task with a given number of parallel episodes, as policies meet it.
+
+    Args:
+        task (Task): the task; with ``Task.noise`` the measured end effector is disturbed.
+
+    Keyword Args:
+        num_threads (int): threads that advance the physics.
+
+    Raises:
+        ValueError: if the task has no environment.
+    """
+    if task.env is None:
+        make_env(task)  # tells so now rather than at the first rollout
+
+    def make(num_envs: int) -> EnvBase:
+        env = make_env(task, num_envs, num_threads=num_threads, max_steps=task.max_steps)
+        return TransformedEnv(env, EndEffectorNoise(task, task.noise)) if task.noise else env
+
+    return make
+
+
+def mode_index_of(task: Task | str) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The function that turns a task's leaf ``mode`` into a number.
+
+    Args:
+        task (Task or str): the task.
+
+    Returns:
+        callable: leaf ``mode`` ``[*B, ...]`` to the number of the mode ``[*B]``, int64, -1 while it is not decided; 0
+        for a task without modes.
+
+    Raises:
+        ValueError: if the task is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.envs import mode_index_of
+        >>> mode_index_of("sorting_2")(torch.tensor([[1, 0], [-1, -1]]))
+        tensor([ 1, -1])
+    """
+    task = get_task(task) if isinstance(task, str) else task
+    if task.modes.index is None:
+        return _only_mode
+    return resolve(task.modes.index, f"modes.index of task {task.name!r}")
+
+
+def _only_mode(mode: torch.Tensor) -> torch.Tensor:
+    return torch.zeros(mode.shape[:-1], dtype=torch.int64, device=mode.device)

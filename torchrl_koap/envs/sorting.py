@@ -1,10 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Sorting: push red and blue cubes over the far edge of a platform into bins of their colour (spec section 6.3)."""
+"""Sorting: push cubes over the far edge of a platform into bins of their colour (docs/d3il.md, Sorting)."""
 
 from __future__ import annotations
-
-import functools
-import itertools
 
 import numpy as np
 import torch
@@ -12,8 +9,18 @@ import torch
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco.scene import compile_scene, scene
-from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.rotations import tan_yaw
+from torchrl_koap.tasks.features import tan_yaw
+from torchrl_koap.tasks.sorting import (
+    BIN_HALF,
+    BIN_RANGE,
+    BIN_WALLS,
+    BIN_X,
+    BIN_Y,
+    BOX_HALF,
+    PLATFORM_X,
+    arrival_orders,
+    sorting_task,
+)
 
 START_JOINTS = (
     -0.32682662579052857,
@@ -24,14 +31,8 @@ START_JOINTS = (
     2.1955061347936957,
     0.22457584505012435,
 )
-TASK_NAMES = {2: "sorting_2", 4: "sorting", 6: "sorting_6"}  # by the number of boxes
 RED, BLUE = 0, 1
-BIN_X = (0.4, 0.625)  # centre of the red and of the blue bin (m)
-BIN_Y = 0.32
-BIN_HALF = 0.1  # a bin reaches this far to both sides
-BIN_RANGE = (0.22, 0.41)  # y between which a box counts as inside (m)
-BOX_HALF = 0.03  # half width of a box (m)
-PLATFORM_X, PLATFORM_Y, PLATFORM_TOP = (0.2, 0.8), (-0.4, 0.2), 0.1  # (m)
+PLATFORM_TOP = 0.1  # (m)
 START_HEIGHT = 0.05  # m; inside the platform, as in the original: the first steps push the boxes up
 ACTION_BOUND = 0.012
 _COLOURS = {RED: (1, 0, 0, 1), BLUE: (0, 0, 1, 1)}
@@ -48,19 +49,8 @@ def box_colours(num_boxes: int) -> np.ndarray:
         >>> box_colours(4)
         array([0, 0, 1, 1])
     """
-    _check_num_boxes(num_boxes)
+    sorting_task(num_boxes)  # refuses other numbers
     return np.repeat((RED, BLUE), num_boxes // 2)
-
-
-def _check_num_boxes(num_boxes: int) -> None:
-    if num_boxes not in TASK_NAMES:
-        raise ValueError(f"num_boxes must be one of {', '.join(map(str, TASK_NAMES))}, got {num_boxes!r}")
-
-
-@functools.cache
-def _sequences(num_boxes: int) -> tuple[tuple[int, ...], ...]:
-    """Every order in which the colours can arrive, in lexicographic order."""
-    return tuple(sorted(set(itertools.permutations(box_colours(num_boxes).tolist()))))
 
 
 def mode_colours(mode: int, num_boxes: int = 4) -> tuple[int, ...]:
@@ -81,7 +71,7 @@ def mode_colours(mode: int, num_boxes: int = 4) -> tuple[int, ...]:
         >>> mode_colours(0), mode_colours(1)
         ((0, 0, 1, 1), (0, 1, 0, 1))
     """
-    sequences = _sequences(num_boxes)
+    sequences = arrival_orders(len(box_colours(num_boxes)))
     if not 0 <= mode < len(sequences):
         raise ValueError(f"mode must be 0 to {len(sequences) - 1} with {num_boxes} boxes, got {mode}")
     return sequences[mode]
@@ -105,7 +95,7 @@ def mode_index(mode: torch.Tensor) -> torch.Tensor:
         >>> mode_index(torch.tensor([[0, 1, 0, 1], [1, 1, 0, 0], [0, 1, -1, -1]]))
         tensor([ 1,  5, -1])
     """
-    sequences = torch.tensor(_sequences(mode.shape[-1]), device=mode.device)
+    sequences = torch.tensor(arrival_orders(len(box_colours(mode.shape[-1]))), device=mode.device)
     same = (mode.unsqueeze(-2) == sequences).all(-1)
     return torch.where(same.any(-1), same.to(torch.int64).argmax(-1), -1)
 
@@ -161,6 +151,8 @@ class SortingEnv(ManipulationEnv):
         torch.Size([2, 3, 16])
     """
 
+    _EPISODE = (*ManipulationEnv._EPISODE, "_noted")
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -174,9 +166,8 @@ class SortingEnv(ManipulationEnv):
         contexts=None,
         arm_alpha: float = 0.3,
     ):
-        _check_num_boxes(num_boxes)
         super().__init__(
-            get_task(TASK_NAMES[num_boxes]),
+            sorting_task(num_boxes),
             compile_scene(sorting_scene(num_boxes=num_boxes, arm_alpha=arm_alpha)),
             start_joints=START_JOINTS,
             num_mode_flags=num_boxes,
@@ -239,10 +230,6 @@ class SortingEnv(ManipulationEnv):
                 noted[count] = nearest
                 self._mode[rows[index], count] = self._colours[nearest]
 
-    def get_state(self, index: int) -> dict:
-        """Full state of one environment, the boxes noted so far included."""
-        return super().get_state(index) | {"_noted": self._noted[index].copy()}
-
 
 def sorting_scene(*, num_boxes: int = 4, arm_alpha: float = 0.3):
     """Scene of Sorting: table, arm with rod, platform, two bins, boxes.
@@ -260,7 +247,7 @@ def sorting_scene(*, num_boxes: int = 4, arm_alpha: float = 0.3):
     colours = box_colours(num_boxes)
 
     def add_boxes(root) -> None:
-        for name, colour in zip(get_task(TASK_NAMES[num_boxes]).objects, colours.tolist(), strict=True):
+        for name, colour in zip(sorting_task(num_boxes).objects, colours.tolist(), strict=True):
             box = root.worldbody.add("body", name=name)
             box.add("freejoint", name=name)
             box.add("geom", name=name, type="box", size=(BOX_HALF,) * 3, mass=0.05, rgba=_COLOURS[colour])
@@ -271,14 +258,8 @@ def sorting_scene(*, num_boxes: int = 4, arm_alpha: float = 0.3):
     size, friction = (0.3, 0.3, PLATFORM_TOP), (0.3, 0.001, 0.0001)
     platform.add("geom", type="box", size=size, friction=friction, priority=1, rgba=(0.5, 0.5, 0.5, 0.5))
     for colour, name in ((RED, "red"), (BLUE, "blue")):
-        walls = (  # far, left, right, near
-            ((0, 0.41 - BIN_Y), (BIN_HALF, 0.01)),
-            ((-BIN_HALF, 0), (0.005, BIN_HALF)),
-            ((BIN_HALF, 0), (0.005, BIN_HALF)),
-            ((0, 0.22 - BIN_Y), (BIN_HALF, 0.005)),
-        )
         bin_ = root.worldbody.add("body", name=f"{name}_bin", pos=(BIN_X[colour], BIN_Y, 0))
-        for place, size in walls:
-            wall = {"pos": (*place, 0), "size": (*size, 0.1), "rgba": (*_COLOURS[colour][:3], 0.5)}
+        for across, along, width, depth in BIN_WALLS:  # far, left, right, near
+            wall = {"pos": (across, along, 0), "size": (width, depth, 0.1), "rgba": (*_COLOURS[colour][:3], 0.5)}
             bin_.add("geom", type="box", **wall)
     return root

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Stacking: pile three boxes on a target zone with the gripper, in any order (spec section 6.4)."""
+"""Stacking: pile three boxes on a target zone with the gripper, in any order (docs/d3il.md, Stacking)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.scene import compile_scene, scene
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.rotations import tan_yaw
+from torchrl_koap.tasks.features import tan_yaw
+from torchrl_koap.tasks.stacking import BOXES, HEIGHT_GAP, TARGET, TARGET_HALF, ZONE_RADIUS
 
 START_JOINTS = (
     -1.1708457375867388e-08,
@@ -22,16 +23,8 @@ START_JOINTS = (
     2.1499041610538185,
     0.78539816721171052,
 )
-TARGET = (0.5, 0.2)  # centre of the target zone (m)
-ZONE_RADIUS = 0.06  # m; a box nearer to the centre than this (horizontally) is in the zone
-HEIGHT_GAP = 0.03  # m; boxes lie on top of each other if all their heights differ by more
 OPEN_ABOVE = 0.075  # a greater gripper number opens the fingers, any other closes them
-# name, half sizes (m), colour
-BOXES = (
-    ("red", (0.03, 0.03, 0.03), (1, 0, 0, 1)),
-    ("green", (0.03, 0.03, 0.03), (0, 1, 0, 1)),
-    ("blue", (0.03, 0.05, 0.03), (0, 0, 1, 1)),
-)
+COLOURS = {"red": (1, 0, 0, 1), "green": (0, 1, 0, 1), "blue": (0, 0, 1, 1)}
 JOINT_BOUND = 0.03  # rad per control step
 GRIPPER_BOUND = 0.08  # m
 
@@ -64,6 +57,18 @@ def mode_index(mode: torch.Tensor, num_boxes: int = 3) -> torch.Tensor:
     first, second = mode[..., 0], mode[..., 1]
     index = first if num_boxes == 1 else 2 * first + (second > 3 - first - second)
     return index.masked_fill((mode[..., :num_boxes] < 0).any(-1), -1)
+
+
+def first_box(mode: torch.Tensor) -> torch.Tensor:
+    """Mode of Stacking-1, which is over with the first box: that box.
+
+    Args:
+        mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 [*B, 3].
+
+    Returns:
+        torch.Tensor: int64 [*B]: 0 red, 1 green, 2 blue, -1 none yet.
+    """
+    return mode[..., 0].long()
 
 
 def _check_num_boxes(num_boxes: int) -> None:
@@ -200,8 +205,9 @@ class StackingEnv(ManipulationEnv):
         place = (self._mode[rows] >= 0).sum(1)
         self._mode[rows[arrived], place[arrived]] = nearest[arrived]
 
-    def _logged_command(self) -> dict[str, np.ndarray]:
-        return {}  # joints are commanded; the log holds them already
+    def logged_command(self) -> dict[str, np.ndarray]:
+        """Nothing: joints are commanded."""
+        return {}  # the log holds them already
 
 
 def stacking_scene(*, arm_alpha: float = 1.0):
@@ -217,10 +223,9 @@ def stacking_scene(*, arm_alpha: float = 1.0):
 
 
 def _add_boxes_and_target(root) -> None:
-    for name, size, colour in BOXES:
+    for name, size in BOXES:
         box = root.worldbody.add("body", name=name)
         box.add("freejoint", name=name)
-        box.add("geom", name=name, type="box", size=size, mass=0.05, rgba=colour)
-    root.worldbody.add(
-        "site", name="target", type="box", pos=(*TARGET, 0), size=(0.05, 0.05, 0.04), rgba=(1, 0.5, 0, 0.3)
-    )
+        box.add("geom", name=name, type="box", size=size, mass=0.05, rgba=COLOURS[name])
+    size = (TARGET_HALF, TARGET_HALF, 0.04)
+    root.worldbody.add("site", name="target", type="box", pos=(*TARGET, 0), size=size, rgba=(1, 0.5, 0, 0.3))

@@ -16,14 +16,14 @@ from torchrl_koap.tasks import Task, get_task
 
 
 class PartialObservation(ObservationTransform):
-    """Drops parts of the observation: by default yaws, quaternions and the commanded position.
+    """Drops parts of the observation: by default what ``Task.state_of`` leaves out, the command and the hidden parts.
 
-    On Sorting with four boxes 10 of 16 columns remain, as in KOAP's partially observable variant (spec section 7).
+    Of PO-Sorting 10 of 16 columns remain, as in KOAP's partially observable variant.
 
     Args:
         task (Task or str): the task whose parts are named.
-        drop (sequence of str, optional): parts to drop, names of ``Task.observation``. Default: the command and every
-            part that tells an orientation.
+        drop (sequence of str, optional): parts to drop, names of ``Task.observation``. Default: the command and
+            ``Task.hidden``.
         in_key (NestedKey): observations ``[*B, obs]``, replaced. Defaults to ``"observation"``.
 
     Raises:
@@ -34,7 +34,7 @@ class PartialObservation(ObservationTransform):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.envs.transforms import PartialObservation
-        >>> hide = PartialObservation("sorting")
+        >>> hide = PartialObservation("po_sorting")
         >>> hide(TensorDict({"observation": torch.zeros(3, 16)}, [3]))["observation"].shape
         torch.Size([3, 10])
     """
@@ -42,7 +42,7 @@ class PartialObservation(ObservationTransform):
     def __init__(self, task: Task | str, drop: Sequence[str] | None = None, *, in_key: NestedKey = OBSERVATION):
         task = get_task(task) if isinstance(task, str) else task
         if drop is None:
-            drop = [name for name in task.observation if name.endswith(("_yaw", "quaternion"))] + [task.command]
+            drop = [name for name in (task.command, *task.hidden) if name is not None]
         unknown = [name for name in drop if name not in task.observation]
         if unknown:
             raise ValueError(f"task {task.name!r} has no part {unknown[0]!r}; known: {', '.join(task.observation)}")

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-r"""Which demonstrations to label next, from the latent actions alone.
+r"""Active labelling: which demonstrations to label next, chosen from the latent actions alone.
 
 A linear decoder under a ridge penalty knows how uncertain it is without knowing a single action: its covariance
 :math:`C = (\sum u u^T + \lambda)^{-1}`, over the labelled steps, holds no label, so neither do choices made with it.
@@ -10,11 +10,21 @@ known before it is labelled.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchrl_koap.data import controller_view
+from torchrl_koap.evaluation.latent_space import infer_steps
+from torchrl_koap.evaluation.run import load_run
+from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import KoopmanInverseDynamics
+from torchrl_koap.training.builders import set_up_torch
+from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.training.plugins import Plugins, load_plugins
 
 _MEAN_SPREAD = 30.0  # prior deviation of a fitted mean against that of what the latent actions explain: nearly free
 
@@ -26,18 +36,23 @@ class Suggestion:
     Args:
         episode (int): its number.
         score (float, optional): what the criterion gives it when its turn comes, in units of the noise variance.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.active_labelling import Suggestion
+        >>> Suggestion(episode=57, score=0.31).episode
+        57
     """
 
     episode: int
     score: float | None
 
 
-def _variance(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
+def _uncertainty(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
     """Mean leverage of the steps of a demonstration."""
     return ((latent @ covariance) * latent).sum(-1).mean().item()
 
 
-def _gain(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
+def _a_optimal(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
     """By how much the mean leverage over all steps falls if these steps are labelled."""
     part = _explained_part(latent, covariance)
     return ((part @ moment) * part).sum().item()
@@ -50,7 +65,7 @@ def _explained_part(latent: Tensor, covariance: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(torch.linalg.cholesky(inner), projected, upper=False)
 
 
-CRITERIA = {"gain": _gain, "variance": _variance, "random": None}
+CRITERIA = {"a_optimal": _a_optimal, "uncertainty": _uncertainty, "random": None}
 
 
 @torch.no_grad()
@@ -60,16 +75,17 @@ def rank_trajectories(
     labelled: Tensor,
     *,
     penalty: float,
-    criterion: str = "gain",
+    criterion: str = "a_optimal",
     count: int = 5,
     bias: bool = False,
     seed: int = 0,
 ) -> list[Suggestion]:
     r"""Chooses trajectories to label, one after the other, each as if those before it were labelled already.
 
-    * ``"gain"``: the one whose labels lower the mean predictive variance over *all* steps the most (I-optimal design,
-      greedy). It prefers long demonstrations that resemble many others.
-    * ``"variance"``: the one along which the decoder is least certain on average. It prefers outliers.
+    * ``"a_optimal"``: the one whose labels lower the mean predictive variance over *all* steps the most (Bayesian
+      A-optimal design, weighted by the second moment of the latent actions, greedy). It prefers long demonstrations
+      that resemble many others.
+    * ``"uncertainty"``: the one along which the decoder is least certain on average. It prefers outliers.
     * ``"random"``: any.
 
     The covariance is that of the plain ridge, also where the decoder is shrunk towards a prior of its own: what it is
@@ -84,7 +100,7 @@ def rank_trajectories(
     Keyword Args:
         penalty (float): the ridge, in units of the mean square norm of the labelled latent actions (of all, where none
             is labelled), as in :class:`~torchrl_koap.modules.koopman.action_decoder.RidgeFit`.
-        criterion (str): ``"gain"``, ``"variance"`` or ``"random"``.
+        criterion (str): ``"a_optimal"``, ``"uncertainty"`` or ``"random"``.
         count (int): trajectories to choose.
         bias (bool): the decoder has a fitted mean.
         seed (int): seed of ``"random"``.
@@ -152,3 +168,124 @@ def _rows(latent: Tensor, labelled: Tensor, penalty: float, bias: bool) -> tuple
     if bias:
         latent = torch.cat([latent, (_MEAN_SPREAD * unit.sqrt()).expand(len(latent), 1)], -1)
     return latent, penalty * unit
+
+
+@dataclass
+class SuggestConfig:
+    """Which unlabelled demonstrations of a trained run to label next; no label outside the budget is read.
+
+    Attributes:
+        count: demonstrations to suggest.
+        criterion: "a_optimal" (lowers the decoder's mean uncertainty the most), "uncertainty" (the decoder is least
+            certain about it) or "random".
+        seed: seed of "random".
+        threads: torch threads.
+        plugins: modules that register tasks or methods, besides those that the run was trained with.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.active_labelling import SuggestConfig, suggest
+        >>> suggest("runs/koap", SuggestConfig(count=3))  # doctest: +SKIP
+    """
+
+    count: int = 5
+    criterion: str = "a_optimal"
+    seed: int = 0
+    threads: int = 1
+    plugins: Plugins = ()
+
+
+@dataclass(frozen=True)
+class SuggestedLabels:
+    """What ``suggestions.json`` holds; printed as a table.
+
+    Args:
+        criterion (str): how they were chosen.
+        penalty (float): ridge of the run's decoder.
+        labelled_steps (int): labels of the run that the choice builds on.
+        labelled_episodes (list of int): trajectories with a label in the run.
+        suggestions (list of dict): ``rank``, ``episode``, ``steps`` to label and ``score``, best first.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.active_labelling import SuggestedLabels
+        >>> row = {"rank": 1, "episode": 57, "steps": 120, "score": 0.31}
+        >>> print(str(SuggestedLabels("a_optimal", 0.1, 80, [3], [row])).splitlines()[-1])
+        with these labelled: koap train --label-episodes 3 57 ...
+    """
+
+    criterion: str
+    penalty: float
+    labelled_steps: int
+    labelled_episodes: list[int]
+    suggestions: list[dict[str, Any]]
+
+    def __str__(self) -> str:
+        lines = [f"{'rank':>4}  {'episode':>7}  {'steps':>5}  {self.criterion:>10}"]
+        for row in self.suggestions:
+            score = "-" if row["score"] is None else f"{row['score']:.4g}"
+            lines.append(f"{row['rank']:>4}  {row['episode']:>7}  {row['steps']:>5}  {score:>10}")
+        every = [*self.labelled_episodes, *(row["episode"] for row in self.suggestions)]
+        lines.append(f"with these labelled: koap train --label-episodes {' '.join(map(str, every))} ...")
+        return "\n".join(lines)
+
+
+def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLabels:
+    """Ranks the unlabelled demonstrations of a run.
+
+    Args:
+        run (str or Path): a run directory.
+        config (SuggestConfig, optional): how many, and by which criterion.
+
+    Raises:
+        ValueError: for an unknown criterion, a count out of range, a run without latent actions or whose decoder was
+            not fitted in closed form, or demonstrations that are not those of the training any more.
+        RunDirectoryError: if the folder is no finished run.
+    """
+    config = SuggestConfig() if config is None else config
+    lookup(CRITERIA, config.criterion, "criterion")
+    set_up_torch(config.threads, "cpu")
+    load_plugins(config.plugins)
+    trained = load_run(run)
+    directory, task, controller = trained.directory, trained.task, trained.controller
+    if not isinstance(controller, KoopmanInverseDynamics):
+        method = directory.read_entry("config.json", "method")
+        raise ValueError(
+            f"{directory.path} was trained with method {method!r}: suggestions need latent actions, method 'koap'"
+        )
+    penalty = directory.read_entry("summary.json", "decoder_fit").get("penalty")
+    if penalty is None:
+        raise ValueError(
+            f"the decoder of {directory.path} was not fitted in closed form and knows no uncertainty:"
+            " train with `--decoder ridge`"
+        )
+    dataset, episodes = (directory.read_entry("config.json", name) for name in ("dataset", "episodes"))
+    if dataset != "scripted" and not Path(dataset).is_dir():
+        raise ValueError(f"the demonstrations {dataset!r} that {directory.path} was trained on are not there any more")
+    data = load_demonstrations(dataset, task, episodes=episodes)
+    # from here on everything outside the budget is NaN
+    data, report = trained.budget.apply(data, command=task.command_columns)
+    recorded = directory.read_entry("summary.json", "labels")  # runs of older versions name fewer facts
+    if {name: report.as_dict().get(name) for name in recorded} != recorded:
+        raise ValueError(f"the demonstrations of {dataset!r} are not those that {directory.path} was trained on")
+    steps = infer_steps(controller, controller_view(data, trained.columns, action_targets=task.action_targets))
+    choices = rank_trajectories(
+        steps["latent_action"],
+        steps[EPISODE],
+        steps[HAS_ACTION],
+        penalty=penalty,
+        criterion=config.criterion,
+        count=config.count,
+        bias=bool(controller.action_decoder.mean_leverage),
+        seed=config.seed,
+    )
+    unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]
+    rows = [
+        {
+            "rank": rank,
+            "episode": choice.episode,
+            "steps": int((unlabelled == choice.episode).sum()),
+            "score": choice.score,
+        }
+        for rank, choice in enumerate(choices, 1)
+    ]
+    labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
+    return SuggestedLabels(config.criterion, penalty, report.labelled_transitions, labelled, rows)

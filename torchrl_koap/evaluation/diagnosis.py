@@ -22,9 +22,8 @@ from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.keys import OBSERVATION
 from torchrl_koap.modules import StatePlanner
-from torchrl_koap.modules.policies.plan_then_control import RecordedPlanner
+from torchrl_koap.modules.policies.replay import RecordedPlanner
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.goals import goal_reached
 
 
 @torch.no_grad()
@@ -53,26 +52,41 @@ def imagine(planner: StatePlanner, start: Tensor, *, interval: int, max_steps: i
 
 
 def contexts_of(task: Task, observation: Tensor) -> Tensor:
-    """Contexts ``[E, objects, 3]`` (x, y in m, yaw in rad) that first observations ``[E, obs]`` show.
+    """Contexts that first observations show.
 
     ``tan(yaw)`` gives the yaw of a box up to half a turn, which looks the same.
+
+    Args:
+        task (Task): tells the bodies and the columns of their poses.
+        observation (Tensor): first observation of every episode ``[E, obs]``.
+
+    Returns:
+        Tensor: ``[E, objects, 3]``: x, y (m) and yaw (rad).
     """
     rows = []
-    for name in task.objects:
-        xy = observation[:, task.observation[task.drawn[name]]][:, :2]
-        if f"{name}_quaternion" in task.observation:
-            w, _, _, z = observation[:, task.observation[f"{name}_quaternion"]].unbind(-1)
+    for body in task.bodies:
+        xy = observation[:, task.observation[body.position]][:, :2]
+        turned = observation[:, task.observation[body.yaw]] if body.yaw else xy.new_zeros(len(xy), 1)
+        if turned.shape[-1] == 4:
+            w, _, _, z = turned.unbind(-1)
             yaw = 2 * torch.atan2(z * w.sign(), w.abs())
         else:
-            yaw = observation[:, task.observation[f"{name}_tan_yaw"]].squeeze(-1).atan()
+            yaw = turned.squeeze(-1).atan()
         rows.append(torch.cat([xy, yaw[:, None]], -1))
     return torch.stack(rows, 1)
 
 
 def recorded_futures(states: Sequence[Tensor], horizon: int) -> Tensor:
-    """For every step of recorded trajectories ``[T_i, d]`` the states that follow, ``[E, max T, H, d]``.
+    """The states that follow every step of recorded trajectories.
 
     The last state of a trajectory is repeated.
+
+    Args:
+        states (sequence of Tensor): trajectories ``[T_i, d]``.
+        horizon (int): number ``H`` of states ahead.
+
+    Returns:
+        Tensor: ``[E, max T, H, d]``.
     """
     longest = max(len(path) for path in states)
     ahead = torch.arange(longest)[:, None] + torch.arange(1, horizon + 1)
@@ -120,6 +134,11 @@ def follow_recordings(
 def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -> dict[str, list[float]]:
     """How far executed states lie from the plan in force, per part of the state.
 
+    Args:
+        task (Task): tells the parts of the state.
+        episodes (sequence of TensorDict): rollouts ``[T]`` with the entry ``remaining_plan_chunk``.
+        interval (int): control steps per plan.
+
     Returns:
         dict: root mean square distance per step ``1 .. interval`` after a plan, in the units of the part.
     """
@@ -138,7 +157,16 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
 
 
 def nearest_distances(states: Tensor, others: Tensor, scale: Tensor) -> Tensor:
-    """Distance of states ``[N, d]`` to the nearest of others ``[M, d]``, columns divided by ``scale``."""
+    """Distance of every state to the nearest of others.
+
+    Args:
+        states (Tensor): ``[N, d]``.
+        others (Tensor): ``[M, d]``.
+        scale (Tensor): what columns are divided by, ``[d]``.
+
+    Returns:
+        Tensor: ``[N]``.
+    """
     found = [torch.cdist(part / scale, others / scale).amin(1) for part in states.split(2048)]
     return torch.cat(found)
 
@@ -147,6 +175,18 @@ def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase, *
     """Distance of visited states to the nearest demonstrated one, and that among demonstrations, in spreads.
 
     Every second demonstration is compared with the others, so that both figures are distances to strangers.
+
+    Args:
+        task (Task): tells which columns make up the state.
+        episodes (sequence of TensorDict): rollouts ``[T]``.
+        data (TensorDictBase): flat demonstrations ``[N]`` with ``state`` and ``episode``.
+
+    Keyword Args:
+        most (int): about how many states of each kind are looked at.
+
+    Returns:
+        dict: median and 95 % quantile of the distances of visited and of demonstrated states; empty if there is a
+        single demonstration.
     """
     every = data["episode"] % 2 == 0
     known, held_out = data["state"][every], data["state"][~every]
@@ -172,8 +212,16 @@ def rate(good: Sequence[bool]) -> Mapping[str, float]:
 
 
 def imagined_success(task: Task, imagined: Tensor) -> list[bool]:
-    """Which imagined episodes ``[E, T, d]`` reach the goal at any time."""
-    return goal_reached(task, imagined).any(-1).tolist()
+    """Which imagined episodes reach the goal at any time.
+
+    Args:
+        task (Task): tells the goal.
+        imagined (Tensor): states ``[E, T, d]``.
+
+    Returns:
+        list of bool: one per episode.
+    """
+    return task.goal_reached(imagined).any(-1).tolist()
 
 
 def executed_success(episodes: Sequence[TensorDict]) -> list[bool]:

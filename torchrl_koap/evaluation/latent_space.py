@@ -15,15 +15,34 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import cut_windows, trajectory_lengths
+from torchrl_koap.evaluation.latent_verdict import (
+    MODELS,
+    ON_THE_CIRCLE,
+    OUTSIDE_THE_BUDGET,
+    error_unit,
+    judge_latent_model,
+    unit_circle_sides,
+)
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics, LinearActionDecoder
 
-OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"
-MODELS = ("koopman", "reconstruction", "linear", "copy_last")
+__all__ = [
+    "MODELS",
+    "OUTSIDE_THE_BUDGET",
+    "analyse_latent",
+    "error_unit",
+    "explained",
+    "infer_steps",
+    "judge_latent_model",
+    "prediction_errors",
+    "probe",
+    "spectrum",
+    "split_trajectories",
+]
 _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
 
 
-def spectrum(eigenvalues: Tensor, *, tolerance: float = 1e-3, slowest: int = 5) -> dict[str, Any]:
+def spectrum(eigenvalues: Tensor, *, tolerance: float = ON_THE_CIRCLE, slowest: int = 5) -> dict[str, Any]:
     r"""Where the eigenvalues of an operator lie, and in how many steps its slowest parts fade to 1/e.
 
     Args:
@@ -41,13 +60,11 @@ def spectrum(eigenvalues: Tensor, *, tolerance: float = 1e-3, slowest: int = 5) 
         {'spectral_radius': 1.25, 'inside': 1, 'on': 1, 'outside': 1, 'slowest_decay_steps': [1.0]}
     """
     size = eigenvalues.detach().abs().double().sort(descending=True).values
-    inside = size[size < 1 - tolerance]
-    outside = int((size > 1 + tolerance).sum())
+    sides = unit_circle_sides(size.tolist(), tolerance=tolerance)
+    inside = size[[side == "inside" for side in sides]]
     return {
         "spectral_radius": size[0].item(),
-        "inside": len(inside),
-        "on": len(size) - len(inside) - outside,
-        "outside": outside,
+        **{side: sides.count(side) for side in ("inside", "on", "outside")},
         "slowest_decay_steps": (-1 / inside[:slowest].log()).tolist(),
     }
 
@@ -64,8 +81,8 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
         TensorDict: ``[M]`` with ``latent_action [M, m]``, ``action``, ``has_action [M]`` and ``episode [M]``.
     """
     keys = [STATE, ACTION, HAS_ACTION, EPISODE]
-    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.history)
-    now = controller.history
+    windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
+    now = controller.num_past
     parts = windows[STATE].split(4096)
     latent = torch.cat([controller.infer(part, range(now, now + 1)).squeeze(-2) for part in parts])
     here = windows[:, now]
@@ -139,7 +156,7 @@ def prediction_errors(
     """
     if horizon < 1:
         raise ValueError(f"horizon must be >= 1 step, got {horizon}")
-    now, length = controller.history, controller.num_window_frames + horizon - 1
+    now, length = controller.num_past, controller.num_window_frames + horizon - 1
     windows = cut_windows(data, length, select=[STATE, EPISODE], pad_before=now)
     fitted = torch.isin(windows[EPISODE][:, -1], fit_on)
     known, new = (windows[STATE][rows] for rows in (fitted, ~fitted))
@@ -180,7 +197,7 @@ def _frames_read(controller: KoopmanInverseDynamics, states: Tensor, frames: ran
 
 
 def _fit_linear(controller: KoopmanInverseDynamics, states: Tensor) -> Tensor:
-    now = controller.history
+    now = controller.num_past
     normalized = controller.normalize_state(states).double()
     inputs = torch.cat([normalized[:, now], _frames_read(controller, states, range(now, now + 1))[:, 0]], -1)
     # x_t is among the frames read: only an SVD finds the smallest of the many best answers
@@ -197,7 +214,14 @@ def _roll_linear(controller: KoopmanInverseDynamics, weight: Tensor, states: Ten
 
 
 def explained(predicted: Tensor, true: Tensor) -> list[float]:
-    """Share ``R^2`` of the variance of every column of ``true [N, a]`` that predictions explain; NaN if it has none.
+    """Share ``R^2`` of the variance of every column that predictions explain.
+
+    Args:
+        predicted (Tensor): predictions ``[N, a]``.
+        true (Tensor): what they are compared with, ``[N, a]``.
+
+    Returns:
+        list of float: one per column, at most 1; NaN for a column without variance.
 
     Examples:
         >>> import torch
@@ -247,7 +271,7 @@ def analyse_latent(
 
     Args:
         controller (KoopmanInverseDynamics): the model, in evaluation mode, on the device of the data.
-        data (TensorDictBase): flat ``[N]``, fully labelled, as the controller sees them.
+        data (TensorDictBase): flat ``[N]`` with all labels that there are, as the controller sees them.
         labelled (Tensor): steps labelled in the budget, bool ``[N]``.
         parts (mapping): columns of the state by name.
 
@@ -257,19 +281,30 @@ def analyse_latent(
 
     Returns:
         dict: ``eigenvalues`` (where the operator is a matrix), ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET`
-        the probe, the number of labels it read and the ``R^2`` of the model's own decoder on the same steps.
+        the probe, the number of labels it read and the ``R^2`` of the model's own decoder on the same steps; or a
+        ``note`` where fewer than two trajectories have labels. Of data that lack labels the probe takes half of the
+        labelled trajectories.
     """
     result: dict[str, Any] = {}
     if hasattr(controller.operator, "eigenvalues"):
         result["eigenvalues"] = spectrum(controller.operator.eigenvalues())
     fit_on = split_trajectories(data[EPISODE], labelled, seed=seed)
-    reach = controller.num_window_frames - 1 - controller.history
+    reach = controller.num_window_frames - 1 - controller.num_past
     horizon = min(horizon, max(1, int(trajectory_lengths(data).min()) - reach))
     held_out = int(len(data[EPISODE].unique()) - len(fit_on))
     errors = prediction_errors(controller, data, fit_on, parts, horizon=horizon)
     sizes = {"steps": horizon, "fitted_trajectories": len(fit_on), "judged_trajectories": held_out}
     result["multi_step"] = sizes | errors
     steps = infer_steps(controller, data)
+    known = steps[HAS_ACTION]
+    if not known.all():  # the data lack labels themselves
+        steps = steps[known]
+        if len(steps[EPISODE].unique()) < 2:
+            result[OUTSIDE_THE_BUDGET] = {
+                "note": "fewer than two trajectories have labels to probe latent actions with"
+            }
+            return result
+        fit_on = split_trajectories(steps[EPISODE], torch.zeros(len(steps), dtype=torch.bool), seed=seed)
     latent, action, fit = steps["latent_action"], steps[ACTION], torch.isin(steps[EPISODE], fit_on)
     budget = data[EPISODE][labelled].unique()
     with torch.no_grad():
@@ -277,6 +312,7 @@ def analyse_latent(
     result[OUTSIDE_THE_BUDGET] = {
         "labels_read": len(steps),
         "steps_judged": int((~fit).sum()),
+        "judged_trajectories": len(steps[EPISODE][~fit].unique()),
         "judged_trajectories_in_budget": int((~torch.isin(budget, fit_on)).sum()),
         "probe_r2": probe(latent, action, steps[EPISODE], fit),
         "decoder_r2": own,

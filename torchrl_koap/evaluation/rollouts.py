@@ -18,15 +18,9 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_koap.evaluation.scores import OUTCOMES, outcome_of
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion.planner import StatePlanner
-from torchrl_koap.modules.diffusion.schedule import SOLVERS
-from torchrl_koap.modules.policies.plan_then_control import (
-    NOISE,
-    OBSERVATION_HISTORY,
-    EpisodeNoise,
-    PlanThenControl,
-    RecordedFutures,
-    policy_transforms,
-)
+from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
+from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
+from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
 
 
 def make_policy(
@@ -36,25 +30,41 @@ def make_policy(
     state_columns: Sequence[int] | Callable[[Tensor], Tensor],
     execution: str = "feedback",
     replan_interval: int = 4,
-    joining: float = 0.8,
+    blend_decay: float = 0.8,
     tempo: float = 1.0,
     controller_columns: Sequence[int] | None = None,
-    gripper: tuple[int, int] | None = None,
+    action_rule: Callable[[Tensor, Tensor], Tensor] | None = None,
     candidates: int = 1,
     choice: str = "quarter",
 ) -> PlanThenControl:
-    """Planner and controller as a policy that observes as many frames as the longer-sighted of the two."""
+    """Planner and controller as a policy that observes as many frames as the longer-sighted of the two.
+
+    Args:
+        planner (StatePlanner): the planner.
+        controller (TensorDictModuleBase): the inverse dynamics.
+
+    Keyword Args:
+        state_columns (sequence of int, or callable): as for :class:`~torchrl_koap.modules.PlanThenControl`, and so are
+            all others.
+        execution (str): ``"feedback"`` or ``"open_loop"``.
+        replan_interval (int): steps per plan.
+        blend_decay (float): share of the distance to the plan that remains after each frame.
+        controller_columns (sequence of int, optional): columns of the state that the controller reads.
+        action_rule (callable, optional): has the last word on actions, such as ``task.action_rule``.
+        candidates (int): plans sampled whenever one is due.
+        choice (str): the rule by which one of them is taken.
+    """
     return PlanThenControl(
         planner,
         controller,
         state_columns=state_columns,
-        history=max(planner.history, controller.history + 1),
+        history=max(planner.history, controller.num_past + 1),
         execution=execution,
         replan_interval=replan_interval,
-        joining=joining,
+        blend_decay=blend_decay,
         tempo=tempo,
         controller_columns=controller_columns,
-        gripper=gripper,
+        action_rule=action_rule,
         candidates=candidates,
         choice=choice,
     )
@@ -84,7 +94,7 @@ def roll_out(
         batch_size (int, optional): episodes at a time. Default: all. Outcomes do not depend on it.
         contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
         futures (Tensor, optional): recorded futures ``[E, steps, H, d]`` for a policy whose planner is a
-            :class:`~torchrl_koap.modules.policies.plan_then_control.RecordedPlanner`.
+            :class:`~torchrl_koap.modules.policies.replay.RecordedPlanner`.
         progress (callable, optional): called with the number of episodes finished.
 
     Returns:
@@ -97,20 +107,18 @@ def roll_out(
         raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
     if contexts is not None and len(contexts) != len(seeds):
         raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
-    planner, device = policy.planner, _device_of(policy)
+    device = _device_of(policy)
     size, episodes = batch_size or len(seeds), []
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
-        _seed_noise(env, part)
+        _seed_episodes(env, part)
         transforms = policy_transforms(policy.history)
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
         if futures is not None:
             noise = RecordedFutures(futures[begin : begin + size])
         else:
-            draws = (policy.candidates,) if getattr(policy, "candidates", 1) > 1 else ()
-            draws += (1 + planner.num_steps,) if SOLVERS[planner.solver].stochastic else ()
-            noise = EpisodeNoise(part, (*draws, *planner.sample_shape), num_steps=max_steps)
+            noise = EpisodeNoise(part, policy.noise_shape, num_steps=max_steps)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(
@@ -123,7 +131,9 @@ def roll_out(
             )
         finally:
             env.close()
-        rollout = rollout.exclude(NOISE, OBSERVATION_HISTORY, ("next", OBSERVATION_HISTORY), "remaining_plan")
+        rollout = rollout.exclude(
+            NOISE, RECORDED_FUTURE, OBSERVATION_HISTORY, ("next", OBSERVATION_HISTORY), "remaining_plan"
+        )
         done = rollout["next", "done"].squeeze(-1)
         lengths = torch.where(done.any(-1), done.int().argmax(-1) + 1, done.shape[-1])
         episodes += [rollout[index, :length] for index, length in enumerate(lengths.tolist())]
@@ -136,8 +146,11 @@ def _device_of(policy: PlanThenControl) -> torch.device:
     return next(itertools.chain(policy.parameters(), policy.buffers()), torch.empty(0)).device
 
 
-def _seed_noise(env: EnvBase, seeds: Sequence[int]) -> None:
-    """Observation noise that an episode meets depends on its own seed alone."""
+def _seed_episodes(env: EnvBase, seeds: Sequence[int]) -> None:
+    """What is random in an episode depends on its own seed alone, where the environment can see to that."""
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    if hasattr(base, "seed_episodes"):
+        base.seed_episodes(seeds)
     transforms = env.transform if isinstance(env, TransformedEnv) else ()
     for transform in transforms if isinstance(transforms, Iterable) else (transforms,):
         if hasattr(transform, "seed_episodes"):
@@ -146,7 +159,19 @@ def _seed_noise(env: EnvBase, seeds: Sequence[int]) -> None:
 
 @torch.no_grad()
 def measure_latency(policy: PlanThenControl, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
-    """Median time of a plan and of a control step between plans, at batch 1, in ms, and the control rate in Hz."""
+    """Median times of a plan and of a control step between plans, at batch 1.
+
+    Args:
+        policy (PlanThenControl): the policy, on the device to measure on.
+        observation_dim (int): number of observation columns.
+
+    Keyword Args:
+        repeats (int): plans timed, and control steps timed; three of each come before, untimed.
+
+    Returns:
+        dict: ``plan_ms``, what a step with a plan takes longer (ms), ``control_ms`` (ms), ``control_hz``, the rate of
+        control with plans spread over the steps (Hz).
+    """
     device = _device_of(policy)
     observed = torch.zeros(1, policy.history, observation_dim, device=device)
     td = TensorDict({OBSERVATION_HISTORY: observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1], device=device)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From rollouts to the numbers that D3IL reports per task (spec sections 6 and 8), each with its interval.
+"""From rollouts to the numbers that D3IL reports per task, each with its interval.
 
 Success rates get Wilson intervals. Entropies get percentile intervals of a bootstrap over what is independent: episodes
 where every episode starts alike, else contexts with all their rollouts.
@@ -8,7 +8,6 @@ where every episode starts alike, else contexts with all their rollouts.
 from __future__ import annotations
 
 import itertools
-import math
 import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,17 +18,9 @@ from torch import Tensor
 from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, mode_entropy, wilson_interval
 from torchrl_koap.keys import COLLISION, MODE, SUCCESS
 from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.import_strings import resolve
 
 OUTCOMES = ("timeout", "success", "collision")
-# share of each order in D3IL's demonstrations of Stacking (spec section 6.4); letters 0 red, 1 green, 2 blue
-STACKING_PRIOR = {
-    (0, 1, 2): 0.152,
-    (0, 2, 1): 0.127,
-    (1, 0, 2): 0.106,
-    (1, 2, 0): 0.287,
-    (2, 0, 1): 0.235,
-    (2, 1, 0): 0.093,
-}
 
 
 def outcome_of(episode: TensorDict) -> str:
@@ -56,7 +47,7 @@ def score(
         seeds (sequence of int): one per episode.
 
     Keyword Args:
-        num_modes (int): base of the logarithm of the entropy.
+        num_modes (int): base of the logarithm of the entropy, which is None for a single mode.
         mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
         contexts (sequence of int, optional): number of the context of every episode. With it ``mode_entropy`` is the
             mean over contexts, None below two rollouts per context, and ``pooled_mode_entropy`` is that of all
@@ -75,8 +66,8 @@ def score(
     modes = [row["mode"] for row in won if row["mode"] >= 0]
     result = _rate("success", len(won), len(rows), {"episodes": len(rows)})
 
-    def pooled(sample: Sequence[int]) -> float:
-        return mode_entropy(sample, num_modes)
+    def pooled(sample: Sequence[int]) -> float | None:
+        return mode_entropy(sample, num_modes) if num_modes > 1 else None
 
     if contexts is None:
         result |= _entropy("mode_entropy", modes, pooled)
@@ -89,7 +80,7 @@ def score(
                 groups[row["context"]].append(row["mode"])
 
         def conditional(sample: Sequence[Sequence[int]]) -> float | None:
-            return conditional_entropy(sample, num_modes, unsolved=unsolved)
+            return conditional_entropy(sample, num_modes, unsolved=unsolved) if num_modes > 1 else None
 
         result["contexts"] = len(groups)
         if len(rows) >= 2 * len(groups):
@@ -111,28 +102,69 @@ def _rate(name: str, good: int, total: int, first: dict[str, Any]) -> dict[str, 
 
 
 def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:
-    interval = (bootstrap_interval(units, statistic) if len(units) else None) or (None, None)
+    known = len(units) and statistic(units) is not None
+    interval = (bootstrap_interval(units, statistic) if known else None) or (None, None)
     low, high = (None if end is None else min(max(end, 0.0), 1.0) for end in interval)
     return {name: statistic(units), f"{name}_low": low, f"{name}_high": high}
 
 
-def stacking_scores(episodes: Sequence[TensorDict], contexts: Sequence[int], *, complete: bool = True) -> dict:
-    """How many boxes were brought to the zone, and in how many orders (spec section 6.4).
+def task_scores(
+    task: Task, result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int] | None
+) -> dict[str, Any]:
+    """The figures that a task adds to those of :func:`score`, by the function that ``Task.score`` names.
+
+    ``d3il_score`` among them is the single figure D3IL ranks methods by, where it is defined.
 
     Args:
+        task (Task): the task.
+        result (dict): from :func:`score`.
+        episodes (sequence of TensorDict): the rollouts.
+        contexts (sequence of int, optional): number of the context of every episode.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.scores import task_scores
+        >>> from torchrl_koap.tasks import get_task
+        >>> task_scores(get_task("aligning"), {"success_rate": 0.5, "mode_entropy": 1.0}, [], [])
+        {'d3il_score': 0.75}
+    """
+    rule = resolve(task.score, f"score of task {task.name!r}")
+    return {} if rule is None else rule(result, episodes, contexts)
+
+
+def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
+    """How many boxes were brought to the zone of Stacking, in how many orders, and D3IL's figure.
+
+    Args:
+        result (dict): from :func:`score`; not looked at.
         episodes (sequence of TensorDict): rollouts of :class:`~torchrl_koap.envs.stacking.StackingEnv`.
         contexts (sequence of int): number of the context of every episode.
 
-    Keyword Args:
-        complete (bool): the criterion was the whole stack; otherwise episodes end with the first box.
+    Returns:
+        dict: ``stacked_1_rate``, ``stacked_2_rate``, ``stacked_3_rate`` with intervals, entropies of the first one, two
+        and three letters (bases 3, 6, 6) over contexts, and ``d3il_score``, the sum of the three rates.
+    """
+    found = _stacked(episodes, contexts, most=3)
+    return found | {"d3il_score": sum(found[f"stacked_{count}_rate"] for count in (1, 2, 3))}
+
+
+def first_box_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
+    """Stacking's scores of the first box alone, with which episodes of Stacking-1 end.
+
+    Args:
+        result (dict): from :func:`score`; not looked at.
+        episodes (sequence of TensorDict): rollouts of :class:`~torchrl_koap.envs.stacking.StackingEnv`.
+        contexts (sequence of int): number of the context of every episode.
 
     Returns:
-        dict: ``stacked_1_rate`` and, if complete, ``stacked_2_rate``, ``stacked_3_rate`` with intervals, and entropies
-        of the first one, two and three letters (bases 3, 6, 6) over contexts.
+        dict: the entries of :func:`stacking_scores` about the first box.
     """
+    return _stacked(episodes, contexts, most=1)
+
+
+def _stacked(episodes: Sequence[TensorDict], contexts: Sequence[int], *, most: int) -> dict[str, Any]:
     letters = [tuple(int(letter) for letter in episode[-1]["next", MODE] if letter >= 0) for episode in episodes]
     result: dict[str, Any] = {}
-    for count, base in ((1, 3), (2, 6), (3, 6))[: 3 if complete else 1]:
+    for count, base in ((1, 3), (2, 6), (3, 6))[:most]:
         good = [len(order) >= count for order in letters]
         if count == 3:  # three letters are not yet a stack
             good = [episode[-1]["next", SUCCESS].item() for episode in episodes]
@@ -145,41 +177,3 @@ def stacking_scores(episodes: Sequence[TensorDict], contexts: Sequence[int], *, 
         if len(episodes) >= 2 * len(groups):
             result[f"stacked_{count}_entropy"] = conditional_entropy(list(groups.values()), base)
     return result
-
-
-def divergence(modes: Sequence[int], prior: Sequence[float]) -> float:
-    """Kullback-Leibler divergence of the modes seen from a prior, logarithm base ``len(prior)``.
-
-    Raises:
-        ValueError: for a mode out of range.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.scores import divergence
-        >>> round(divergence([0, 0], [0.5, 0.5]), 6), round(divergence([0, 1], [0.5, 0.5]), 6)
-        (1.0, 0.0)
-    """
-    base = len(prior)
-    entropy = mode_entropy(modes, base)
-    cross = sum(math.log(prior[mode], base) for mode in modes) / len(modes)
-    return -entropy - cross
-
-
-def d3il_score(task: Task, result: dict[str, Any]) -> dict[str, float]:
-    """The single figure D3IL ranks methods by, where it is defined.
-
-    Avoiding: 0.8 success + 0.2 entropy. Aligning: the mean of success and entropy. Sorting: success minus the
-    divergence of the modes from equally frequent ones, which our demonstrations have. Stacking: the sum of the three
-    success rates. The tasks with contexts need two rollouts per context at least.
-    """
-    success, entropy = result["success_rate"], result["mode_entropy"]
-    if task.name == "stacking":
-        return {"d3il_score": sum(result[f"stacked_{count}_rate"] for count in (1, 2, 3))}
-    if entropy is None:
-        return {}
-    if task.name == "avoiding":
-        return {"d3il_score": 0.8 * success + 0.2 * entropy}
-    if task.name == "aligning":
-        return {"d3il_score": 0.5 * (success + entropy)}
-    if "sorting" in task.name:
-        return {"d3il_score": success - (1 - entropy)}
-    return {}

@@ -12,7 +12,7 @@ from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.diffusion.policy import DiffusionPolicy
 from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.unet import TemporalUnet
-from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics, WindowController
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import (
@@ -25,14 +25,24 @@ from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.policies.action_chunks import ChunkedPolicy
-from torchrl_koap.modules.policies.plan_then_control import EpisodeNoise, PlanThenControl, join_plan, policy_transforms
+from torchrl_koap.modules.policies.agent import Agent
+from torchrl_koap.modules.policies.asynchronous import AsynchronousAgent
+from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
+from torchrl_koap.modules.policies.policy_env import PolicyEnv, SeededNoise
+from torchrl_koap.modules.policies.receding_horizon import RecedingHorizonPolicy, policy_transforms
+from torchrl_koap.modules.policies.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
+from torchrl_koap.modules.time_alignment import FrameGatherer
 
 __all__ = [
     "PRESETS",
+    "Agent",
+    "AsynchronousAgent",
     "ChunkedPolicy",
     "DiffusionPolicy",
     "EpisodeNoise",
     "FiniteScalarQuantizer",
+    "FrameGatherer",
+    "InverseDynamics",
     "KoopmanInverseDynamics",
     "KoopmanLifting",
     "KoopmanOperator",
@@ -48,16 +58,20 @@ __all__ = [
     "NonlinearInverseDynamics",
     "Normalizer",
     "PlanThenControl",
+    "PolicyEnv",
     "QuantizedInverseDynamics",
+    "RecedingHorizonPolicy",
+    "RecordedFutures",
+    "RecordedPlanner",
     "RecurrentInverseDynamics",
     "RidgeFit",
+    "SeededNoise",
     "StatePlanner",
     "SupervisedInverseDynamics",
     "TemporalUnet",
     "TransformerDenoiser",
     "VariationalInverseDynamics",
-    "WindowController",
-    "join_plan",
+    "blend_plan",
     "make_koopman_inverse_dynamics",
     "policy_transforms",
 ]

@@ -1,29 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The two plain networks that everything here is made of."""
+"""A recurrent network over the time axis; perceptrons are :class:`torchrl.modules.MLP`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from torch import Tensor, nn
 from torchrl.modules import LSTM
-
-
-def mlp(in_features: int, hidden_dims: Sequence[int], out_features: int, *, dropout: float = 0.0) -> nn.Sequential:
-    """A multi-layer perceptron with ReLU, and dropout behind every hidden layer if asked for.
-
-    Examples:
-        >>> from torchrl_koap.modules.networks import mlp
-        >>> [layer.out_features for layer in mlp(3, (8, 8), 2) if hasattr(layer, "out_features")]
-        [8, 8, 2]
-    """
-    layers: list[nn.Module] = []
-    for width in hidden_dims:
-        layers += [nn.Linear(in_features, width), nn.ReLU()]
-        if dropout:
-            layers.append(nn.Dropout(dropout))
-        in_features = width
-    return nn.Sequential(*layers, nn.Linear(in_features, out_features))
 
 
 class SequenceLSTM(nn.Module):
@@ -31,6 +12,11 @@ class SequenceLSTM(nn.Module):
 
     TorchRL's python LSTM is used because it traces under :func:`torch.compile`; its weights are those of
     :class:`torch.nn.LSTM`.
+
+    Args:
+        in_features (int): columns of the sequence.
+        hidden_dim (int): width of the LSTM.
+        out_features (int): columns of the output.
 
     Examples:
         >>> import torch

@@ -69,7 +69,7 @@ class Normalizer(nn.Module):
         if offset is not None:
             if offset.ndim != 1 or offset.shape != scale.shape:
                 raise ValueError(f"offset and scale must be [d], got {list(offset.shape)} and {list(scale.shape)}")
-            if not (offset.isfinite().all() and scale.isfinite().all() and (scale > 0).all()):
+            if not offset.is_meta and not (offset.isfinite().all() and scale.isfinite().all() and (scale > 0).all()):
                 raise ValueError("offset must be finite, scale finite and positive")
             offset, scale = offset.detach().clone(), scale.detach().clone()
         self.register_buffer("offset", offset)
@@ -132,14 +132,6 @@ class Normalizer(nn.Module):
         """Turns normalised values ``[*B, d]`` back."""
         offset, scale = self._statistics(values)
         return values * scale + offset
-
-    def scale_difference(self, differences: torch.Tensor) -> torch.Tensor:
-        """Normalises differences of values ``[*B, d]``, which have no offset."""
-        return differences / self._statistics(differences)[1]
-
-    def unscale_difference(self, differences: torch.Tensor) -> torch.Tensor:
-        """Turns normalised differences ``[*B, d]`` back."""
-        return differences * self._statistics(differences)[1]
 
     def extra_repr(self) -> str:
         """Size for printing."""

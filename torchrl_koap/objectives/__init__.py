@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Loss modules."""
 
-from torchrl_koap.objectives.diffusion_policy import DiffusionPolicyLoss
+from torchrl_koap.objectives.diffusion import DenoisingLoss, DiffusionPolicyLoss, PlannerLoss
 from torchrl_koap.objectives.koopman import (
     KOAPLoss,
     KoopmanDynamicsLoss,
@@ -10,12 +10,12 @@ from torchrl_koap.objectives.koopman import (
 )
 from torchrl_koap.objectives.latent_decoder import LatentDecoderLoss
 from torchrl_koap.objectives.nonlinear import NonlinearLoss
-from torchrl_koap.objectives.planner import PlannerLoss
 from torchrl_koap.objectives.quantized import QuantizedDynamicsLoss
 from torchrl_koap.objectives.supervised import InverseDynamicsLoss
 from torchrl_koap.objectives.variational import VariationalLoss
 
 __all__ = [
+    "DenoisingLoss",
     "DiffusionPolicyLoss",
     "InverseDynamicsLoss",
     "KOAPLoss",

@@ -7,15 +7,20 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictParams
+from tensordict.nn import TensorDictParams
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
 from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 
 def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
     """An entry that must be there.
+
+    Args:
+        tensordict (TensorDictBase): a batch.
+        key (NestedKey): the entry.
 
     Raises:
         KeyError: if it is not; the message lists what is.
@@ -27,7 +32,15 @@ def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def read_mask(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
-    """A mask of the frames of windows ``[*B, T, d]`` as bool ``[*B, T]``; stored with a trailing 1 or not.
+    """A mask of the frames of windows, stored with a trailing 1 or not.
+
+    Args:
+        tensordict (TensorDictBase): a batch.
+        key (NestedKey): the entry, bool ``[*B, T, 1]`` or ``[*B, T]``.
+        state (Tensor): windows ``[*B, T, d]``, for the shape.
+
+    Returns:
+        Tensor: bool ``[*B, T]``.
 
     Raises:
         KeyError: if it is not there.
@@ -45,15 +58,23 @@ class WindowLoss(LossModule):
     """Base of the losses on windows of states of which some frames have an action label.
 
     Args:
-        network (TensorDictModuleBase): the model; has ``set_keys(state=, action=)``.
+        network (InverseDynamics): the controller; its entries of states and actions are those of the loss.
 
     Keyword Args:
-        state_key (NestedKey): the network's entry of states.
-        action_key (NestedKey): the network's entry of actions.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
 
     Raises:
         ValueError: for an unknown reduction.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KoopmanReconstructionLoss  # a subclass
+        >>> loss = KoopmanReconstructionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> loss.set_keys(state="frames")
+        >>> loss.in_keys, loss(TensorDict({"frames": torch.randn(4, 16, 2)}, [4]))["loss_reconstruction"].shape
+        (['frames'], torch.Size([]))
     """
 
     @dataclass
@@ -77,21 +98,19 @@ class WindowLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    network: TensorDictModuleBase
+    network: InverseDynamics
     network_params: TensorDictParams
     target_network_params: TensorDictParams
 
     uses_labels = False
 
-    def __init__(
-        self, network: TensorDictModuleBase, *, state_key: NestedKey, action_key: NestedKey, reduction: str = "mean"
-    ):
+    def __init__(self, network: InverseDynamics, *, reduction: str = "mean"):
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         super().__init__()
         self.convert_to_functional(network, "network", create_target_params=False)
         self.reduction = reduction
-        super().set_keys(state=state_key, action=action_key)
+        super().set_keys(state=network.in_key, action=network.out_key)
 
     def set_keys(self, **kwargs) -> None:
         """Renames entries (None: back to the default); ``state`` and ``action`` are renamed in the network too."""

@@ -7,7 +7,7 @@ r"""Losses of the Koopman inverse dynamics model.
     L_{kpm} = \overline{|K g(x_t) + u_t - g(x_{t+1})|^2}, \quad
     L_a = \overline{|D u_t + b - a_t|^2}
 
-(design section 2). All residuals are in normalised units. ``L_a`` averages over the labelled frames alone; a batch
+All residuals are in normalised units. ``L_a`` averages over the labelled frames alone; a batch
 without labels gives exactly 0, and an unlabelled (NaN) action reaches neither value nor gradient.
 """
 
@@ -30,7 +30,7 @@ class _KoopmanLoss(WindowLoss):
     target_network_params: TensorDictParams
 
     def __init__(self, network: KoopmanInverseDynamics, *, reduction: str = "mean"):
-        super().__init__(network, state_key=network.state_key, action_key=network.action_key, reduction=reduction)
+        super().__init__(network, reduction=reduction)
 
     def _reconstruction(self, state: Tensor, lifted: Tensor) -> Tensor:
         target = self.network.normalize_state(state)
@@ -94,6 +94,15 @@ class KoopmanDynamicsLoss(_KoopmanLoss):
 
     Keyword Args:
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KoopmanDynamicsLoss
+        >>> loss = KoopmanDynamicsLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4]))["loss_koopman"].shape
+        torch.Size([])
     """
 
     out_keys = ["loss_koopman"]
@@ -117,6 +126,17 @@ class LatentActionLoss(_KoopmanLoss):
 
     Keyword Args:
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where unlabelled).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import LatentActionLoss
+        >>> loss = LatentActionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> batch = TensorDict({"state": torch.randn(4, 16, 2), "action": torch.full((4, 16, 2), torch.nan),
+        ...                     "has_action": torch.zeros(4, 16, 1, dtype=torch.bool)}, [4])
+        >>> loss(batch)["loss_action"].item()
+        0.0
     """
 
     out_keys = ["loss_action"]

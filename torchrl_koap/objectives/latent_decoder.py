@@ -45,7 +45,7 @@ class LatentDecoderLoss(WindowLoss):
     uses_labels = True
 
     def __init__(self, network: LatentInverseDynamics, *, train_encoder: bool = False, reduction: str = "mean"):
-        super().__init__(network, state_key=network.in_keys[0], action_key=network.out_keys[-1], reduction=reduction)
+        super().__init__(network, reduction=reduction)
         self.train_encoder = train_encoder
 
     @dispatch

@@ -60,7 +60,7 @@ class NonlinearLoss(WindowLoss):
         action_coeff: float = 1.0,
         reduction: str = "mean",
     ):
-        super().__init__(network, state_key=network.in_keys[0], action_key=network.out_keys[-1], reduction=reduction)
+        super().__init__(network, reduction=reduction)
         self.register_coeff_buffer("dynamics_coeff", dynamics_coeff)
         self.register_coeff_buffer("action_coeff", action_coeff)
 

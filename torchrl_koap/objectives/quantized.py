@@ -42,7 +42,7 @@ class QuantizedDynamicsLoss(WindowLoss):
     out_keys = ["loss_dynamics"]
 
     def __init__(self, network: QuantizedInverseDynamics, *, reduction: str = "mean"):
-        super().__init__(network, state_key=network.in_keys[0], action_key=network.out_keys[-1], reduction=reduction)
+        super().__init__(network, reduction=reduction)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

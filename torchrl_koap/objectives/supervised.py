@@ -40,7 +40,7 @@ class InverseDynamicsLoss(WindowLoss):
     uses_labels = True
 
     def __init__(self, network: SupervisedInverseDynamics | RecurrentInverseDynamics, *, reduction: str = "mean"):
-        super().__init__(network, state_key=network.in_keys[0], action_key=network.out_keys[0], reduction=reduction)
+        super().__init__(network, reduction=reduction)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

@@ -66,7 +66,7 @@ class VariationalLoss(WindowLoss):
     _schedulable_buffers = frozenset({"kl_coeff"})
 
     def __init__(self, network: VariationalInverseDynamics, *, kl_coeff: float = 0.01, reduction: str = "mean"):
-        super().__init__(network, state_key=network.in_keys[0], action_key=network.out_keys[-1], reduction=reduction)
+        super().__init__(network, reduction=reduction)
         self.register_coeff_buffer("kl_coeff", kl_coeff)
 
     def _noise(self, tensordict: TensorDictBase, mean: Tensor) -> Tensor:

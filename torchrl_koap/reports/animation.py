@@ -14,19 +14,31 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from torchrl_koap.reports.mode_colors import mode_colors
 from torchrl_koap.reports.objects import object_looks, object_paths
-from torchrl_koap.reports.rollout_plots import FAILURE_MARKS, NO_MODE, SUCCESS, executed_paths
-from torchrl_koap.reports.scenes import INK, draw_scene, set_title
-from torchrl_koap.reports.training_plots import as_array
-from torchrl_koap.tasks.modes import mode_colors
+from torchrl_koap.reports.pictures import NotFilmed, NothingToDraw, picture
+from torchrl_koap.reports.rollout_plots import executed_paths, has_objects, keep_inside
+from torchrl_koap.reports.scenes import draw_scene
+from torchrl_koap.reports.style import FAILURE_MARKS, INK, NO_MODE, SUCCESS, as_array, set_title
+from torchrl_koap.tasks.registry import get_task
 
 HOLD_SECONDS = 1.5
 MOST_PICTURES = 170  # of an animation from above, unless a stride is given
 FILM_PICTURES = 24  # of a film likewise: software rendering takes 0.1 s each
-CAMERAS = {"aligning": "cage", "sorting": "cage", "sorting_2": "cage", "sorting_6": "cage", "po_sorting": "cage"}
 _VIDEO = "a .mp4 needs imageio with ffmpeg: pip install imageio imageio-ffmpeg, or write a .gif"
 
 
+@picture(
+    "rollouts.gif",
+    source="rollouts.safetensors",
+    title="The same rollouts in real time",
+    caption="Every dot is one rollout, the thin grey line ahead of it is its present plan. Plans that swing from"
+    " picture to picture mean a planner that cannot make up its mind between modes.",
+    caption_of=has_objects(
+        " Squares are the objects, pale lines their paths; black marks are tools that ran out of time."
+    ),
+    place=20,
+)
 def animate_rollouts(
     rollouts: Mapping[str, Any],
     path: str | Path,
@@ -82,12 +94,45 @@ def animate_rollouts(
         steps.append(longest - 1)
 
     def pictures() -> Iterator[np.ndarray]:
-        for number, picture in enumerate(_top_down(rollouts, paths, episodes, steps, task, num_modes)):
+        for number, image in enumerate(_top_down(rollouts, paths, episodes, steps, task, num_modes)):
             if progress is not None:
                 progress(number + 1, len(steps))
-            yield picture
+            yield image
 
     return _write(pictures(), path, stride / control_hz)
+
+
+@picture(
+    "film.gif",
+    source="rollouts.safetensors",
+    title="One rollout as the camera sees it",
+    caption="Recorded commands, played again in the simulator: the first success, or the first rollout if there is"
+    " none. Long ones pass faster than they did.",
+    place=30,
+)
+def film_rollout(rollouts: Mapping[str, Any], path: Path, *, task: str | None) -> Path:
+    """Films the first successful rollout, or the first one if there is none.
+
+    Args:
+        rollouts (mapping): ``action`` [E, T, act], ``outcome`` [E], ``context`` [E, objects, 3] of tasks with any.
+        path (Path): gif to write.
+
+    Keyword Args:
+        task (str, optional): name of the task.
+
+    Raises:
+        NothingToDraw: if actions were not kept, or the task is not known.
+        NotFilmed: if no OpenGL library can be used.
+    """
+    if task is None or "action" not in rollouts:
+        raise NothingToDraw("the rollouts hold no actions of a known task")
+    won = np.flatnonzero(rollouts["outcome"] == SUCCESS)
+    index = int(won[0]) if len(won) else 0
+    context = rollouts["context"][index] if "context" in rollouts else None
+    try:
+        return render_rollout(rollouts["action"][index], path, task=task, context=context)
+    except RuntimeError as error:
+        raise NotFilmed(error) from error
 
 
 def render_rollout(
@@ -126,9 +171,9 @@ def render_rollout(
         RuntimeError: if no OpenGL library can be used; the message says what to install.
     """
     _check_kind(path)
-    from torchrl_koap.tasks import get_task  # takes seconds, as what follows
-
     facts = get_task(task)
+    if facts.env is None or facts.scene.camera is None:
+        raise RuntimeError(f"task {task!r} names no camera of a simulator to film it with")
     actions = as_array("actions", actions, [None, facts.action_dim])
     actions = actions[np.isfinite(actions).all(1)].astype(np.float64)
     if facts.objects:
@@ -141,14 +186,14 @@ def render_rollout(
     import torch
 
     from torchrl_koap.envs.mujoco.rendering import Renderer
-    from torchrl_koap.envs.registry import ENVIRONMENTS
+    from torchrl_koap.envs.registry import make_env
 
-    env = ENVIRONMENTS[task](1, max_steps=len(actions) + 1, dtype=torch.float64)
+    env = make_env(facts, 1, max_steps=len(actions) + 1, dtype=torch.float64)
     renderer = None
 
     def pictures() -> Iterator[np.ndarray]:
         data = env.reset() if context is None else env.reset(contexts=context)
-        view = camera or CAMERAS.get(task, "front")
+        view = camera or facts.scene.camera
         yield renderer.render(env.sims.data[0], view)
         for number, action in enumerate(actions):
             data = env.step(data.set("action", data["observation"].new_tensor(action[None])))["next"]
@@ -189,10 +234,8 @@ def _top_down(rollouts, paths, episodes, steps, task, num_modes) -> Iterator[np.
     axes = draw_scene(figure.add_subplot(), task)
     axes.set(xlabel="", ylabel="")
     set_title(axes, f"{int((outcome[episodes] == SUCCESS).sum())} of {len(episodes)} rollouts succeed")
-    if task is None:
-        everything = np.concatenate([paths[e] for e in episodes])
-        axes.update_datalim(everything)
-        axes.autoscale_view()
+    moving = [] if bodies is None else [bodies[e].reshape(-1, 2) for e in episodes]
+    keep_inside(axes, [*(paths[e] for e in episodes), *moving])
     trails = axes.add_collection(LineCollection([], linewidths=0.5 if looks else 1.0, animated=True, zorder=3))
     squares = axes.scatter([], [], s=26, marker="s", animated=True, zorder=4, edgecolors="white", linewidths=0.4)
     plans = axes.add_collection(LineCollection([], linewidths=0.6, colors="#565c66", animated=True, alpha=0.75))

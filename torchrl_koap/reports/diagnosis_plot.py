@@ -9,15 +9,29 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from torchrl_koap.reports.scenes import INK, MUTED, set_title, tidy
-from torchrl_koap.reports.training_plots import BLUE, ORANGE, save_figure
-from torchrl_koap.tasks import Task
+from torchrl_koap.reports.pictures import NothingToDraw, picture
+from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, save_figure, set_title, tidy
+from torchrl_koap.tasks import Task, get_task
 
 EXPERIMENTS = {
     "imagined": "planner alone\n(imagined)",
     "followed": "controller alone\n(recorded states)",
     "closed_loop": "both\n(closed loop)",
 }
+
+
+@picture(
+    "inspect.png",
+    source="inspect.json",
+    title="Which part fails",
+    caption="Success of the planner's own imagination, of the controller on recorded states, and of both in closed"
+    " loop; distances of executed states to plans.",
+    place=70,
+)
+def _draw_inspection(result: Mapping[str, Any], path: Path, *, task: str | None) -> Path:
+    if "closed_loop" not in result or task is None:
+        raise NothingToDraw("the experiments in the simulator were left out")
+    return plot_inspection(result, get_task(task), path)
 
 
 def plot_inspection(result: Mapping[str, Any], task: Task, path: str | Path) -> Path:
@@ -38,14 +52,14 @@ def plot_inspection(result: Mapping[str, Any], task: Task, path: str | Path) -> 
         ...     plot_inspection(result, get_task("avoiding"), f"{folder}/inspect.png").name
         'inspect.png'
     """
-    figure = Figure(figsize=(9.2, 3.8), layout="constrained")
+    figure = Figure(figsize=(9.8, 4.1), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
     for index, name in enumerate(EXPERIMENTS):
         value = result[name]
-        left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "closed_loop" else "#9cc3f5")
+        left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "closed_loop" else PALE_BLUE)
         left.vlines(index, 100 * value["low"], 100 * value["high"], color=INK, linewidth=1.4)
-        left.annotate(f"n = {value['episodes']}", (index, 2), ha="center", fontsize=8, color=MUTED)
-    left.set_xticks(range(3), EXPERIMENTS.values(), fontsize=8)
+    numbers = [f"{words}\nn = {result[name]['episodes']}" for name, words in EXPERIMENTS.items()]
+    left.set_xticks(range(3), numbers, fontsize=8)
     left.set_ylim(0, 105)
     left.set_ylabel("success (%)")
     set_title(left, "Who reaches the goal (95 % intervals)")
@@ -61,9 +75,9 @@ def plot_inspection(result: Mapping[str, Any], task: Task, path: str | Path) -> 
     names = list(result["plan_to_execution"])
     right.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
     right.invert_yaxis()
-    right.set_xlabel("root mean square distance after the last step of a plan (m, rad, or on the unit circle)")
+    right.set_xlabel("root mean square distance after the last step of a plan\n(m, rad, or on the unit circle)")
     set_title(right, "How far execution is")
     if names:
-        right.legend(frameon=False, fontsize=8)
+        right.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.24), ncols=2)
     tidy(right)
     return save_figure(figure, path)

@@ -11,20 +11,52 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from safetensors.numpy import load_file
 
-from torchrl_koap.evaluation.latent_space import MODELS, OUTSIDE_THE_BUDGET
-from torchrl_koap.reports.scenes import FAINT, INK, MUTED, set_title, tidy
-from torchrl_koap.reports.training_plots import BLUE, ORANGE, as_array, save_figure
-from torchrl_koap.tasks import Task
+from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET, error_unit
+from torchrl_koap.reports.pictures import NothingToDraw, picture
+from torchrl_koap.reports.spectrum_plot import as_spectrum, draw_spectrum
+from torchrl_koap.reports.style import (
+    BLUE,
+    FAINT,
+    INK,
+    MUTED,
+    ORANGE,
+    PALE_BLUE,
+    WARNING,
+    as_array,
+    legend_beside,
+    save_figure,
+    set_title,
+    tidy,
+)
+from torchrl_koap.tasks import Task, get_task
 
-_WARNING = "#9a3412"
-_BLOWN_UP = 1e6  # mm; a prediction further off is left out of the picture
+_BLOWN_UP = 1e6  # in the unit shown; a prediction further off is left out of the picture
 _LABELS = {
     "koopman": ("latent dynamics", BLUE),
-    "reconstruction": ("lifted and mapped back", "#9cc3f5"),
+    "reconstruction": ("lifted and mapped back", PALE_BLUE),
     "linear": ("linear model on raw states", ORANGE),
     "copy_last": ("standing still", MUTED),
 }
+
+
+@picture(
+    "latent.png",
+    source="inspect.json",
+    title="What the latent space holds",
+    caption="Left: eigenvalues of the operator. Middle: errors of predicted states, latent actions given; a test of the"
+    " models, not a forecast. Right, for analysis only: how much of the true actions a linear probe on labels"
+    " outside the budget, and the run's own decoder, explain on held-out demonstrations.",
+    place=60,
+)
+def _draw_latent(result: Mapping[str, Any], path: Path, *, task: str | None, run_dir: Path) -> Path:
+    latent, values = result.get("latent", {}), run_dir / "eigenvalues.safetensors"
+    if "multi_step" not in latent or task is None:
+        raise NothingToDraw("no latent space was looked into")
+    parts = load_file(values) if values.exists() and "eigenvalues" in latent else None
+    spectrum = None if parts is None else parts["real"] + 1j * parts["imag"]
+    return plot_latent(latent, path, task=get_task(task), eigenvalues=spectrum)
 
 
 def plot_latent(latent: Mapping[str, Any], path: str | Path, *, task: Task, eigenvalues: Any = None) -> Path:
@@ -40,7 +72,7 @@ def plot_latent(latent: Mapping[str, Any], path: str | Path, *, task: Task, eige
 
     Examples:
         >>> import tempfile
-        >>> from torchrl_koap.evaluation.latent_space import MODELS, OUTSIDE_THE_BUDGET
+        >>> from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET
         >>> from torchrl_koap.reports.latent_plot import plot_latent
         >>> from torchrl_koap.tasks import get_task
         >>> errors = {name: {"measured_xy": [0.001, 0.002]} for name in MODELS}
@@ -51,98 +83,54 @@ def plot_latent(latent: Mapping[str, Any], path: str | Path, *, task: Task, eige
         'latent.png'
     """
     outside = latent[OUTSIDE_THE_BUDGET]
-    panels = (["spectrum"] if eigenvalues is not None else []) + ["errors", "probe"]
-    figure = Figure(figsize=(4.1 * len(panels), 3.9), layout="constrained")
-    axes = dict(zip(panels, figure.subplots(1, len(panels)), strict=True))
+    panels = (["spectrum"] if eigenvalues is not None else []) + ["errors"] + ([] if "note" in outside else ["probe"])
+    figure = Figure(figsize=(4.6 * len(panels) + 0.8, 4.1), layout="constrained")
+    axes = dict(zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True))
     if eigenvalues is not None:
-        _draw_spectrum(axes["spectrum"], as_array("eigenvalues", eigenvalues, [None]), latent["eigenvalues"])
+        values = as_array("eigenvalues", eigenvalues, [None])
+        draw_spectrum(axes["spectrum"], as_spectrum(values.real, values.imag))
     _draw_errors(axes["errors"], latent["multi_step"], task)
-    _draw_probe(axes["probe"], outside, action_names(task))
+    if "probe" in axes:
+        _draw_probe(axes["probe"], outside, list(task.action_names))
+    if "note" in outside:
+        return save_figure(figure, path)
+    shared = outside.get("judged_trajectories_in_budget")
+    inside = bool(shared) and shared == outside.get("judged_trajectories")
+    which = "of the budget, which the decoder has seen" if inside else "outside the budget"
     figure.suptitle(
-        f"probe and decoder: for analysis only, reads {outside['labels_read']:,} labels, outside the budget",
+        f"probe and decoder: for analysis only, reads {outside['labels_read']:,} labels, {which}",
         fontsize=10,
-        color=_WARNING,
+        color=WARNING,
         x=0.99,
         ha="right",
     )
     return save_figure(figure, path)
 
 
-def action_names(task: Task) -> list[str]:
-    """Short names of the action entries of a task.
-
-    Examples:
-        >>> from torchrl_koap.reports.latent_plot import action_names
-        >>> from torchrl_koap.tasks import get_task
-        >>> action_names(get_task("aligning")), action_names(get_task("stacking"))[-2:]
-        (['x', 'y', 'z'], ['joint 7', 'gripper'])
-    """
-    if task.action_unit == "rad":
-        return [*(f"joint {index + 1}" for index in range(task.same_unit)), "gripper"]
-    return list("xyz"[: task.action_dim])
-
-
-def error_unit(part: str) -> str:
-    """Unit in which errors of a part of the state are shown, a thousandth of that in the data.
-
-    Examples:
-        >>> from torchrl_koap.reports.latent_plot import error_unit
-        >>> error_unit("measured_xy"), error_unit("measured_joints")
-        ('mm', 'mrad')
-    """
-    return "mrad" if "joints" in part else "mm"
-
-
-def _draw_spectrum(axes: Axes, values: np.ndarray, facts: Mapping[str, Any]) -> None:
-    angle = np.linspace(0, 2 * np.pi, 400)
-    axes.fill(np.cos(angle), np.sin(angle), color="#f4f5f7", zorder=0)
-    axes.plot(np.cos(angle), np.sin(angle), color=MUTED, linewidth=1)
-    axes.axhline(0, color=FAINT, linewidth=0.6, zorder=0.5)
-    axes.axvline(0, color=FAINT, linewidth=0.6, zorder=0.5)
-    panels = [axes]
-    centre = np.array([values.real.min() + values.real.max(), values.imag.min() + values.imag.max()]) / 2
-    spread = max(np.ptp(values.real), np.ptp(values.imag), 0.02)
-    if spread < 0.4 and values.real.min() > 0.25:  # the empty half has room for a closer look
-        inset = axes.inset_axes((0.2, 0.55, 0.33, 0.33))
-        inset.set(xlim=centre[0] + 0.6 * spread * np.array([-1, 1]), ylim=centre[1] + 0.6 * spread * np.array([-1, 1]))
-        inset.plot(np.cos(angle), np.sin(angle), color=MUTED, linewidth=1)
-        inset.tick_params(labelsize=6.5, color=FAINT, labelcolor=MUTED)
-        inset.locator_params(nbins=3)
-        axes.indicate_inset_zoom(inset, edgecolor=MUTED)
-        panels.append(inset)
-    for panel in panels:
-        panel.scatter(values.real, values.imag, s=20, color=BLUE, alpha=0.6, linewidths=0, zorder=2)
-    reach = 1.1 * min(max(1.0, float(np.abs(values).max())), 4.0)  # the title counts those beyond
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1, xlabel="real part", ylabel="imaginary part")
-    counts = f"{facts['inside']} inside, {facts['on']} on, {facts['outside']} outside the circle"
-    set_title(axes, f"Eigenvalues, radius {facts['spectral_radius']:.5g}\n{counts}")
-    tidy(axes)
-
-
 def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
     part = next(iter(errors["koopman"]))
+    shown, factor = error_unit(part, task)
     steps = np.arange(1, errors["steps"] + 1)
     for model in MODELS:
-        values = 1e3 * np.asarray(errors[model][part], dtype=float)
+        values = factor * np.asarray(errors[model][part], dtype=float)
         label, color = _LABELS[model]
         axes.plot(steps, np.where((values > 0) & (values < _BLOWN_UP), values, np.nan), ".-", color=color, label=label)
     axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high * (high / low) ** 0.45)  # room for the legend
-    axes.set_xlabel(f"control steps ahead (latent actions given; {1e3 / task.control_hz:.0f} ms each)")
-    axes.set_ylabel(f"root mean square distance ({error_unit(part)})")
+    axes.margins(y=0.1)
+    axes.set_xlabel(f"control steps ahead, {1e3 / task.control_hz:.0f} ms each\n(latent actions given)")
+    axes.set_ylabel(f"root mean square distance ({shown})" if shown else "root mean square distance")
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
     judged = f"on {errors['judged_trajectories']} demonstrations"
     set_title(axes, f"Error of the predicted {part.replace('_', ' ')}\n{judged}")
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2)
     tidy(axes)
 
 
 def _draw_probe(axes: Axes, outside: Mapping[str, Any], names: list[str]) -> None:
     places = np.arange(len(names))
     for offset, key, color, label in (
-        (-0.19, "probe_r2", "#9cc3f5", "linear probe, all labels of half"),
+        (-0.19, "probe_r2", PALE_BLUE, "linear probe, all labels of half"),
         (0.19, "decoder_r2", BLUE, "the run's decoder"),
     ):
         values = np.asarray(outside[key], dtype=float)
@@ -151,10 +139,10 @@ def _draw_probe(axes: Axes, outside: Mapping[str, Any], names: list[str]) -> Non
             if np.isfinite(value):
                 style = {"ha": "center", "fontsize": 7, "color": INK, "rotation": 90 if len(names) > 4 else 0}
                 axes.annotate(f"{value:.3f}", (place, max(value, 0) + 0.01), **style)
-    axes.set_ylim(0, 1.3)
+    axes.set_ylim(0, 1.12)
     axes.set_xticks(places, names, fontsize=8, rotation=45 if len(names) > 4 else 0)
     axes.set_yticks((0, 0.25, 0.5, 0.75, 1))
     axes.set_ylabel("share of variance explained (R²)")
     set_title(axes, "True actions from latent actions\non the same held-out demonstrations")
-    axes.legend(frameon=False, fontsize=8, loc="upper left", ncols=2, columnspacing=1)
+    legend_beside(axes, loc="upper center", bbox_to_anchor=(0.5, -0.22), ncols=2, columnspacing=1)
     tidy(axes)

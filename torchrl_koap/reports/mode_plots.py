@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
+from safetensors.numpy import load_file
 
 from torchrl_koap.evaluation.statistics import mode_entropy
-from torchrl_koap.reports.scenes import FAINT, INK, MUTED, set_title, tidy
-from torchrl_koap.reports.training_plots import as_array, save_figure
-from torchrl_koap.tasks.modes import initials, mode_choices, mode_colors
+from torchrl_koap.reports.mode_colors import initials, mode_colors
+from torchrl_koap.reports.pictures import picture
+from torchrl_koap.reports.style import FAINT, INK, MUTED, SUCCESS, as_array, legend_beside, save_figure, set_title, tidy
+from torchrl_koap.tasks.avoiding import OBSTACLES
+from torchrl_koap.tasks.modes import mode_choices
+
+_ROW_REACH = 0.03  # m before and behind a row of cylinders: the gap is the one at the first frame within it
 
 
 def even_entropy(episodes: int, num_modes: int) -> float:
@@ -24,6 +30,13 @@ def even_entropy(episodes: int, num_modes: int) -> float:
 
     A few episodes cannot fill all modes evenly, so this is below 1: what a policy without preferences scores on
     average. It is the exact mean over the binomial counts.
+
+    Args:
+        episodes (int): number of episodes.
+        num_modes (int): number of modes, and base of the logarithm.
+
+    Returns:
+        float: 0 to 1.
 
     Examples:
         >>> from torchrl_koap.reports.mode_plots import even_entropy
@@ -38,6 +51,22 @@ def even_entropy(episodes: int, num_modes: int) -> float:
         log_chance += count * math.log(1 / num_modes) + (episodes - count) * math.log(1 - 1 / num_modes)
         total -= math.exp(log_chance) * count / episodes * math.log(count / episodes)
     return num_modes * total / math.log(num_modes)
+
+
+@picture(
+    "modes.png",
+    source="rollouts.safetensors",
+    title="Modes of the successful rollouts",
+    caption="One bar per mode. Black ticks: the share of each mode in the demonstrations, where they say which they"
+    " took. Entropy is 1 when all modes are equally frequent; a handful of rollouts cannot reach 1 even with an even"
+    " choice, the title says what to expect.",
+    place=40,
+)
+def _draw_modes(rollouts: Mapping[str, Any], path: Path, *, task: str | None, num_modes: int, run_dir: Path) -> Path:
+    demonstrations = run_dir / "demonstrations.safetensors"
+    reference = recorded_modes(load_file(demonstrations), task) if demonstrations.exists() else None
+    mode = rollouts["mode"][rollouts["outcome"] == SUCCESS]
+    return plot_modes(mode, path, task=task, num_modes=num_modes, reference=reference)
 
 
 def plot_modes(
@@ -55,8 +84,11 @@ def plot_modes(
         path (str or Path): png to write.
         task (str, optional): task whose choices order and colour the bars.
         num_modes (int, optional): number of modes, needed where the task names no choices.
-        reference (torch.Tensor or array, optional): modes of the demonstrations; drawn as ticks, scaled to the number
-            of rollouts.
+        reference (torch.Tensor or array, optional): modes of the demonstrations; drawn as black ticks, scaled to the
+            number of rollouts.
+
+    Raises:
+        ValueError: if a shape is wrong, or the task names no modes and their number is not given.
 
     Examples:
         >>> import tempfile
@@ -85,7 +117,7 @@ def plot_modes(
             level = np.bincount(reference, minlength=number) * len(mode) / len(reference)
             label = f"{len(reference)} demonstrations, scaled"
             axes.hlines(level, places - 0.46, places + 0.46, color=INK, linewidth=1.3, zorder=3, label=label)
-            axes.legend(frameon=False, fontsize=8, loc="upper right", borderpad=0)
+            legend_beside(axes)
     axes.set_ylabel("successful rollouts")
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.set_ylim(0, 1.2 * max(1, axes.dataLim.y1))
@@ -107,6 +139,44 @@ def plot_modes(
     tidy(axes)
     axes.tick_params(axis="x", length=0)
     return save_figure(figure, path)
+
+
+def recorded_modes(demonstrations: Mapping[str, Any], task: str | None) -> np.ndarray | None:
+    """Modes of the demonstrations: those recorded, or for Avoiding those that their paths show.
+
+    Args:
+        demonstrations (mapping): ``mode`` [episodes], or ``position`` [N, 2] (m) with ``episode`` [N].
+        task (str, optional): the task.
+
+    Returns:
+        np.ndarray or None: a mode per demonstration, -1 where a row was not passed; None if they cannot be known.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.reports.mode_plots import recorded_modes
+        >>> path = np.array([[0.55, -0.1], [0.5, 0.08], [0.6, 0.27]])
+        >>> recorded_modes({"position": path, "episode": np.zeros(3)}, "avoiding").tolist()
+        [18]
+    """
+    if "mode" in demonstrations:
+        return as_array("mode", demonstrations["mode"], [None]).astype(int)
+    if task != "avoiding" or "position" not in demonstrations:
+        return None
+    position = as_array("position", demonstrations["position"], [None, 2])
+    episode = as_array("episode", demonstrations["episode"], [len(position)])
+    rows: dict[float, list[float]] = {}
+    for _, x, y, *_ in OBSTACLES:
+        rows.setdefault(y, []).append(x)
+    modes = []
+    for path in np.split(position, np.flatnonzero(np.diff(episode) != 0) + 1):
+        mode = 0
+        for number, (y, cylinders) in enumerate(sorted(rows.items())):
+            last = number == len(rows) - 1
+            near = path[:, 1] >= y if last else abs(path[:, 1] - y) <= _ROW_REACH
+            gap = int((path[near.argmax(), 0] > cylinders).sum())
+            mode = mode * (len(cylinders) + 1) + gap if near.any() and mode >= 0 else -1
+        modes.append(mode)
+    return np.array(modes)
 
 
 def draw_mode_table(axes: Axes, mode: np.ndarray, choices: tuple, colors: np.ndarray) -> None:

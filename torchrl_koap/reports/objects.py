@@ -1,14 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The bodies that a task's contexts place, from above: where they start, their paths, where they end.
 
-A new task adds one line to :data:`OBJECTS`, in the order of its contexts. Sizes are repeated here because the
-environments take seconds to import; a test compares them.
+Their sizes and colours are those of ``Task.bodies``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,58 +15,28 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
-from torchrl_koap.reports.scenes import BLUE, GREEN, INK, MUTED, RED
-from torchrl_koap.reports.training_plots import as_array
+from torchrl_koap.reports.scenes import color_of
+from torchrl_koap.reports.style import INK, MUTED, as_array
+from torchrl_koap.tasks import Body
+from torchrl_koap.tasks.registry import find_task
+
+MANY = 20
+_UNKNOWN = Body("objects", position="")
 
 
-@dataclass(frozen=True)
-class Look:
-    """How a body looks from above.
+def object_looks(task: str | None, number: int) -> tuple[Body, ...]:
+    """A look for each of ``number`` bodies; grey ones where the task is not known or has another number.
 
     Args:
-        name (str): its name in a legend; bodies of the same name share an entry.
-        color (str): its colour.
-        half (tuple of float): half its width and half its depth (m).
-        front (bool): its far side is emphasised, where its orientation matters.
-        still (bool): it stays where it starts.
+        task (str, optional): name of the task.
+        number (int): number of bodies.
+
+    Returns:
+        tuple of Body: those of the task, their colours as matplotlib takes them.
     """
-
-    name: str
-    color: str
-    half: tuple[float, float]
-    front: bool = False
-    still: bool = False
-
-
-def _boxes(each: int) -> tuple[Look, ...]:
-    return (Look("red boxes", RED, (0.03, 0.03)),) * each + (Look("blue boxes", BLUE, (0.03, 0.03)),) * each
-
-
-_STACK = (
-    Look("red box", RED, (0.03, 0.03)),
-    Look("green box", GREEN, (0.03, 0.03)),
-    Look("blue box", BLUE, (0.03, 0.05)),
-)
-OBJECTS = {
-    "aligning": (
-        Look("tray", "#9a5b13", (0.05, 0.05), front=True),
-        Look("target", "#0a7f7f", (0.05, 0.05), front=True, still=True),
-    ),
-    "sorting": _boxes(2),
-    "sorting_2": _boxes(1),
-    "sorting_6": _boxes(3),
-    "po_sorting": _boxes(2),
-    "stacking": _STACK,
-    "stacking_1": _STACK,
-}
-MANY = 20
-_UNKNOWN = Look("objects", MUTED, (0.03, 0.03))
-
-
-def object_looks(task: str | None, number: int) -> tuple[Look, ...]:
-    """A look for each of ``number`` bodies; grey ones where the task is not known or has another number."""
-    looks = OBJECTS.get(task, ())
-    return looks if len(looks) == number else (_UNKNOWN,) * number
+    known = find_task(task)
+    looks = known.bodies if known is not None and len(known.bodies) == number else (_UNKNOWN,) * number
+    return tuple(replace(look, color=color_of(look.color)) for look in looks)
 
 
 def outlines(poses: np.ndarray, half: tuple[float, float]) -> np.ndarray:
@@ -118,7 +87,7 @@ def object_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray] | None:
     return [path[np.isfinite(path).all((1, 2))] for path in paths]
 
 
-def draw_starts(axes: Axes, contexts: Any, looks: Sequence[Look]) -> None:
+def draw_starts(axes: Axes, contexts: Any, looks: Sequence[Body]) -> None:
     """Outlines of the bodies as the contexts place them, paler the more there are.
 
     The far side of a body whose orientation matters is thick; of more than 20 only the centres are drawn, each with a
@@ -127,7 +96,7 @@ def draw_starts(axes: Axes, contexts: Any, looks: Sequence[Look]) -> None:
     Args:
         axes (Axes): where to draw.
         contexts (array): ``[E, objects, 3]``: x, y (m), yaw (rad).
-        looks (sequence of Look): one per body.
+        looks (sequence of Body): one per body.
 
     Raises:
         ValueError: if the contexts have another shape.
@@ -149,13 +118,13 @@ def draw_starts(axes: Axes, contexts: Any, looks: Sequence[Look]) -> None:
             axes.add_collection(LineCollection(outline[:, 2:4], alpha=opacity, linewidths=2.2, **style))
 
 
-def draw_object_paths(axes: Axes, paths: Sequence[np.ndarray], looks: Sequence[Look], good: Sequence[bool]) -> None:
+def draw_object_paths(axes: Axes, paths: Sequence[np.ndarray], looks: Sequence[Body], good: Sequence[bool]) -> None:
     """Thin paths of the bodies in their colours; a dot where they end, a cross in episodes that failed.
 
     Args:
         axes (Axes): where to draw.
         paths (sequence): positions [frames, objects, 2] (m) of each episode.
-        looks (sequence of Look): one per body.
+        looks (sequence of Body): one per body.
         good (sequence of bool): whether each episode succeeded.
     """
     opacity = float(np.clip(8 / max(len(paths), 1), 0.3, 0.9))
@@ -172,12 +141,20 @@ def draw_object_paths(axes: Axes, paths: Sequence[np.ndarray], looks: Sequence[L
             axes.scatter(*ends.T, color=look.color, edgecolors="white" if fine else INK, **style)
 
 
-def legend_handles(looks: Sequence[Look], good: Sequence[bool] = ()) -> list[Line2D]:
-    """Entries of a legend: every kind of body once, and the marks of :func:`draw_object_paths` that occur."""
+def legend_handles(looks: Sequence[Body], good: Sequence[bool] = ()) -> list[Line2D]:
+    """Entries of a legend: every kind of body once, and the marks of :func:`draw_object_paths` that occur.
+
+    Args:
+        looks (sequence of Body): bodies that are drawn.
+        good (sequence of bool): whether each drawn episode succeeded.
+
+    Returns:
+        list of Line2D: handles with labels, for ``axes.legend(handles=...)``.
+    """
     handles = {}
     for look in looks:
         style = {"linestyle": "--" if look.still else "-", "linewidth": 1.6}
-        handles.setdefault(look.name, Line2D([], [], color=look.color, label=look.name, **style))
+        handles.setdefault(look.label, Line2D([], [], color=look.color, label=look.label, **style))
     for fine, mark, label in ((True, "o", "end"), (False, "X", "end of a failure")):
         if any(bool(kind) is fine for kind in good):
             handles[label] = Line2D([], [], color=MUTED, marker=mark, linestyle="none", markersize=5, label=label)

@@ -1,26 +1,59 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""All pictures of a run directory, from the files that training and evaluation left there."""
+"""The register of a run's pictures: what each is drawn from, what it shows, and which function draws it.
+
+A picture is one decorated function, here or in any other package::
+
+    @picture("speed.png", source="rollouts.safetensors", title="Speed", caption="Of the tool, per control step.")
+    def plot_speed(rollouts, path, *, control_hz):
+        ...
+
+The function is called with the content of its source file and the path to write, and with those of the facts about the
+run (see :data:`FACTS`) that it names as keyword arguments.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
+import inspect
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from torchrl_koap.reports.animation import animate_rollouts, render_rollout
-from torchrl_koap.reports.mode_plots import plot_modes
-from torchrl_koap.reports.rollout_plots import SUCCESS, plot_demonstrations, plot_plans, plot_rollouts
-from torchrl_koap.reports.scenes import SCENES
-from torchrl_koap.reports.training_plots import plot_actions, plot_eigenvalues, plot_losses
-from torchrl_koap.tasks import TASKS
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.tasks import task_of
 
 FOLDER = "plots"
+FACTS = {
+    "task": "name of the run's task, None where its scene cannot be drawn",
+    "num_modes": "number of modes of the task",
+    "control_hz": "control steps per second, None where unknown",
+    "actions": "name, unit and whether it is absolute of every action column, None where unknown",
+    "columns": "name and unit of every state column of a task without an environment, None for others",
+    "run_dir": "the run directory",
+}
+_BUILT_IN = (
+    "rollout_plots",
+    "offline_plots",
+    "animation",
+    "mode_plots",
+    "training_plots",
+    "latent_plot",
+    "diagnosis_plot",
+)
+_MOVING = (".gif", ".mp4")
+
+
+class NothingToDraw(ValueError):
+    """The source holds nothing that this picture could show; an earlier picture is removed."""
+
+
+class NotFilmed(RuntimeError):
+    """No OpenGL library can be used here; everything else can be drawn."""
 
 
 @dataclass(frozen=True)
@@ -30,24 +63,114 @@ class Picture:
     Args:
         name (str): file name inside ``plots/``.
         source (str): file of the run directory it is drawn from.
-        command (str): the ``koap`` command that leaves this file, ``{run}`` stands for the directory.
-        draw (callable): called with the run directory, the picture's path, and ``task``, ``num_modes``.
+        title (str): its heading in the report.
+        caption (str): what it shows and how to read it.
+        draw (callable): called with the content of the source and the path, and the facts it names.
+        command (str): the ``koap`` command that leaves the source, ``{run}`` stands for the directory.
+        place (int): pictures stand in the report in this order.
+        caption_of (callable, optional): from the name of a task (or None) to a further sentence of the caption.
+        empty (str): what the report says where the source holds nothing to draw; nothing if it is empty.
+
+    Examples:
+        >>> from torchrl_koap.reports.pictures import all_pictures
+        >>> picture = all_pictures()["rollouts.png"]
+        >>> picture.source, picture.caption_for() == picture.caption
+        ('rollouts.safetensors', True)
     """
 
     name: str
     source: str
-    command: str
-    draw: Callable[..., Path]
+    title: str
+    caption: str
+    draw: Callable[..., Path | None]
+    command: str = "koap train --out {run}"
+    place: int = 1000
+    caption_of: Callable[[str | None], str] | None = None
+    empty: str = ""
+
+    def caption_for(self, task: str | None = None) -> str:
+        """The caption, with what it adds for a task."""
+        return self.caption + (self.caption_of(task) if self.caption_of else "")
 
 
-class NotFilmed(RuntimeError):
-    """No OpenGL library can be used here; everything else can be drawn."""
+_PICTURES: dict[str, Picture] = {}
+_COMMANDS = {
+    "rollouts.safetensors": "koap eval {run} --episodes 60 --seed 100",
+    "inspect.json": "koap inspect {run}",
+}
+
+
+def picture(
+    name: str,
+    *,
+    source: str,
+    title: str,
+    caption: str,
+    command: str | None = None,
+    place: int = 1000,
+    caption_of: Callable[[str | None], str] | None = None,
+    empty: str = "",
+) -> Callable[[Callable[..., Path | None]], Callable[..., Path | None]]:
+    """Registers the decorated function as the one that draws a picture of a run; the function stays as it is.
+
+    Args:
+        name (str): file name inside ``plots/``, with its ending.
+        source (str): file of the run directory that is read: ``.safetensors`` comes as a dictionary of arrays,
+            ``.json`` as what it holds, ``.csv`` as a list of rows.
+
+    Keyword Args:
+        title (str): heading in the report.
+        caption (str): what the picture shows and how to read it.
+        command (str, optional): the ``koap`` command that leaves the source. Default: the one known for that file.
+        place (int): rank in the report; those of equal rank keep the order of their registration.
+        caption_of (callable, optional): a further sentence of the caption for a task.
+        empty (str): what the report says where the source holds nothing to draw.
+
+    Raises:
+        ValueError: if there is a picture of that name already, or a fact is asked for that does not exist.
+
+    Examples:
+        >>> from torchrl_koap.reports.pictures import all_pictures, picture
+        >>> @picture("speed.png", source="rollouts.safetensors", title="Speed", caption="Of the tool.")
+        ... def plot_speed(rollouts, path): ...
+        >>> all_pictures()["speed.png"].command
+        'koap eval {run} --episodes 60 --seed 100'
+        >>> del _PICTURES["speed.png"]
+    """
+
+    def register(draw: Callable[..., Path | None]) -> Callable[..., Path | None]:
+        known = _PICTURES.get(name)
+        where = f"{draw.__module__}.{draw.__qualname__}"
+        if known is not None:
+            first = f"{known.draw.__module__}.{known.draw.__qualname__}"
+            raise ValueError(f"a picture {name!r} is registered already, by {first}; {where} needs another name")
+        for key, parameter in _facts_of(draw):
+            if key not in FACTS and parameter.default is parameter.empty:
+                raise ValueError(f"picture {name!r}: {where} wants {key!r}, there are only {', '.join(FACTS)}")
+        usual = command or _COMMANDS.get(source, "koap train --out {run}")
+        _PICTURES[name] = Picture(name, source, title, caption, draw, usual, place, caption_of, empty)
+        return draw
+
+    return register
+
+
+def all_pictures() -> dict[str, Picture]:
+    """Every registered picture by name, in the order of the report.
+
+    Examples:
+        >>> from torchrl_koap.reports.pictures import all_pictures
+        >>> list(all_pictures())[0], "cylinders" in all_pictures()["rollouts.png"].caption_for("avoiding")
+        ('rollouts.png', True)
+    """
+    for module in _BUILT_IN:
+        import_module(f"torchrl_koap.reports.{module}")
+    return dict(sorted(_PICTURES.items(), key=lambda item: item[1].place))
 
 
 def draw_pictures(
     run_dir: str | Path, *, animation: bool = True, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, str]:
-    r"""Draws every picture whose data are there into ``plots/``; one that fails does not stop the others.
+    r"""Draws every picture whose source is there into ``plots/``; one that fails does not stop the others.
 
     Args:
         run_dir (str or Path): the run directory.
@@ -55,8 +178,8 @@ def draw_pictures(
         progress (callable, optional): called with (pictures looked at, pictures in all).
 
     Returns:
-        dict: what went wrong, a message per picture that could not be drawn although its data are there. A picture
-        whose data are absent is not an error.
+        dict: what went wrong, a message per picture that could not be drawn although its source is there. A picture
+        whose source is absent, or holds nothing to draw, is not an error.
 
     Raises:
         FileNotFoundError: if there is no such directory.
@@ -73,106 +196,78 @@ def draw_pictures(
     run_dir = Path(run_dir)
     if not run_dir.is_dir():
         raise FileNotFoundError(f"there is no run directory {str(run_dir)!r}")
-    names = task_names(run_dir)
-    problems = {}
-    for number, picture in enumerate(PICTURES):
-        if (run_dir / picture.source).exists() and (animation or not picture.name.endswith(".gif")):
+    facts, wanted, problems = run_facts(run_dir), all_pictures(), {}
+    for number, (name, item) in enumerate(wanted.items()):
+        if (run_dir / item.source).exists() and (animation or not name.endswith(_MOVING)):
             try:
-                picture.draw(run_dir, run_dir / FOLDER / picture.name, **names)
+                draw_picture(item, run_dir, facts)
+            except NothingToDraw:
+                (run_dir / FOLDER / name).unlink(missing_ok=True)  # an earlier picture shows other data
             except NotFilmed as error:
-                problems[picture.name] = f"{picture.name} was not made: {error}"
-            except (ValueError, KeyError, OSError, SafetensorError) as error:
-                problems[picture.name] = f"{picture.source}: {error}"
+                problems[name] = f"{name} was not made: {error}"
+            except (ValueError, KeyError, OSError, TypeError, SafetensorError) as error:
+                problems[name] = f"{item.source}: {error}"
         if progress is not None:
-            progress(number + 1, len(PICTURES))
+            progress(number + 1, len(wanted))
     return problems
 
 
-def task_names(run_dir: Path) -> dict[str, Any]:
-    """Task of the run, if its scene can be drawn, and number of modes, as keyword arguments of the pictures."""
-    try:
-        task = RunDirectory(run_dir).read_json("config.json").get("task")
-    except (RunDirectoryError, AttributeError):
-        task = None
-    facts = TASKS.get(task) if isinstance(task, str) else None
-    return {"task": task if task in SCENES else None, "num_modes": facts.num_modes if facts else 24}
+def draw_picture(item: Picture, run_dir: Path, facts: Mapping[str, Any] | None = None) -> Path:
+    """Draws a single picture of a run.
 
+    Args:
+        item (Picture): the picture.
+        run_dir (Path): the run directory, which holds its source.
+        facts (mapping, optional): of :func:`run_facts`; read from the directory if not given.
 
-def _losses(run_dir: Path, path: Path, **_: Any) -> Path:
-    rows = RunDirectory(run_dir).read_metrics()
-    if not rows:
-        raise ValueError("no row has been logged yet")
-    columns = {}
-    for name in rows[0]:
-        if name == "step" or (name or "").startswith("loss_"):
-            columns[name] = [float(row[name]) if row[name] else np.nan for row in rows]
-    return plot_losses(columns, path)
-
-
-def _rollouts(run_dir: Path, path: Path, **names: Any) -> Path:
-    return plot_rollouts(load_file(run_dir / "rollouts.safetensors"), path, **names)
-
-
-def _animation(run_dir: Path, path: Path, **names: Any) -> Path:
-    return animate_rollouts(load_file(run_dir / "rollouts.safetensors"), path, **names)
-
-
-def _film(run_dir: Path, path: Path, *, task: str | None, **_: Any) -> Path:
-    rollouts = load_file(run_dir / "rollouts.safetensors")
-    if task is None or "action" not in rollouts:  # a file of before actions were kept
-        return path
-    won = np.flatnonzero(rollouts["outcome"] == SUCCESS)
-    index = int(won[0]) if len(won) else 0
-    context = rollouts["context"][index] if "context" in rollouts else None
-    try:
-        return render_rollout(rollouts["action"][index], path, task=task, context=context)
-    except RuntimeError as error:
-        raise NotFilmed(error) from error
-
-
-def _plans(run_dir: Path, path: Path, **names: Any) -> Path:
-    rollouts = load_file(run_dir / "rollouts.safetensors")
-    if rollouts["plan"].shape[1]:
-        return plot_plans(rollouts, path, **names)
-    path.unlink(missing_ok=True)  # plans of joints, or none kept: an earlier picture shows other rollouts
+    Returns:
+        Path: the file.
+    """
+    facts = run_facts(run_dir) if facts is None else facts
+    path = run_dir / FOLDER / item.name
+    asked = {
+        key: facts[key]
+        for key, parameter in _facts_of(item.draw)
+        if key in facts and (facts[key] is not None or key == "task" or parameter.default is parameter.empty)
+    }
+    content = _load(run_dir / item.source)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    item.draw(content, path, **asked)
     return path
 
 
-def _modes(run_dir: Path, path: Path, **names: Any) -> Path:
-    rollouts = load_file(run_dir / "rollouts.safetensors")
-    demonstrations = run_dir / "demonstrations.safetensors"
-    reference = load_file(demonstrations).get("mode") if demonstrations.exists() else None
-    return plot_modes(rollouts["mode"][rollouts["outcome"] == SUCCESS], path, reference=reference, **names)
+def run_facts(run_dir: Path) -> dict[str, Any]:
+    """What is known about a run beside its sources: :data:`FACTS` as keyword arguments of the pictures.
+
+    Args:
+        run_dir (Path): the run directory; ``config.json`` is read if it is there.
+    """
+    try:
+        task = task_of(json.loads((run_dir / "config.json").read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # a run of a task that nobody knows here
+        task = None
+    columns, offline = None, task is not None and task.env is None
+    if task is not None:
+        columns = [(column, unit, column in task.absolute_actions) for column, unit in task.actions.items()]
+    return {
+        "task": task.name if task else None,
+        "num_modes": task.num_modes if task else 24,
+        "control_hz": task.control_hz if task else None,
+        "actions": columns,
+        "columns": list(zip(task.state_names, task.state_units, strict=True)) if offline else None,
+        "run_dir": run_dir,
+    }
 
 
-def _demonstrations(run_dir: Path, path: Path, *, task: str | None, **_: Any) -> Path:
-    return plot_demonstrations(load_file(run_dir / "demonstrations.safetensors"), path, task=task)
+def _facts_of(draw: Callable) -> list[tuple[str, inspect.Parameter]]:
+    parameters = inspect.signature(draw).parameters
+    return [(key, part) for key, part in parameters.items() if part.kind is part.KEYWORD_ONLY]
 
 
-def _actions(run_dir: Path, path: Path, *, task: str | None, **_: Any) -> Path:
-    data = load_file(run_dir / "actions.safetensors")
-    if task in TASKS and TASKS[task].action_unit == "rad":
-        joints = TASKS[task].same_unit
-        names = [*(f"joint {index + 1}" for index in range(joints)), "gripper"]
-        return plot_actions(data["predicted"], data["true"], path, names=names, unit="mrad", absolute={"gripper": "mm"})
-    return plot_actions(data["predicted"], data["true"], path, names=("x", "y", "z"))
-
-
-def _eigenvalues(run_dir: Path, path: Path, *, task: str | None, **_: Any) -> Path:
-    data = load_file(run_dir / "eigenvalues.safetensors")
-    hz = TASKS[task].control_hz if task in TASKS else None
-    return plot_eigenvalues(data["real"], data["imag"], path, control_hz=hz)
-
-
-_TRAIN, _EVAL = "koap train --out {run}", "koap eval {run} --episodes 60 --seed 100"
-PICTURES = (
-    Picture("rollouts.png", "rollouts.safetensors", _EVAL, _rollouts),
-    Picture("rollouts.gif", "rollouts.safetensors", _EVAL, _animation),
-    Picture("film.gif", "rollouts.safetensors", _EVAL, _film),
-    Picture("modes.png", "rollouts.safetensors", _EVAL, _modes),
-    Picture("plans.png", "rollouts.safetensors", _EVAL, _plans),
-    Picture("demonstrations.png", "demonstrations.safetensors", _TRAIN, _demonstrations),
-    Picture("actions.png", "actions.safetensors", _TRAIN, _actions),
-    Picture("losses.png", "metrics.csv", _TRAIN, _losses),
-    Picture("eigenvalues.png", "eigenvalues.safetensors", _TRAIN, _eigenvalues),
-)
+def _load(source: Path) -> Any:
+    if source.suffix == ".safetensors":
+        return load_file(source)
+    if source.suffix == ".json":
+        return json.loads(source.read_text(encoding="utf-8"))
+    with source.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,44 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from torchrl_koap.reports.mode_colors import mode_colors
 from torchrl_koap.reports.mode_plots import draw_mode_table
 from torchrl_koap.reports.objects import draw_object_paths, draw_starts, legend_handles, object_looks, object_paths
-from torchrl_koap.reports.scenes import BLUE, INK, draw_scene, set_title
-from torchrl_koap.reports.training_plots import as_array, save_figure
-from torchrl_koap.tasks.modes import mode_choices, mode_colors, mode_name
+from torchrl_koap.reports.offline_plots import plot_columns
+from torchrl_koap.reports.pictures import NothingToDraw, picture
+from torchrl_koap.reports.scenes import draw_scene
+from torchrl_koap.reports.style import (
+    BLUE,
+    FAILURE_MARKS,
+    INK,
+    NO_MODE,
+    OUTCOMES,
+    SUCCESS,
+    as_array,
+    save_figure,
+    set_title,
+    thousandths,
+)
+from torchrl_koap.tasks.modes import mode_choices, mode_name
+from torchrl_koap.tasks.registry import find_task
 
-TIMEOUT, SUCCESS, COLLISION = 0, 1, 2
-OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision"}
-FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X"}
-NO_MODE = "#8a919c"
+_MOST_ROOM = 0.5  # of the scene's own size is added on a side where paths leave it, at most
+
+
+def scene_caption(task: str | None) -> str:
+    """What the caption of the rollouts adds for a task."""
+    known = find_task(task)
+    return known.scene.caption if known else ""
+
+
+def has_objects(sentence: str) -> Callable[[str | None], str]:
+    """Adds a sentence to the caption of tasks with objects."""
+
+    def caption_of(task: str | None) -> str:
+        known = find_task(task)
+        return sentence if known and known.bodies else ""
+
+    return caption_of
 
 
 def executed_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
@@ -50,6 +78,15 @@ def executed_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
     return [path[np.isfinite(path).all(1)] for path in paths]
 
 
+@picture(
+    "rollouts.png",
+    source="rollouts.safetensors",
+    title="Executed rollouts",
+    caption="Path of the tool centre from above, to scale; a colour per mode, the table counts successes per mode."
+    " Failures are black and end in a cross (collision) or a square (out of time).",
+    caption_of=scene_caption,
+    place=10,
+)
 def plot_rollouts(
     rollouts: Mapping[str, Any], path: str | Path, *, task: str | None = "avoiding", num_modes: int | None = None
 ) -> Path:
@@ -102,8 +139,9 @@ def plot_rollouts(
     )
     for index in np.flatnonzero(~good):
         _draw_failure(axes, paths[index], outcome[index])
-    if task is None:
-        axes.autoscale()
+    keep_inside(axes, paths)
+    if bodies is not None:
+        keep_inside(beside, [path.reshape(-1, 2) for path in bodies])
     counts = [f"{int(good.sum())} of {len(good)} rollouts succeed"]
     counts += [f"{OUTCOMES[kind]}: {int((outcome == kind).sum())}" for kind in FAILURE_MARKS if (outcome == kind).any()]
     set_title(axes, ", ".join(counts))
@@ -121,6 +159,18 @@ def plot_rollouts(
     return save_figure(figure, path)
 
 
+@picture(
+    "plans.png",
+    source="rollouts.safetensors",
+    title="Plans against execution",
+    caption="Wide pale band: the executed path. Thin lines: every plan of that episode; dots: where each was made. A"
+    " plan that leaves the band at once was not followed (the controller errs); plans that fan out at their ends were"
+    " followed, then replaced (the planner revises). Distances are to the nearest point of the path, whatever the"
+    " time; what was planned beyond its end does not count. Failures come first.",
+    caption_of=has_objects(" Outlines and thin coloured lines are the objects of that episode: starts and paths."),
+    place=50,
+    empty="the rollouts hold no plans of positions",
+)
 def plot_plans(
     rollouts: Mapping[str, Any],
     path: str | Path,
@@ -142,6 +192,10 @@ def plot_plans(
             different modes as possible.
         count (int): number of episodes drawn by default.
 
+    Raises:
+        ValueError: if an entry is missing or has a wrong shape, or an episode does not exist.
+        NothingToDraw: if no plan was kept.
+
     Examples:
         >>> import tempfile
         >>> import torch
@@ -154,6 +208,8 @@ def plot_plans(
     """
     paths, mode, outcome = _read(rollouts)
     plan = as_array("plan", _entry(rollouts, "plan"), [len(paths), None, None, 2])
+    if not plan.shape[1]:
+        raise NothingToDraw("the rollouts hold no plans of positions")
     plan_step = as_array("plan_step", _entry(rollouts, "plan_step"), plan.shape[:2])
     colors, bodies = mode_colors(task, num_modes), object_paths(rollouts)
     if episodes is None:
@@ -179,21 +235,31 @@ def plot_plans(
         if outcome[index] in FAILURE_MARKS and len(paths[index]):
             mark = FAILURE_MARKS[outcome[index]]
             axes.scatter(*paths[index][-1], s=70, marker=mark, color=INK, edgecolors="white", linewidths=0.8, zorder=6)
-        if task is None:
-            axes.autoscale()
+        keep_inside(axes, [paths[index], *lines])
         stray = plan_deviation(paths[index], lines)
         what = mode_name(int(mode[index]), task, num_modes) if outcome[index] == SUCCESS else OUTCOMES[outcome[index]]
         note = "no plan within the path"
         if len(stray):
-            middle, most = 1e3 * np.quantile(stray, [0.5, 0.95])
-            note = f"off the path: median {middle:.1f}, 95 % within {most:.1f} mm"
+            unit, factor = thousandths("m")
+            middle, most = factor * np.quantile(stray, [0.5, 0.95])
+            note = f"off the path: median {middle:.1f}, 95 % within {most:.1f} {unit}"
         set_title(axes, f"episode {index}: {what}\n{note}")
         axes.label_outer()
     return save_figure(figure, path)
 
 
 def choose_episodes(mode: Any, outcome: Any, count: int) -> list[int]:
-    """Up to two failures, then successes, a new mode each as long as there are any, then what is left.
+    """Numbers of the episodes worth showing.
+
+    Up to two failures, then successes, a new mode each as long as there are any, then what is left.
+
+    Args:
+        mode (array): mode of every episode, int [E]; -1 where it has none.
+        outcome (array): outcome of every episode, int [E]; 1 is success.
+        count (int): how many to choose at most.
+
+    Returns:
+        list of int: rows of the arrays.
 
     Examples:
         >>> from torchrl_koap.reports.rollout_plots import choose_episodes
@@ -244,6 +310,27 @@ def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:
     return distance.min(1)[~beyond]
 
 
+@picture(
+    "demonstrations.png",
+    source="demonstrations.safetensors",
+    title="Demonstrations and labels",
+    caption="Blue: transitions whose action the training may read. Grey: states only.",
+    caption_of=has_objects(" Beside it the objects that were moved."),
+    place=80,
+)
+def _draw_demonstrations(
+    demonstrations: Mapping[str, Any],
+    path: Path,
+    *,
+    task: str | None,
+    columns: Sequence[tuple[str, str]] | None = None,
+    control_hz: float | None = None,
+) -> Path:
+    if columns is not None:  # no environment says what lies in a plane
+        return plot_columns(demonstrations, path, columns=columns, control_hz=control_hz)
+    return plot_demonstrations(demonstrations, path, task=task)
+
+
 def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, task: str | None = "avoiding") -> Path:
     """Paths of the demonstrations; transitions with an action label are emphasised, the others grey.
 
@@ -288,8 +375,7 @@ def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, 
     same = np.flatnonzero(labelled[:-1] & (episode[1:] == episode[:-1]))
     segments = np.stack([position[same], position[same + 1]], axis=1)
     axes.add_collection(LineCollection(segments, colors=BLUE, linewidths=1.7, capstyle="round", zorder=3))
-    if task is None:
-        axes.autoscale()
+    keep_inside(axes, paths)
     touched = len(np.unique(episode[labelled]))
     share = f"{labelled.mean():.1%}" if len(labelled) else "none"
     head = f"{len(paths)} demonstrations; labels on {int(labelled.sum()):,} of {len(labelled):,} transitions ({share})"
@@ -298,7 +384,7 @@ def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, 
         Line2D([], [], color=BLUE, linewidth=1.7, label="with action label"),
         Line2D([], [], color="#9aa1ab", linewidth=0.9, label="states only"),
     ]
-    axes.legend(handles=handles, fontsize=8.5, loc="lower right", frameon=False)
+    axes.legend(handles=handles, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False)
     return save_figure(figure, path)
 
 
@@ -316,8 +402,32 @@ def draw_bodies(axes: Axes, paths: Sequence[np.ndarray], contexts: Any, task: st
     if contexts is not None:
         draw_starts(axes, contexts, looks)
     draw_object_paths(axes, paths, looks, good)
-    if task is None:
-        axes.autoscale()
+    keep_inside(axes, [path.reshape(-1, 2) for path in paths])
+
+
+def keep_inside(axes: Axes, paths: Sequence[np.ndarray]) -> None:
+    """Widens a panel until paths lie inside it, on every side by at most half of what it showed before.
+
+    Args:
+        axes (Axes): the panel; one that shows no scene yet is fitted to the paths.
+        paths (sequence): positions [n, 2] (m) each.
+    """
+    points = np.concatenate([np.zeros((0, 2)), *paths])
+    points = points[np.isfinite(points).all(1)]
+    if not len(points):
+        return
+    fresh = axes.get_autoscale_on()  # nobody has set limits
+    low, high = points.min(0), points.max(0)
+    margin = 0.03 * np.maximum(high - low, 1e-3)
+    for now, change, start, end in (
+        (axes.get_xlim(), axes.set_xlim, low[0] - margin[0], high[0] + margin[0]),
+        (axes.get_ylim(), axes.set_ylim, low[1] - margin[1], high[1] + margin[1]),
+    ):
+        if fresh:
+            change(start, end)
+        else:
+            room = _MOST_ROOM * (now[1] - now[0])
+            change(max(min(now[0], start), now[0] - room), min(max(now[1], end), now[1] + room), auto=False)
 
 
 def _draw_failure(axes: Axes, path: np.ndarray, outcome: int) -> None:

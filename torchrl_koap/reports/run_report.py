@@ -1,25 +1,27 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The one-page report of a run directory: plain HTML beside the pictures, nothing fetched from elsewhere."""
+"""The one-page report of a run directory: what a template needs, gathered from the files that are there."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Mapping
-from html import escape
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.files import replacing_file
-from torchrl_koap.reports.captions import CAPTIONS, caption
-from torchrl_koap.reports.html import STYLE, definition, duration, interval_bar, number, table, tile
+from torchrl_koap.reports.html import bar, duration, number, write_page
 from torchrl_koap.reports.mode_plots import even_entropy
-from torchrl_koap.reports.pictures import FOLDER, PICTURES, draw_pictures, task_names
+from torchrl_koap.reports.pictures import FOLDER, all_pictures, draw_pictures, run_facts
+from torchrl_koap.reports.style import thousandths
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
+_SIMULATED = ("rollouts.safetensors", "inspect.json")
 _BESIDE_LABELS = "demonstrations.png"
+_COMMANDS = {"train": "koap train --out {run}", "eval": "koap eval {run} --episodes 60 --seed 100"}
+_OFFLINE_COMMANDS = _COMMANDS | {"eval": "koap eval {run}"}
+_PLAN_BASELINES = ("standing_still", "constant_velocity")
 _SUMMARY_ELSEWHERE = ("labels",)
-_EVAL_ELSEWHERE = ("episode", "command")
+_EVAL_ELSEWHERE = ("episode", "command", "trajectory", "faults")
 _CONFIG_ELSEWHERE = ("versions", "command")
 
 
@@ -63,26 +65,34 @@ def write_report(
         files[name], note = _read(run_dir, f"{name}.json")
         notes += note
     config, summary, evaluation = files["config"], files["summary"], files["eval"]
-    names = task_names(run_dir)
-    sections = [
-        _header(run_dir, config),
-        "".join(f'<p class="warning">{escape(note)}</p>' for note in notes),
-        _headline(run_dir, config, summary, evaluation, names["num_modes"]),
-        _labels(run_dir, summary, problems),
-        _pictures(run_dir, problems, names["task"]),
-        _numbers(summary, evaluation),
-        _reproduce(run_dir, config, evaluation),
-    ]
-    title = escape(_title(config))
-    page = (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}</style></head>\n'
-        f"<body><main>\n{chr(10).join(section for section in sections if section)}\n</main></body></html>\n"
+    facts = run_facts(run_dir)
+    offline = facts["columns"] is not None
+    notes += evaluation.get("faults") or []
+    figures, missing = _figures(run_dir, problems, facts["task"], offline=offline)
+    return write_page(
+        "run.html",
+        run_dir / "index.html",
+        title=_title(config),
+        subtitle=_subtitle(run_dir, config),
+        notes=notes,
+        tiles=_tiles(config, summary, evaluation, facts["num_modes"]),
+        evaluated=bool(evaluation),
+        commands={
+            name: _filled(command, run_dir) for name, command in (_OFFLINE_COMMANDS if offline else _COMMANDS).items()
+        },
+        labels=summary.get("labels"),
+        labels_read=number(_action_errors(summary)[0].get("analysis_labels_read")),
+        label_figure=next((item for item in figures if item.get("name") == _BESIDE_LABELS), None),
+        figures=[item for item in figures if item["name"] != _BESIDE_LABELS],
+        missing=missing,
+        numbers=_numbers(summary, evaluation),
+        episodes=evaluation.get("episode") or evaluation.get("trajectory"),
+        again=_commands(run_dir, config, evaluation),
+        configured=bool(config),
+        has_command=_given(config, "command"),
+        versions=config.get("versions"),
+        options={key: value for key, value in config.items() if key not in _CONFIG_ELSEWHERE},
     )
-    path = run_dir / "index.html"
-    with replacing_file(path) as aside:
-        aside.write_text(page, encoding="utf-8")
-    return path
 
 
 def _read(run_dir: Path, name: str) -> tuple[dict[str, Any], list[str]]:
@@ -103,14 +113,18 @@ def _title(config: Mapping[str, Any]) -> str:
     return f"{method} on {task}" if method and task else str(task or method or "run")
 
 
-def _header(run_dir: Path, config: Mapping[str, Any]) -> str:
+def _subtitle(run_dir: Path, config: Mapping[str, Any]) -> str:
     shown = [f"{key.replace('_', ' ')} {config[key]}" for key in ("preset", "dataset", "seed") if _given(config, key)]
-    line = " · ".join([str(run_dir), *shown])
-    return f"<header><h1>{escape(_title(config))}</h1><p>{escape(line)}</p></header>"
+    return " · ".join([str(run_dir), *shown])
 
 
-def _headline(run_dir: Path, config: Mapping, summary: Mapping, evaluation: Mapping, num_modes: int) -> str:
-    tiles = []
+def _tile(name: str, value: str, note: str, bar: tuple[float, float, float] | None = None) -> dict[str, Any]:
+    return {"name": name, "value": value, "note": note, "bar": bar}
+
+
+def _tiles(config: Mapping, summary: Mapping, evaluation: Mapping, num_modes: int) -> list[dict[str, Any]]:
+    """The headline numbers, those that there are."""
+    tiles = _offline_tiles(evaluation)
     rate, episodes = number(evaluation.get("success_rate")), number(evaluation.get("episodes"))
     contexts = number(evaluation.get("contexts"))
     among = f" in {contexts:g} contexts" if contexts else ""
@@ -127,7 +141,7 @@ def _headline(run_dir: Path, config: Mapping, summary: Mapping, evaluation: Mapp
             even = f"an even choice averages {even_entropy(successes, num_modes):.2f}, n = {successes}"
         notes = (_between(evaluation, given, "{:.2f}"), seen, even if successes else "")
         head = f"{ENTROPIES[given]}, base {num_modes}"
-        tiles.append(tile(head, f"{number(evaluation[given]):.2f}", "; ".join(filter(None, notes))))
+        tiles.append(_tile(head, f"{number(evaluation[given]):.2f}", "; ".join(filter(None, notes))))
     errors, unit = _action_errors(summary)
     if errors:
         values = {key: number(value) for key, value in errors.items() if key != "analysis_labels_read"}
@@ -137,26 +151,43 @@ def _headline(run_dir: Path, config: Mapping, summary: Mapping, evaluation: Mapp
             others = [f"{key} {value:.2f} {unit}" for key, value in values.items() if key != own]
             read = number(errors.get("analysis_labels_read"))
             others += [f"n = {read:,.0f} unlabelled steps"] if read else []
-            tiles.append(tile(f"action error, {own}", f"{values[own]:.2f} {unit}", ", ".join(others)))
+            tiles.append(_tile(f"action error, {own}", f"{values[own]:.2f} {unit}", ", ".join(others)))
     labels = summary.get("labels")
     if isinstance(labels, Mapping) and number(labels.get("labelled_transitions")) is not None:
-        tiles.append(tile("action labels", f"{labels['labelled_transitions']:,.0f}", _share(labels)))
+        tiles.append(_tile("action labels", f"{labels['labelled_transitions']:,.0f}", _share(labels)))
     control = number(evaluation.get("control_hz"))
     if control is not None:
         parts = [("plan_ms", "ms per plan"), ("control_ms", "ms per control step")]
         latency = [f"{number(evaluation[key]):.3g} {what}" for key, what in parts if number(evaluation.get(key))]
-        tiles.append(tile("control rate", f"{control:.0f} Hz", ", ".join(latency)))
+        tiles.append(_tile("control rate", f"{control:.0f} Hz", ", ".join(latency)))
     seconds = summary.get("train_seconds")
     spent = {"": seconds} if not isinstance(seconds, Mapping) else seconds
     spent = {key: number(value) for key, value in spent.items() if number(value) is not None}
     if spent:
         each = ", ".join(f"{key} {duration(value)}" for key, value in spent.items() if key)
         whole = sum(value for key, value in spent.items() if key != "total")
-        tiles.append(tile("training time", duration(whole), each))
-    missing = ""
-    if not evaluation:
-        missing = f"<p>Not evaluated yet. {_hint('koap eval {run} --episodes 60 --seed 100', run_dir)}</p>"
-    return f'<section><h2>Result</h2><div class="tiles">{"".join(tiles)}</div>{missing}</section>'
+        tiles.append(_tile("training time", duration(whole), each))
+    return tiles
+
+
+def _offline_tiles(evaluation: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Errors of plans and actions, of an evaluation without an environment."""
+    tiles = []
+    for row in evaluation.get("plan_errors", {}).get("unit", ()):
+        shown, factor = thousandths(row["unit"])
+        values = {name: factor * row[name]["energy_score"]["overall"] for name in ("planner", *_PLAN_BASELINES)}
+        note = ", ".join(f"{name.replace('_', ' ')} {values[name]:.3g}" for name in _PLAN_BASELINES)
+        head = f"plan error, energy score, {len(row['columns'])} columns"
+        tiles.append(_tile(head, f"{values['planner']:.3g} {shown}".rstrip(), note))
+    errors = evaluation.get("action_errors", {})
+    split = evaluation.get("action_errors_on")
+    for row in errors.get(split, {}).get("unit", ()) if split else ():
+        shown, factor = thousandths(row["unit"])
+        others = [f"{name.replace('_', ' ')} {factor * row[name]:.3g}" for name in ("ridge", "mean_action")]
+        others.append(f"n = {errors[split]['labels']:,} labels, {split.replace('_', ' ')}")
+        head = f"action error, {len(row['columns'])} columns"
+        tiles.append(_tile(head, f"{factor * row['controller']:.3g} {shown}".rstrip(), ", ".join(others)))
+    return tiles
 
 
 def _between(evaluation: Mapping[str, Any], name: str, form: str) -> str:
@@ -165,24 +196,24 @@ def _between(evaluation: Mapping[str, Any], name: str, form: str) -> str:
     return "" if low is None or high is None else f"95 % interval {form.format(low)} to {form.format(high)}"
 
 
-def _rate(evaluation: Mapping[str, Any], name: str, head: str, what: str) -> list[str]:
+def _rate(evaluation: Mapping[str, Any], name: str, head: str, what: str) -> list[dict[str, Any]]:
     """Tile of a share of the rollouts with its interval, if it was measured."""
     rate, episodes = number(evaluation.get(f"{name}_rate")), number(evaluation.get("episodes"))
     if rate is None:
         return []
     low, high = (number(evaluation.get(f"{name}_{end}")) for end in ("low", "high"))
-    between, bar = "", ""
+    between, drawn = "", None
     if low is not None and high is not None:
-        between, bar = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %", interval_bar(rate, low, high)
+        between, drawn = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %", bar(rate, low, high)
     count = f"{round(rate * episodes)} of {episodes:g}{what}" if episodes else ""
-    return [tile(head, f"{100 * rate:.1f} %", ", ".join(filter(None, (between, count))), bar)]
+    return [_tile(head, f"{100 * rate:.1f} %", ", ".join(filter(None, (between, count))), drawn)]
 
 
 def _action_errors(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
     """Errors of the predicted actions, empty if there are none, and their unit."""
-    for unit in ("mm", "mrad"):
-        if isinstance(summary.get(f"action_error_{unit}"), Mapping):
-            return summary[f"action_error_{unit}"], unit
+    for name, errors in summary.items():
+        if name.startswith("action_error") and isinstance(errors, Mapping):
+            return errors, name.removeprefix("action_error").removeprefix("_")
     return {}, ""
 
 
@@ -194,86 +225,46 @@ def _share(labels: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _labels(run_dir: Path, summary: Mapping[str, Any], problems: Mapping[str, str]) -> str:
-    labels = summary.get("labels")
-    if isinstance(labels, Mapping):
-        text = "<p>What the training was allowed to read; everything else was hidden before it began.</p>"
-        text += table(labels)
-    else:
-        text = f"<p>No account of the labels. {_hint('koap train --out {run}', run_dir)}</p>"
-    read = number(_action_errors(summary)[0].get("analysis_labels_read"))
-    if read:
-        text += (
-            f"<p><strong>Outside the budget, for analysis only:</strong> {read:,.0f} labels were read to measure the"
-            " action error below. They trained nothing and selected nothing.</p>"
+def _figures(
+    run_dir: Path, problems: Mapping[str, str], task: str | None, *, offline: bool
+) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
+    """What is to be shown, and for each command the titles of the pictures whose source it would leave."""
+    figures, missing = [], {}
+    for name, item in all_pictures().items():
+        file = next((n for n in (name, Path(name).stem + ".mp4") if (run_dir / FOLDER / n).exists()), None)
+        if name in problems:
+            continue
+        figure = {"name": name, "title": item.title, "caption": item.caption_for(task), "empty": ""}
+        if file is not None:
+            moving = file.endswith((".gif", ".mp4"))
+            figures.append(figure | {"source": f"{FOLDER}/{file}", "beside": moving})
+        elif (item.source in _SIMULATED) if offline else (item.source == "eval.json"):
+            continue  # no command makes it for this task
+        elif not (run_dir / item.source).exists():
+            missing.setdefault(_filled(item.command, run_dir), []).append(item.title)
+        elif item.empty:
+            figures.append(figure | {"empty": item.empty})
+    return figures, missing
+
+
+def _numbers(summary: Mapping[str, Any], evaluation: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Everything else in the files, under a heading each."""
+    return [
+        (head, shown)
+        for head, source, elsewhere in (
+            ("Evaluation", evaluation, _EVAL_ELSEWHERE),
+            ("Training", summary, _SUMMARY_ELSEWHERE),
         )
-    figure = _figure(run_dir, _BESIDE_LABELS, problems)
-    return f'<section><h2>Labels</h2><div class="account"><div>{text}</div>{figure}</div></section>'
+        if (shown := {key: value for key, value in source.items() if key not in elsewhere})
+    ]
 
 
-def _pictures(run_dir: Path, problems: Mapping[str, str], task: str | None) -> str:
-    known = {picture.name: picture for picture in PICTURES}
-    parts, missing = [], {}
-    for name, (head, _) in CAPTIONS.items():
-        figure = _figure(run_dir, name, problems, task)
-        if figure and name != _BESIDE_LABELS:
-            parts.append(figure)
-        elif not figure and name not in problems and name in known and not (run_dir / known[name].source).exists():
-            missing.setdefault(known[name].command, []).append(head)
-        elif not figure and name == "plans.png" and name not in problems:
-            parts.append(f'<p class="absent">{head}: not drawn, the rollouts hold no plans of positions.</p>')
-    hints = [f"<li>{escape(', '.join(heads))}. {_hint(command, run_dir)}</li>" for command, heads in missing.items()]
-    absent = f'<div class="absent"><p>Not drawn because the data are absent:</p><ul>{"".join(hints)}</ul></div>'
-    return f"<section><h2>Pictures</h2>{''.join(parts)}{absent if hints else ''}</section>"
-
-
-def _figure(run_dir: Path, name: str, problems: Mapping[str, str], task: str | None = None) -> str:
-    source = f"{FOLDER}/{name}"
-    if name in problems or not (run_dir / source).exists():
-        return ""
-    head, text = map(escape, caption(name, task))
-    if name.endswith(".mp4"):
-        media = f'<video src="{source}" controls loop muted playsinline aria-label="{head}"></video>'
-    else:
-        media = f'<a href="{source}"><img src="{source}" alt="{head}"></a>'
-    if name.endswith((".gif", ".mp4")):
-        return f'<figure class="beside">{media}<figcaption><h3>{head}</h3>{text}</figcaption></figure>'
-    return f"<figure><h3>{head}</h3>{media}<figcaption>{text}</figcaption></figure>"
-
-
-def _numbers(summary: Mapping[str, Any], evaluation: Mapping[str, Any]) -> str:
-    columns = ""
-    for head, source, elsewhere in (
-        ("Evaluation", evaluation, _EVAL_ELSEWHERE),
-        ("Training", summary, _SUMMARY_ELSEWHERE),
-    ):
-        shown = {key: value for key, value in source.items() if key not in elsewhere}
-        if shown:
-            columns += f"<div><h3>{head}</h3>{table(shown)}</div>"
-    episodes = ""
-    if evaluation.get("episode"):
-        rows = definition("episode", evaluation["episode"])
-        episodes = f"<details><summary>Every episode</summary>{rows}</details>"
-    if not columns and not episodes:
-        return ""
-    return f'<section><h2>All numbers</h2><div class="account">{columns}</div>{episodes}</section>'
-
-
-def _reproduce(run_dir: Path, config: Mapping[str, Any], evaluation: Mapping[str, Any]) -> str:
+def _commands(run_dir: Path, config: Mapping[str, Any], evaluation: Mapping[str, Any]) -> list[str]:
+    """Command lines that train and evaluate the run again."""
     commands = [_command(source["command"]) for source in (config, evaluation) if _given(source, "command")]
     if evaluation and not _given(evaluation, "command"):
         commands.append(_eval_command(run_dir, evaluation))
-    text = f"<pre>{escape(chr(10).join(commands))}</pre>" if commands else ""
-    if config and not _given(config, "command"):
-        text += "<p>The configuration holds no command line; its options are below.</p>"
-    if _given(config, "versions"):
-        text += "<h3>Versions</h3>" + definition("versions", config["versions"])
-    shown = {key: value for key, value in config.items() if key not in _CONFIG_ELSEWHERE}
-    if shown:
-        text += "<details><summary>Every option of the training</summary>" + table(shown) + "</details>"
-    if not config:
-        text += f"<p>No <code>config.json</code>. {_hint('koap train --out {run}', run_dir)}</p>"
-    return f"<section><h2>Do it again</h2>{text}</section>"
+    return commands
 
 
 def _command(command: Any) -> str:
@@ -282,18 +273,20 @@ def _command(command: Any) -> str:
 
 def _eval_command(run_dir: Path, evaluation: Mapping[str, Any]) -> str:
     words = ["koap", "eval", str(run_dir)]
+    if evaluation.get("kind") == "offline":
+        evaluation = {name: evaluation.get(name) for name in ("seed", "solver", "solver_steps")}
     episode = evaluation.get("episode")
     first = episode[0] if isinstance(episode, list) and episode and isinstance(episode[0], Mapping) else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
-    options |= {key: evaluation.get(key) for key in ("execution", "solver", "solver_steps")}
+    options |= {key: evaluation.get(key) for key in ("execution", "solver", "solver_steps", "env", "success_key")}
     for key, value in options.items():
         if value is not None:
             words += [f"--{key.replace('_', '-')}", str(value)]
     return shlex.join(words)
 
 
-def _hint(command: str, run_dir: Path) -> str:
-    return f"Made by <code>{escape(command.format(run=shlex.quote(str(run_dir))))}</code>."
+def _filled(command: str, run_dir: Path) -> str:
+    return command.format(run=shlex.quote(str(run_dir)))
 
 
 def _given(source: Mapping[str, Any], key: str) -> bool:

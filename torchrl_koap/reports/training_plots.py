@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Charts of training and controller; paths are in ``path_plots``, modes in ``mode_plots``.
+"""Charts of training and controller: losses, eigenvalues, predicted actions.
 
 Every function takes plain tensors or arrays and a file, draws into a figure of its own (no pyplot, no global state),
 writes aside, renames, and returns the file.
@@ -13,13 +13,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from torchrl_koap.reports.scenes import BLUE, FAINT, GREEN, INK, MUTED, set_title, tidy
+from torchrl_koap.reports.pictures import picture
+from torchrl_koap.reports.spectrum_plot import as_spectrum, draw_distances, draw_spectrum
+from torchrl_koap.reports.style import (
+    BLUE,
+    FAINT,
+    MUTED,
+    SERIES,
+    WARNING,
+    as_array,
+    legend_beside,
+    save_figure,
+    set_title,
+    thousandths,
+    tidy,
+)
 
-ORANGE = "#d9730d"
-_SERIES = (BLUE, ORANGE, GREEN, "#8250df", "#bf3989", "#0a7f7f", "#6b7280")
 _ROUND = (1, 2, 5, 10)
 TERMS = {
     "loss_planner": "planner",
@@ -29,40 +42,22 @@ TERMS = {
 }
 
 
-def as_array(name: str, value: Any, shape: Sequence[int | None]) -> np.ndarray:
-    """Turns a tensor or array into a numpy array and checks its shape.
-
-    Args:
-        name (str): name used in the message.
-        value (torch.Tensor or array): what was handed in; on any device, with or without gradient.
-        shape (sequence): wanted sizes, None where any size will do.
-
-    Raises:
-        ValueError: if the shape is another one.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.reports.training_plots import as_array
-        >>> as_array("real", torch.ones(3), [None]).tolist()
-        [1.0, 1.0, 1.0]
-    """
-    if hasattr(value, "detach"):  # a tensor; torch itself is not imported, that takes seconds
-        value = value.detach().cpu().numpy()
-    value = np.asarray(value)
-    if value.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, value.shape, strict=False)):
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name!r} must have shape [{wanted}], got {list(value.shape)}")
-    return value
-
-
-def save_figure(figure: Figure, path: str | Path, *, dpi: int = 150) -> Path:
-    """Writes a figure as png, aside first, so that an earlier picture is replaced whole or not at all."""
-    from torchrl_koap.files import replacing_file  # imports torch: only when something is written
-
-    path = Path(path)
-    with replacing_file(path) as aside:
-        figure.savefig(aside, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
-    return path
+@picture(
+    "losses.png",
+    source="metrics.csv",
+    title="Losses",
+    caption="Pale: logged values; line: running mean, its last value in the corner. Logarithmic. A planner's loss says"
+    " little about its rollouts: judge it by the pictures above.",
+    place=100,
+)
+def _draw_losses(rows: Sequence[Mapping[str, str]], path: Path) -> Path:
+    if not rows:
+        raise ValueError("no row has been logged yet")
+    columns = {}
+    for name in rows[0]:
+        if name == "step" or (name or "").startswith("loss_"):
+            columns[name] = [float(row[name]) if row[name] else np.nan for row in rows]
+    return plot_losses(columns, path)
 
 
 def plot_losses(metrics: Mapping[str, Sequence[float]], path: str | Path) -> Path:
@@ -129,6 +124,13 @@ def plot_losses(metrics: Mapping[str, Sequence[float]], path: str | Path) -> Pat
 def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
     """Mean of the values at most ``reach`` places away, leaving out NaN; shorter windows at both ends.
 
+    Args:
+        values (np.ndarray): numbers [N].
+        reach (int): places to either side.
+
+    Returns:
+        np.ndarray: means [N]; NaN where there is nothing to average.
+
     Examples:
         >>> import numpy as np
         >>> from torchrl_koap.reports.training_plots import running_mean
@@ -144,14 +146,31 @@ def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
     return np.where(number > 0, (total[last] - total[first]) / np.maximum(number, 1), np.nan)
 
 
+@picture(
+    "eigenvalues.png",
+    source="eigenvalues.safetensors",
+    title="Koopman eigenvalues",
+    caption="Left: eigenvalues of the latent operator in the complex plane; orange ones lie outside the unit circle,"
+    " where predictions grow, pale ones on it within a thousandth. Right: how far each lies from the circle, on an axis"
+    " that is linear within a thousandth of it and logarithmic beyond, with the time in which such a part of the state"
+    " fades.",
+    place=110,
+)
+def _draw_eigenvalues(values: Mapping[str, Any], path: Path, *, control_hz: float | None) -> Path:
+    return plot_eigenvalues(values["real"], values["imag"], path, control_hz=control_hz)
+
+
 def plot_eigenvalues(real: Any, imag: Any, path: str | Path, *, control_hz: float | None = None) -> Path:
-    """Eigenvalues of the Koopman operator in the unit circle, and their magnitudes in order.
+    """Eigenvalues of the Koopman operator in the complex plane, and how far each lies from the unit circle.
 
     Args:
         real (torch.Tensor or array): real parts [m].
         imag (torch.Tensor or array): imaginary parts [m].
         path (str or Path): png to write.
         control_hz (float, optional): control steps per second; adds the time in which a mode fades to 1/e.
+
+    Raises:
+        ValueError: if there is none, or one is not finite.
 
     Examples:
         >>> import tempfile
@@ -160,70 +179,29 @@ def plot_eigenvalues(real: Any, imag: Any, path: str | Path, *, control_hz: floa
         ...     plot_eigenvalues([0.9, 0.5], [0.1, 0.0], f"{folder}/eigenvalues.png").name
         'eigenvalues.png'
     """
-    real = as_array("real", real, [None])
-    imag = as_array("imag", imag, [len(real)])
-    size = np.hypot(real, imag)
-    if not len(size) or not np.isfinite(size).all():
-        raise ValueError(f"eigenvalues must be finite and at least one, got {len(size)} with NaN or infinite ones")
-    outside = size > 1 + 1e-6
-    figure = Figure(figsize=(8.4, 4.1), layout="constrained")
-    plane, rank = figure.subplots(1, 2, width_ratios=(1, 1.05))
-
-    angle = np.linspace(0, 2 * np.pi, 400)
-    plane.fill(np.cos(angle), np.sin(angle), color="#f4f5f7", zorder=0)
-    plane.plot(np.cos(angle), np.sin(angle), color=MUTED, linewidth=1, zorder=1)
-    plane.axhline(0, color=FAINT, linewidth=0.6, zorder=0.5)
-    plane.axvline(0, color=FAINT, linewidth=0.6, zorder=0.5)
-    reach = 1.1 * max(1.0, float(size.max()))
-    plane.set_xlim(-reach, reach)
-    plane.set_ylim(-reach, reach)
-    plane.set_box_aspect(1)
-    rank.set_box_aspect(1)
-    plane.set_xticks((-1, -0.5, 0, 0.5, 1))
-    plane.set_yticks((-1, -0.5, 0, 0.5, 1))
-    plane.set_xlabel("real part")
-    plane.set_ylabel("imaginary part")
-    set_title(plane, f"{len(size)} eigenvalues, {int(outside.sum())} outside the unit circle")
-
-    order = np.argsort(-size)
-    rank.axhline(1, color=MUTED, linewidth=1)
-    rank.set_xlabel("rank")
-    rank.set_ylabel("magnitude")
-    set_title(rank, f"largest magnitude {size.max():.4f}")
-    low, high = max(0.0, size.min() - 0.02), max(1.0, size.max()) + 0.02
-    rank.set_ylim(low - 0.05 * (high - low) if low else 0, high + 0.05 * (high - low))
-    panels = [plane]
-    spread = max(np.ptp(real), np.ptp(imag), 0.02)
-    if spread < 0.4 and real.min() > 0.25:  # the empty half has room for a closer look
-        inset = plane.inset_axes((0.1, 0.53, 0.35, 0.35))
-        centre = np.array([real.min() + real.max(), imag.min() + imag.max()]) / 2
-        inset.set_xlim(centre[0] - 0.6 * spread, centre[0] + 0.6 * spread)
-        inset.set_ylim(centre[1] - 0.6 * spread, centre[1] + 0.6 * spread)
-        inset.plot(np.cos(angle), np.sin(angle), color=MUTED, linewidth=1, zorder=1)
-        inset.tick_params(labelsize=6.5, color=FAINT, labelcolor=MUTED)
-        inset.locator_params(nbins=3)
-        plane.indicate_inset_zoom(inset, edgecolor=MUTED)
-        panels.append(inset)
-    ranks = np.arange(1, len(size) + 1)
-    for subset, color in ((~outside, BLUE), (outside, ORANGE)):
-        style = {"s": 20, "color": color, "alpha": 0.6, "linewidths": 0}
-        for axes in panels:
-            axes.scatter(real[subset], imag[subset], zorder=2, **style)
-        rank.scatter(ranks[subset[order]], size[order][subset[order]], **style)
-    tidy(plane), tidy(rank)
-    if control_hz is not None:
-        bottom, top = rank.get_ylim()
-        ticks: dict[float, str] = {}
-        for time in (0.01, 0.03, 0.1, 0.3, 1, 3, 10):
-            place = math.exp(-1 / (time * control_hz))
-            if place > max([bottom, *(tick + 0.045 * (top - bottom) for tick in ticks)]):  # labels need room
-                ticks[place] = f"{time:g} s"
-        fades = rank.secondary_yaxis("right")
-        fades.set_yticks(list(ticks), list(ticks.values()))
-        fades.tick_params(labelsize=8, color=FAINT, labelcolor=MUTED)
-        fades.set_ylabel("fades to 1/e within", size=9, color=INK)
-        fades.spines["right"].set_visible(False)
+    values = as_spectrum(real, imag)
+    figure = Figure(figsize=(9.4, 4.2), layout="constrained")
+    plane, rank = figure.subplots(1, 2, width_ratios=(1, 1.15))
+    draw_spectrum(plane, values)
+    draw_distances(rank, values, control_hz=control_hz)
     return save_figure(figure, path)
+
+
+@picture(
+    "actions.png",
+    source="actions.safetensors",
+    title="Predicted against recorded actions",
+    caption="For analysis only: the recorded actions of unlabelled demonstrations lie outside the label budget and were"
+    " not used for training or selection. Points on the diagonal are exact; a slope below 1 means timid actions, an"
+    " offset in the error histogram means drift.",
+    place=90,
+)
+def _draw_actions(data: Mapping[str, Any], path: Path, *, actions: Sequence[tuple[str, str, bool]] | None) -> Path:
+    if not actions or len(actions) != data["true"].shape[-1]:
+        return plot_actions(data["predicted"], data["true"], path)
+    names, units, _ = zip(*actions, strict=True)
+    levels = [name for name, _, level in actions if level]  # a number that is set, not a change per step
+    return plot_actions(data["predicted"], data["true"], path, names=names, units=units, absolute=levels)
 
 
 def plot_actions(
@@ -231,10 +209,9 @@ def plot_actions(
     true: Any,
     path: str | Path,
     *,
-    names: Sequence[str] = ("x", "y"),
-    scale: float = 1e3,
-    unit: str = "mm",
-    absolute: Mapping[str, str] | None = None,
+    names: Sequence[str] | None = None,
+    units: Sequence[str] | None = None,
+    absolute: Sequence[str] = (),
 ) -> Path:
     """Predicted against recorded actions, a panel per dimension, and the distribution of the errors.
 
@@ -245,14 +222,14 @@ def plot_actions(
         predicted (torch.Tensor or array): actions the controller gives [N, d].
         true (torch.Tensor or array): recorded actions [N, d].
         path (str or Path): png to write.
-        names (sequence of str): name of each dimension.
-        scale (float): factor from the unit of the data (m or rad per step) to the unit shown.
-        unit (str): the unit shown.
-        absolute (mapping, optional): dimensions that are no change per step, by name, with the unit shown. They are
-            left out of the distribution of the errors.
+        names (sequence of str, optional): name of each column. Default: numbers.
+        units (sequence of str, optional): unit of each column in the data, ``""`` for none; metres, radians, seconds
+            and newtons are shown in thousandths.
+        absolute (sequence of str): columns that are no change per step, by name. They, and columns of another unit
+            than the first, are left out of the distribution of the errors.
 
     Raises:
-        ValueError: if shapes differ, or no row is finite in both.
+        ValueError: if shapes differ, names or units are not one per column, or no row is finite in both.
 
     Examples:
         >>> import tempfile
@@ -264,50 +241,63 @@ def plot_actions(
     """
     true = as_array("true", true, [None, None])
     predicted = as_array("predicted", predicted, true.shape)
+    width = true.shape[1]
+    names = [f"action {index + 1}" for index in range(width)] if names is None else list(names)
+    units = [""] * width if units is None else list(units)
+    for what, given in (("names", names), ("units", units)):
+        if len(given) != width:
+            raise ValueError(f"{what!r} must be one per action column, {width} in all, got {len(given)}")
     there = np.isfinite(true).all(1) & np.isfinite(predicted).all(1)
     if not there.any():
         raise ValueError(f"'predicted' and 'true' have no row of {len(true)} that is finite in both")
-    true, predicted = scale * true[there], scale * predicted[there]
+    shown, factor = zip(*map(thousandths, units), strict=True)
+    true, predicted = true[there] * factor, predicted[there] * factor
     error = predicted - true
-    width = true.shape[1]
-    names = [names[index] if index < len(names) else str(index) for index in range(width)]
-    absolute = absolute or {}
     across = width + 1 if width < 5 else -(-(width + 1) // 2)
     down = -(-(width + 1) // across)
-    figure = Figure(figsize=(3.2 * across, 3.4 * down + 0.35), layout="constrained")
+    figure = Figure(figsize=(3.2 * across + 0.6, 3.4 * down + 0.35), layout="constrained")
     for index, name in enumerate(names):
         axes = figure.add_subplot(down, across, index + 1)
-        low, high = np.quantile(np.concatenate([true[:, index], predicted[:, index]]), [0.0005, 0.9995])
-        margin = 0.06 * (high - low) + 1e-9
-        span = (low - margin, high + margin)
-        axes.plot(span, span, color=MUTED, linewidth=0.8, zorder=1)
-        size = float(np.clip(3000 / len(true), 1.5, 14))
-        opacity = float(np.clip(600 / len(true), 0.12, 0.7))
-        axes.scatter(true[:, index], predicted[:, index], s=size, color=BLUE, alpha=opacity, linewidths=0, zorder=2)
-        shown = absolute.get(name, f"{unit} per step")
-        axes.set(xlim=span, ylim=span, box_aspect=1, xlabel=f"recorded {name} ({shown})")
-        axes.set_ylabel(f"predicted {name} ({shown})")
-        set_title(axes, f"{name}: RMSE {_rms(error[:, index]):.2f} {absolute.get(name, unit)}")
-        axes.xaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
-        axes.yaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
-        tidy(axes)
+        _scatter(axes, true[:, index], predicted[:, index])
+        each = " ".join(filter(None, (shown[index], "" if name in absolute else "per step")))
+        axes.set_xlabel(f"recorded {name} ({each})" if each else f"recorded {name}")
+        axes.set_ylabel(f"predicted {name} ({each})" if each else f"predicted {name}")
+        set_title(axes, f"{name}: RMSE {_rms(error[:, index]):.3g} {shown[index]}".rstrip())
+    same = [n for n in range(width) if names[n] not in absolute and units[n] == units[0]] or list(range(width))
+    left_out = [names[index] for index in range(width) if index not in same]
     axes = figure.add_subplot(down, across, width + 1)
-    same = [index for index, name in enumerate(names) if name not in absolute] or list(range(width))
-    error = error[:, same]
-    reach = max(float(np.quantile(abs(error), 0.995)), 1e-9)
-    for column, index in enumerate(same):
-        style = {"histtype": "step", "color": _SERIES[column % len(_SERIES)], "linewidth": 1.4, "label": names[index]}
-        axes.hist(np.clip(error[:, column], -reach, reach), bins=41, range=(-reach, reach), **style)
-    which = "all" if len(same) == width else f"all but {', '.join(absolute)}"
-    set_title(axes, f"{which}: RMSE {_rms(error):.2f} {unit}, median {np.median(abs(error)):.2f}")
-    axes.set_box_aspect(1)
-    axes.set_xlabel(f"predicted - recorded ({unit} per step)")
-    axes.set_ylabel("steps")
-    axes.legend(frameon=False, fontsize=9 if len(same) < 5 else 7)
-    tidy(axes)
+    _histogram(axes, error[:, same], [names[index] for index in same], shown[same[0]], left_out)
     title = f"{len(true):,} steps of unlabelled demonstrations - for analysis only: reads labels outside the budget"
-    figure.suptitle(title, fontsize=10, color="#9a3412", x=0.01, ha="left")
+    figure.suptitle(title, fontsize=10, color=WARNING, x=0.01, ha="left")
     return save_figure(figure, path)
+
+
+def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:
+    low, high = np.quantile(np.concatenate([true, predicted]), [0.0005, 0.9995])
+    margin = 0.06 * (high - low) + 1e-9
+    span = (low - margin, high + margin)
+    axes.plot(span, span, color=MUTED, linewidth=0.8, zorder=1)
+    size, opacity = float(np.clip(3000 / len(true), 1.5, 14)), float(np.clip(600 / len(true), 0.12, 0.7))
+    axes.scatter(true, predicted, s=size, color=BLUE, alpha=opacity, linewidths=0, zorder=2)
+    axes.set(xlim=span, ylim=span, box_aspect=1)
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
+    axes.yaxis.set_major_locator(MaxNLocator(6, steps=_ROUND))
+    tidy(axes)
+
+
+def _histogram(axes: Axes, error: np.ndarray, names: Sequence[str], unit: str, left_out: Sequence[str]) -> None:
+    reach = max(float(np.quantile(abs(error), 0.995)), 1e-9)
+    for column, name in enumerate(names):
+        style = {"histtype": "step", "color": SERIES[column % len(SERIES)], "linewidth": 1.4, "label": name}
+        axes.hist(np.clip(error[:, column], -reach, reach), bins=41, range=(-reach, reach), **style)
+    which = f"all but {', '.join(left_out)}" if left_out else "all"
+    size = f"RMSE {_rms(error):.3g} {unit}".rstrip()
+    set_title(axes, f"{which}: {size}, median {np.median(abs(error)):.2g}")
+    axes.set_box_aspect(1)
+    axes.set_xlabel(f"predicted - recorded ({unit})" if unit else "predicted - recorded")
+    axes.set_ylabel("steps")
+    legend_beside(axes)
+    tidy(axes)
 
 
 def _rms(values: np.ndarray) -> float:

@@ -7,25 +7,19 @@ last and in one go, marks it as done, so a process may be killed at any moment.
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from torchrl_koap.data import limit_observations
-from torchrl_koap.evaluation.run import Eval, run_eval
-from torchrl_koap.tasks import get_task
-from torchrl_koap.training.builders import load_demonstrations, set_up_torch
-from torchrl_koap.training.config import Train, configure, with_task_defaults
-from torchrl_koap.training.methods import METHODS
-from torchrl_koap.training.planner import train_planner
-from torchrl_koap.training.run import run_train
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.evaluation import EvalConfig, evaluate
+from torchrl_koap.evaluation.offline import KIND
+from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.training import RunDirectory, RunDirectoryError, TrainConfig, get_method, train
+from torchrl_koap.training.run import train_shared_planner
 
 DONE = "cell.json"
+_ERRORS = ("relative_plan_error", "relative_action_error")
 
 
 @dataclass(frozen=True)
@@ -37,6 +31,11 @@ class Cell:
         fraction (float): share of the units that keep their labels.
         observations (float): share of the trajectories that are used at all.
         seed (int): of label choice, initialisation and batches.
+
+    Examples:
+        >>> from torchrl_koap.studies.cells import Cell
+        >>> Cell("koap", fraction=0.02, observations=1.0, seed=0).folder
+        'cells/koap-0.02-1-seed0'
     """
 
     method: str
@@ -52,7 +51,7 @@ class Cell:
     @property
     def planner(self) -> str | None:
         """The folder of the planner that it shares, None for a method without one."""
-        return None if METHODS[self.method].acts else planner_folder(self.observations)
+        return planner_folder(self.observations) if get_method(self.method).has_planner else None
 
 
 def planner_folder(observations: float) -> str:
@@ -85,27 +84,17 @@ def _is_readable(run: RunDirectory, name: str) -> bool:
 def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) -> None:
     """Trains a planner on states alone: all actions are hidden before anything looks at the data.
 
-    Args:
+    Keyword Args:
         folder (str): where to.
         observations (float): share of the trajectories to use.
-        settings (dict): options of :class:`~torchrl_koap.training.config.Train`.
+        settings (dict): options of :class:`~torchrl_koap.training.TrainConfig`.
     """
     began = time.perf_counter()
     resume = (Path(folder) / "config.json").exists()
-    options = Train(out=Path(folder), observation_fraction=observations, resume=resume, **settings)
-    task = get_task(options.task)
-    options = with_task_defaults(options, task)
-    set_up_torch(options.threads, options.device)
-    run = RunDirectory(options.out)
-    data = load_demonstrations(options.dataset, task)
-    data["action"] = torch.full_like(data["action"], math.nan)
-    data["has_action"] = torch.zeros_like(data["has_action"])
-    data = limit_observations(data, observations).to(options.device)
-    config = configure(run, options)
-    run.write_json("config.json", config)
-    torch.manual_seed(options.seed)
-    _, values = train_planner(run, options, config, task, data, None)
-    run.write_json(DONE, {"train_seconds": time.perf_counter() - began} | values)
+    values = train_shared_planner(
+        TrainConfig(out=Path(folder), observation_fraction=observations, resume=resume, **settings)
+    )
+    RunDirectory(folder).write_json(DONE, {"train_seconds": time.perf_counter() - began} | values)
 
 
 def do_cell(
@@ -113,18 +102,18 @@ def do_cell(
 ) -> None:
     """Trains and evaluates a cell, from where it was left.
 
-    Args:
+    Keyword Args:
         folder (str): its run directory.
         cell (dict): fields of :class:`Cell`.
         planner (str, optional): folder of the planner to share.
-        settings (dict): options of :class:`~torchrl_koap.training.config.Train`.
-        evaluation (dict): options of :class:`~torchrl_koap.evaluation.run.Eval`.
+        settings (dict): options of :class:`~torchrl_koap.training.TrainConfig`.
+        evaluation (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig`.
     """
     path, this = Path(folder), Cell(**cell)
     began = time.perf_counter()
     if not _is_readable(RunDirectory(path), "summary.json"):
-        run_train(
-            Train(
+        train(
+            TrainConfig(
                 out=path,
                 method=this.method,
                 label_fraction=this.fraction,
@@ -136,7 +125,7 @@ def do_cell(
             )
         )
     trained = time.perf_counter()
-    result = run_eval(Eval(run=path, animate=False, report=False, **evaluation))
+    result = evaluate(path, EvalConfig(**evaluation))
     run = RunDirectory(path)
     run.write_json(
         DONE,
@@ -145,8 +134,7 @@ def do_cell(
             "labels": run.read_entry("summary.json", "labels"),
             "train_seconds": trained - began,
             "eval_seconds": time.perf_counter() - trained,
-            "episodes": result["episodes"],
-            "successes": _successes(result),
+            **_counts(result),
         },
     )
 
@@ -182,8 +170,9 @@ def _results(run: RunDirectory) -> dict[str, Any]:
     done, summary, result = (run.read_json(name) for name in (DONE, "summary.json", "eval.json"))
     try:
         columns = _columns(done, summary, result)
-        episodes = done.get("episodes", result["episodes"])  # a cell of before says nothing of them
-        same = (done["successes"], episodes) == (_successes(result), result["episodes"])
+        counts = _counts(result)
+        done.setdefault("episodes", counts["episodes"])  # a cell of before says nothing of them
+        same = all(done[name] == value for name, value in counts.items())
     except (KeyError, TypeError, AttributeError) as error:
         raise RunDirectoryError(f"{run.path}: its results are damaged ({type(error).__name__}: {error})") from error
     if not same:
@@ -191,18 +180,29 @@ def _results(run: RunDirectory) -> dict[str, Any]:
     return columns
 
 
-def _successes(result: dict[str, Any]) -> int:
-    return round(result["success_rate"] * result["episodes"])
+def _counts(result: dict[str, Any]) -> dict[str, Any]:
+    """What says whether an evaluation is the one that a cell was finished with."""
+    if result.get("kind") == KIND:
+        return {"episodes": None, "successes": None, **{name: result[name] for name in _ERRORS}}
+    return {"episodes": result["episodes"], "successes": round(result["success_rate"] * result["episodes"])}
 
 
 def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
     labels = done["labels"]
-    errors = next((value for name, value in summary.items() if name.startswith("action_error_")), {})
-    entropy = result["mode_entropy"]
-    return {
+    errors = next((value for name, value in summary.items() if name.startswith("action_error")), {})
+    common = {
         "labelled_units": labels["selected_units"],
         "labelled_transitions": labels["labelled_transitions"],
         "trajectories_touched": labels["trajectories_touched"],
+        "action_error": errors.get("controller"),
+        "controller_updates": summary["controller_updates"],
+        "train_seconds": done["train_seconds"],
+        "eval_seconds": done["eval_seconds"],
+    }
+    if result.get("kind") == KIND:
+        return common | {"kind": KIND, "action_error": _own_error(result)} | {name: result[name] for name in _ERRORS}
+    entropy = result["mode_entropy"]
+    return common | {
         "episodes": result["episodes"],
         "successes": done["successes"],
         "success_rate": result["success_rate"],
@@ -211,8 +211,13 @@ def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, An
         "mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy,
         "collisions": result["collisions"],
         "mean_steps": result["mean_steps"],
-        "action_error": errors.get("controller"),
-        "controller_updates": summary["controller_updates"],
-        "train_seconds": done["train_seconds"],
-        "eval_seconds": done["eval_seconds"],
     }
+
+
+def _own_error(result: dict[str, Any]) -> float | None:
+    """Error of the actions in the unit of the first column, as it is shown; None if nothing was measured."""
+    split = result["action_errors_on"]
+    if split is None:
+        return None
+    row = result["action_errors"][split]["unit"][0]
+    return row["controller"] * thousandths(row["unit"])[1]

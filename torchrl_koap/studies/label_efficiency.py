@@ -1,29 +1,29 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap curve``: methods x label budgets x seeds in one command, on one shared planner, resumable at any moment."""
+"""Label-efficiency curves: methods x label budgets x seeds on one shared planner, resumable at any moment."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tqdm import tqdm
 
-from torchrl_koap.data import LabelBudget, flatten_trajectories, limit_observations, save_ted
+from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted, subsample_trajectories
 from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
 from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.studies.table import write_cells
-from torchrl_koap.tasks import HISTORY, WINDOW, Task, get_task
-from torchrl_koap.training.builders import load_demonstrations
+from torchrl_koap.tasks import HISTORY, WINDOW, Task
+from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.released_settings import get_released
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
@@ -31,14 +31,15 @@ ALL = "koap,koap_labelled_only,linear,dd,vae,lapo,dp,relabel,nonlinear,pretrain"
 
 
 @dataclass
-class Curve:
+class CurveConfig:
     """Measure success against the number of labels: methods x label fractions x seeds.
 
     Attributes:
         out: folder of the curve; the same command goes on where it was interrupted, and may add methods, fractions or
             seeds.
-        task: name of the task.
-        dataset: "scripted", or a folder: of D3IL raw pickles, a LeRobot data set, or written by `koap demos`.
+        task: name of the task (default: that of the data set, if it says so; else "avoiding").
+        dataset: "scripted", or a folder: written by `koap demos` or save_demonstrations, of D3IL raw pickles, or a
+            LeRobot data set.
         demonstrations: number of scripted demonstrations (default: that of the task).
         methods: names in torchrl_koap.training.methods.METHODS, with commas between.
         fractions: shares of the units that keep their labels, with commas between.
@@ -53,10 +54,17 @@ class Curve:
         workers: cells at a time (default: one per core; a cluster given by its address decides for itself).
         launcher: "local" or "ray".
         address: of a Ray cluster (default: one on this machine).
+        plugins: modules that register tasks, methods or pictures; every cell imports them, and every later call.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.studies.label_efficiency import CurveConfig, run_curve
+        >>> config = CurveConfig(out=Path("curve"), methods="koap,dd", fractions="0.01,0.1", seeds=2)
+        >>> run_curve(config)  # doctest: +SKIP
     """
 
     out: Path
-    task: str = "avoiding"
+    task: str | None = None
     dataset: str = "scripted"
     demonstrations: int | None = None
     methods: str = ALL
@@ -72,6 +80,10 @@ class Curve:
     workers: int | None = None
     launcher: str = "local"
     address: str | None = None
+    plugins: Plugins = ()
+
+    def __post_init__(self):
+        self.out = Path(self.out)  # so that a string will do in Python
 
 
 # what all cells of a folder must have in common; the rest may grow
@@ -89,8 +101,11 @@ _FIXED = (
 _GROWS = ("methods", "fractions", "observations", "seeds")
 
 
-def run_curve(options: Curve) -> dict[str, Any]:
-    """Does what is missing of a curve and writes its report.
+def run_curve(config: CurveConfig) -> dict[str, Any]:
+    """Does what is missing of a curve and writes its report; ``koap curve`` calls this.
+
+    Args:
+        config (CurveConfig): what to compare on what, and where to write it.
 
     Returns:
         dict: how many cells are done, failed and missing, and where the report is.
@@ -99,9 +114,13 @@ def run_curve(options: Curve) -> dict[str, Any]:
         ValueError: for unknown methods, fractions out of range or that select nothing.
         RunDirectoryError: if the folder holds something else, a curve with other settings, or one that is being worked
             on.
+        PluginError: if a plugin cannot be imported.
     """
+    options = _with_earlier_plugins(config)
+    load_plugins(options.plugins)
     cells = _cells(options)
-    task = get_task(options.task)
+    task = find_task_of(options.dataset, options.task)
+    options = replace(options, task=task.name)
     for name in ("seeds", "demonstrations", "episodes", "steps", "controller_steps", "epochs", "workers"):
         value = getattr(options, name)
         if value is not None and value < 1:
@@ -113,7 +132,7 @@ def run_curve(options: Curve) -> dict[str, Any]:
     _check_folder(root, options)
     to_record = options.dataset == "scripted" and not (root.path / "demonstrations" / "ted").exists()
     _check_budgets(cells, options, _first_look(root, options, task))
-    with _locked(root):
+    with root.locked("koap curve", "lock"):
         _check_folder(root, options)  # another one may have finished here in the meantime
         dataset = _demonstrations(root, options, task)
         if to_record:
@@ -127,7 +146,7 @@ def run_curve(options: Curve) -> dict[str, Any]:
     return counts | {"report": str(report)}
 
 
-def _cells(options: Curve) -> list[Cell]:
+def _cells(options: CurveConfig) -> list[Cell]:
     """All cells in the order asked for; repeated names count once."""
     methods = _split("methods", options.methods, str)
     for name in methods:
@@ -157,11 +176,11 @@ def _split(name: str, text: str, kind: type) -> list[Any]:
         raise ValueError(f"{name} must be numbers with commas between, got {text!r}") from None
 
 
-def _check_folder(root: RunDirectory, options: Curve) -> None:
+def _check_folder(root: RunDirectory, options: CurveConfig) -> None:
     if (root.path / "curve.json").exists():
         earlier, now = root.read_json("curve.json"), _plain(options)
         # an option that is younger than the folder was at its default
-        earlier = {name: earlier.get(name, getattr(Curve, name)) for name in _FIXED}
+        earlier = {name: earlier.get(name, getattr(CurveConfig, name)) for name in _FIXED}
         changed = [f"{name} ({value})" for name, value in earlier.items() if now[name] != value]
         if changed:
             raise RunDirectoryError(
@@ -176,11 +195,11 @@ def _check_folder(root: RunDirectory, options: Curve) -> None:
         raise RunDirectoryError(f"{root.path} is not empty and no folder of `koap curve`; choose another --out")
 
 
-def _plain(options: Curve) -> dict[str, Any]:
+def _plain(options: CurveConfig) -> dict[str, Any]:
     return asdict(options) | {"out": str(options.out), "dataset": _dataset(options)}
 
 
-def _write_options(root: RunDirectory, options: Curve) -> None:
+def _write_options(root: RunDirectory, options: CurveConfig) -> None:
     """Keeps what was asked for, earlier methods, fractions and seeds included."""
     content = _plain(options)
     if (root.path / "curve.json").exists():
@@ -191,29 +210,22 @@ def _write_options(root: RunDirectory, options: Curve) -> None:
     root.write_json("curve.json", content)
 
 
-@contextmanager
-def _locked(root: RunDirectory) -> Iterator[None]:
-    root.path.mkdir(parents=True, exist_ok=True)
-    if importlib.util.find_spec("fcntl") is None:  # Windows, on which the other commands are to work nevertheless
-        yield
-        return
-    import fcntl
-
-    with (root.path / "lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunDirectoryError(f"another `koap curve` is working in {root.path}") from None
-        yield  # the system lets go of the lock however this process ends
+def _with_earlier_plugins(options: CurveConfig) -> CurveConfig:
+    """The options with the plugins of earlier calls, without which methods of theirs would be unknown."""
+    root = RunDirectory(options.out)
+    earlier = root.read_json("curve.json").get("plugins") or () if (root.path / "curve.json").exists() else ()
+    return replace(options, plugins=tuple(dict.fromkeys([*earlier, *options.plugins])))
 
 
-def _dataset(options: Curve) -> str:
+def _dataset(options: CurveConfig) -> str:
     """The data set by its whole path: a cell may run in another working directory."""
     return options.dataset if options.dataset == "scripted" else str(Path(options.dataset).absolute())
 
 
-def _first_look(root: RunDirectory, options: Curve, task: Task) -> TensorDictBase | None:
+def _first_look(root: RunDirectory, options: CurveConfig, task: Task) -> TensorDictBase | None:
     """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
+    if options.dataset == "scripted" and task.env is None:
+        raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: name a --dataset")
     if options.dataset != "scripted":
         return load_demonstrations(_dataset(options), task)
     if (root.path / "demonstrations" / "ted").exists():
@@ -221,11 +233,11 @@ def _first_look(root: RunDirectory, options: Curve, task: Task) -> TensorDictBas
     if options.units != "trajectory":
         LabelBudget(1, unit=options.units)  # knows the units
         return None
-    number = options.demonstrations or task.demonstrations
+    number = options.demonstrations or task.defaults.demonstrations
     return flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number)
 
 
-def _demonstrations(root: RunDirectory, options: Curve, task: Task) -> str:
+def _demonstrations(root: RunDirectory, options: CurveConfig, task: Task) -> str:
     """The data set as a folder: scripted demonstrations are recorded once for all cells."""
     if options.dataset != "scripted":
         return _dataset(options)
@@ -233,32 +245,31 @@ def _demonstrations(root: RunDirectory, options: Curve, task: Task) -> str:
     if not (folder / "ted").exists():
         from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 
-        episodes = options.demonstrations or task.demonstrations
-        with tqdm(total=episodes, desc="demonstrations", unit="episode") as bar:
-            data, _ = record_demonstrations(
-                task.name, episodes, 0, progress=lambda recorded, wanted: bar.update(recorded - bar.n)
-            )
+        episodes = options.demonstrations or task.defaults.demonstrations
+        with progress_bar(episodes, "demonstrations", unit="episode") as bar:
+            data, _ = record_demonstrations(task.name, episodes, 0, progress=count_up_to(bar))
         save_ted(data, folder / "ted", task=task.source)
     return str(folder)
 
 
-def _check_budgets(cells: Sequence[Cell], options: Curve, data: TensorDictBase | None) -> None:
+def _check_budgets(cells: Sequence[Cell], options: CurveConfig, data: TensorDictBase | None) -> None:
     """Refuses before any work what would fail in a cell: budgets that select nothing, shares below the labelled."""
     if data is None:
         return
     # windows of another seed lie in another number of trajectories
     for fraction, share, seed in dict.fromkeys((cell.fraction, cell.observations, cell.seed) for cell in cells):
         budget = LabelBudget(fraction, unit=options.units, seed=seed, window=WINDOW, history=HISTORY)
-        limit_observations(budget.apply(data)[0], share)
+        subsample_trajectories(budget.apply(data)[0], share)
 
 
-def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:
+def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:
     """Does the cells that are not done; returns why some failed."""
     common = {
         "task": options.task,
         "dataset": dataset,
         "steps": options.steps,
         "controller_steps": options.controller_steps,
+        "plugins": options.plugins,
     }
     cell_settings = common | {
         "label_unit": options.units,
@@ -297,8 +308,14 @@ def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: st
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     workers = options.workers or cores
     reasons: dict[Cell, str] = {}
-    with tqdm(total=len(first) + len(jobs), desc="cells", unit="cell", smoothing=0.1) as bar:
-        ended = launch([*first, *jobs], launcher=options.launcher, workers=workers, address=options.address)
+    with progress_bar(len(first) + len(jobs), "cells", unit="cell", smoothing=0.1) as bar:
+        ended = launch(
+            [*first, *jobs],
+            launcher=options.launcher,
+            workers=workers,
+            address=options.address,
+            preload=[do_cell.__module__],
+        )
         with closing(ended):
             for job, reason in ended:
                 bar.update()
@@ -310,7 +327,9 @@ def _work(root: RunDirectory, options: Curve, cells: Sequence[Cell], dataset: st
     return reasons
 
 
-def _rows(root: RunDirectory, cells: Sequence[Cell], options: Curve, reasons: dict[Cell, str]) -> list[dict[str, Any]]:
+def _rows(
+    root: RunDirectory, cells: Sequence[Cell], options: CurveConfig, reasons: dict[Cell, str]
+) -> list[dict[str, Any]]:
     """Writes ``cells.csv`` from the folders of all cells, asked for now or earlier, and returns its rows."""
     known = list(cells)
     earlier = root.read_json("curve.json")

@@ -19,7 +19,6 @@ from typing import Any, TextIO
 
 from torchrl_koap.lookup import lookup
 
-_PRELOAD = ("torchrl_koap.studies.cells",)  # imported once; every job's process starts as a copy of that
 _LONGEST = 500  # characters of a reason
 
 
@@ -33,6 +32,12 @@ class Job:
         arguments (dict): its keyword arguments, plain values.
         log (Path): file that what it prints is appended to.
         needs (tuple of str): names of the jobs that must have succeeded before.
+
+    Examples:
+        >>> import time
+        >>> from torchrl_koap.studies.launchers import Job
+        >>> Job("after", time.sleep, {"secs": 0}, needs=("before",)).needs
+        ('before',)
     """
 
     name: str
@@ -43,7 +48,12 @@ class Job:
 
 
 def launch(
-    jobs: Sequence[Job], *, launcher: str = "local", workers: int = 2, address: str | None = None
+    jobs: Sequence[Job],
+    *,
+    launcher: str = "local",
+    workers: int = 2,
+    address: str | None = None,
+    preload: Sequence[str] = (),
 ) -> Iterator[tuple[Job, str | None]]:
     """Runs jobs, each in a process of its own, and yields them as they end with the reason if they failed.
 
@@ -56,6 +66,7 @@ def launch(
         launcher (str): ``"local"`` or ``"ray"`` (extra ``ray``; the folders must be visible to all machines).
         workers (int): jobs at a time; on a cluster what Ray's own resources allow, one CPU each.
         address (str, optional): of a Ray cluster. Default: one on this machine with that many workers.
+        preload (sequence of str): modules to import once on this machine; a job's process starts as a copy of that.
 
     Raises:
         ValueError: for an unknown launcher, no workers, two jobs of one name, a need that is no job, jobs that wait for
@@ -74,7 +85,7 @@ def launch(
         graphlib.TopologicalSorter(needs).prepare()
     except graphlib.CycleError as error:
         raise ValueError(f"jobs wait for each other: {' -> '.join(error.args[1])}") from None
-    return _schedule(list(jobs), LAUNCHERS[launcher](workers, address))
+    return _schedule(list(jobs), LAUNCHERS[launcher](workers, address, preload))
 
 
 def check_launcher(launcher: str, *, workers: int = 1, address: str | None = None) -> None:
@@ -130,7 +141,16 @@ def _schedule(waiting: list[Job], pool: Any) -> Iterator[tuple[Job, str | None]]
 
 
 def run_logged(job_log: str, function: Callable[..., None], arguments: dict[str, Any]) -> str | None:
-    """Calls a function with everything it prints going to a file; returns why it failed, if it did."""
+    """Calls a function with everything it prints going to a file.
+
+    Args:
+        job_log (str): file to append to.
+        function (callable): what to call.
+        arguments (dict): its keyword arguments.
+
+    Returns:
+        str or None: why it failed, None if it did not.
+    """
     try:
         with _open_log(job_log) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
             try:
@@ -157,10 +177,10 @@ def _in_words(error: Exception) -> str:
 class _LocalPool:
     """Processes that are copies of a server which has imported everything: a job starts in a fraction of a second."""
 
-    def __init__(self, workers: int, address: str | None):
+    def __init__(self, workers: int, address: str | None, preload: Sequence[str] = ()):
         self.workers = workers
         self.context = multiprocessing.get_context("forkserver")
-        self.context.set_forkserver_preload(list(_PRELOAD))
+        self.context.set_forkserver_preload(list(preload))
         self.running: dict[Any, tuple[Job, Any, Any]] = {}
 
     @property
@@ -221,7 +241,7 @@ def _die_with_parent() -> None:
 class _RayPool:
     """Tasks of a Ray cluster; a task that dies is not tried again."""
 
-    def __init__(self, workers: int, address: str | None):
+    def __init__(self, workers: int, address: str | None, preload: Sequence[str] = ()):
         import ray
 
         self.ray = ray

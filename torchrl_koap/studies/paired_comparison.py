@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.evaluation.offline import KIND
+
 Outcomes = Mapping[int, Mapping[tuple[int, int], bool]]
 """Successes of a method: training seed, then (context, evaluation seed)."""
 
@@ -53,6 +55,13 @@ class Comparison:
         contexts (int): number of contexts compared.
         seeds (int): number of training seeds that both methods have.
         pairs (int): number of pairs of rollouts behind it.
+
+    Examples:
+        >>> from torchrl_koap.studies.paired_comparison import compare
+        >>> same = {0: {(context, 7): True for context in range(6)}}
+        >>> result = compare(same, same)
+        >>> result.difference, result.p, result.seeds, result.pairs
+        (0.0, 1.0, 1, 6)
     """
 
     difference: float
@@ -64,7 +73,7 @@ class Comparison:
     pairs: int
 
 
-def compare(first: Outcomes, second: Outcomes, *, level: float = 0.95) -> Comparison | None:
+def compare(first: Outcomes, second: Outcomes, *, level: float = 0.95, errors: bool = False) -> Comparison | None:
     r"""Compares two methods on what both have: equal training seed, context and evaluation seed.
 
     With :math:`d_{sc}` the difference of the successes for training seed s in context c, averaged over rollouts of that
@@ -90,6 +99,8 @@ def compare(first: Outcomes, second: Outcomes, *, level: float = 0.95) -> Compar
         first (mapping): training seed to ``{(context, evaluation seed): success}``, see :func:`read_outcomes`.
         second (mapping): the same of the other method.
         level (float): probability that the interval holds.
+        errors (bool): the outcomes are errors, which have no bounds, instead of successes. Where nothing varies there
+            is then no interval (NaN).
 
     Returns:
         Comparison or None: None if the two share nothing. The same arguments always give the same numbers.
@@ -117,7 +128,9 @@ def compare(first: Outcomes, second: Outcomes, *, level: float = 0.95) -> Compar
     difference = np.where(there, total / np.maximum(count, 1), 0.0)  # [seeds, contexts]
     per_context = difference.sum(0) / there.sum(0)
     low, high = _interval(difference, there, level)
-    if low == high:  # nothing varied: resampling cannot say more, but other contexts could
+    if errors:
+        low, high = (low, high) if len(contexts) > 1 else (math.nan, math.nan)
+    elif low == high:  # nothing varied: resampling cannot say more, but other contexts could
         reach = min(3 / len(contexts), 1.0)
         low, high = max(low - reach, -1.0), min(high + reach, 1.0)
     return Comparison(
@@ -228,6 +241,31 @@ def read_outcomes(path: str | Path) -> dict[tuple[int, int], bool]:
     return outcomes
 
 
+def read_errors(path: str | Path) -> dict[tuple[int, int], float] | None:
+    """Relative action errors by trajectory, of an evaluation without an environment; None for one in closed loop.
+
+    Args:
+        path (str or Path): an ``eval.json``.
+
+    Raises:
+        ValueError: if the file is damaged or lacks the errors; the message names it.
+        FileNotFoundError: if it is not there.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(content, dict) or content.get("kind") != KIND:
+        return None
+    try:
+        split = content["action_errors_on"]
+        rows = content["action_errors"][split]["trajectory"] if split else ()
+        return {(int(row["episode"]), 0): float(row["relative_action_error"]) for row in rows}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: its action errors are damaged ({type(error).__name__}: {error})") from error
+
+
 def compare_cells(
     folder: str | Path, rows: Sequence[Mapping[str, Any]], *, reference: str = "koap"
 ) -> tuple[list[dict[str, Any]], list[str]]:
@@ -240,11 +278,12 @@ def compare_cells(
 
     Returns:
         tuple: a row of :data:`COMPARISON_COLUMNS` per other method and budget, where ``difference`` is the reference's
-        success minus the other's, ``p_holm`` is corrected over all rows, ``n`` counts paired rollouts and what cannot
+        success minus the other's (of tasks without an environment: its relative action error, trajectory by trajectory
+        in place of contexts), ``p_holm`` is corrected over all rows, ``n`` counts paired rollouts and what cannot
         be compared is None; and what was wrong with evaluations that could not be read.
     """
     groups: dict[tuple, dict[str, dict[int, dict]]] = {}
-    problems = []
+    problems, offline = [], set()
     for row in rows:
         observations = row.get("observations")
         key = (row["task"], row.get("label_unit") or "", 1.0 if observations is None else observations, row["fraction"])
@@ -252,16 +291,21 @@ def compare_cells(
         if row["status"] != "done":
             continue
         try:
-            outcomes[row["seed"]] = read_outcomes(Path(folder) / (row.get("run") or "") / "eval.json")
+            path = Path(folder) / (row.get("run") or "") / "eval.json"
+            errors = read_errors(path)
+            if errors is not None:
+                offline.add(key)
+            outcomes[row["seed"]] = read_outcomes(path) if errors is None else errors
         except (OSError, ValueError) as error:
             problems.append(f"left out of the paired comparisons: {error}")
     found = []
     for key in groups:
         for method in groups[key]:
             if reference in groups[key] and method != reference:
-                result = compare(groups[key][reference], groups[key][method])
+                result = compare(groups[key][reference], groups[key][method], errors=key in offline)
                 named = dict(zip(COMPARISON_COLUMNS, (*key, reference, method), strict=False))
                 numbers = {name: getattr(result, name, None) for name in COMPARISON_COLUMNS if name not in named}
+                numbers = {name: None if value != value else value for name, value in numbers.items()}  # NaN
                 found.append(named | numbers | {"n": result.pairs if result else 0})
     for row, adjusted in zip(found, holm([row["p"] for row in found]), strict=True):
         row["p_holm"] = adjusted

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap bench``: the comparisons of the paper as presets of ``koap curve``, its figures drawn beside ours."""
+"""The comparisons of the paper as presets of label-efficiency curves, its figures drawn beside ours."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.studies.label_efficiency import Curve, run_curve
+from torchrl_koap.studies.label_efficiency import CurveConfig, run_curve
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.studies.table import read_cells, write_cells
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import TASKS, get_task
+from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
-TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_1")
+PAPER_TASKS = tuple(name for name, task in TASKS.items() if task.in_paper)
 
 
 @dataclass(frozen=True)
@@ -28,11 +29,16 @@ class Preset:
         tasks (tuple of str): tasks it is made on.
         levels (int, optional): label levels, from the fewest labels on. Default: all of the task.
         observations (str): shares of the trajectories that are used at all.
+
+    Examples:
+        >>> from torchrl_koap.studies.paper_tables import Preset
+        >>> Preset("Two methods", "koap,dd", tasks=("avoiding",)).levels
+        (1, 2, 3, 4, 5)
     """
 
     title: str
     methods: str
-    tasks: tuple[str, ...] = TASKS
+    tasks: tuple[str, ...] = PAPER_TASKS
     levels: tuple[int, ...] = (1, 2, 3, 4, 5)
     observations: str = "1"
 
@@ -52,7 +58,7 @@ PRESETS = {
 
 
 @dataclass
-class Bench:
+class BenchConfig:
     """Reproduce a comparison of the paper: a curve per task, and one report over all.
 
     Attributes:
@@ -72,6 +78,13 @@ class Bench:
         workers: cells at a time (default: one per core).
         launcher: "local" or "ray".
         address: of a Ray cluster.
+        plugins: modules that register tasks, methods or pictures.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.studies.paper_tables import BenchConfig, run_bench
+        >>> config = BenchConfig(out=Path("bench"), table=1, tasks="avoiding", seeds=1)
+        >>> run_bench(config)  # doctest: +SKIP
     """
 
     out: Path
@@ -90,10 +103,17 @@ class Bench:
     workers: int | None = None
     launcher: str = "local"
     address: str | None = None
+    plugins: Plugins = ()
+
+    def __post_init__(self):
+        self.out = Path(self.out)  # so that a string will do in Python
 
 
-def run_bench(options: Bench) -> dict[str, Any]:
+def run_bench(config: BenchConfig) -> dict[str, Any]:
     """Does what is missing of a comparison; writes ``cells.csv`` and the report over all tasks.
+
+    Args:
+        config (BenchConfig): which comparison, and where to write it.
 
     Returns:
         dict: how many cells are done, failed and missing, and where the report is.
@@ -103,15 +123,16 @@ def run_bench(options: Bench) -> dict[str, Any]:
         RunDirectoryError: if the folder holds another comparison, or one of its curves cannot go on
             (:func:`~torchrl_koap.studies.label_efficiency.run_curve`).
     """
-    if (options.table is None) == (options.study is None):
+    if (config.table is None) == (config.study is None):
         raise ValueError("exactly one of --table and --study is needed")
-    name = f"study {options.study}" if options.table is None else f"table {options.table}"
+    load_plugins(config.plugins)
+    name = f"study {config.study}" if config.table is None else f"table {config.table}"
     preset = lookup(PRESETS, name, "comparison")
-    tasks = preset.tasks if options.tasks is None else [task.strip() for task in options.tasks.split(",")]
+    tasks = preset.tasks if config.tasks is None else [task.strip() for task in config.tasks.split(",")]
     facts = [get_task(task) for task in tasks]
     # the study needs labels of whole trajectories: windows of a share touch nearly all of them
-    units = options.units or ("window" if options.study is None else "trajectory")
-    root = RunDirectory(options.out)
+    units = config.units or ("window" if config.study is None else "trajectory")
+    root = RunDirectory(config.out)
     if (root.path / "bench.json").exists() and root.read_entry("bench.json", "comparison") != name:
         raise RunDirectoryError(f"{root.path} holds another comparison than {name!r}; choose another --out")
     root.write_json("bench.json", {"comparison": name})
@@ -119,33 +140,32 @@ def run_bench(options: Bench) -> dict[str, Any]:
     for task in facts:
         fractions = [task.label_levels[level - 1] for level in preset.levels]
         run_curve(
-            Curve(
-                out=options.out / task.name,
+            CurveConfig(
+                out=config.out / task.name,
                 task=task.name,
-                demonstrations=options.demonstrations,
-                methods=options.methods or preset.methods,
+                demonstrations=config.demonstrations,
+                methods=config.methods or preset.methods,
                 fractions=",".join(f"{fraction:g}" for fraction in fractions),
                 units=units,
                 observations=preset.observations,
-                seeds=options.seeds,
-                episodes=options.episodes,
-                steps=options.steps,
-                controller_steps=options.controller_steps,
-                released_settings=options.released_settings,
-                epochs=options.epochs,
-                workers=options.workers,
-                launcher=options.launcher,
-                address=options.address,
+                seeds=config.seeds,
+                episodes=config.episodes,
+                steps=config.steps,
+                controller_steps=config.controller_steps,
+                released_settings=config.released_settings,
+                epochs=config.epochs,
+                workers=config.workers,
+                launcher=config.launcher,
+                address=config.address,
+                plugins=config.plugins,
             )
         )
-        rows += [
-            row | {"run": f"{task.name}/{row['run']}"} for row in read_cells(options.out / task.name / "cells.csv")
-        ]
+        rows += [row | {"run": f"{task.name}/{row['run']}"} for row in read_cells(config.out / task.name / "cells.csv")]
         paper += paper_points(task.name, task.label_levels)
         # after every task: a long benchmark can be looked at while it runs
-        write_cells(options.out / "cells.csv", rows)
+        write_cells(config.out / "cells.csv", rows)
         report = write_curve_report(
-            options.out, rows, title=preset.title, paper=paper if units == "window" and options.table else None
+            config.out, rows, title=preset.title, paper=paper if units == "window" and config.table else None
         )
     counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
     return counts | {"report": str(report)}

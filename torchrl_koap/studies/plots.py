@@ -16,8 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
-from torchrl_koap.reports.scenes import FAINT, INK, set_title, tidy
-from torchrl_koap.reports.training_plots import save_figure
+from torchrl_koap.reports.style import FAINT, INK, save_figure, set_title, tidy
 from torchrl_koap.studies.summary import Summary, percent
 
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#56b4e9", "#882255", "#7a8b00")
@@ -142,6 +141,7 @@ def plot_action_error(
     unit: str = "",
     methods: Sequence[str] | None = None,
     label: str = "",
+    relative: bool = False,
 ) -> Path:
     """Error of the predicted actions against the labelled share, both logarithmic; bands from best to worst seed.
 
@@ -153,15 +153,19 @@ def plot_action_error(
         unit (str): unit of the error.
         methods (sequence of str, optional): see :func:`plot_success`.
         label (str): what the budget counts.
+        relative (bool): draw the share of the mean action's error instead, with a line at 1.
 
     Raises:
         ValueError: if no cell has an action error above 0.
     """
-    wanted = ("action_error", "action_error_low", "action_error_high")
+    wanted = tuple(f"{'relative_' if relative else ''}action_error{end}" for end in ("", "_low", "_high"))
     lines = [line for line in _lines(summaries, "fraction", wanted, methods).values() if line.x]
     if not lines or min(min(line.low) for line in lines) <= 0:
         raise ValueError("there is no action error above 0 to draw")
-    figure, axes = _from_best_to_worst(lines, label, f"action error ({unit})" if unit else "action error")
+    head = "action error, share of the mean action's" if relative else "action error"
+    figure, axes = _from_best_to_worst(lines, label, f"{head} ({unit})" if unit else head)
+    if relative:
+        axes.axhline(1, color=INK, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)
     axes.set_yscale("log")
     low, high = min(min(line.low) for line in lines), max(max(line.high) for line in lines)
     wide = max(1.15, (2.2 * low / high) ** 0.5)  # at least a factor of two is shown, or chance looks like a trend

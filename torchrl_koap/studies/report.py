@@ -6,12 +6,12 @@ from __future__ import annotations
 import csv
 import statistics
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from torchrl_koap.files import replacing_file
-from torchrl_koap.reports.html import STYLE, definition, duration, table
+from torchrl_koap.reports.html import duration, write_page
+from torchrl_koap.reports.style import thousandths
 from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, compare_cells, p_text
 from torchrl_koap.studies.plots import plot_action_error, plot_entropy, plot_success
 from torchrl_koap.studies.summary import Summary, cell_name, percent, plural, summarise
@@ -21,7 +21,7 @@ from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 FOLDER = "plots"
-_STYLE = ".scroll td { white-space: nowrap; }\n"  # an interval on two lines cannot be read down the column
+_CELL = ("method", "labels", "seed", "status", "success", "training", "evaluation", "run")
 _CAPTIONS = {
     "success": (
         "Success against the labels",
@@ -42,33 +42,19 @@ _CAPTIONS = {
         " were read for this picture only; nothing was trained or selected with them. A smaller error need not mean"
         " more success: the planner has its own failures.",
     ),
+    "relative_action_error": (
+        "Action error against the labels",
+        "Mean over seeds, with the best and the worst seed. There is no environment to succeed in, so actions decoded"
+        " from recorded states are compared with recorded ones: on labels outside the budget where the data have some"
+        " (read for this only), else inside it, a labelled trajectory left out at a time. 1 (dashed): no better than"
+        " always giving the mean action. Columns of every unit count alike.",
+    ),
     "observations": (
         "Success against the trajectories used",
         "How much the trajectories without labels are worth: the same share of labels, but only part of all"
         " trajectories known at all.",
     ),
 }
-_READING = """
-<p>A <strong>cell</strong> is one method, trained with one seed on one budget of labels, then rolled out on fixed
-evaluation contexts. The table pools the seeds.</p>
-<ul>
-<li><strong>Success (95 %)</strong> is a Wilson interval over all rollouts. It takes them for independent; the same
-contexts recur for every seed, so where single seeds lie further apart than chance allows it is too narrow. That is why
-the range of the seeds stands beside it.</li>
-<li><strong>Paired comparisons</strong> use that all methods met the same contexts with the same evaluation seeds. The
-difference is averaged over training seeds within each context, then over contexts. Its interval resamples contexts and
-training seeds both: a few seeds say little about the next training, and the interval is as wide as that. With a single
-seed it holds for that one training only.</li>
-<li><strong>p</strong> flips signs per context: could the advantage of these trained networks be chance of the contexts?
-It does not cover other training seeds: where those matter it is below 0.05 far too often, and the interval is what to
-go by. Where episodes have no contexts (Avoiding) a pair shares its evaluation seed alone, and pairing gains little.
-<strong>p (Holm)</strong> is corrected for the number of comparisons on this page.</li>
-<li><strong>One planner</strong> is shared by all cells that plan, for each task and share of the trajectories. The
-seeds vary the controller and which labels it sees; how much another planner would change is in no interval here.</li>
-<li>Cells that <strong>failed or are missing</strong> are in no average. They are counted and named; if hard cells fail
-more often, the averages of the others flatter the method.</li>
-</ul>
-"""
 
 
 def write_curve_report(
@@ -118,27 +104,27 @@ def write_curve_report(
         writer = csv.DictWriter(file, COMPARISON_COLUMNS)
         writer.writeheader()
         writer.writerows(compared)
-    figures = _draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows)), paper or ())
-    sections = [
-        f"<header><h1>{escape(title)}</h1><p>{escape(str(folder))}</p></header>",
-        "".join(f'<p class="warning">{escape(problem)}</p>' for problem in problems),
-        _what_was_run(rows, options),
-        _section("Success", _wide(table_rows(summaries)) + _paper_table(summaries, paper or ())),
-        _section("Pictures", figures),
-        _section("Paired comparisons", _comparisons(compared, reference)),
-        _not_done(rows),
-        _section("How to read this", _READING),
-        _section("Time", _time(rows)),
-    ]
-    page = (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}{_STYLE}</style></head>\n'
-        f"<body><main>\n{chr(10).join(section for section in sections if section)}\n</main></body></html>\n"
+    points = paper or ()
+    times, total = _times(rows)
+    return write_page(
+        "curve.html",
+        folder / "index.html",
+        title=title,
+        subtitle=str(folder),
+        notes=problems,
+        **_what_was_run(rows),
+        options=options,
+        table=table_rows(summaries),
+        paper=_paper_rows(summaries, points),
+        offline=any(item.offline for item in summaries),
+        figures=_draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows)), points),
+        compared=_comparison_rows(compared, reference, offline=any(item.offline for item in summaries)),
+        reference=reference,
+        not_done=[f"{cell_name(row)}: {why_not_done(row)}" for row in rows if row["status"] != "done"],
+        times=times,
+        total_time=total,
+        cells=[dict(zip(_CELL, _cell(row), strict=True)) for row in rows],
     )
-    path = folder / "index.html"
-    with replacing_file(path) as aside:
-        aside.write_text(page, encoding="utf-8")
-    return path
 
 
 def _options(folder: Path) -> tuple[dict[str, Any], list[str]]:
@@ -150,16 +136,8 @@ def _options(folder: Path) -> tuple[dict[str, Any], list[str]]:
         return {}, [str(error)]
 
 
-def _section(head: str, body: str) -> str:
-    return f"<section><h2>{escape(head)}</h2>{body}</section>" if body else ""
-
-
-def _wide(rows: Sequence[Mapping[str, str]]) -> str:
-    """A table of texts; an empty one says so."""
-    return definition("", list(rows)) if rows else "<p>No cells.</p>"
-
-
-def _what_was_run(rows: Sequence[Mapping[str, Any]], options: Mapping[str, Any]) -> str:
+def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Two sentences on the cells, and what their methods are."""
     count = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
     names = {name: list(dict.fromkeys(row.get(name) for row in rows)) for name in ("task", "method", "seed")}
     unit = list(dict.fromkeys(plural(row.get("label_unit") or "") for row in rows))
@@ -172,18 +150,16 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]], options: Mapping[str, Any])
         )
     )
     done = f"Of {len(rows)} cells {count['done']} are done; failed: {count['failed']}, missing: {count['missing']}."
-    every = f"<details><summary>Every option</summary>{table(options)}</details>" if options else ""
     known = [{"method": name, "what it is": METHODS[name].title} for name in names["method"] if name in METHODS]
-    what = definition("", known) if known else ""
-    return _section("What was run", f"<p>{escape(text)}.</p><p>{escape(done)}</p>{what}{every}")
+    return {"run_sentence": f"{text}.", "done_sentence": done, "methods": known}
 
 
 def _draw(
     folder: Path, summaries: Sequence[Summary], methods: Sequence[str], paper: Sequence[Mapping[str, Any]]
-) -> str:
-    """Draws the pictures of every task and unit of the labels; markup that shows them."""
+) -> list[dict[str, Any]]:
+    """Draws the pictures of every task and unit of the labels; what the page needs to show them."""
     groups = list(dict.fromkeys((item.task, item.label_unit) for item in summaries))
-    text = ""
+    figures = []
     for task, unit in groups:
         items = [item for item in summaries if (item.task, item.label_unit) == (task, unit)]
         shares = sorted({item.observations for item in items})
@@ -198,40 +174,37 @@ def _draw(
                     plot_success(main, base / f"{name}_success_{what}.png", by=[by], paper=points, **common)
             used = f" All with {percent(shares[-1])} of the trajectories." if shares[-1] != 1 else ""
             hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""
-            text += _figure(name, "success", task, used + hollow)
+            figures.append(_figure(name, "success", task, used + hollow))
         if any(item.entropy is not None for item in main):
             plot_entropy(main, base / f"{name}_entropy.png", **common)
-            text += _figure(name, "entropy", task, "")
-        if any((item.action_error_low or 0) > 0 for item in main):
+            figures.append(_figure(name, "entropy", task))
+        if any((item.relative_action_error_low or 0) > 0 for item in main):
+            plot_action_error(main, base / f"{name}_relative_action_error.png", relative=True, **common)
+            figures.append(_figure(name, "relative_action_error", task))
+        elif any((item.action_error_low or 0) > 0 for item in main):
             plot_action_error(main, base / f"{name}_action_error.png", unit=_error_unit(task), **common)
-            text += _figure(name, "action_error", task, "")
+            figures.append(_figure(name, "action_error", task))
         if len(shares) > 1 and any(item.success is not None for item in items):
             plot_success(items, base / f"{name}_observations.png", by=["observations"], **common)
-            text += _figure(name, "observations", task, "")
-    return text or "<p>Nothing to draw: no cell is done.</p>"
+            figures.append(_figure(name, "observations", task))
+    return figures
 
 
 def _error_unit(task: str) -> str:
     try:
-        return {"m": "mm", "rad": "mrad"}.get(get_task(task).action_unit, "")
+        return thousandths(get_task(task).action_unit or "")[0]
     except ValueError:
         return ""
 
 
-def _figure(name: str, kind: str, task: str, more: str) -> str:
+def _figure(name: str, kind: str, task: str, more: str = "") -> dict[str, Any]:
     head, caption = _CAPTIONS[kind]
-    source = escape(f"{FOLDER}/{name}_{kind}.png")
-    head = escape(f"{head}, {task}")
-    image = f'<a href="{source}"><img src="{source}" alt="{head}"></a>'
-    text = escape(caption + more)
-    if kind == "success":  # two panels need the width of the page
-        return f"<figure><h3>{head}</h3>{image}<figcaption>{text}</figcaption></figure>"
-    return f'<figure class="beside">{image}<figcaption><h3>{head}</h3>{text}</figcaption></figure>'
+    wide = kind == "success"  # two panels need the width of the page
+    source = f"{FOLDER}/{name}_{kind}.png"
+    return {"title": f"{head}, {task}", "caption": caption + more, "source": source, "beside": not wide}
 
 
-def _paper_table(summaries: Sequence[Summary], paper: Sequence[Mapping[str, Any]]) -> str:
-    if not paper:
-        return ""
+def _paper_rows(summaries: Sequence[Summary], paper: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     ours = {(item.task, item.method, item.fraction): item for item in summaries if item.success is not None}
     rows = []
     for row in paper:
@@ -239,19 +212,16 @@ def _paper_table(summaries: Sequence[Summary], paper: Sequence[Mapping[str, Any]
         here = "not run" if item is None else f"{percent(item.success, 1)} ({100 * item.low:.1f}-{100 * item.high:.1f})"
         names = {"task": row.get("task", ""), "method": row["method"], "labels": percent(row["fraction"])}
         rows.append(names | {"paper": percent(row["success"], 0), "here (95 %)": here})
-    return (
-        "<h3>Beside the paper's figures</h3>" + _wide(rows) + '<p class="absent">The paper\'s figures are for its own'
-        " demonstrations, planner and number of rollouts: no like-for-like comparison. What is not listed is not known"
-        " to this package.</p>"
-    )
+    return rows
 
 
-def _comparisons(compared: Sequence[Mapping[str, Any]], reference: str) -> str:
-    if not compared:
-        return f"<p>No other method beside {escape(reference)} to compare with, or {escape(reference)} was not run.</p>"
+def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str, *, offline: bool) -> list[dict[str, str]]:
     rows = []
     for row in compared:
         known = row["difference"] is not None
+        written, head, unit = _points, "difference (points)", "contexts"
+        if offline:
+            written, head, unit = _share, "difference of the relative action error", "trajectories"
         names = {"task": row["task"]} if len({other["task"] for other in compared}) > 1 else {}
         if len({other["observations"] for other in compared}) > 1:
             names["trajectories used"] = percent(row["observations"])
@@ -260,30 +230,28 @@ def _comparisons(compared: Sequence[Mapping[str, Any]], reference: str) -> str:
             | {
                 "labels": percent(row["fraction"]),
                 f"{reference} against": row["method"],
-                "difference (points)": _points(row["difference"]) if known else "nothing in common",
-                "95 % interval": f"{_points(row['low'])} to {_points(row['high'])}" if known else "–",
+                head: written(row["difference"]) if known else "nothing in common",
+                "95 % interval": "–" if row["low"] is None else f"{written(row['low'])} to {written(row['high'])}",
                 "p": p_text(row["p"]),
                 "p (Holm)": p_text(row["p_holm"]),
-                "contexts": str(row["contexts"] or 0),
+                unit: str(row["contexts"] or 0),
                 "seeds": str(row["seeds"] or 0),
                 "n (pairs)": str(row["n"]),
             }
         )
-    text = f"<p>Above 0: {escape(reference)} succeeds more often. Also in <code>comparisons.csv</code>.</p>"
-    return text + _wide(rows)
+    return rows
 
 
 def _points(difference: float) -> str:
     return f"{round(100 * difference, 1) + 0.0:+.1f}"  # the sum turns -0.0 into 0.0
 
 
-def _not_done(rows: Sequence[Mapping[str, Any]]) -> str:
-    items = [row for row in rows if row["status"] != "done"]
-    lines = [f"<li>{escape(cell_name(row))}: {escape(why_not_done(row))}</li>" for row in items]
-    return _section("Failed and missing cells", f"<ul>{''.join(lines)}</ul>" if lines else "")
+def _share(difference: float) -> str:
+    return f"{round(difference, 3) + 0.0:+.3f}"
 
 
-def _time(rows: Sequence[Mapping[str, Any]]) -> str:
+def _times(rows: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, str]], float]:
+    """What the done cells of every task and method took, and all of them together (s)."""
     done = [row for row in rows if row["status"] == "done"]
     spent_by, total = [], 0.0
     for task, method in dict.fromkeys((row["task"], row["method"]) for row in done):
@@ -295,14 +263,7 @@ def _time(rows: Sequence[Mapping[str, Any]]) -> str:
             worst = f", at most {duration(max(values))}" if len(values) > 1 else ""
             spent[head] = f"{duration(statistics.fmean(values))}{worst}" if values else "–"
         spent_by.append(spent)
-    names = ("method", "labels", "seed", "status", "success", "training", "evaluation", "run")
-    every = [dict(zip(names, _cell(row), strict=True)) for row in rows]
-    if not spent_by:
-        return ""
-    text = (
-        f"<p>All cells together: {duration(total)} as they report it; a planner is trained once for all that plan.</p>"
-    )
-    return text + _wide(spent_by) + f"<details><summary>Every cell</summary>{_wide(every)}</details>"
+    return spent_by, total
 
 
 def _cell(row: Mapping[str, Any]) -> list[str]:

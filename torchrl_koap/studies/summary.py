@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from torchrl_koap.evaluation.offline import KIND
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.lookup import lookup
 
@@ -35,9 +36,19 @@ class Summary:
         entropy (float, optional): mean entropy of the modes; ``entropy_low`` and ``entropy_high`` are those of single
             seeds.
         action_error (float, optional): mean; ``action_error_low`` and ``action_error_high`` are those of single seeds.
+        relative_action_error (float, optional): mean error of the actions as a share of that of the mean action, of a
+            task without an environment; ``_low`` and ``_high`` as above.
+        relative_plan_error (float, optional): mean error of plans as a share of that of standing still, likewise.
         labelled_transitions (float, optional): mean number of distinct transitions whose action was read.
         trajectories_touched (float, optional): mean number of trajectories they lie in.
         train_seconds (float, optional): mean time of training; ``eval_seconds`` that of evaluation.
+
+    Examples:
+        >>> from torchrl_koap.studies.summary import summarise
+        >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.02, "seed": 0, "status": "missing"}
+        >>> summary = summarise([cell])[0]
+        >>> summary.missing, summary.success is None
+        ((0,), True)
     """
 
     task: str
@@ -61,10 +72,19 @@ class Summary:
     action_error: float | None
     action_error_low: float | None
     action_error_high: float | None
+    relative_action_error: float | None
+    relative_action_error_low: float | None
+    relative_action_error_high: float | None
+    relative_plan_error: float | None
     labelled_transitions: float | None
     trajectories_touched: float | None
     train_seconds: float | None
     eval_seconds: float | None
+
+    @property
+    def offline(self) -> bool:
+        """Whether cells are done and none was rolled out: a task without an environment."""
+        return bool(self.done) and not self.episodes
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
@@ -101,7 +121,8 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
         cells = groups.setdefault(key, {})
         if row["seed"] in cells:
             raise ValueError(f"the cell {cell_name(row)} occurs twice")
-        if row["status"] == "done" and (not row.get("episodes") or row.get("successes") is None):
+        needed = needed_when_done(row) if row["status"] == "done" else ()
+        if needed and (not row.get("episodes") or row.get("successes") is None):
             raise ValueError(f"the cell {cell_name(row)} is done but has no 'episodes' or 'successes'")
         cells[row["seed"]] = row
     return [
@@ -114,9 +135,11 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
 def _summary(task: str, method: str, fraction: float, observations: float, unit: str, cells: Mapping) -> Summary:
     seeds = {status: tuple(sorted(s for s, row in cells.items() if row["status"] == status)) for status in STATUSES}
     done = [cells[seed] for seed in seeds["done"]]
-    successes, episodes = (sum(row[name] for row in done) for name in ("successes", "episodes"))
+    rolled_out = [row for row in done if row.get("episodes")]
+    successes, episodes = (sum(row[name] for row in rolled_out) for name in ("successes", "episodes"))
     low, high = wilson_interval(successes, episodes) if episodes else (None, None)
-    rates = [row["successes"] / row["episodes"] for row in done]
+    rates = [row["successes"] / row["episodes"] for row in rolled_out]
+    shares = _values(done, "relative_action_error")
     errors, entropies = _values(done, "action_error"), _values(done, "mode_entropy")
     return Summary(
         task=task,
@@ -138,6 +161,10 @@ def _summary(task: str, method: str, fraction: float, observations: float, unit:
         action_error=_mean(done, "action_error"),
         action_error_low=min(errors, default=None),
         action_error_high=max(errors, default=None),
+        relative_action_error=_mean(done, "relative_action_error"),
+        relative_action_error_low=min(shares, default=None),
+        relative_action_error_high=max(shares, default=None),
+        relative_plan_error=_mean(done, "relative_plan_error"),
         labelled_transitions=_mean(done, "labelled_transitions"),
         trajectories_touched=_mean(done, "trajectories_touched"),
         train_seconds=_mean(done, "train_seconds"),
@@ -148,6 +175,20 @@ def _summary(task: str, method: str, fraction: float, observations: float, unit:
 def _values(rows: Sequence[Mapping[str, Any]], name: str) -> list[float]:
     values = [row.get(name) for row in rows]
     return [value for value in values if value is not None and math.isfinite(value)]
+
+
+def needed_when_done(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Columns that a cell which is done must have: those of its rollouts, none where it has no environment.
+
+    Args:
+        row (mapping): the cell; its ``kind`` is ``"offline"`` where there was no environment.
+
+    Examples:
+        >>> from torchrl_koap.studies.summary import needed_when_done
+        >>> needed_when_done({"kind": "offline"}), needed_when_done({})
+        ((), ('episodes', 'successes'))
+    """
+    return () if row.get("kind") == KIND else ("episodes", "successes")
 
 
 def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float | None:
@@ -170,6 +211,10 @@ def cell_name(row: Mapping[str, Any]) -> str:
 
 def percent(share: float | None, digits: int | None = None) -> str:
     """A share in percent, with as few digits as it has if ``digits`` is not given.
+
+    Args:
+        share (float, optional): the share, 1 for the whole; None gives a dash.
+        digits (int, optional): digits after the point.
 
     Examples:
         >>> from torchrl_koap.studies.summary import percent

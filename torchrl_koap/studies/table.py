@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.studies.summary import STATUSES, Summary, cell_name, percent, plural, summarise
+from torchrl_koap.studies.summary import STATUSES, Summary, cell_name, needed_when_done, percent, plural, summarise
 
 _KINDS = {
     "task": str,
@@ -36,6 +36,9 @@ _KINDS = {
     "collisions": int,
     "mean_steps": float,
     "action_error": float,
+    "relative_action_error": float,
+    "relative_plan_error": float,
+    "kind": str,
     "controller_updates": int,
     "train_seconds": float,
     "eval_seconds": float,
@@ -43,7 +46,7 @@ _KINDS = {
 }
 CELL_COLUMNS = tuple(_KINDS)
 _ALWAYS = ("task", "method", "fraction", "observations", "seed", "status")
-_WHEN_DONE = ("episodes", "successes")
+_LATER = ("relative_action_error", "relative_plan_error", "kind")  # columns that files of before do not have
 _WORDS = {int: "a whole number", float: "a finite number"}
 
 
@@ -105,15 +108,15 @@ def read_cells(path: str | Path) -> list[dict[str, Any]]:
     except (csv.Error, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     for name in CELL_COLUMNS:
-        if name not in names:
+        if name not in names and name not in _LATER:
             raise ValueError(f"{path} lacks the column {name!r}")
     rows = []
     for number, line in lines:
         where = f"{path}, line {number}"
         if line.get("") is not None:
             raise ValueError(f"{where}: more values than the {len(names)} columns")
-        row = {name: _read(line[name], name, where) for name in CELL_COLUMNS}
-        for name in _ALWAYS + (_WHEN_DONE if row["status"] == "done" else ()):
+        row = {name: _read(line[name], name, where) if name in names else None for name in CELL_COLUMNS}
+        for name in _ALWAYS + (needed_when_done(row) if row["status"] == "done" else ()):
             if row[name] in (None, ""):
                 raise ValueError(f"{where}, column {name!r}: empty")
         rows.append(row)
@@ -155,13 +158,15 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
                 labels: percent(item.fraction) + (f" of {plural(item.label_unit)}" if len(units) > 1 else ""),
                 "trajectories used": percent(item.observations),
                 "method": item.method,
-                "success (95 %)": _interval(item),
-                "n": str(item.episodes),
+                "success (95 %)": "–" if item.offline else _interval(item),
+                "n": "–" if item.offline else str(item.episodes),
                 "seeds": f"{len(item.done)} of {len(item.done) + len(item.failed) + len(item.missing)}",
                 "not done": _not_done(item),
                 "range of seeds": _range(item.lowest, item.highest, len(item.done)),
                 "mode entropy": _number(item.entropy, ".2f"),
-                "action error (mm, mrad)": _number(item.action_error, ".3g"),
+                "action error (of the mean action's)": _number(item.relative_action_error, ".3g"),
+                "plan error (of standing still's)": _number(item.relative_plan_error, ".3g"),
+                _error_heading(summaries): _number(item.action_error, ".3g"),
                 "labelled transitions": _number(item.labelled_transitions, ",.0f"),
                 "in trajectories": _number(item.trajectories_touched, ".4g"),
             }
@@ -172,6 +177,10 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
         if len(values) == 1 and (usual is None or values == {usual}):
             empty.add(name)
     return [{name: text for name, text in row.items() if name not in empty} for row in rows]
+
+
+def _error_heading(summaries: Sequence[Summary]) -> str:
+    return "action error (unit of the first column)" if any(s.offline for s in summaries) else "action error (mm, mrad)"
 
 
 def _interval(item: Summary) -> str:

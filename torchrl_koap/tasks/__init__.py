@@ -1,7 +1,32 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a task is: layout of the observation, goal, modes, drawing; numbers and rules only, no simulator."""
+"""What a task is: columns, goal, modes, looks, and the names of the code that simulates it; no simulator, no torch."""
 
-from torchrl_koap.tasks.registry import TASKS, get_task
-from torchrl_koap.tasks.task import CONTROL_HZ, HISTORY, HORIZON, REPLAN_INTERVAL, WINDOW, Task
+from torchrl_koap.tasks.registry import TASKS, adopt_task, get_task, register_task, task_of
+from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.task import CONTROL_HZ, HISTORY, HORIZON, REPLAN_INTERVAL, WINDOW, Defaults, Modes, Task
 
-__all__ = ["CONTROL_HZ", "HISTORY", "HORIZON", "REPLAN_INTERVAL", "TASKS", "WINDOW", "Task", "get_task"]
+from torchrl_koap.tasks import avoiding, aligning, sorting, stacking  # isort: skip  # in the order of TASKS
+
+__all__ = [
+    "CONTROL_HZ",
+    "HISTORY",
+    "HORIZON",
+    "REPLAN_INTERVAL",
+    "TASKS",
+    "WINDOW",
+    "Body",
+    "Defaults",
+    "Modes",
+    "Scene",
+    "Shape",
+    "StartRegions",
+    "Task",
+    "adopt_task",
+    "aligning",
+    "avoiding",
+    "get_task",
+    "register_task",
+    "sorting",
+    "stacking",
+    "task_of",
+]

@@ -8,6 +8,7 @@ than the yaw up to half a turn.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,4 +51,26 @@ def yaw_of(quaternion: Tensor) -> Tensor:
     return direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-6)
 
 
+def tan_yaw(quaternion: np.ndarray) -> np.ndarray:
+    """Tangent of the yaw as D3IL computes it: environments and readers of recordings must agree on it.
+
+    The sign of ``x y`` is the original's, which matters for tilted boxes only.
+
+    Args:
+        quaternion (np.ndarray): ``[..., 4]`` (w, x, y, z).
+
+    Returns:
+        np.ndarray: ``[...]``.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.tasks.features import tan_yaw
+        >>> print(f"{tan_yaw(np.array([np.cos(0.25), 0.0, 0.0, np.sin(0.25)])):.4f} = tan(0.5) = {np.tan(0.5):.4f}")
+        0.5463 = tan(0.5) = 0.5463
+    """
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    return np.tan(np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2)))
+
+
+# a feature of one's own is named by its import string; StateParts names the columns of these
 FEATURES = {"plain": plain, "plane": plane, "tan_yaw": double_yaw, "quaternion": yaw_of}

@@ -41,3 +41,29 @@ def gripper_number(width: Tensor, *, open_above: float = OPEN_ABOVE) -> Tensor:
     soon = padded.unfold(-1, OPENING, 1).amax(-1)
     opening = (following > now + _MOVES) & (soon > open_above)
     return torch.where(opening | (following > open_above), following.clamp_min(OPEN), following)
+
+
+def command_gripper(states: Tensor, actions: Tensor, *, entry: int, column: int) -> Tensor:
+    """Actions whose gripper entry is the number read off the widths that are planned.
+
+    Args:
+        states (Tensor): observed and planned states ``[*B, T, d]``.
+        actions (Tensor): actions of the same frames ``[*B, T, act]``; not changed.
+
+    Keyword Args:
+        entry (int): the gripper's entry of an action.
+        column (int): the state column of its width (m).
+
+    Returns:
+        Tensor: ``[*B, T, act]``; the last frame, which nothing follows, stays as it is.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.tasks.gripper import command_gripper
+        >>> widths = torch.tensor([[0.0], [0.05], [0.08]])
+        >>> command_gripper(widths, torch.zeros(3, 2), entry=1, column=0)[:, 1]
+        tensor([0.0800, 0.0800, 0.0000])
+    """
+    actions = actions.clone()
+    actions[..., :-1, entry] = gripper_number(states[..., column], open_above=PLANNED_OPEN_ABOVE)
+    return actions

@@ -1,154 +1,63 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The D3IL tasks: everything that differs from task to task on the learning side, in one table."""
+"""The tasks there are: registered by import, or found through the entry-point group ``torchrl_koap.tasks``."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import combinations
+from collections.abc import Callable, Mapping
+from importlib.metadata import entry_points
+from typing import Any
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.tasks.task import CONTROL_HZ, Task
+from torchrl_koap.tasks.task import Task
+
+GROUP = "torchrl_koap.tasks"
+TASKS: dict[str, Task] = {}
+_observers: list[Callable[[Task], None]] = []
+_loaded = False
+_adopted: set[str] = set()  # names of tasks that came with data
 
 
-def _parts(*named: tuple[str, int]) -> dict[str, slice]:
-    parts, start = {}, 0
-    for name, size in named:
-        parts[name] = slice(start, start + size)
-        start += size
-    return parts
+def register_task(task: Task) -> Task:
+    """Makes a task known by its name, to Python and to every command.
 
+    A task of one's own is registered by importing the module that does so: by hand, with ``koap ... --plugin module``,
+    or through an entry point of the group ``torchrl_koap.tasks`` (a module, or a :class:`Task` in it) of an installed
+    package.
 
-def _sorting(num_boxes: int, num_modes: int) -> Task:
-    boxes = [f"{colour}_{index + 1}" for colour in ("red", "blue") for index in range(num_boxes // 2)]
-    columns = [part for box in boxes for part in ((f"{box}_xy", 2), (f"{box}_tan_yaw", 1))]
-    return Task(
-        name="sorting" if num_boxes == 4 else f"sorting_{num_boxes}",
-        observation=_parts(("desired_xy", 2), ("measured_xy", 2), *columns),
-        command="desired_xy",
-        position="measured_xy",
-        action_dim=2,
-        max_steps=700,
-        control_hz=CONTROL_HZ,
-        num_modes=num_modes,
-        actuated=(0, 1),
-        robot=(0, 1),
-        state={"measured_xy": "plain"} | {name: "tan_yaw" if size == 1 else "plain" for name, size in columns},
-        objects=tuple(boxes),
-        drawn={box: f"{box}_xy" for box in boxes},
-        entropy="solved_contexts",
-        relations=tuple(("measured_xy", f"{box}_xy") for box in boxes),
-        alike=(tuple(boxes[: num_boxes // 2]), tuple(boxes[num_boxes // 2 :])),
-    )
+    Args:
+        task (Task): the task. The same task may be registered again.
 
+    Returns:
+        Task: the task.
 
-_STACKING_BOXES = ("red", "green", "blue")
-_stacking = Task(
-    name="stacking",
-    observation=_parts(
-        ("desired_joints_and_gripper", 8),
-        *(part for box in _STACKING_BOXES for part in ((f"{box}_position", 3), (f"{box}_tan_yaw", 1))),
-        ("measured_joints", 7),
-        ("gripper_width", 1),
-        ("tcp_position", 3),
-    ),
-    command="desired_joints_and_gripper",
-    position="tcp_position",
-    action_dim=8,
-    max_steps=1000,
-    control_hz=1 / 0.03,
-    num_modes=6,
-    robot=tuple(range(8)),
-    gripper=(7, 7),
-    state={"measured_joints": "plain", "gripper_width": "plain", "tcp_position": "plain"}
-    | {
-        name: kind
-        for box in _STACKING_BOXES
-        for name, kind in ((f"{box}_position", "plain"), (f"{box}_tan_yaw", "tan_yaw"))
-    },
-    objects=_STACKING_BOXES,
-    drawn={box: f"{box}_position" for box in _STACKING_BOXES},
-    action_unit="rad",
-    entropy="solved_contexts",
-    alike=(("red", "green"),),
-    relations=(
-        *(("tcp_position", f"{box}_position") for box in _STACKING_BOXES),
-        *((f"{box}_position", f"{other}_position") for box, other in combinations(_STACKING_BOXES, 2)),
-    ),
-    recovery_sigma=0.0,  # measured: a shifted arm, redundant as it is, learns to wander (benchmarks/RESULTS.md)
-)
+    Raises:
+        ValueError: if another task has the name.
 
-_tasks = (
-    Task(
-        name="avoiding",
-        observation=_parts(("desired_xy", 2), ("measured_xy", 2)),
-        command="desired_xy",
-        position="measured_xy",
-        action_dim=2,
-        max_steps=250,
-        control_hz=CONTROL_HZ,
-        num_modes=24,
-        actuated=(0, 1),
-        robot=(0, 1),
-        collides=True,
-        demonstrations=96,
-        planner_steps=5000,
-        channels=(32, 64),
-        relative=False,
-    ),
-    Task(
-        name="aligning",
-        observation=_parts(
-            ("desired_xyz", 3),
-            ("measured_xyz", 3),
-            ("box_position", 3),
-            ("box_quaternion", 4),
-            ("target_position", 3),
-            ("target_quaternion", 4),
-        ),
-        command="desired_xyz",
-        position="measured_xyz",
-        action_dim=3,
-        max_steps=400,
-        control_hz=CONTROL_HZ,
-        num_modes=2,
-        actuated=(0, 1, 2),
-        robot=(0, 1, 2),
-        state={
-            "measured_xyz": "plain",
-            "box_position": "plane",
-            "box_quaternion": "quaternion",
-            "target_position": "plane",
-            "target_quaternion": "quaternion",
-        },
-        objects=("box", "target"),
-        drawn={"box": "box_position", "target": "target_position"},
-        entropy="contexts",
-        scene=("measured_xyz", "box_position", "box_quaternion", "target_position", "target_quaternion"),
-        relations=(
-            ("measured_xyz", "box_position", "box_quaternion"),
-            ("target_position", "box_position", "box_quaternion", "target_quaternion"),
-            ("measured_xyz", "target_position", "target_quaternion"),
-        ),
-    ),
-    _sorting(4, num_modes=6),
-    _sorting(2, num_modes=2),
-    _sorting(6, num_modes=20),
-    replace(
-        _sorting(4, num_modes=6),
-        name="po_sorting",
-        max_steps=400,
-        hidden=tuple(f"{box}_tan_yaw" for box in ("red_1", "red_2", "blue_1", "blue_2")),
-        noise=0.002,
-        data="sorting",
-    ),
-    _stacking,
-    replace(_stacking, name="stacking_1", max_steps=400, num_modes=3, data="stacking"),
-)
-TASKS = {task.name: task for task in _tasks}
+    Examples:
+        >>> from torchrl_koap.tasks import Task, get_task, register_task
+        >>> arm = Task(
+        ...     name="doctest_arm", observation_parts={"joints": 2}, actions={"a": "rad", "b": "rad"}, position="joints"
+        ... )
+        >>> register_task(arm) is get_task("doctest_arm")
+        True
+    """
+    if not isinstance(task, Task):
+        raise TypeError(f"wanted a Task, got {type(task).__name__}")
+    known = TASKS.get(task.name)
+    if known is not None and known != task:
+        raise ValueError(f"another task named {task.name!r} is registered already; choose another name")
+    if known is None:
+        TASKS[task.name] = task
+        for observer in _observers:
+            observer(task)
+    return TASKS[task.name]
 
 
 def get_task(name: str) -> Task:
-    """Looks a task up by name.
+    """Looks a task up by name; installed packages are asked for theirs if it is not known yet.
+
+    Args:
+        name (str): the name.
 
     Raises:
         ValueError: if the name is unknown; the message suggests the nearest one.
@@ -158,4 +67,105 @@ def get_task(name: str) -> Task:
         >>> get_task("avoiding").state_columns, get_task("sorting").state_dim, get_task("po_sorting").state_dim
         ((2, 3), 18, 10)
     """
+    if not (isinstance(name, str) and name in TASKS):
+        load_entry_points()
     return lookup(TASKS, name, "task")
+
+
+def find_task(name: object) -> Task | None:
+    """The task of that name, None where there is none: for pictures of data whose task may be unknown.
+
+    Args:
+        name (object): the name; anything that is no name of a task gives None.
+
+    Examples:
+        >>> from torchrl_koap.tasks.registry import find_task
+        >>> find_task("avoiding").num_modes, find_task(None)
+        (24, None)
+    """
+    if isinstance(name, str) and name not in TASKS:
+        load_entry_points()
+    return TASKS.get(name) if isinstance(name, str) else None
+
+
+def adopt_task(task: Task) -> Task:
+    """Makes a task known that came with a data set or a run; the next one of that name takes its place.
+
+    Args:
+        task (Task): the task.
+
+    Raises:
+        ValueError: if a package has registered another task of that name.
+
+    Examples:
+        >>> from torchrl_koap.tasks import Task, get_task
+        >>> from torchrl_koap.tasks.registry import adopt_task
+        >>> for joints in (6, 7):
+        ...     arm = Task(name="my_arm", observation_parts={"joints": joints}, actions={"a": "rad"}, position="joints")
+        ...     adopted = adopt_task(arm)
+        >>> get_task("my_arm").observation_dim
+        7
+    """
+    if task.name in _adopted:
+        TASKS[task.name] = task
+    elif TASKS.get(task.name) != task:
+        register_task(task)
+        _adopted.add(task.name)
+    return TASKS[task.name]
+
+
+def is_adopted(task: Task) -> bool:
+    """Whether a task came with data: no package registers it, so a run has to bring it along."""
+    return task.name in _adopted
+
+
+def task_of(config: Mapping[str, Any]) -> Task:
+    """The task of a run, from its ``config.json``: the one it brings along, or a registered one.
+
+    Args:
+        config (mapping): content of ``config.json``.
+
+    Raises:
+        ValueError: if the task it brings along is damaged or names code, or nobody has registered it.
+
+    Examples:
+        >>> from torchrl_koap.tasks.registry import task_of
+        >>> task_of({"task": "avoiding"}).state_dim
+        2
+    """
+    definition = config.get("task_definition")
+    if definition is None:
+        return get_task(config["task"])
+    from torchrl_koap.tasks.json_format import plain_task_from_json
+
+    return adopt_task(plain_task_from_json(definition))
+
+
+def load_entry_points() -> None:
+    """Imports what installed packages name in the entry-point group ``torchrl_koap.tasks``, once.
+
+    Raises:
+        RuntimeError: if one of them cannot be imported; the message names it.
+    """
+    global _loaded
+    if _loaded:
+        return
+    _loaded = True
+    for point in entry_points(group=GROUP):
+        try:
+            found = point.load()
+        except Exception as error:
+            raise RuntimeError(f"entry point {point.name!r} = {point.value!r} of {GROUP!r} failed: {error}") from error
+        if isinstance(found, Task):
+            register_task(found)
+
+
+def observe_tasks(observer: Callable[[Task], None]) -> None:
+    """Calls a function for every task, those registered later included.
+
+    Args:
+        observer (callable): called with a task.
+    """
+    _observers.append(observer)
+    for task in list(TASKS.values()):
+        observer(task)

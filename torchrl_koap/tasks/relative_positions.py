@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Where the tool is as seen from the objects: what a planner has to know to a millimetre near a contact.
+"""Relative position features: where the tool is as seen from the objects, to a millimetre near a contact.
 
 A state tells tool and objects in world coordinates, to some per cent of the table's size once it is normalised. The
 difference of two positions, turned into the object's own frame and magnified near zero, tells them to a millimetre.
@@ -18,7 +18,7 @@ NEAR = (0.05, 0.015)  # m; distances that the magnified copies resolve
 
 
 @dataclass(frozen=True)
-class Relation:
+class RelativePosition:
     """One position as seen from another.
 
     Args:
@@ -26,6 +26,12 @@ class Relation:
         origin (slice): state columns of the position it is seen from; where it has 2, the height is taken as it is.
         yaw (slice, optional): state columns ``cos, sin`` of the yaw of the frame it is seen in.
         other_yaw (slice, optional): ``cos, sin`` of a yaw to be told relative to that frame, too.
+
+    Examples:
+        >>> from torchrl_koap.tasks.relative_positions import RelativePosition
+        >>> tool_from_box = RelativePosition(place=slice(0, 2), origin=slice(2, 4), yaw=slice(4, 6))
+        >>> tool_from_box.other_yaw is None
+        True
     """
 
     place: slice
@@ -34,52 +40,52 @@ class Relation:
     other_yaw: slice | None = None
 
 
-class Relations(nn.Module):
+class RelativePositionFeatures(nn.Module):
     r"""Relative positions of the current state, plain and magnified near zero.
 
     .. math::
         d = R(-\theta) (p - o), \qquad (d,\; \tanh(d / 0.05\,\mathrm{m}),\; \tanh(d / 0.015\,\mathrm{m}))
 
-    for every relation of a position ``p`` to an origin ``o`` with yaw ``theta``; heights are not turned.
+    for every position ``p`` to an origin ``o`` with yaw ``theta``; heights are not turned.
 
     Args:
-        relations (sequence of Relation): the relations.
+        pairs (sequence of RelativePosition): positions and what they are seen from.
 
     Shape:
         history of states ``[*B, h, d]`` to ``[*B, num_features]``; the last frame counts.
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.tasks.relative_positions import Relation, Relations
-        >>> relations = Relations([Relation(slice(0, 2), slice(2, 4), yaw=slice(4, 6))])
+        >>> from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
+        >>> features = RelativePositionFeatures([RelativePosition(slice(0, 2), slice(2, 4), yaw=slice(4, 6))])
         >>> state = torch.tensor([[0.1, 0.3, 0.1, 0.2, 0.0, 1.0]])  # 0.1 m ahead of an object turned by 90 deg
-        >>> relations(state)[:2]
+        >>> features(state)[:2]
         tensor([0.1000, 0.0000])
     """
 
-    def __init__(self, relations: Sequence[Relation]):
+    def __init__(self, pairs: Sequence[RelativePosition]):
         super().__init__()
-        self.relations = tuple(relations)
+        self.pairs = tuple(pairs)
 
     @property
     def num_features(self) -> int:
         """Number of features."""
-        sizes = (_size(relation.place) for relation in self.relations)
-        return sum((1 + len(NEAR)) * size for size in sizes) + sum(2 for r in self.relations if r.other_yaw)
+        sizes = (_size(pair.place) for pair in self.pairs)
+        return sum((1 + len(NEAR)) * size for size in sizes) + sum(2 for r in self.pairs if r.other_yaw)
 
     def forward(self, history: Tensor) -> Tensor:
         """Features of the last frame."""
         state = history[..., -1, :]
         parts = []
-        for relation in self.relations:
-            place, origin = state[..., relation.place], state[..., relation.origin]
+        for pair in self.pairs:
+            place, origin = state[..., pair.place], state[..., pair.origin]
             shared = min(place.shape[-1], origin.shape[-1])
             gap = torch.cat([place[..., :shared] - origin[..., :shared], place[..., shared:]], -1)
-            if relation.yaw is not None:
-                frame = state[..., relation.yaw]
+            if pair.yaw is not None:
+                frame = state[..., pair.yaw]
                 gap = torch.cat([_turn_back(gap[..., :2], frame), gap[..., 2:]], -1)
-                if relation.other_yaw is not None:
-                    parts.append(_turn_back(state[..., relation.other_yaw], frame))
+                if pair.other_yaw is not None:
+                    parts.append(_turn_back(state[..., pair.other_yaw], frame))
             parts += [gap, *(torch.tanh(gap / near) for near in NEAR)]
         return torch.cat(parts, -1)
 

@@ -35,6 +35,11 @@ def save_weights(path: str | Path, module: nn.Module, about: Mapping[str, Any]) 
 def load_weights(path: str | Path, module: nn.Module, *, task: str) -> dict[str, Any]:
     """Loads weights into a module of the same architecture.
 
+    Args:
+        path (str or Path): the file.
+        module (nn.Module): receives the weights.
+        task (str): name of the task that they must have been trained on.
+
     Returns:
         dict: the facts in the header.
 
@@ -54,7 +59,13 @@ def load_weights(path: str | Path, module: nn.Module, *, task: str) -> dict[str,
 
 
 def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
-    """Writes tensors and facts to one safetensors file, aside and renamed."""
+    """Writes tensors and facts to one safetensors file, aside and renamed.
+
+    Args:
+        path (str or Path): the file; it is complete or not there.
+        tensors (mapping): tensors by name, on any device.
+        about (mapping, optional): facts for the header, plain JSON types.
+    """
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with replacing_file(path) as aside:
         save_file(tensors, aside, metadata={"about": json.dumps(about or {})})
@@ -109,6 +120,11 @@ def save_training_state(
 
 def load_training_state(path: str | Path, loss: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     """Restores what :func:`save_training_state` wrote, the global random state included.
+
+    Args:
+        path (str or Path): the file.
+        loss (nn.Module): loss module, built as it was; receives its parameters and averages.
+        optimizer (torch.optim.Optimizer): optimiser of the same parameters; receives its moments.
 
     Returns:
         dict: the facts given when it was saved.

@@ -1,40 +1,49 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Options of ``koap train`` and the ``config.json`` that a run keeps of them."""
+"""What a training is asked to do, and the same with every default filled in and every name looked up."""
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
-import sys
-from dataclasses import asdict, dataclass, fields, replace
+import importlib.util
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.data import LabelBudget
+from tensordict import TensorDictBase
+
+from torchrl_koap.data import LabelBudget, controller_view
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
+from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.methods import Method, get_method
-from torchrl_koap.training.released_settings import POLICY, get_released
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.training.plugins import Plugins
+from torchrl_koap.training.released_settings import POLICY, Released, get_released
+from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.training.validation import default_fraction
+
+LABEL_FRACTION, ALL_LABELS = 0.02, 1.0  # defaults for data with all labels, and for data that lack some
 
 
 @dataclass
-class Train:
+class TrainConfig:
     """Train planner and controller on demonstrations of which few have action labels.
 
     Attributes:
         out: run directory to write.
-        task: name of the task.
-        dataset: "scripted", or a folder: of D3IL raw pickles, a LeRobot data set, or written by `koap demos`.
-        label_fraction: share of the trajectories, windows or transitions that keep their actions.
+        task: name of the task (default: that of the data set, if it says so; else "avoiding").
+        dataset: "scripted", or a folder: written by `koap demos`, `koap convert` or save_demonstrations, of D3IL raw
+            pickles, or a LeRobot data set.
+        label_fraction: share of the trajectories, windows or transitions that keep their actions (default: 0.02; all
+            labels that there are, where data lack some).
         label_count: number of them instead of a share.
         label_episodes: these trajectories instead of a random choice, as `koap suggest` names them.
         label_unit: "trajectory", "window" (the paper's levels) or "transition".
         seed: seed of label choice, initialisation and batches.
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
+        validation_fraction: share of the trajectories that the planner never sees, those without labels first, for
+            `koap eval` to judge its plans by (default: 0.1 for a task without an environment, else none).
         method: "koap", "linear" (ridge on raw frames), "dd" (supervised inverse dynamics), "dp" (Diffusion Policy), or
-            another name in torchrl_koap.training.methods.METHODS.
+            another name in torchrl_koap.training.methods.METHODS, those that plugins register included.
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
         preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
@@ -47,7 +56,6 @@ class Train:
         controller_learning_rate: peak learning rate of the controller.
         denoiser: "unet", "mlp", "film" (an mlp that the condition also scales and shifts), "transformer" or "released"
             (11.9 M parameters).
-        channels: widths of the U-Net's levels (default: the task's).
         denoiser_width: hidden width of "mlp" and "transformer" (default: 256 and 64).
         denoiser_depth: their number of residual layers (default: 3).
         condition_octaves: octaves of the Fourier features of what was observed (default: 4).
@@ -56,6 +64,8 @@ class Train:
         first_steps_weight: weight of the first planned step in the planner's loss against the last one's (default: 1).
         precision: "float32", or "bfloat16" for the matrix products of the planner's training: several times quicker
             where the processor has them (default: float32).
+        candidates: plans sampled whenever one is due at evaluation, unless told otherwise there (default: 1).
+        channels: widths of the U-Net's levels (default: the task's).
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
         relative: plan displacements from the current state instead of states (default: the task's).
@@ -67,7 +77,6 @@ class Train:
         exchange: exchange objects that are alike.
         solver: solver used at evaluation unless told otherwise.
         solver_steps: its number of steps.
-        candidates: plans sampled whenever one is due at evaluation, unless told otherwise there (default: 1).
         planner_from: run directory whose planner is taken over instead of training one.
         episodes: number of scripted demonstrations (default: that of the task).
         threads: torch threads.
@@ -76,16 +85,25 @@ class Train:
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
         logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
+        plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
+            reads the run.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training import TrainConfig, train
+        >>> config = TrainConfig(out=Path("runs/koap"), task="avoiding", label_fraction=0.05)
+        >>> train(config)  # doctest: +SKIP
     """
 
     out: Path
-    task: str = "avoiding"
+    task: str | None = None
     dataset: str = "scripted"
-    label_fraction: float = 0.02
+    label_fraction: float | None = None
     label_count: int | None = None
     label_episodes: tuple[int, ...] | None = None
     label_unit: str = "trajectory"
     observation_fraction: float = 1.0
+    validation_fraction: float | None = None
     seed: int = 0
     method: str = "koap"
     released_settings: bool = False
@@ -99,7 +117,6 @@ class Train:
     planner_learning_rate: float = 3e-3
     controller_learning_rate: float = 1e-3
     denoiser: str = "unet"
-    channels: tuple[int, ...] | None = None
     denoiser_width: int | None = None
     denoiser_depth: int | None = None
     condition_octaves: int | None = None
@@ -107,6 +124,8 @@ class Train:
     planner_weight_decay: float | None = None
     first_steps_weight: float | None = None
     precision: str | None = None
+    candidates: int | None = None
+    channels: tuple[int, ...] | None = None
     schedule: str = "squared_cosine"
     prediction: str = "sample"
     relative: bool | None = None
@@ -118,7 +137,6 @@ class Train:
     exchange: bool = True
     solver: str = "dpm++2m"
     solver_steps: int = 10
-    candidates: int | None = None
     planner_from: Path | None = None
     episodes: int | None = None
     threads: int = 1
@@ -127,83 +145,177 @@ class Train:
     resume: bool = False
     logger: str = "csv"
     analysis: bool = True
+    plugins: Plugins = ()
+
+    def __post_init__(self):
+        self.out = Path(self.out)  # so that a string will do in Python
 
 
-# options with which a run may be resumed differently; with other threads sums are rounded differently
-FREE = ("out", "threads", "checkpoint_every", "resume")
+@dataclass(frozen=True)
+class ResolvedConfig:
+    """A :class:`TrainConfig` that leaves nothing open: what planner and controller are trained by.
+
+    Args:
+        options (TrainConfig): with the task's defaults where nothing was asked for.
+        task (Task): the task.
+        method (Method): the method, with the decoder asked for.
+        teacher (Method, optional): the method that labels the rest of the data for it.
+        released (Released, optional): the settings of the first public code, if they were asked for.
+        budget (LabelBudget): which labels may be seen.
+        planner (dict): what :func:`~torchrl_koap.training.diffusion_builders.build_planner` takes.
+        controller (dict): what :func:`~torchrl_koap.training.builders.build_controller` takes.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training.config import TrainConfig, resolve
+        >>> resolved = resolve(TrainConfig(out=Path("runs/koap"), label_fraction=0.05))
+        >>> resolved.task.name, resolved.method.name, resolved.budget.amount, resolved.options.steps
+        ('avoiding', 'koap', 0.05, 5000)
+    """
+
+    options: TrainConfig
+    task: Task
+    method: Method
+    teacher: Method | None
+    released: Released | None
+    budget: LabelBudget
+    planner: dict[str, Any]
+    controller: dict[str, Any]
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """State columns that the controller reads."""
+        return self.task.controller_columns(self.options.controller_state)
+
+    def controller_view(self, data: TensorDictBase) -> TensorDictBase:
+        """Flat data ``[N]`` as the controller sees them: its columns, and actions as distances to their targets."""
+        return controller_view(data, self.columns, action_targets=self.task.action_targets)
+
+    def with_labels_of(self, data: TensorDictBase) -> ResolvedConfig:
+        """The same with the share of labels that is the default for these data, if none was asked for."""
+        if self.options.label_fraction is not None:
+            return self
+        share = ALL_LABELS if not data["has_action"].all() else LABEL_FRACTION
+        options = replace(self.options, label_fraction=share)
+        return replace(self, options=options, budget=_budget(options))
 
 
-def budget_of(options: Train) -> LabelBudget:
-    """The label budget that the options describe.
+def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
+    """Looks every name up and fills every default in, once; plugins must have been imported.
+
+    Args:
+        config (TrainConfig): what is asked for.
+        task (Task, optional): the task, registered or not. Default: the one of the data set.
 
     Raises:
-        ValueError: if it is out of range, or episodes are given together with another choice.
+        ValueError: for unknown names, numbers out of range, and options that exclude each other.
+        RunDirectoryError: if ``planner_from`` is no finished run.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training.config import TrainConfig, resolve
+        >>> resolved = resolve(TrainConfig(out=Path("run"), task="avoiding", method="linear"))
+        >>> resolved.options.steps, resolved.method.closed_form, resolved.columns
+        (5000, True, (0, 1))
     """
+    task = find_task_of(config.dataset, config.task) if task is None else task
+    options = replace(_with_task_defaults(config, task), task=task.name)
+    released = _released(options)
+    method = _method(options) if released is None else released.method
+    _check(options, method)
+    if options.planner_from is not None:
+        planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
+    else:
+        planner = _planner_entry(options)
+    if released is not None and not method.has_planner:
+        planner |= POLICY
+    controller = {
+        "method": options.method,
+        "decoder": options.decoder,
+        "released": options.released_settings,
+        "preset": "released" if options.released_settings else options.preset or method.presets[0],
+        "state": options.controller_state if method.has_planner else "all",
+    }
+    return ResolvedConfig(
+        options=options,
+        task=task,
+        method=method,
+        teacher=get_method(method.teacher) if method.teacher else None,
+        released=released,
+        budget=_budget(options),
+        planner=planner,
+        controller=controller,
+    )
+
+
+def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
+    defaults = {
+        "steps": task.defaults.planner_steps,
+        "recovery_sigma": task.defaults.recovery_sigma,
+        "episodes": task.defaults.demonstrations,
+        "relative": task.defaults.relative,
+        "channels": task.defaults.channels,
+        "validation_fraction": default_fraction(task),
+    }
+    return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
+
+
+def _released(options: TrainConfig) -> Released | None:
+    if not options.released_settings:
+        if options.epochs is not None:
+            raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
+        return None
+    if options.decoder is not None or options.preset is not None:
+        raise ValueError("released settings come with their own decoder and preset: no --decoder, no --preset")
+    if options.epochs is not None and options.epochs < 1:
+        raise ValueError(f"epochs must be >= 1, got {options.epochs}")
+    return get_released(options.method)
+
+
+def _method(options: TrainConfig) -> Method:
+    method = get_method(options.method, options.decoder)
+    if options.preset is not None:
+        lookup(PRESETS, options.preset, "preset")
+        if options.preset not in method.presets:
+            has = list(method.presets)
+            raise ValueError(f"method {options.method!r} has no preset {options.preset!r}, it has {has}")
+    return method
+
+
+def _check(options: TrainConfig, method: Method) -> None:
+    lookup(("csv", "wandb"), options.logger, "logger")
+    if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
+        raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
+    if not method.has_planner and options.planner_from is not None:
+        raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
+    if options.steps < 1 or options.controller_steps < 0:
+        raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
+    if not 0 <= (options.validation_fraction or 0) < 1:
+        raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
+    for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
+
+
+def _budget(options: TrainConfig) -> LabelBudget:
     if options.label_episodes is not None:
         if options.label_count is not None or options.label_unit != "trajectory":
             raise ValueError("label_episodes are trajectories of their own choice: no label_count or label_unit")
         return LabelBudget.of_episodes(options.label_episodes)
     amount = options.label_fraction if options.label_count is None else options.label_count
+    amount = LABEL_FRACTION if amount is None else amount
     return LabelBudget(amount, unit=options.label_unit, seed=options.seed, window=WINDOW, history=HISTORY)
 
 
-def method_of(options: Train) -> Method:
-    """The method that the options name.
-
-    Raises:
-        ValueError: if there is none, or not with that decoder or released settings.
-    """
-    if options.released_settings:
-        if options.decoder is not None or options.preset is not None:
-            raise ValueError("released settings come with their own decoder and preset: no --decoder, no --preset")
-        if options.epochs is not None and options.epochs < 1:
-            raise ValueError(f"epochs must be >= 1, got {options.epochs}")
-        return get_released(options.method).method
-    if options.epochs is not None:
-        raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
-    method = get_method(options.method, options.decoder)
-    if (
-        options.preset is not None
-        and lookup(PRESETS, options.preset, "preset")
-        and (options.preset not in method.presets)
-    ):
-        raise ValueError(f"method {options.method!r} has no preset {options.preset!r}, it has {list(method.presets)}")
-    return method
-
-
-def started_with(run: RunDirectory, options: Train) -> Train:
-    """The options of a resumed run: what was not asked for otherwise is as it was."""
-    if not (options.resume and (run.path / "config.json").exists()):
-        return options
-    earlier = run.read_json("config.json")
-    left = [field.name for field in fields(options) if getattr(options, field.name) == field.default]
-    kept = {name: earlier[name] for name in left if name in earlier}
-    for name in ("channels", "label_episodes"):
-        if kept.get(name) is not None:
-            kept[name] = tuple(kept[name])
-    if kept.get("planner_from") is not None:
-        kept["planner_from"] = Path(kept["planner_from"])
-    return replace(options, **kept)
-
-
-def with_task_defaults(options: Train, task: Task) -> Train:
-    """Fills in what was left to the task."""
-    defaults = {
-        "steps": task.planner_steps,
-        "recovery_sigma": task.recovery_sigma,
-        "episodes": task.demonstrations,
-        "relative": task.relative,
-        "channels": task.channels,
+def _planner_entry(options: TrainConfig) -> dict[str, Any]:
+    sizes = {
+        "width": options.denoiser_width,
+        "depth": options.denoiser_depth,
+        "frequencies": options.condition_octaves,
+        "dropout": options.dropout,
     }
-    left = {name: value for name, value in defaults.items() if getattr(options, name) is None}
-    return replace(options, **left)
-
-
-def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
-    """Everything that ``config.json`` holds; compared with what is there already."""
-    config = asdict(options)
-    config |= {name: str(config[name]) for name in ("out", "planner_from") if config[name] is not None}
-    config["planner"] = {
+    # what was left out is left out here too, so that a run of before can be resumed
+    return {name: value for name, value in sizes.items() if value is not None} | {
         "denoiser": options.denoiser,
         "channels": list(options.channels),
         "schedule": options.schedule,
@@ -216,44 +328,3 @@ def configure(run: RunDirectory, options: Train) -> dict[str, Any]:
         "solver_steps": options.solver_steps,
         "clip": 1.2 if options.prediction == "sample" else 1.0,
     }
-    sizes = {
-        "width": options.denoiser_width,
-        "depth": options.denoiser_depth,
-        "frequencies": options.condition_octaves,
-        "dropout": options.dropout,
-    }
-    # what was left out is left out here too, so that a run of before can be resumed
-    config["planner"] |= {name: value for name, value in sizes.items() if value is not None}
-    if options.planner_from is not None:
-        config["planner"] = RunDirectory(options.planner_from).read_entry("config.json", "planner")
-    method = method_of(options)
-    if method.acts and options.released_settings:
-        config["planner"] |= POLICY
-    config["controller"] = {
-        "method": options.method,
-        "decoder": options.decoder,
-        "released": options.released_settings,
-        "preset": "released" if options.released_settings else options.preset or method.presets[0],
-        "state": "all" if method.acts else options.controller_state,
-    }
-    for name in ("channels", "label_episodes"):
-        if config[name] is not None:
-            config[name] = list(config[name])
-    config["command"] = "koap " + " ".join(sys.argv[1:])
-    config["versions"] = {"python": platform.python_version()} | {
-        name: importlib.metadata.version(name) for name in ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
-    }
-    if (run.path / "config.json").exists():
-        if not options.resume:
-            raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
-        earlier = run.read_json("config.json")
-        free = {*FREE, "command", "versions"}
-        # a folder that is gone was moved, probably together with this run: there is nothing to compare with
-        paths = {name: earlier.get(name) for name in ("dataset", "planner_from")}
-        free |= {name for name, path in paths.items() if path not in (None, "scripted") and not Path(path).exists()}
-        changed = [key for key in config if key not in free and config[key] != earlier.get(key)]
-        if changed:
-            raise RunDirectoryError(
-                f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so"
-            )
-    return config

@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The part of ``koap train`` that spends labels: a controller, or a diffusion policy."""
+"""The part of a training that spends labels: a controller, or a policy of its own."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,69 +11,84 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from torchrl_koap.data import WindowTable, controller_view, cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.data import WindowTable, cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
-from torchrl_koap.modules import DiffusionPolicy, KoopmanInverseDynamics
-from torchrl_koap.objectives import DiffusionPolicyLoss
+from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 from torchrl_koap.training import released_settings
-from torchrl_koap.training.builders import build_controller, build_diffusion_policy
+from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.checkpoints import save_tensors, save_weights
 from torchrl_koap.training.closed_form import fit_closed_form
-from torchrl_koap.training.config import Train, method_of
-from torchrl_koap.training.loop import moving_average, train
-from torchrl_koap.training.methods import METHODS, Method, Phase
-from torchrl_koap.training.planner import training_dtype
-from torchrl_koap.training.progress import progress_bar, show_progress
-from torchrl_koap.training.released_settings import epochs_of, get_released
+from torchrl_koap.training.config import ResolvedConfig
+from torchrl_koap.training.loop import moving_average, train_phase
+from torchrl_koap.training.methods import LABELLED_SHARES, Method, Phase
+from torchrl_koap.training.planner import planner_weight_decay, training_dtype
+from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.run_directory import RunDirectory
 
 _KEYS = ["state", "action", "has_action"]
-# share of every batch that has labels; None: as it comes
-_LABELLED_SHARE = {"all": None, "mixed": 0.25, "labelled": 1.0}
 
 
 def train_controller(
-    run: RunDirectory, options: Train, config: dict[str, Any], task: Task, data: TensorDictBase, logger
+    run: RunDirectory, resolved: ResolvedConfig, data: TensorDictBase, logger: Any = None
 ) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
     """Trains what turns states into actions and writes its weights.
 
     Args:
         run (RunDirectory): where weights, metrics and checkpoints go.
-        options (Train): all options.
-        config (dict): the run's ``config.json``.
-        task (Task): the task.
+        resolved (ResolvedConfig): all options.
         data (TensorDictBase): flat data after the label budget was applied, with the whole ``state``.
-        logger: a TorchRL logger, or None.
+        logger (optional): a TorchRL logger.
 
     Returns:
         tuple: the module, what was found by a closed form (empty if there is none), and the last losses.
     """
-    method = method_of(options)
-    train_one = _Training(run, options, logger, task)
-    if method.acts:
-        fit: dict[str, Any] = {}
-        if method.teacher:
-            data = _relabelled(train_one, method, config, task, data)
-        controller, values = _train_policy(train_one, config, task, data)
-    else:
-        view = controller_view(data, task.controller_columns(options.controller_state))
-        controller, fit, values = _train_network(train_one, method, config["controller"], task, view)
-    values["updates"] = train_one.updates
-    save_weights(run.path / "controller.safetensors", controller, {"task": task.name, "kind": "controller"})
+    controller, fit, values = learn_actions(resolved, data, run=run, logger=logger)
+    about = {"task": resolved.task.name, "kind": "controller"}
+    save_weights(run.path / "controller.safetensors", controller, about)
     if isinstance(controller, KoopmanInverseDynamics):
         eigenvalues = controller.operator.eigenvalues()
         save_tensors(run.path / "eigenvalues.safetensors", {"real": eigenvalues.real, "imag": eigenvalues.imag})
     return controller, fit, values
 
 
+def learn_actions(
+    resolved: ResolvedConfig, data: TensorDictBase, *, run: RunDirectory | None = None, logger: Any = None
+) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
+    """Builds and trains what turns states into actions, without writing it.
+
+    Args:
+        resolved (ResolvedConfig): all options.
+        data (TensorDictBase): flat data after the label budget was applied, with the whole ``state``.
+
+    Keyword Args:
+        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
+        logger (optional): a TorchRL logger.
+
+    Returns:
+        tuple: as :func:`train_controller`.
+    """
+    method = resolved.method
+    train_one = _Training(run, resolved, logger)
+    fit: dict[str, Any] = {}
+    if method.has_planner:
+        view = resolved.controller_view(data)
+        controller, fit, values = _train_network(train_one, method, resolved.controller, view)
+    else:
+        if resolved.teacher is not None:
+            data = _relabelled(train_one, resolved, data)
+        controller, values = _train_policy(train_one, resolved, data)
+    values["updates"] = train_one.updates
+    return controller, fit, values
+
+
 class _Training:
     """Runs phases with the options of a run."""
 
-    def __init__(self, run: RunDirectory, options: Train, logger, task: Task):
-        self.run, self.options, self.logger = run, options, logger
-        self.released = get_released(options.method) if options.released_settings else None
-        self.epochs = epochs_of(task.name)
+    def __init__(self, run: RunDirectory | None, resolved: ResolvedConfig, logger: Any):
+        self.run, self.options, self.logger, self.task = run, resolved.options, logger, resolved.task
+        self.released = resolved.released
+        self.epochs = resolved.task.defaults.released_epochs
         self.updates = 0
 
     def batch_size(self, own: int) -> int:
@@ -96,8 +111,8 @@ class _Training:
                 "decay": False,
             }
         self.updates += num_steps
-        with progress_bar(num_steps, name) as bar:
-            return train(
+        with progress_bar(num_steps, name, smoothing=0.05, mininterval=0.5) as bar:
+            return train_phase(
                 name,
                 loss,
                 sample,
@@ -106,24 +121,24 @@ class _Training:
                 logger=self.logger,
                 checkpoint_every=self.options.checkpoint_every,
                 resume=self.options.resume,
-                progress=show_progress(bar),
+                progress=show_losses(bar),
                 **settings,
             )
 
 
 def _train_network(
-    train_one: _Training, method: Method, entry: dict[str, Any], task: Task, data: TensorDictBase
+    train_one: _Training, method: Method, entry: dict[str, Any], data: TensorDictBase
 ) -> tuple[nn.Module, dict[str, Any], dict[str, float]]:
     """A controller's phases, and its closed form if it has one."""
-    options = train_one.options
-    controller = build_controller(entry, data["state"].shape[-1], task.action_dim, data).to(options.device)
-    history = controller.history
+    options, task = train_one.options, train_one.task
+    controller = build_controller(entry, data["state"].shape[-1], task.action_dim, data, method=method)
+    controller = controller.to(options.device)
+    history = controller.num_past
     window = max(WINDOW, controller.num_window_frames)
-    if hasattr(controller, "fit_scales"):
-        windows = cut_windows(data, window, select=["state", "has_action"], pad_before=history)
-        if method.labelled_only:
-            windows = windows[windows["has_action"].squeeze(-1).any(-1)]
-        controller.fit_scales(windows["state"])
+    windows = cut_windows(data, window, select=["state", "has_action"], pad_before=history)
+    if method.labelled_only:
+        windows = windows[windows["has_action"].squeeze(-1).any(-1)]
+    controller.fit_scales(windows["state"])
     values: dict[str, float] = {}
     budget = min(options.controller_steps, options.steps)
     table = WindowTable.build(data, window, pad_before=history)
@@ -134,7 +149,7 @@ def _train_network(
             train_one.batch_size(options.controller_batch_size),
             select=_KEYS,
             pad_before=history,
-            labelled_share=_LABELLED_SHARE[phase.windows],
+            labelled_share=LABELLED_SHARES[phase.windows],
         )
         values |= train_one(
             phase.name,
@@ -145,23 +160,34 @@ def _train_network(
             weight_decay=1e-3,
         )
     controller.eval()
-    fit = fit_closed_form(controller, data, shared_axes=task.actuated) if method.closed_form else {}
+    fit: dict[str, Any] = {}
+    if method.closed_form:
+        columns = task.controller_columns(options.controller_state)
+        fit = fit_closed_form(controller, data, shared_axes=task.actuated, guessed_axes=_likely_axes(task, columns))
     return controller, fit, values
 
 
+def _likely_axes(task: Task, columns: Sequence[int]) -> list[int]:
+    """The column that each action is likely to move, for a robot that came with data alone, which does not say it."""
+    moved = task.action_targets or task.robot
+    if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
+        return []
+    return [list(columns).index(column) for column in moved]
+
+
 def _train_policy(
-    train_one: _Training, config: dict[str, Any], task: Task, data: TensorDictBase
-) -> tuple[DiffusionPolicy, dict[str, float]]:
-    """A diffusion policy on labelled windows, with the updates that a planner would have."""
-    options = train_one.options
-    policy = build_diffusion_policy(
-        config["planner"], data["state"].shape[-1], task.action_dim, task.planner_features()
-    )
+    train_one: _Training, resolved: ResolvedConfig, data: TensorDictBase
+) -> tuple[nn.Module, dict[str, float]]:
+    """A policy of its own, with the updates that a planner would have."""
+    options, task = resolved.options, resolved.task
+    (phase,) = resolved.method.phases
+    policy = resolved.method.build(data["state"].shape[-1], task.action_dim, task.planner_features(), resolved.planner)
     has_action = data["has_action"].squeeze(-1)
     seen = data[torch.isin(data["episode"], data["episode"][has_action])]
     states = cut_windows(extrapolate_ends(seen, HORIZON - 1), WINDOW, select=["state"], pad_before=1)["state"]
     policy.fit_normalizers(states, data["action"][has_action])
     policy.to(options.device)
+    policy.training_dtype = training_dtype(options.precision)
     # at the end of a demonstration only the steps that were recorded count
     buffer = make_window_buffer(
         data,
@@ -170,12 +196,10 @@ def _train_policy(
         select=_KEYS,
         pad_before=1,
         pad_after=HORIZON - 1,
-        labelled_share=_LABELLED_SHARE["labelled"],
+        labelled_share=LABELLED_SHARES[phase.windows],
     )
-    policy.training_dtype = training_dtype(options.precision)
-    loss = DiffusionPolicyLoss(policy)
+    loss = phase.loss(policy)
     table = WindowTable.build(data, WINDOW, pad_before=1, pad_after=HORIZON - 1)
-    phase = Phase("policy", DiffusionPolicyLoss, "labelled")
     num_steps = train_one.budget(phase, options.steps, table, released_settings.POLICY_EPOCHS)
     values = train_one(
         phase.name,
@@ -183,21 +207,21 @@ def _train_policy(
         buffer.sample,
         num_steps=num_steps,
         learning_rate=options.planner_learning_rate,
-        weight_decay=1e-4 if options.planner_weight_decay is None else options.planner_weight_decay,
+        weight_decay=planner_weight_decay(options),
         target_update=moving_average(loss, num_steps),
     )
     loss.target_policy_params.to_module(policy)
     return policy, values
 
 
-def _relabelled(
-    train_one: _Training, method: Method, config: dict[str, Any], task: Task, data: TensorDictBase
-) -> TensorDictBase:
+def _relabelled(train_one: _Training, resolved: ResolvedConfig, data: TensorDictBase) -> TensorDictBase:
     """The data with the teacher's actions where there is no label."""
-    teacher = METHODS[method.teacher]
+    teacher = resolved.teacher
     phases = tuple(replace(phase, name=f"teacher_{phase.name}") for phase in teacher.phases)
-    entry = {"method": method.teacher, "preset": config["controller"]["preset"]}
-    view = controller_view(data, task.controller_columns(train_one.options.controller_state))
-    controller, _, _ = _train_network(train_one, replace(teacher, phases=phases), entry, task, view)
+    entry = {"method": teacher.name, "preset": resolved.controller["preset"]}
+    view = resolved.controller_view(data)
+    controller, _, _ = _train_network(train_one, replace(teacher, phases=phases), entry, view)
     labelled = relabel(controller, view, window=max(WINDOW, controller.num_window_frames))
+    if resolved.task.action_targets:
+        labelled["action"] = labelled["action"] + data["state"][..., list(resolved.task.action_targets)]
     return data.copy().update(labelled.select("action", "has_action"))

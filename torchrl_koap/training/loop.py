@@ -21,6 +21,14 @@ from torchrl_koap.training.run_directory import RunDirectory
 def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
     """Share of the peak learning rate at ``step``: linear warm-up, then half a cosine to 0.
 
+    Args:
+        step (int): number of the update, from 0.
+        num_steps (int): all updates.
+        warmup (int): updates of the warm-up.
+
+    Returns:
+        float: 0 to 1.
+
     Examples:
         >>> from torchrl_koap.training.loop import warmup_cosine
         >>> [round(warmup_cosine(step, 100, 10), 2) for step in (0, 9, 50, 99)]
@@ -30,7 +38,15 @@ def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
 
 
 def moving_average(loss_module: nn.Module, num_steps: int) -> SoftUpdate:
-    """The average of a loss's parameters that is used after training; its memory is a share of a short training."""
+    """The average of a loss's parameters that is used after training; its memory is a share of a short training.
+
+    Args:
+        loss_module (nn.Module): a loss with ``target_*_params``.
+        num_steps (int): updates of the training.
+
+    Returns:
+        SoftUpdate: to be stepped after every update; its decay is ``1 - 10 / (num_steps + 10)``, at most 0.998.
+    """
     return SoftUpdate(loss_module, eps=min(0.998, 1 - 10 / (num_steps + 10)))
 
 
@@ -38,7 +54,7 @@ class DivergedError(RuntimeError):
     """A loss that became NaN or infinite."""
 
 
-def train(
+def train_phase(
     phase: str,
     loss_module: nn.Module,
     sample: Callable[[], TensorDictBase],
@@ -139,5 +155,10 @@ def train(
 
 
 def phase_finished(run: RunDirectory, phase: str) -> bool:
-    """Whether the weights of a phase were written, which happens once, at its end."""
+    """Whether the weights of a phase were written, which happens once, at its end.
+
+    Args:
+        run (RunDirectory): the run.
+        phase (str): name of the phase, and of its weights.
+    """
     return Path(run.path / f"{phase}.safetensors").exists()

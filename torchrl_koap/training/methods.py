@@ -1,6 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Every method that the library compares, one entry each: the network, and what it is trained on.
 
+A method from outside the package is registered the same way (:func:`register_method`) by a module that ``--plugin`` or
+an entry point of the group ``torchrl_koap.methods`` names.
+
 Fair by construction: all controllers get the same labelled windows, the same planner and the same number of updates
 (two-stage methods share theirs between the stages). Networks that may look ahead read the same frames, 4 before and up
 to 5 after the present one; Decision Diffuser's controller may not, it is defined by the next state. ``dp`` and
@@ -13,6 +16,7 @@ none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action re
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -33,6 +37,7 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
 )
 from torchrl_koap.objectives import (
+    DiffusionPolicyLoss,
     InverseDynamicsLoss,
     KOAPLoss,
     LatentDecoderLoss,
@@ -40,19 +45,33 @@ from torchrl_koap.objectives import (
     QuantizedDynamicsLoss,
     VariationalLoss,
 )
+from torchrl_koap.training.diffusion_builders import build_diffusion_policy
+from torchrl_koap.training.plugins import load_entry_points
 
 LOOK_AHEAD = (1, 2, 3, 4, 5)
 
 
+KINDS = ("controller", "policy")
+# share of every batch that has labels; None: as it comes
+LABELLED_SHARES = {"all": None, "mixed": 0.25, "labelled": 1.0}
+GROUP = "torchrl_koap.methods"  # of entry points
+
+
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of a controller's training.
+    """A stretch of training.
 
     Args:
         name (str): its name in the log.
-        loss (callable): the loss of a network.
+        loss (callable): the loss of a network, a ``LossModule`` whose ``loss_*`` entries are minimised and logged.
         windows (str): ``"all"`` (labelled or not), ``"mixed"`` (a quarter of every batch has labels) or ``"labelled"``.
         share (float): of the updates that a controller may have.
+
+    Examples:
+        >>> from torchrl_koap.objectives import InverseDynamicsLoss
+        >>> from torchrl_koap.training.methods import Phase
+        >>> Phase("controller", InverseDynamicsLoss, "labelled").share
+        1.0
     """
 
     name: str
@@ -60,32 +79,76 @@ class Phase:
     windows: str = "all"
     share: float = 1.0
 
+    def __post_init__(self):
+        lookup(LABELLED_SHARES, self.windows, "kind of windows")
+        if not 0 < self.share <= 1:
+            raise ValueError(f"the share of phase {self.name!r} must be in (0, 1], got {self.share}")
+
 
 @dataclass(frozen=True)
 class Method:
     """A way to get from few labels to a policy.
 
+    A ``"controller"`` maps windows of states ``[*B, T, d]`` to actions ``[*B, T, act]`` and follows the plans of the
+    planner that all controllers share: a :class:`~torchrl_koap.modules.InverseDynamics`, whose docstring lists what is
+    asked of one. With ``closed_form`` it also has ``fit_decoder(windows, mask, groups=)``, called once after all
+    updates with windows of which frame ``num_past`` counts where ``mask`` is True; it returns numbers for the summary,
+    or a :class:`~torchrl_koap.modules.RidgeFit`.
+
+    A ``"policy"`` has no planner beside it: see :class:`~torchrl_koap.modules.DiffusionPolicy` for what it offers.
+
     Args:
+        name (str): what ``--method`` calls it.
         title (str): what tables and legends call it.
-        build (callable): makes the controller from sizes, normalisers and options; None for a policy of its own.
-        phases (tuple of Phase): how the controller is trained.
-        closed_form (bool): its linear decoder is fitted by ridge regression at the end.
+        build (callable): for a controller ``build(state_dim, action_dim, normalizers, options)`` with the keyword
+            arguments ``state_normalizer`` and ``action_normalizer`` in ``normalizers`` and the ``controller`` entry of
+            ``config.json`` as ``options``; for a policy ``build(state_dim, action_dim, features, options)`` with the
+            task's relative positions, or None, and the ``planner`` entry.
+        phases (tuple of Phase): how it is trained.
+        kind (str): ``"controller"``, or ``"policy"``, which has the planner's updates instead of a planner.
+        closed_form (bool): its decoder is fitted in closed form at the end.
         labelled_only (bool): it sees labelled windows and nothing else, statistics of the states included.
-        acts (bool): a policy of its own, Diffusion Policy: it needs no planner and has the planner's updates instead.
         teacher (str): the method whose controller labels the rest of the data first.
         other_decoder (str): the same method with the other way to get a decoder.
         presets (tuple of str): values of ``--preset`` that it can be built with; the first is its own.
+
+    Raises:
+        ValueError: for an unknown kind, a name that cannot be a folder's, or two phases of one name.
+
+    Examples:
+        >>> from torchrl_koap.modules import LinearInverseDynamics
+        >>> from torchrl_koap.training.methods import Method
+        >>> def build(state_dim, action_dim, normalizers, options):
+        ...     return LinearInverseDynamics(state_dim, action_dim)
+        >>> Method("my_ridge", "a ridge of mine", build, closed_form=True).has_planner
+        True
     """
 
+    name: str
     title: str
-    build: Callable[..., TensorDictModuleBase] | None = None
+    build: Callable[..., TensorDictModuleBase]
     phases: tuple[Phase, ...] = ()
+    kind: str = "controller"
     closed_form: bool = False
     labelled_only: bool = False
-    acts: bool = False
     teacher: str = ""
     other_decoder: str = ""
     presets: tuple[str, ...] = ("default",)
+
+    def __post_init__(self):
+        lookup(KINDS, self.kind, "kind of method")
+        if not re.fullmatch(r"[A-Za-z0-9_.]+", self.name):
+            raise ValueError(f"the name of a method must be letters, digits, '_' and '.', got {self.name!r}")
+        names = [phase.name for phase in self.phases]
+        if len(set(names)) < len(names):
+            raise ValueError(f"phases of method {self.name!r} need names of their own, got {names}")
+        if self.kind == "policy" and len(names) != 1:
+            raise ValueError(f"a policy is trained in one phase, method {self.name!r} has {len(names)}")
+
+    @property
+    def has_planner(self) -> bool:
+        """Whether a planner is trained beside it."""
+        return self.kind != "policy"
 
 
 def _koap(state_dim, action_dim, normalizers, options, **overrides):
@@ -104,6 +167,10 @@ def _network(state_dim, action_dim, normalizers, options, *, kind):
     return kind(state_dim, action_dim, **normalizers)
 
 
+def _diffusion_policy(state_dim, action_dim, features, options):
+    return build_diffusion_policy(options, state_dim, action_dim, features)
+
+
 def without_actions(network: nn.Module) -> LossModule:
     """KOAP's loss on states alone."""
     return KOAPLoss(network, action_coeff=0.0)
@@ -114,10 +181,45 @@ _JOINT = (Phase("controller", KOAPLoss, "mixed"),)
 # the decoder that is fitted afterwards, on a frozen encoder
 _DECODER = Phase("decoder", LatentDecoderLoss, "labelled", share=0.5)
 
+_POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
+
 _ANY_PRESET = tuple(PRESETS)
 
-METHODS = {
-    "koap": Method(
+METHODS: dict[str, Method] = {}
+
+
+def register_method(method: Method) -> Method:
+    """Adds a method, which ``koap train --method``, curves and reports then know by its name.
+
+    Args:
+        method (Method): the method.
+
+    Returns:
+        Method: the same.
+
+    Raises:
+        ValueError: if there is a method of that name already, or the methods that it names are unknown.
+
+    Examples:
+        >>> from torchrl_koap.training.methods import METHODS, register_method
+        >>> register_method(METHODS["koap"])
+        Traceback (most recent call last):
+        ...
+        ValueError: there is a method 'koap' already ('KOAP'); choose another name
+    """
+    if method.name in METHODS:
+        raise ValueError(
+            f"there is a method {method.name!r} already ({METHODS[method.name].title!r}); choose another name"
+        )
+    if method.teacher and not lookup(METHODS, method.teacher, "teacher").has_planner:
+        raise ValueError(f"the teacher of method {method.name!r} must be a controller, {method.teacher!r} is a policy")
+    METHODS[method.name] = method
+    return method
+
+
+for _method in (
+    Method(
+        "koap",
         "KOAP",
         _koap,
         (Phase("controller", without_actions),),
@@ -125,9 +227,10 @@ METHODS = {
         other_decoder="koap_sgd",
         presets=_ANY_PRESET,
     ),
-    "koap_sgd": Method("KOAP, decoder trained with the rest", _koap, _JOINT, other_decoder="koap", presets=_ANY_PRESET),
-    "koap_paper": Method("KOAP as in the paper", _koap, _JOINT, presets=("paper",)),
-    "koap_labelled_only": Method(
+    Method("koap_sgd", "KOAP, decoder trained with the rest", _koap, _JOINT, other_decoder="koap", presets=_ANY_PRESET),
+    Method("koap_paper", "KOAP as in the paper", _koap, _JOINT, presets=("paper",)),
+    Method(
+        "koap_labelled_only",
         "KOAP, labelled windows alone",
         _koap,
         (Phase("controller", without_actions, "labelled"),),
@@ -135,35 +238,47 @@ METHODS = {
         labelled_only=True,
         presets=_ANY_PRESET,
     ),
-    "koap_untrained": Method("KOAP, nothing trained but the decoder", _koap, closed_form=True, presets=_ANY_PRESET),
-    "pretrain": Method(
+    Method("koap_untrained", "KOAP, nothing trained but the decoder", _koap, closed_form=True, presets=_ANY_PRESET),
+    Method(
+        "pretrain",
         "KOAP, pre-trained and fine-tuned",
         _koap,
         (Phase("controller", without_actions, share=0.5), Phase("finetune", KOAPLoss, "labelled", share=0.5)),
         presets=_ANY_PRESET,
     ),
-    "linear_steps": Method("ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
-    "linear": Method("ridge on raw frames", _linear, closed_form=True),
-    "dd": Method("supervised, next state (Decision Diffuser)", partial(_supervised, look_ahead=1), _LABELS),
-    "dd_lookahead": Method("supervised, look-ahead", partial(_supervised, look_ahead=LOOK_AHEAD), _LABELS),
-    "vae": Method(
+    Method("linear_steps", "ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
+    Method("linear", "ridge on raw frames", _linear, closed_form=True),
+    Method("dd", "supervised, next state (Decision Diffuser)", partial(_supervised, look_ahead=1), _LABELS),
+    Method("dd_lookahead", "supervised, look-ahead", partial(_supervised, look_ahead=LOOK_AHEAD), _LABELS),
+    Method(
+        "vae",
         "variational autoencoder",
         partial(_network, kind=VariationalInverseDynamics),
         (Phase("controller", VariationalLoss, share=0.5), _DECODER),
     ),
-    "lapo": Method(
+    Method(
+        "lapo",
         "LAPO, quantised latent actions",
         partial(_network, kind=QuantizedInverseDynamics),
         (Phase("controller", QuantizedDynamicsLoss, share=0.5), _DECODER),
     ),
-    "nonlinear": Method(
+    Method(
+        "nonlinear",
         "KOAP with nonlinear maps",
         partial(_network, kind=NonlinearInverseDynamics),
         (Phase("controller", NonlinearLoss, "mixed"),),
     ),
-    "dp": Method("Diffusion Policy", acts=True),
-    "relabel": Method("Diffusion Policy on relabelled data", acts=True, teacher="dd_lookahead"),
-}
+    Method("dp", "Diffusion Policy", _diffusion_policy, _POLICY, kind="policy"),
+    Method(
+        "relabel",
+        "Diffusion Policy on relabelled data",
+        _diffusion_policy,
+        _POLICY,
+        kind="policy",
+        teacher="dd_lookahead",
+    ),
+):
+    register_method(_method)
 
 
 def get_method(name: str, decoder: str | None = None) -> Method:
@@ -186,15 +301,25 @@ def get_method(name: str, decoder: str | None = None) -> Method:
         ...
         ValueError: unknown method 'kaop'; did you mean 'koap'?
     """
+    if name not in METHODS:
+        load_entry_points(GROUP)
     method = lookup(METHODS, name, "method")
     if decoder is None or lookup(("ridge", "sgd"), decoder, "decoder") == ("ridge" if method.closed_form else "sgd"):
         return method
     if not method.other_decoder:
         own = "a closed form" if method.closed_form else "trained by gradients"
         raise ValueError(f"the decoder of method {name!r} is {own}: it has no decoder {decoder!r}")
-    return METHODS[method.other_decoder]
+    return lookup(METHODS, method.other_decoder, "method")
 
 
 def normalizers_of(state: nn.Module, action: nn.Module) -> Mapping[str, nn.Module]:
-    """The two normalisers as the keyword arguments that every network takes."""
+    """The two normalisers as the keyword arguments that every network takes.
+
+    Args:
+        state (nn.Module): maps raw states ``[*B, d]`` to the network's units.
+        action (nn.Module): maps raw actions ``[*B, act]`` to them.
+
+    Returns:
+        dict: ``state_normalizer`` and ``action_normalizer``.
+    """
     return {"state_normalizer": state, "action_normalizer": action}

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The planner's part of ``koap train``."""
+"""The part of a training that needs no labels: the planner."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from torchrl_koap.data import (
-    ExchangeAugmentation,
+    ObjectPermutation,
+    RandomPlanarTransform,
     RecoveryAugmentation,
-    SceneAugmentation,
     cut_windows,
     extrapolate_ends,
     make_window_buffer,
@@ -22,25 +22,65 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
-from torchrl_koap.training.builders import build_planner
 from torchrl_koap.training.checkpoints import load_weights, save_weights
-from torchrl_koap.training.config import Train
-from torchrl_koap.training.loop import moving_average, phase_finished, train
-from torchrl_koap.training.progress import progress_bar, show_progress
+from torchrl_koap.training.config import ResolvedConfig, TrainConfig
+from torchrl_koap.training.diffusion_builders import build_planner
+from torchrl_koap.training.loop import moving_average, phase_finished, train_phase
+from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.run_directory import RunDirectory
 
 
 def train_planner(
-    run: RunDirectory, options: Train, config: dict[str, Any], task: Task, data: TensorDictBase, logger
+    run: RunDirectory, resolved: ResolvedConfig, data: TensorDictBase, logger: Any = None
 ) -> tuple[StatePlanner, dict[str, float]]:
-    """Trains the planner, takes it over from another run, or loads it where that is done; returns it and its losses."""
-    planner = build_planner(config["planner"], data["state"].shape[-1], task.planner_features()).to(options.device)
+    """Trains the planner, takes it over from another run, or loads it where that is done.
+
+    Args:
+        run (RunDirectory): where weights, metrics and checkpoints go.
+        resolved (ResolvedConfig): all options.
+        data (TensorDictBase): flat data with the whole ``state``; no action is looked at.
+        logger (optional): a TorchRL logger.
+
+    Returns:
+        tuple: the planner and its last losses.
+    """
+    options, task = resolved.options, resolved.task
+    planner = build_planner(resolved.planner, data["state"].shape[-1], task.planner_features()).to(options.device)
     source = run.path if options.planner_from is None else Path(options.planner_from)
     if options.planner_from is not None or (options.resume and phase_finished(run, "planner")):
         load_weights(source / "planner.safetensors", planner, task=task.name)
         if options.planner_from is not None:
             save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
         return planner, run.last_metrics("planner")
+    values = learn_states(planner, data, task, options, run=run, logger=logger)
+    save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
+    return planner, values
+
+
+def learn_states(
+    planner: StatePlanner,
+    data: TensorDictBase,
+    task: Task,
+    options: TrainConfig,
+    *,
+    run: RunDirectory | None = None,
+    logger: Any = None,
+) -> dict[str, float]:
+    """Fits a planner's statistics and trains it; it is left with the average of its parameters.
+
+    Args:
+        planner (StatePlanner): the planner; it is trained in place.
+        data (TensorDictBase): flat data with the whole ``state``; no action is looked at.
+        task (Task): whose data they are.
+        options (TrainConfig): updates, batch size, learning rate, augmentation, with the task's defaults filled in.
+
+    Keyword Args:
+        run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
+        logger (optional): a TorchRL logger.
+
+    Returns:
+        dict: its last losses.
+    """
     # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
     extended = extrapolate_ends(data, HORIZON - 1)
     planner.fit_normalizers(cut_windows(extended, WINDOW, select=["state"], pad_before=1)["state"])
@@ -50,24 +90,23 @@ def train_planner(
     planner.training_dtype = training_dtype(options.precision)
     weight = 1.0 if options.first_steps_weight is None else options.first_steps_weight
     loss = PlannerLoss(planner, first_steps_weight=weight)
-    with progress_bar(options.steps, "planner") as bar:
-        values = train(
+    with progress_bar(options.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
+        values = train_phase(
             "planner",
             loss,
             lambda: augment(buffer.sample()),
             num_steps=options.steps,
             learning_rate=options.planner_learning_rate,
-            weight_decay=1e-4 if options.planner_weight_decay is None else options.planner_weight_decay,
+            weight_decay=planner_weight_decay(options),
             target_update=moving_average(loss, options.steps),
             run=run,
             logger=logger,
             checkpoint_every=options.checkpoint_every,
             resume=options.resume,
-            progress=show_progress(bar),
+            progress=show_losses(bar),
         )
     loss.target_planner_params.to_module(planner)
-    save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
-    return planner, values
+    return values
 
 
 def training_dtype(precision: str | None) -> torch.dtype | None:
@@ -79,15 +118,22 @@ def training_dtype(precision: str | None) -> torch.dtype | None:
     return lookup({"float32": None, "bfloat16": torch.bfloat16}, precision or "float32", "precision")
 
 
-def _augmentation(options: Train, task: Task) -> TensorDictSequential:
+def planner_weight_decay(options: TrainConfig) -> float:
+    """Decoupled weight decay of a planner, or of a policy of its own."""
+    return 1e-4 if options.planner_weight_decay is None else options.planner_weight_decay
+
+
+def _augmentation(options: TrainConfig, task: Task) -> TensorDictSequential:
     """What windows undergo before the planner learns from them."""
     steps = []
-    if options.exchange and task.alike_columns():
-        steps.append(ExchangeAugmentation(task.alike_columns()))
-    if task.scene and (options.scene_shift or options.scene_turn):
+    if options.exchange and task.interchangeable_columns():
+        steps.append(ObjectPermutation(task.interchangeable_columns()))
+    if task.planar_parts and (options.scene_shift or options.scene_turn):
         shift, turn = options.scene_shift, options.scene_turn
-        steps.append(SceneAugmentation(*task.scene_columns(), shift=shift, turn=turn, history=HISTORY))
+        steps.append(RandomPlanarTransform(*task.planar_columns(), shift=shift, turn=turn, history=HISTORY))
     arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
     sigma = options.recovery_sigma
-    steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, tool=task.tool_columns))
+    steps.append(
+        RecoveryAugmentation(sigma, history=HISTORY, columns=arm, tool=task.tool_columns, kinematics=task.tool_position)
+    )
     return TensorDictSequential(*steps)

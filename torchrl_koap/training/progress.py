@@ -1,20 +1,65 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The progress bar of a training phase."""
+"""Progress bars, which can be turned off for a while."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from typing import Any
 
 from tqdm import tqdm
 
-
-def progress_bar(total: int, description: str) -> tqdm:
-    """A bar that counts updates."""
-    return tqdm(total=total, desc=description, unit="it", smoothing=0.05, mininterval=0.5)
+_SHOWN: ContextVar[bool] = ContextVar("shown", default=True)
 
 
-def show_progress(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
-    """What :func:`~torchrl_koap.training.loop.train` calls after every update: moves the bar, shows the losses."""
+def progress_bar(total: int | None, description: str, *, unit: str = "it", shown: bool = True, **options: Any) -> tqdm:
+    """A bar on stderr that counts to ``total``.
+
+    Args:
+        total (int, optional): where it ends.
+        description (str): what is counted.
+
+    Keyword Args:
+        unit (str): the name of one of them.
+        shown (bool): no bar if False.
+        **options: of ``tqdm``.
+
+    Examples:
+        >>> from torchrl_koap.training.progress import progress_bar, without_progress_bars
+        >>> with without_progress_bars(), progress_bar(2, "updates") as bar:
+        ...     bar.update(2)
+        ...     bar.disable
+        True
+    """
+    return tqdm(total=total, desc=description, unit=unit, disable=not (shown and _SHOWN.get()), **options)
+
+
+@contextlib.contextmanager
+def without_progress_bars() -> Iterator[None]:
+    """Inside the block no bar of the library is shown."""
+    token = _SHOWN.set(False)
+    try:
+        yield
+    finally:
+        _SHOWN.reset(token)
+
+
+def count_up_to(bar: tqdm) -> Callable[..., None]:
+    """A function that moves a bar to the number it is called with first, whatever else it is told.
+
+    Args:
+        bar (tqdm): the bar.
+    """
+    return lambda done, *rest: bar.update(done - bar.n) and None
+
+
+def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
+    """What :func:`~torchrl_koap.training.loop.train_phase` calls after every update: moves the bar, shows the losses.
+
+    Args:
+        bar (tqdm): the bar.
+    """
 
     def update(step: int, values: dict[str, float]) -> None:
         bar.update(step - bar.n)

@@ -3,10 +3,10 @@
 
 There every controller has its own architecture, look-ahead, learning rate and dropout, and its updates are counted in
 epochs of its own windows: with 2 % of the windows labelled KOAP makes 14 updates in the time in which the supervised
-controller makes one (``koap_release_notes`` sections 3 and 5). What is taken over: network, learning rate, weight
+controller makes one. What is taken over: network, learning rate, weight
 decay, batch size, warm-up without decay, epochs per task. What is not: early stopping and choice of weights on a
-validation set whose labels lie outside the budget (bug B7), the moving average with a memory of five updates, other
-labelled windows for every method (B9), Diffusion Policy's skipped action (B4). The recurrent VAE and FSQ controllers of
+validation set whose labels lie outside the budget, the moving average with a memory of five updates, other
+labelled windows for every method, Diffusion Policy's skipped action. The recurrent VAE and FSQ controllers of
 that code are not re-expressed here.
 """
 
@@ -19,10 +19,9 @@ from torchrl_koap.data import WindowTable
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import RecurrentInverseDynamics, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import InverseDynamicsLoss, KOAPLoss
-from torchrl_koap.training.methods import METHODS, Method, Phase, without_actions
+from torchrl_koap.training.methods import METHODS, Method, Phase, get_method, without_actions
 
 BATCH_SIZE, WEIGHT_DECAY, WARMUP = 256, 0.01, 200
-EPOCHS = {"avoiding": 500, "sorting": 400, "stacking": 400, "aligning": 200, "po_sorting": 200}
 POLICY_EPOCHS = 200
 # of the diffusion policy: 11.95 M parameters, all 50 ancestral steps
 POLICY = {"denoiser": "released", "prediction": "epsilon", "solver": "ddpm", "solver_steps": 50, "clip": 1.0}
@@ -35,13 +34,28 @@ class Released:
     Args:
         method (Method): network and phases.
         learning_rate (float): reached after the warm-up and kept.
+
+    Examples:
+        >>> from torchrl_koap.training.released_settings import get_released
+        >>> released = get_released("koap")
+        >>> released.method.name, released.learning_rate
+        ('koap', 0.0003)
     """
 
     method: Method
     learning_rate: float
 
     def updates(self, phase: Phase, table: WindowTable, epochs: int) -> int:
-        """Updates of a phase: passes over the windows that it trains on."""
+        """Updates of a phase: epochs times the batches of an epoch.
+
+        Args:
+            phase (Phase): tells which windows it trains on.
+            table (WindowTable): the windows.
+            epochs (int): passes over them.
+
+        Returns:
+            int: at least 1.
+        """
         number = int(table.labelled.sum()) if phase.windows == "labelled" else len(table.starts)
         return max(epochs * math.ceil(number / BATCH_SIZE), 1)
 
@@ -55,9 +69,10 @@ def _recurrent(state_dim, action_dim, normalizers, options):
 
 
 RELEASED = {
-    "koap": Released(Method("KOAP, first code", _koap, (Phase("controller", KOAPLoss),)), 3e-4),
+    "koap": Released(Method("koap", "KOAP, first code", _koap, (Phase("controller", KOAPLoss),)), 3e-4),
     "pretrain": Released(
         Method(
+            "pretrain",
             "KOAP pre-trained, first code",
             _koap,
             (Phase("controller", without_actions), Phase("finetune", KOAPLoss, "labelled")),
@@ -65,7 +80,10 @@ RELEASED = {
         3e-4,
     ),
     "dd": Released(
-        Method("supervised LSTM, first code", _recurrent, (Phase("controller", InverseDynamicsLoss, "labelled"),)), 1e-3
+        Method(
+            "dd", "supervised LSTM, first code", _recurrent, (Phase("controller", InverseDynamicsLoss, "labelled"),)
+        ),
+        1e-3,
     ),
     "dp": Released(METHODS["dp"], 1e-4),
 }
@@ -82,10 +100,5 @@ def get_released(name: str) -> Released:
         >>> get_released("dd").learning_rate
         0.001
     """
-    lookup(METHODS, name, "method")
+    get_method(name)  # an unknown name is answered with those of all methods
     return lookup(RELEASED, name, "method with released settings:")
-
-
-def epochs_of(task: str) -> int:
-    """Epochs of a controller in the first public code (``koap_release_notes`` section 5)."""
-    return EPOCHS.get(task, EPOCHS.get(task.split("_")[0], 400))

@@ -1,127 +1,181 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap train``: demonstrations and a label budget in, a run directory with planner and controller out."""
+"""The whole training: demonstrations and a label budget in, a run directory with planner and controller out."""
 
 from __future__ import annotations
 
-import importlib.metadata
-import importlib.util
 import os
 import time
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tqdm import tqdm
 
-from torchrl_koap.data import WindowTable, limit_observations
-from torchrl_koap.lookup import lookup
-from torchrl_koap.tasks import WINDOW, Task, get_task
-from torchrl_koap.training.action_errors import AFTER, BEFORE, UNITS, write_analysis
-from torchrl_koap.training.builders import (
-    build_controller,
-    build_diffusion_policy,
-    build_planner,
-    load_demonstrations,
-    set_up_torch,
-)
+from torchrl_koap.data import WindowTable, subsample_trajectories
+from torchrl_koap.tasks import WINDOW
+from torchrl_koap.training.action_errors import AFTER, BEFORE, error_entry, write_analysis
+from torchrl_koap.training.builders import build_controller, set_up_torch
 from torchrl_koap.training.checkpoints import load_weights
-from torchrl_koap.training.config import Train, budget_of, configure, method_of, started_with, with_task_defaults
+from torchrl_koap.training.config import ResolvedConfig, TrainConfig, resolve
 from torchrl_koap.training.controller import train_controller
+from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.planner import train_planner
+from torchrl_koap.training.plugins import load_plugins
+from torchrl_koap.training.progress import count_up_to, progress_bar
+from torchrl_koap.training.provenance import to_json
+from torchrl_koap.training.resume import check_resume, started_with
 from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.training.validation import choose_validation, validation_of, without_validation
 
 
-def run_train(options: Train) -> dict[str, Any]:
-    """Trains; returns the summary that is also written to ``summary.json``.
+def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
+    """Trains planner and controller, or a policy of its own; ``koap train`` calls this.
+
+    Args:
+        config (TrainConfig): what to train on what, and where to write it.
+
+    Keyword Args:
+        command (str, optional): how it was called, if from a shell; kept in ``config.json``.
+
+    Returns:
+        dict: the summary that is also written to ``summary.json``: labels spent, sizes, losses, action errors.
 
     Raises:
         ValueError: for unknown options and budgets that select nothing.
-        RunDirectoryError: if the folder holds another run, or one that was not asked to be resumed.
+        RunDirectoryError: if the folder holds another run, one that was not asked to be resumed, or one that is being
+            worked on.
+        PluginError: if a plugin cannot be imported.
     """
-    run = RunDirectory(options.out)
-    options = started_with(run, options)
-    task = get_task(options.task)
-    options = with_task_defaults(options, task)
-    method = method_of(options)
-    lookup(("csv", "wandb"), options.logger, "logger")
-    if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-        raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
-    if method.acts and options.planner_from is not None:
-        raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
-    if options.steps < 1 or options.controller_steps < 0:
-        raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
-    for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
-        if getattr(options, name) < 1:
-            raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
-    budget = budget_of(options)
-    set_up_torch(options.threads, options.device)
-    config = configure(run, options)
-    # finds unknown names before any work is done
-    if method.acts:
-        build_diffusion_policy(config["planner"], task.state_dim, task.action_dim, task.planner_features())
-    else:
-        planner = build_planner(config["planner"], task.state_dim, task.planner_features())
-    if options.planner_from is not None:
-        load_weights(options.planner_from / "planner.safetensors", planner, task=task.name)
+    run = RunDirectory(config.out)
+    with ExitStack() as held:
+        mine = (run.path / ".lock").exists()  # a new folder is not made before the options are known to do
+        if mine:
+            held.enter_context(run.locked("koap train"))
+        config = started_with(run, config)
+        load_plugins(config.plugins)
+        resolved = resolve(config)
+        options, task = resolved.options, resolved.task
+        set_up_torch(options.threads, options.device)
+        content = to_json(resolved, command)
+        check_resume(run, content, resume=options.resume)
+        _build_once(resolved)
 
-    with tqdm(desc="demonstrations", unit="episode", disable=options.dataset != "scripted") as bar:
-        data = load_demonstrations(
-            options.dataset,
-            task,
-            episodes=options.episodes,
-            progress=lambda recorded, wanted: bar.update(recorded - bar.n),
-        )
-    labelled, report = budget.apply(data, command=task.observation[task.command])
-    # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
-    labelled = limit_observations(labelled, options.observation_fraction).to(options.device)
-    _check_lengths(options, config, task, labelled)
-    run.write_json("config.json", config)  # not before the data are known to be good: a wrong call leaves nothing
+        with progress_bar(None, "demonstrations", unit="episode", shown=options.dataset == "scripted") as bar:
+            data = load_demonstrations(options.dataset, task, episodes=options.episodes, progress=count_up_to(bar))
+        resolved = resolved.with_labels_of(data)
+        options = resolved.options
+        content["label_fraction"] = options.label_fraction
+        labelled, report = resolved.budget.apply(data, command=task.command_columns)
+        # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
+        labelled = subsample_trajectories(labelled, options.observation_fraction).to(options.device)
+        held_out = _validation(resolved, labelled)
+        if held_out:
+            content["validation_episodes"] = held_out
+        _check_lengths(resolved, labelled)
+        planner_data = without_validation(labelled, held_out)
+        labelled = without_validation(labelled, held_out, keep_labelled=True)
+        if not mine:
+            held.enter_context(run.locked("koap train"))
+            check_resume(run, content, resume=options.resume)  # another one may have begun here in the meantime
+        run.write_json("config.json", content)  # not before the data are known to be good: a wrong call leaves nothing
 
-    began = time.perf_counter()
-    logger = _make_logger(options)
-    try:
-        torch.manual_seed(options.seed)
-        trained, planner_values = None, {}
-        if not method.acts:
-            trained, planner_values = train_planner(run, options, config, task, labelled, logger)
-        planned = time.perf_counter()
-        torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
-        controller, fit, controller_values = train_controller(run, options, config, task, labelled, logger)
-    finally:
-        if logger is not None:
-            logger.close()
-    summary = {
-        "labels": report.as_dict(),
-        "trajectories_used": len(labelled["episode"].unique()),
-        "planner_parameters": 0 if trained is None else sum(p.numel() for p in trained.parameters()),
-        "controller_parameters": sum(p.numel() for p in controller.parameters()),
-        "train_seconds": {"planner": planned - began, "controller": time.perf_counter() - planned},
-        "planner": planner_values,
-        "controller": controller_values,
-        "controller_updates": controller_values.pop("updates", 0),
-        "decoder_fit": fit,
-    }
-    if options.analysis and not method.acts:
-        columns = task.controller_columns(options.controller_state)
-        analysis = write_analysis(run, task, data, labelled, controller, columns)
-        summary[f"action_error_{UNITS[task.action_unit]}"] = analysis
-    run.write_json("summary.json", summary)
+        began = time.perf_counter()
+        logger = _make_logger(options)
+        try:
+            torch.manual_seed(options.seed)
+            planner, planner_values = None, {}
+            if resolved.method.has_planner:
+                planner, planner_values = train_planner(run, resolved, planner_data, logger)
+            planned = time.perf_counter()
+            torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
+            controller, fit, controller_values = train_controller(run, resolved, labelled, logger)
+        finally:
+            if logger is not None:
+                logger.close()
+        summary = {
+            "labels": report.as_dict(),
+            "trajectories_used": len(labelled["episode"].unique()),
+            "planner_parameters": 0 if planner is None else sum(p.numel() for p in planner.parameters()),
+            "controller_parameters": sum(p.numel() for p in controller.parameters()),
+            "train_seconds": {"planner": planned - began, "controller": time.perf_counter() - planned},
+            "planner": planner_values,
+            "controller": controller_values,
+            "controller_updates": controller_values.pop("updates", 0),
+            "decoder_fit": fit,
+        }
+        if options.analysis and resolved.method.has_planner:
+            analysis = write_analysis(run, task, data, labelled, controller, resolved.columns)
+            summary[error_entry(task.action_unit)] = analysis
+        run.write_json("summary.json", summary)
     return summary
 
 
-def _check_lengths(options: Train, config: dict[str, Any], task: Task, data: TensorDictBase) -> None:
+def train_shared_planner(config: TrainConfig) -> dict[str, float]:
+    """Trains a planner alone, for other runs to take over (``planner_from``); all actions are hidden before.
+
+    Args:
+        config (TrainConfig): as for :func:`train`; what concerns labels and controllers is not used.
+
+    Returns:
+        dict: its last losses.
+    """
+    run = RunDirectory(config.out)
+    load_plugins(config.plugins)
+    resolved = resolve(config)
+    options = resolved.options
+    set_up_torch(options.threads, options.device)
+    data = load_demonstrations(options.dataset, resolved.task)
+    # all cells of a curve share it, whichever labels they draw: only labels that there are count as such here
+    held_out = choose_validation(data, options.validation_fraction, seed=options.seed)
+    data["action"] = torch.full_like(data["action"], torch.nan)
+    data["has_action"] = torch.zeros_like(data["has_action"])
+    data = subsample_trajectories(data, options.observation_fraction).to(options.device)
+    content = to_json(resolved)
+    if held_out:
+        content["validation_episodes"] = held_out
+    check_resume(run, content, resume=options.resume)
+    run.write_json("config.json", content)
+    torch.manual_seed(options.seed)
+    return train_planner(run, resolved, without_validation(data, held_out))[1]
+
+
+def _validation(resolved: ResolvedConfig, labelled: TensorDictBase) -> list[int]:
+    """Trajectories that the planner does not see, or, where it is taken over, has not seen."""
+    options = resolved.options
+    if not resolved.method.has_planner:
+        return []
+    if options.planner_from is not None:
+        return validation_of(options.planner_from, options.dataset)
+    return choose_validation(labelled, options.validation_fraction, seed=options.seed)
+
+
+def _build_once(resolved: ResolvedConfig) -> None:
+    """Finds unknown names and weights that do not fit before any work is done."""
+    task, features = resolved.task, resolved.task.planner_features()
+    if not resolved.method.has_planner:
+        resolved.method.build(task.state_dim, task.action_dim, features, resolved.planner)
+        return
+    planner = build_planner(resolved.planner, task.state_dim, features)
+    if resolved.options.planner_from is not None:
+        load_weights(Path(resolved.options.planner_from) / "planner.safetensors", planner, task=task.name)
+
+
+def _check_lengths(resolved: ResolvedConfig, data: TensorDictBase) -> None:
     """Finds trajectories that are too short now rather than after the planner was trained."""
-    if method_of(options).acts:
+    if not resolved.method.has_planner:
         WindowTable.build(data, WINDOW, pad_before=1)
         return
-    width = len(task.controller_columns(options.controller_state))
-    controller = build_controller(config["controller"], width, task.action_dim)
-    WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.history)
-    if options.analysis:
+    controller = build_controller(
+        resolved.controller, len(resolved.columns), resolved.task.action_dim, method=resolved.method
+    )
+    WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.num_past)
+    if resolved.options.analysis:
         WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
 
 
-def _make_logger(options: Train):
+def _make_logger(options: TrainConfig):
     if options.logger == "csv":
         return None
     from torchrl.record.loggers import get_logger

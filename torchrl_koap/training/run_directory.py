@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.files import replacing_file
+from torchrl_koap.files import LockedError, one_at_a_time, replacing_file
 
 
 class RunDirectoryError(ValueError):
@@ -20,8 +21,8 @@ class RunDirectoryError(ValueError):
 class RunDirectory:
     """Reads and writes the files of one run.
 
-    ``config.json`` (all options), ``metrics.csv`` (one row per logged step), ``summary.json``, ``eval.json``, weights
-    and pictures. JSON is written aside and renamed, so that a full disk leaves the earlier file.
+    ``config.json`` (all options), ``metrics.csv`` (one row per logged step, columns as they come), ``summary.json``,
+    ``eval.json``, weights and pictures. JSON is written aside and renamed, so that a full disk leaves the earlier file.
 
     Args:
         path (str or Path): the folder; it need not exist yet.
@@ -37,25 +38,16 @@ class RunDirectory:
         ('avoiding', '0.5')
     """
 
-    COLUMNS = (
-        "phase",
-        "step",
-        "loss_planner",
-        "loss_reconstruction",
-        "loss_koopman",
-        "loss_kl",
-        "loss_dynamics",
-        "loss_action",
-        "loss_policy",
-        "learning_rate",
-        "iterations_per_second",
-    )
-
     def __init__(self, path: str | Path):
         self.path = Path(path)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Writes a JSON file in one go; numbers that are not finite, which JSON does not know, become null."""
+        """Writes a JSON file in one go; numbers that are not finite, which JSON does not know, become null.
+
+        Args:
+            name (str): the file.
+            content (mapping): what it is to hold.
+        """
         with replacing_file(self.path / name) as aside:
             aside.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
@@ -79,6 +71,10 @@ class RunDirectory:
     def read_entry(self, name: str, key: str) -> Any:
         """Reads one entry of a JSON file.
 
+        Args:
+            name (str): the file.
+            key (str): the entry.
+
         Raises:
             RunDirectoryError: if the file or the entry is not there; the message names both.
         """
@@ -88,15 +84,36 @@ class RunDirectory:
         return content[key]
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
-        """Appends a row to ``metrics.csv``."""
+        """Appends a row to ``metrics.csv``; a value that no row had before gets a column of its own.
+
+        Args:
+            phase (str): part of the training.
+            step (int): updates done in it.
+            values (mapping): name to value: losses, learning rate, speed.
+        """
         path = self.path / "metrics.csv"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = not path.exists()
+        row = {"phase": phase, "step": step, **values}
+        columns = self._columns()
+        new = [name for name in row if name not in columns]
+        if new:
+            self._write_metrics([*columns, *new], self.read_metrics())
+            columns += new
         with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, self.COLUMNS)
-            if fresh:
-                writer.writeheader()
-            writer.writerow({"phase": phase, "step": step, **values})
+            csv.DictWriter(file, columns).writerow(row)
+
+    def _columns(self) -> list[str]:
+        path = self.path / "metrics.csv"
+        if not path.exists():
+            return []
+        with path.open(newline="") as file:
+            head = file.readline()
+        return next(csv.reader([head]), []) if head.endswith("\n") else []
+
+    def _write_metrics(self, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+        with replacing_file(self.path / "metrics.csv") as aside, aside.open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns, restval="")
+            writer.writeheader()
+            writer.writerows(rows)
 
     def read_metrics(self) -> list[dict[str, str]]:
         """All complete rows of ``metrics.csv``; none if there is no such file.
@@ -117,7 +134,12 @@ class RunDirectory:
         return {key: float(value) for key, value in rows[-1].items() if value and key not in ("phase", "step")}
 
     def rewind_metrics(self, phase: str, step: int) -> None:
-        """Drops the rows of ``phase`` behind ``step``, and those of later phases, before a run goes on from there."""
+        """Drops the rows of ``phase`` behind ``step``, and those of later phases, before a run goes on from there.
+
+        Args:
+            phase (str): part of the training.
+            step (int): its updates that are kept.
+        """
         if not (self.path / "metrics.csv").exists():
             return
         kept = []
@@ -125,10 +147,25 @@ class RunDirectory:
             if row["phase"] == phase and int(row["step"]) > step:
                 break
             kept.append(row)
-        with replacing_file(self.path / "metrics.csv") as aside, aside.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self.COLUMNS)
-            writer.writeheader()
-            writer.writerows(kept)
+        self._write_metrics(self._columns(), kept)
+
+    @contextlib.contextmanager
+    def locked(self, what: str, name: str = ".lock") -> Iterator[None]:
+        """Keeps others out of the folder as long as the block lasts.
+
+        Args:
+            what (str): what works in the folder, for the message: ``"koap train"``.
+            name (str): the lock file in the folder.
+
+        Raises:
+            RunDirectoryError: if somebody works in the folder already.
+        """
+        with contextlib.ExitStack() as held:
+            try:
+                held.enter_context(one_at_a_time(self.path / name, busy=f"another `{what}` is working in {self.path}"))
+            except LockedError as error:
+                raise RunDirectoryError(str(error)) from None
+            yield
 
 
 def _finite(value: Any) -> Any:

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Raw episodes of every task become the specification's columns; D3IL's folders and lists; files of another task."""
+"""Raw episodes of every task become the columns of docs/d3il.md; D3IL's folders and lists; files of another task."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from torchrl_koap.data import (
-    CONVERTERS,
     D3ILExperienceReplay,
     RawEpisode,
     RawFolderError,
@@ -22,11 +21,11 @@ from torchrl_koap.data import (
     save_ted,
     write_raw_episode,
 )
-from torchrl_koap.data.d3il.conversion import OBJECTS, get_converter
+from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, get_task
-from torchrl_koap.training.builders import load_demonstrations
+from torchrl_koap.training.datasets import load_demonstrations
 
 ROOT3 = math.sqrt(3)
 
@@ -36,6 +35,9 @@ def turned(*degrees, sign=1.0):
     half = np.radians(np.array(degrees)) / 2
     zeros = np.zeros_like(half)
     return sign * np.stack([np.cos(half), zeros, zeros, np.sin(half)], 1)
+
+
+RAW = [name for name, task in TASKS.items() if not task.data]
 
 
 def pose(positions, quat):
@@ -59,7 +61,7 @@ def write_folder(folder, task, episodes=3, **kwargs):
 
 
 def convert(task, episode):
-    return CONVERTERS[task].convert(episode)
+    return get_converter(task).convert(episode)
 
 
 def same(array, wanted):
@@ -207,7 +209,7 @@ def test_every_task_gets_its_columns(tmp_path, task):
     assert data["observation"].shape == (12, facts.observation_dim) and data["action"].shape == (12, facts.action_dim)
     assert torch.equal(data["state"], facts.state_of(data["observation"]))
     # the command and the action give the next command
-    command, size = facts.observation[facts.command], facts.same_unit
+    command, size = facts.observation[facts.command], facts.num_delta_actions
     reached = data["observation"][:, command][:, :size] + data["action"][:, :size]
     torch.testing.assert_close(reached, data["next", "observation"][:, command][:, :size], rtol=0, atol=1e-6)
     assert torch.equal(load_demonstrations(str(tmp_path / "raw"), facts)["state"], data["state"])
@@ -215,7 +217,7 @@ def test_every_task_gets_its_columns(tmp_path, task):
 
 @pytest.mark.parametrize(("task", "source"), [("po_sorting", "sorting"), ("stacking_1", "stacking")])
 def test_demonstrations_of_another_task_are_used_where_that_is_meant(tmp_path, task, source):
-    assert OBJECTS[source] == get_converter(task).objects
+    assert get_converter(source) is get_converter(task)
     write_folder(tmp_path / "raw", source)
     theirs = D3ILExperienceReplay(source, tmp_path / "raw").data
     save_ted(theirs.exclude("state"), tmp_path / "demos" / "ted", task=source)
@@ -282,8 +284,8 @@ def faults(task, files):
     return error.value.problems
 
 
-@pytest.mark.parametrize("wanted", CONVERTERS)
-@pytest.mark.parametrize("logged", CONVERTERS)
+@pytest.mark.parametrize("wanted", RAW)
+@pytest.mark.parametrize("logged", RAW)
 def test_demonstrations_of_another_task_are_refused_by_name(tmp_path, wanted, logged):
     files = write_folder(tmp_path, logged, episodes=1)
     if wanted == logged:
@@ -291,7 +293,7 @@ def test_demonstrations_of_another_task_are_refused_by_name(tmp_path, wanted, lo
         return
     (problem,) = faults(wanted, files)
     assert problem.startswith(f"{files[0]}: a demonstration of {logged!r}: it logs ")
-    assert problem.endswith(f", wanted {', '.join(OBJECTS[wanted]) or 'no objects'}")
+    assert problem.endswith(f", wanted {', '.join(get_converter(wanted).objects) or 'no objects'}")
 
 
 def test_the_target_of_stacking_is_no_other_task(tmp_path):

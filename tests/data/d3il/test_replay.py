@@ -56,7 +56,7 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_values_follow_the_specification(folder, dtype):
+def test_values_are_those_of_the_raw_episodes(folder, dtype):
     data = validate(D3ILExperienceReplay("avoiding", folder, dtype=dtype).data)
     assert data.shape == (sum(LENGTHS) - len(LENGTHS),)
     begin = 0
@@ -293,7 +293,7 @@ def test_save_refuses(tmp_path):
 def test_flatten_trajectories_checks():
     with pytest.raises(ValueError, match="trajectory 1: .*T - 1"):
         flatten_trajectories([torch.zeros(3, 2), torch.zeros(3, 2)], [torch.zeros(2, 1), torch.zeros(3, 1)])
-    with pytest.raises(ValueError, match="other columns"):
+    with pytest.raises(ValueError, match="trajectory 1 has 1 observation"):
         flatten_trajectories([torch.zeros(3, 2), torch.zeros(3, 1)], [torch.zeros(2, 1), torch.zeros(2, 1)])
     with pytest.raises(ValueError, match="0 trajectories"):
         flatten_trajectories([], [])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_koap.commands.doctor import Validate, run_validate
+from torchrl_koap.commands.doctor import Validate
 from torchrl_koap.data import D3ILExperienceReplay, RawFolderError, flatten_trajectories, read_about, read_lerobot
 from torchrl_koap.data.d3il import replay as d3il_module
 from torchrl_koap.data.lerobot import reader as lerobot_module
@@ -19,7 +19,7 @@ from torchrl_koap.data.lerobot.reader import column_names
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, get_task
-from torchrl_koap.training.builders import load_demonstrations
+from torchrl_koap.training.datasets import load_demonstrations
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra lerobot)")
 import pyarrow as pa  # noqa: E402
@@ -57,7 +57,7 @@ def made_up(task, lengths=(5, 8), seed=0):
     """Random observations of a task whose command follows from the actions."""
     generator = torch.Generator().manual_seed(seed)
     facts = get_task(task)
-    command, size = facts.observation[facts.command], facts.same_unit
+    command, size = facts.observation[facts.command], facts.num_delta_actions
     frames_of, steps_of = [], []
     for length in lengths:
         frames = torch.randn(length, facts.observation_dim, generator=generator, dtype=torch.float64)
@@ -144,7 +144,7 @@ def test_round_trip_of_recorded_demonstrations(tmp_path, recorded, version, warn
     assert (dataset.data.exclude("state") == recorded).all()
     assert torch.equal(dataset.data["state"], recorded["observation"][:, 2:])
     assert (load_demonstrations(str(root), get_task("avoiding")).exclude("state") == recorded).all()
-    assert run_validate(Validate(str(root)))["trajectories"] == "3"
+    assert Validate(dataset=str(root))()["trajectories"] == "3"
     assert not warnings
 
 
@@ -212,7 +212,7 @@ def test_unknown_names_are_told(tmp_path, recorded, warnings):
 @pytest.mark.parametrize("task", ["avoiding", "stacking"])
 def test_absolute_actions(tmp_path, task, own_row):
     data = made_up(task)
-    command, size = get_task(task).observation[get_task(task).command], get_task(task).same_unit
+    command, size = get_task(task).observation[get_task(task).command], get_task(task).num_delta_actions
     positions = torch.cat([frames[:, command] if own_row else frames[1:, command] for frames, _ in episodes_of(data)])
     rows = iter(positions.tolist())
 

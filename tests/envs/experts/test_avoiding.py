@@ -12,7 +12,7 @@ import torch
 from shared_data import HUMAN
 
 from torchrl_koap.data import read_raw_episode
-from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.experts.avoiding import _HAND, _HAND_REST, FULL_PUSH, GAPS, AvoidingExpert, mode_gaps
 from torchrl_koap.envs.experts.demonstrations import record_episodes
 

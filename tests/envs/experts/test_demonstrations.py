@@ -11,10 +11,9 @@ import torch
 
 from torchrl_koap.data import D3ILExperienceReplay, read_raw_episode, trajectory_lengths
 from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
-from torchrl_koap.envs import AvoidingEnv, mode_index
-from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES
+from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.experts import demonstrations
-from torchrl_koap.envs.experts.avoiding import ROD_RADIUS
+from torchrl_koap.envs.experts.avoiding import AvoidingExpert
 from torchrl_koap.envs.experts.demonstrations import (
     RecordingError,
     balanced_modes,
@@ -23,8 +22,8 @@ from torchrl_koap.envs.experts.demonstrations import (
     record_episodes,
     write_raw_episodes,
 )
-from torchrl_koap.envs.experts.recording import RECIPES
 from torchrl_koap.keys import validate
+from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS
 
 EPISODES = 26
 
@@ -129,20 +128,17 @@ def test_modes_are_balanced():
     assert balanced_modes(5, 24, 1) != balanced_modes(5, 24, 2)
 
 
-def change_recipe(monkeypatch, **changes):
-    recipe = replace(RECIPES["avoiding"](), **changes)
-    monkeypatch.setitem(RECIPES, "avoiding", lambda: recipe)
-
-
 def test_failed_attempts_are_counted_and_given_up_on(monkeypatch):
     class Blind:
+        rules = AvoidingExpert.rules
+
         def __init__(self, modes, contexts, seeds):
             self.finished = np.zeros(len(modes), dtype=bool)
 
         def act(self, observation):
             return np.tile([-0.0006, 0.012], (len(observation), 1))  # straight into the first cylinder
 
-    change_recipe(monkeypatch, make_expert=Blind)
+    monkeypatch.setattr("torchrl_koap.envs.experts.avoiding.AvoidingExpert", Blind)
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 2)
     with pytest.raises(RecordingError, match=r"episodes \[0, 1\].*'collision': 4"):
         record_demonstrations(episodes=2)
@@ -150,7 +146,7 @@ def test_failed_attempts_are_counted_and_given_up_on(monkeypatch):
 
 @pytest.mark.parametrize(("limit", "reason"), [({"least_clearance": 1.0}, "close"), ({"most_rows": 30}, "slow")])
 def test_attempts_unlike_human_ones_are_discarded(monkeypatch, limit, reason):
-    change_recipe(monkeypatch, **limit)
+    monkeypatch.setattr(AvoidingExpert, "rules", replace(AvoidingExpert.rules, **limit))
     monkeypatch.setattr(demonstrations, "MAX_ATTEMPTS", 1)
     with pytest.raises(RecordingError, match=f"'{reason}': 1"):
         record_demonstrations(episodes=1)
@@ -183,14 +179,13 @@ def test_demonstrations_do_not_depend_on_how_many_are_played_at_once(task, batch
 
 
 def test_no_more_environments_than_the_batch_are_made(monkeypatch):
-    made = []
-    recipe = RECIPES["avoiding"]()
+    made, make = [], demonstrations.make_env
 
-    def make_env(count, **options):
+    def make_env(task, count, **options):
         made.append(count)
-        return recipe.make_env(count, **options)
+        return make(task, count, **options)
 
-    monkeypatch.setitem(RECIPES, "avoiding", lambda: replace(recipe, make_env=make_env))
+    monkeypatch.setattr(demonstrations, "make_env", make_env)
     record_episodes("avoiding", 7, batch_size=4)
     assert made == [4]
 

@@ -12,8 +12,8 @@ from torchrl_koap.envs.experts.path_planning import (
     SHAPE,
     STEP,
     descent,
+    solve_eikonal,
     square_distance,
-    travel_cost,
     value_at,
 )
 
@@ -32,7 +32,7 @@ def source(i, j):
 
 
 def test_costs_are_distances_where_slowness_is_one():
-    cost = travel_cost(np.ones(SHAPE), source(40, 40))
+    cost = solve_eikonal(np.ones(SHAPE), source(40, 40))
     i, j = np.indices(SHAPE)
     distance = STEP * np.hypot(i - 40, j - 40)
     assert np.abs(cost - distance).max() < 0.03  # first order: some STEP too long along diagonals
@@ -44,7 +44,7 @@ def test_costs_are_distances_where_slowness_is_one():
 def test_a_wall_is_gone_round():
     slowness = np.ones(SHAPE)
     slowness[30:32, :60] = 50.0
-    cost = travel_cost(slowness, source(20, 30))
+    cost = solve_eikonal(slowness, source(20, 30))
     around = STEP * (np.hypot(10, 30) + np.hypot(12, 30))
     assert around < cost[42, 30] < around + 0.04
     direction = descent(cost, ORIGIN[0] + 42 * STEP, ORIGIN[1] + 30 * STEP)

@@ -34,7 +34,7 @@ def kinematics(q):
 
 
 def numpy_inverse_kinematics(target, q):
-    """Spec section 3.1 in plain NumPy, with an explicit singular value decomposition."""
+    """Inverse kinematics of the controller in plain NumPy, with an explicit singular value decomposition."""
     q = q.copy()
     for _ in range(3):
         axes, origins, tcp, r = kinematics(q)

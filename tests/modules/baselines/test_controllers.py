@@ -12,20 +12,20 @@ from torchrl_koap.modules import LinearInverseDynamics, Normalizer, RecurrentInv
 MAKERS = (LinearInverseDynamics, RecurrentInverseDynamics, SupervisedInverseDynamics)
 
 
-def linear_windows(*batch, frames=12, look_ahead=5, history=2, dtype=torch.float64, seed=0):
+def linear_windows(*batch, frames=12, look_ahead=5, num_past=2, dtype=torch.float64, seed=0):
     """Actions that are a fixed affine map of x_{t-2}, x_{t-1}, x_t, x_{t+5}, where these lie in the window."""
     generator = torch.Generator().manual_seed(seed)
     state = torch.randn(*batch, frames, 3, generator=generator, dtype=torch.float64)
     true = torch.randn(2, 4 * 3, generator=torch.Generator().manual_seed(99), dtype=torch.float64)
     action = torch.full((*batch, frames, 2), torch.nan, dtype=torch.float64)
-    for t in range(history, frames - look_ahead):
+    for t in range(num_past, frames - look_ahead):
         read = torch.cat([state[..., t - 2, :], state[..., t - 1, :], state[..., t, :], state[..., t + 5, :]], -1)
         action[..., t, :] = read @ true.T + torch.tensor([0.5, -2.0])
     return TensorDict({"state": state.to(dtype), "action": action.to(dtype)}, batch)
 
 
 def test_ridge_recovers_a_linear_system_and_generalises():
-    model = LinearInverseDynamics(3, 2, history=2, look_ahead=5).double()
+    model = LinearInverseDynamics(3, 2, num_past=2, look_ahead=5).double()
     windows = linear_windows(40)
     fit = model.fit_decoder(windows, torch.ones(40, 12, dtype=torch.bool))
     assert fit.num_labels == 40 * 5  # frames 2..6 see everything
@@ -37,7 +37,7 @@ def test_ridge_recovers_a_linear_system_and_generalises():
 def test_ridge_reads_no_action_outside_the_mask():
     windows, mask = linear_windows(40), torch.zeros(40, 12, dtype=torch.bool)
     mask[:5] = True
-    models = [LinearInverseDynamics(3, 2, history=2, look_ahead=5).double() for _ in range(2)]
+    models = [LinearInverseDynamics(3, 2, num_past=2, look_ahead=5).double() for _ in range(2)]
     models[0].fit_decoder(windows, mask)
     poisoned = windows.clone()
     poisoned["action"][5:] = 1e9
@@ -58,7 +58,7 @@ def test_groups_are_left_out_together():
     mask = torch.ones(30, 12, dtype=torch.bool)
     errors = [
         min(
-            LinearInverseDynamics(3, 2, history=2, look_ahead=5)
+            LinearInverseDynamics(3, 2, num_past=2, look_ahead=5)
             .double()
             .fit_decoder(windows, mask, groups=g)
             .errors.values()
@@ -72,7 +72,7 @@ def test_constant_columns_do_not_disturb_the_ridge():
     windows = linear_windows(40)
     constant = torch.full((40, 12, 1), 7.0, dtype=torch.float64)
     wide = TensorDict({"state": torch.cat([windows["state"], constant], -1), "action": windows["action"]}, [40])
-    model = LinearInverseDynamics(4, 2, history=2, look_ahead=5).double()
+    model = LinearInverseDynamics(4, 2, num_past=2, look_ahead=5).double()
     model.fit_decoder(wide, torch.ones(40, 12, dtype=torch.bool))
     predicted = model(wide.clone())["action"][:, 2:7]
     torch.testing.assert_close(predicted, windows["action"][:, 2:7], atol=1e-4, rtol=0)
@@ -93,7 +93,7 @@ def test_batch_dimensions_types_keys_and_state_dict(make, dtype):
     other = make(3, 2).to(dtype)
     other.load_state_dict(model.state_dict())
     torch.testing.assert_close(other(TensorDict({"state": state}, [2, 4]))["action"], action, rtol=0, atol=0)
-    assert model.num_window_frames == model.history + (9 if make is LinearInverseDynamics else 2)
+    assert model.num_window_frames == model.num_past + (9 if make is LinearInverseDynamics else 2)
 
 
 def test_recurrent_action_depends_on_everything_up_to_the_next_state_and_nothing_later():
@@ -137,7 +137,7 @@ def test_look_ahead_of_the_next_state_is_refused():
 @pytest.mark.parametrize("look_ahead", [(1,), (1, 3)])
 def test_supervised_action_depends_on_its_frames_and_no_others(look_ahead):
     torch.manual_seed(0)
-    model = SupervisedInverseDynamics(3, 2, hidden_dims=(8,), history=2, look_ahead=look_ahead)
+    model = SupervisedInverseDynamics(3, 2, hidden_dims=(8,), num_past=2, look_ahead=look_ahead)
     state = torch.randn(1, 9, 3, requires_grad=True)
     assert model.span(9) == range(2, 9 - look_ahead[-1])
     for frame in model.span(9):

@@ -23,7 +23,7 @@ def make_network(seed=0, **options):
         latent_dim=6,
         hidden_dims=(16,),
         lifting_dims=(12,),
-        history=HISTORY,
+        num_past=HISTORY,
         look_ahead=LOOK_AHEAD,
         state_normalizer=Normalizer(torch.tensor([0.1, -0.2, 0.0]), torch.tensor([2.0, 1.0, 3.0])),
         action_normalizer=Normalizer(torch.tensor([0.3, 0.0]), torch.tensor([0.5, 2.0])),
@@ -124,7 +124,7 @@ def test_one_term_trains_only_what_it_should():
 
 def test_its_latent_actions_are_those_of_the_koopman_models_network():
     network, state = make_network(), torch.randn(4, T, 3)
-    plain = LatentActionMLP(3, 6, hidden_dims=(16,), history=HISTORY, look_ahead=LOOK_AHEAD, relative=True)
+    plain = LatentActionMLP(3, 6, hidden_dims=(16,), num_past=HISTORY, look_ahead=LOOK_AHEAD, relative=True)
     plain.load_state_dict(network.reader.state_dict())
     expected = plain(TensorDict({"state": network.normalize_state(state)}, [4]))["latent_action"]
     assert torch.equal(network(TensorDict({"state": state}, [4]))["latent_action"], expected)
@@ -136,7 +136,7 @@ def test_the_successor_reaches_no_latent_action():
     for t in SPAN:
         (gradient,) = torch.autograd.grad(action[0, t].sum(), state, retain_graph=True)
         assert gradient[0].abs().sum(-1).nonzero().flatten().tolist() == [t - 2, t - 1, t, t + 2, t + 3]
-    assert network.span(T) == SPAN and network.num_window_frames == 6 and network.history == 2
+    assert network.span(T) == SPAN and network.num_window_frames == 6 and network.num_past == 2
     with pytest.raises(ValueError, match="look_ahead offsets must be >= 2"):
         NonlinearInverseDynamics(3, 2, look_ahead=(1, 2))
     with pytest.raises(ValueError, match="at least 6 frames are needed"):
@@ -198,7 +198,7 @@ def test_it_learns_curved_actions_from_some_labels_beside_unlabelled_windows():
     data["has_action"] = torch.zeros(1280, 8, 1, dtype=torch.bool)
     data["has_action"][:128] = True
     torch.manual_seed(0)
-    network = NonlinearInverseDynamics(2, 2, latent_dim=8, hidden_dims=(64, 64), history=1, look_ahead=(2, 3))
+    network = NonlinearInverseDynamics(2, 2, latent_dim=8, hidden_dims=(64, 64), num_past=1, look_ahead=(2, 3))
     network.fit_scales(data["state"][:1024])
     loss = NonlinearLoss(network)
     unseen = data[1024:]

@@ -23,7 +23,7 @@ def make_network(seed=0, **options):
         2,
         latent_dim=6,
         hidden_dims=(16,),
-        history=HISTORY,
+        num_past=HISTORY,
         look_ahead=LOOK_AHEAD,
         state_normalizer=Normalizer(torch.tensor([0.1, -0.2, 0.0]), torch.tensor([2.0, 1.0, 3.0])),
         action_normalizer=Normalizer(torch.tensor([0.3, 0.0]), torch.tensor([0.5, 2.0])),
@@ -199,7 +199,7 @@ def test_two_stages_learn_actions_from_few_labels():
     data["has_action"] = torch.zeros(1280, 12, 1, dtype=torch.bool)
     data["has_action"][:32] = True
     torch.manual_seed(0)
-    network = QuantizedInverseDynamics(2, 2, hidden_dims=(64, 64), history=1, look_ahead=(1, 2))
+    network = QuantizedInverseDynamics(2, 2, hidden_dims=(64, 64), num_past=1, look_ahead=(1, 2))
     network.fit_scales(data["state"][:1024])
     unseen = data[1024:]
     for loss, num_steps, rows in ((QuantizedDynamicsLoss(network), 400, 1024), (LatentDecoderLoss(network), 300, 32)):

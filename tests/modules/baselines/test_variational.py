@@ -23,7 +23,7 @@ def make_network(seed=0, **options):
         2,
         latent_dim=4,
         hidden_dims=(16,),
-        history=HISTORY,
+        num_past=HISTORY,
         look_ahead=LOOK_AHEAD,
         state_normalizer=Normalizer(torch.tensor([0.1, -0.2, 0.0]), torch.tensor([2.0, 1.0, 3.0])),
         action_normalizer=Normalizer(torch.tensor([0.3, 0.0]), torch.tensor([0.5, 2.0])),
@@ -215,7 +215,7 @@ def test_an_action_depends_on_the_frames_it_may_read_and_no_others():
         (gradient,) = torch.autograd.grad(action[0, t].sum(), state, retain_graph=True)
         read = {min(max(t + offset, 0), T - 1) for offset in (-2, -1, 0, 1, 3)}
         assert set(gradient[0].abs().sum(-1).nonzero().flatten().tolist()) == read
-    assert network.span(T) == SPAN and network.num_window_frames == 6 and network.history == 2
+    assert network.span(T) == SPAN and network.num_window_frames == 6 and network.num_past == 2
     with pytest.raises(ValueError, match="at least 6 frames are needed"):
         VariationalLoss(network)(TensorDict({"state": state[:, :5]}, [1]))
 
@@ -248,7 +248,7 @@ def test_two_stages_learn_actions_from_few_labels():
     data["has_action"] = torch.zeros(1280, 12, 1, dtype=torch.bool)
     data["has_action"][:32] = True
     torch.manual_seed(0)
-    network = VariationalInverseDynamics(2, 2, hidden_dims=(64, 64), history=1, look_ahead=(1, 2))
+    network = VariationalInverseDynamics(2, 2, hidden_dims=(64, 64), num_past=1, look_ahead=(1, 2))
     network.fit_scales(data["state"][:1024])
     for loss, num_steps, rows in ((VariationalLoss(network), 400, 1024), (LatentDecoderLoss(network), 300, 32)):
         optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)

@@ -94,11 +94,11 @@ def test_renamed_and_nested_keys(parts, normalizers, late):
         other.set_keys(**names)
     else:
         other = make_model(
-            normalizers=normalizers, parts=parts and parts(), state_key=names["state"], action_key=names["action"]
+            normalizers=normalizers, parts=parts and parts(), in_key=names["state"], out_key=names["action"]
         )
     other.load_state_dict(model.state_dict())
     assert other.in_keys == [names["state"]] and other.out_keys[-1] == names["action"]
-    assert (other.state_key, other.action_key) == tuple(names.values())
+    assert (other.in_key, other.out_key) == tuple(names.values())
     td = other(TensorDict({"agent": {"window": state}}, [4]))
     torch.testing.assert_close(td["agent", "command"], expected)
     extra = {"normalized_state", "normalized_action"} if normalizers else set()

@@ -24,7 +24,7 @@ def windows(*batch, dtype=torch.float32, num_frames=16, d=2):
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_batch_gives_the_same_latent_actions(kind, dtype):
     torch.manual_seed(0)
-    network = kind(2, 6, history=2, look_ahead=(3, 5)).to(dtype)
+    network = kind(2, 6, num_past=2, look_ahead=(3, 5)).to(dtype)
     state = windows(2, 3, dtype=dtype)
     td = network(TensorDict({"state": state}, [2, 3]))
     latent = td["latent_action"]
@@ -51,7 +51,7 @@ def test_the_base_infers_nothing():
 
 
 def test_absolute_frames_are_gathered_as_they_are():
-    network = LatentActionMLP(2, 3, history=1, look_ahead=(2, 4))
+    network = LatentActionMLP(2, 3, num_past=1, look_ahead=(2, 4))
     state = windows(3)
     read = network.gather(state, range(1, 12))
     for t in range(1, 12):
@@ -62,7 +62,7 @@ def test_absolute_frames_are_gathered_as_they_are():
 @pytest.mark.parametrize("kind", [LatentActionMLP, LatentActionFourier])
 def test_relative_frames_have_unit_spread_and_the_current_one_is_untouched(kind):
     more = {} if kind is LatentActionFourier else {"relative": True}
-    network = kind(2, 3, history=2, look_ahead=(2, 4), **more)
+    network = kind(2, 3, num_past=2, look_ahead=(2, 4), **more)
     state = windows(200) * torch.tensor([1e-3, 50.0]) + 7.0
     span = network.span(16)
     plain = network.gather(state, span)
@@ -110,7 +110,7 @@ def test_a_window_too_short_leaves_the_scales_as_they_were():
 
 
 def test_the_lstm_reads_its_frames_in_order():
-    network = LatentActionLSTM(2, 3, hidden_dim=5, history=2, look_ahead=4)
+    network = LatentActionLSTM(2, 3, hidden_dim=5, num_past=2, look_ahead=4)
     reference = torch.nn.LSTM(2, 5, batch_first=True)
     reference.load_state_dict(network.lstm.state_dict())
     state = windows(1)[0]
@@ -138,7 +138,7 @@ def fourier_parts(num_features, curvature=0.3, motion_scale=0.7, position_scale=
     network = LatentActionFourier(
         2,
         num_features,
-        history=1,
+        num_past=1,
         look_ahead=(2, 4),
         curvature=curvature,
         motion_scale=motion_scale,
@@ -179,7 +179,7 @@ def test_a_small_curvature_leaves_linear_regression():
 
 def test_frequencies_are_drawn_anew_and_trained():
     torch.manual_seed(0)
-    network = LatentActionFourier(2, 4000, history=1, look_ahead=8)
+    network = LatentActionFourier(2, 4000, num_past=1, look_ahead=8)
     before = network.frequency.detach().clone()
     assert abs(before.mean().item()) < 0.05 and abs(before.std().item() - 1) < 0.05
     assert 0 <= network.phase.min() and 6.2 < network.phase.max() <= 2 * math.pi
@@ -190,7 +190,7 @@ def test_frequencies_are_drawn_anew_and_trained():
 
 
 def test_steps_tells_where_a_latent_action_holds_the_steps_of_an_axis():
-    network = LatentActionFourier(3, 8, history=2, look_ahead=(2, 5))
+    network = LatentActionFourier(3, 8, num_past=2, look_ahead=(2, 5))
     state = torch.randn(40, 16, 3, generator=torch.Generator().manual_seed(0)).cumsum(1)
     network.fit_scales(state)
     latent = network.infer(network.gather(state, range(4, 5)))[:, 0]

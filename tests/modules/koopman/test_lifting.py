@@ -7,8 +7,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.modules import KoopmanLifting, KoopmanOperator
-from torchrl_koap.modules.networks import SequenceLSTM, mlp
+from torchrl_koap.modules import KoopmanLifting, KoopmanOperator, LatentActionMLP
+from torchrl_koap.modules.networks import SequenceLSTM
 
 STRUCTURES = [("dense", 2), ("diagonal", 2), ("block_diagonal", 1), ("block_diagonal", 2), ("block_diagonal", 3)]
 
@@ -204,10 +204,10 @@ def test_the_recurrent_network_is_torch_lstm():
     torch.testing.assert_close(network(sequence), network.readout(reference(sequence)[0]))
 
 
-def test_perceptron_without_hidden_layers_is_linear_and_dropout_follows_every_hidden_layer():
-    assert [type(layer).__name__ for layer in mlp(2, (), 3)] == ["Linear"]
-    names = [type(layer).__name__ for layer in mlp(2, (4, 4), 3, dropout=0.1)]
-    assert names == ["Linear", "ReLU", "Dropout"] * 2 + ["Linear"]
+def test_perceptron_without_hidden_layers_is_linear_and_dropout_belongs_to_every_hidden_layer():
+    assert [type(layer).__name__ for layer in LatentActionMLP(2, 3, hidden_dims=()).network] == ["Linear"]
+    network = LatentActionMLP(2, 3, hidden_dims=(4, 4), dropout=0.1).network
+    assert [type(layer).__name__ for layer in network] == ["Linear", "Dropout", "ReLU"] * 2 + ["Linear"]
 
 
 def test_keys_of_the_lifting():

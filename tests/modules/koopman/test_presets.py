@@ -39,7 +39,7 @@ def test_released_has_the_released_number_of_parameters(state_dim, expected):
 
 
 def test_released_parts_have_the_released_sizes():
-    """koap_release_notes section 3.1 and 3: encoder, decoder, z_act, act_decoder and K in Avoiding."""
+    """Parameters of the networks of KOAP's first public code in Avoiding (docs/first_code.md), and frames read."""
     model = make_koopman_inverse_dynamics(2, 2, preset="released")
     assert count(model.lifting.encoder) == 397_824 and count(model.lifting.decoder) == 788_994
     assert count(model.latent_action) == 199_168 and count(model.action_decoder) == 1_026
@@ -113,13 +113,13 @@ def test_options_override_the_preset_and_reach_the_parts():
         linear_skip=True,
         structure="block_diagonal",
         look_ahead=(2, 5),
-        history=3,
+        num_past=3,
         clamped=False,
         include_state=True,
         latent_dim=10,
     )
     f = model.latent_action
-    assert (f.history, f.look_ahead, f.relative, f.clamped, f.latent_dim) == (3, (2, 5), True, False, 10)
+    assert (f.num_past, f.look_ahead, f.relative, f.clamped, f.latent_dim) == (3, (2, 5), True, False, 10)
     assert f.skip is not None and any(getattr(layer, "p", None) == 0.3 for layer in f.network)
     assert model.operator.structure == "block_diagonal" and model.lifting.include_state
     fourier = make_koopman_inverse_dynamics(

@@ -12,7 +12,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType
 from toy_policies import EpisodesOfRandomLength, state_number
 
-from torchrl_koap.envs import AvoidingEnv, mode_index
+from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.modules import (
     ChunkedPolicy,
@@ -29,7 +29,7 @@ class CountingPolicy(nn.Module):
     """Entry ``k`` of a chunk sampled at state ``x`` is ``(k, x, x of the frame before, second column of x)``."""
 
     history, horizon, state_dim, action_dim = 2, 6, 2, 4
-    num_steps, solver, sample_shape = 1, "ddim", (6, 4)
+    num_steps, solver, sample_shape, noise_shape, noise_key = 1, "ddim", (6, 4), (6, 4), "noise"
 
     def __init__(self):
         super().__init__()

@@ -92,7 +92,7 @@ class TwoGaps(nn.Module):
     """Plans lead straight to the left or the right, as the noise says; nothing observed matters."""
 
     history, horizon, num_steps, solver, state_dim = 1, 6, 1, "ddim", 1
-    sample_shape = (6, 1)
+    sample_shape, noise_key = (6, 1), "noise"
 
     def plan(self, history, noise=None):
         way = torch.arange(1.0, 7)[:, None]

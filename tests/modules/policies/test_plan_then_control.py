@@ -24,7 +24,7 @@ from torchrl_koap.modules import (
     PlanThenControl,
     StatePlanner,
     TemporalUnet,
-    join_plan,
+    blend_plan,
     make_koopman_inverse_dynamics,
     policy_transforms,
 )
@@ -34,7 +34,7 @@ LENGTHS = ((5, 3, 11), (9,), (1, 2, 7, 4), (12, 6), (4, 4, 8))
 
 
 def make_policy(execution="feedback", interval=4, history=2, **options):
-    options.setdefault("joining", 0.0)  # the reference loop decodes plans as they are
+    options.setdefault("blend_decay", 0.0)  # the reference loop decodes plans as they are
     return PlanThenControl(
         CountingPlanner(),
         EchoController(),
@@ -140,7 +140,7 @@ def test_renamed_keys_of_policy_and_controller(execution):
         execution=execution,
         history_key=("agent", "frames"),
         action_key=("agent", "command"),
-        joining=0.0,
+        blend_decay=0.0,
     )
     expected = make_policy(execution)
     observed = torch.rand(3, 2, 3)
@@ -230,18 +230,18 @@ def test_a_stochastic_start_stays_stochastic_under_deterministic_exploration():
     assert not torch.equal(action[0], action[1])
 
 
-def test_a_joined_plan_leaves_from_the_present_state_and_ends_as_planned():
+def test_a_blended_plan_leaves_from_the_present_state_and_ends_as_planned():
     line = torch.stack([torch.arange(1.0, 15.0), 2 * torch.arange(1.0, 15.0)], -1)  # at (0, 0) at present
     history = torch.tensor([[9.0, 9.0], [5.0, -3.0]])
-    joined = join_plan(history, line, 0.8)
+    blended = blend_plan(history, line, 0.8)
     for k in range(14):
-        torch.testing.assert_close(joined[k], line[k] + 0.8 ** (k + 1) * history[-1])
-    torch.testing.assert_close(join_plan(torch.zeros(2, 2), line, 0.8), line)  # a plan that fits is left as it is
-    assert torch.equal(join_plan(history, line, 0.0), line)
-    batched = join_plan(history.expand(3, 4, 2, 2), line.expand(3, 4, 14, 2), 0.8)
-    torch.testing.assert_close(batched[2, 3], joined)
+        torch.testing.assert_close(blended[k], line[k] + 0.8 ** (k + 1) * history[-1])
+    torch.testing.assert_close(blend_plan(torch.zeros(2, 2), line, 0.8), line)  # a plan that fits is left as it is
+    assert torch.equal(blend_plan(history, line, 0.0), line)
+    batched = blend_plan(history.expand(3, 4, 2, 2), line.expand(3, 4, 14, 2), 0.8)
+    torch.testing.assert_close(batched[2, 3], blended)
     uneven = torch.tensor([[1.0], [5.0], [3.0]])  # least-squares line through (1, 1), (2, 5), (3, 3): at 0 it is 1
-    torch.testing.assert_close(join_plan(torch.tensor([[1.0]]), uneven, 0.5), uneven)
+    torch.testing.assert_close(blend_plan(torch.tensor([[1.0]]), uneven, 0.5), uneven)
 
 
 @pytest.mark.parametrize("tempo", [0.5, 0.8, 1.0, 1.1, 1.5, 2.0])

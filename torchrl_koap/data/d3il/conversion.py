@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""From a folder of D3IL's raw pickles to flat trajectories (specification, sections 7 and 9).
+"""From a folder of D3IL's raw pickles to flat trajectories (docs/d3il.md, Recordings).
 
-Another task is one small function and one line in ``CONVERTERS``.
+``Task.converter`` names the :class:`Converter` of a task.
 """
 
 from __future__ import annotations
@@ -19,26 +19,13 @@ from tensordict import TensorDictBase
 from torchrl_koap.data.d3il.raw import RawEpisode, RawEpisodeError, read_raw_episode
 from torchrl_koap.data.d3il.unpickling import load_pickle
 from torchrl_koap.data.trajectories import flatten_trajectories
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import TASKS, get_task
+from torchrl_koap.tasks.features import tan_yaw
 from torchrl_koap.tasks.gripper import gripper_number
-from torchrl_koap.tasks.rotations import tan_yaw
+from torchrl_koap.tasks.import_strings import resolve
 
 SPLITS = ("train", "eval")
 _NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.pkl")
-
-_SORTING_OBJECTS = {
-    num_boxes: tuple(f"{colour}-box{index + 1}" for colour in ("red", "blue") for index in range(num_boxes // 2))
-    for num_boxes in (2, 4, 6)
-}
-# names of the logged objects, in the order of Task.objects
-OBJECTS = {
-    "avoiding": (),
-    "aligning": ("push-box", "target-box"),
-    "sorting": _SORTING_OBJECTS[4],
-    "sorting_2": _SORTING_OBJECTS[2],
-    "sorting_6": _SORTING_OBJECTS[6],
-    "stacking": ("red-box", "green-box", "blue-box"),
-}
 
 
 @dataclass(frozen=True)
@@ -47,11 +34,16 @@ class Converter:
 
     Args:
         robot (tuple of str): entries of ``robot`` that are read.
-        objects (tuple of str): objects whose pose is read.
+        objects (tuple of str): logged objects whose pose is read, in the order of ``Task.objects``.
         folder (str): where D3IL keeps the files, seen from its data folder.
         convert (callable): from a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``,
             as float64 arrays.
         unread (tuple of str): objects that may be logged as well and are not read.
+
+    Examples:
+        >>> from torchrl_koap.data.d3il.conversion import AVOIDING
+        >>> AVOIDING.robot, AVOIDING.folder
+        (('des_c_pos', 'c_pos'), 'avoiding/data')
     """
 
     robot: tuple[str, ...]
@@ -77,7 +69,7 @@ def _avoiding(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
 
 def _aligning(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
     desired = _robot(episode, "des_c_pos")
-    poses = [part for name in OBJECTS["aligning"] for part in _pose(episode, name)]
+    poses = [part for name in ALIGNING.objects for part in _pose(episode, name)]
     return np.concatenate([desired, _robot(episode, "c_pos"), *poses], axis=1), np.diff(desired, axis=0)
 
 
@@ -92,7 +84,7 @@ def _sorting(episode: RawEpisode, boxes: tuple[str, ...]) -> tuple[np.ndarray, n
 def _stacking(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
     desired, width = _robot(episode, "des_j_pos"), _robot(episode, "gripper_width")[:, None]
     columns = [desired, width]
-    for name in OBJECTS["stacking"]:
+    for name in STACKING.objects:
         position, quat = _pose(episode, name)
         columns += [position, tan_yaw(quat)[:, None]]
     columns += [_robot(episode, "j_pos"), width, _robot(episode, "c_pos")]
@@ -101,32 +93,22 @@ def _stacking(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(columns, axis=1), actions
 
 
-CONVERTERS = {
-    "avoiding": Converter(
-        robot=("des_c_pos", "c_pos"), objects=OBJECTS["avoiding"], folder="avoiding/data", convert=_avoiding
-    ),
-    "aligning": Converter(
-        robot=("des_c_pos", "c_pos"),
-        objects=OBJECTS["aligning"],
-        folder="aligning/all_data/state",
-        convert=_aligning,
-    ),
-    "stacking": Converter(
-        robot=("des_j_pos", "j_pos", "gripper_width", "c_pos"),
-        objects=OBJECTS["stacking"],
-        folder="stacking/all_data",
-        convert=_stacking,
-        unread=("target-box",),  # it never moves
-    ),
-} | {
-    "sorting" if num_boxes == 4 else f"sorting_{num_boxes}": Converter(
-        robot=("des_c_pos", "c_pos"),
-        objects=boxes,
-        folder=f"sorting/{num_boxes}_boxes/state",
-        convert=partial(_sorting, boxes=boxes),
-    )
-    for num_boxes, boxes in _SORTING_OBJECTS.items()
-}
+def _sorting_converter(num_boxes: int) -> Converter:
+    boxes = tuple(f"{colour}-box{index + 1}" for colour in ("red", "blue") for index in range(num_boxes // 2))
+    folder = f"sorting/{num_boxes}_boxes/state"
+    return Converter(("des_c_pos", "c_pos"), boxes, folder, partial(_sorting, boxes=boxes))
+
+
+AVOIDING = Converter(("des_c_pos", "c_pos"), (), "avoiding/data", _avoiding)
+ALIGNING = Converter(("des_c_pos", "c_pos"), ("push-box", "target-box"), "aligning/all_data/state", _aligning)
+SORTING_2, SORTING_4, SORTING_6 = (_sorting_converter(num_boxes) for num_boxes in (2, 4, 6))
+STACKING = Converter(
+    robot=("des_j_pos", "j_pos", "gripper_width", "c_pos"),
+    objects=("red-box", "green-box", "blue-box"),
+    folder="stacking/all_data",
+    convert=_stacking,
+    unread=("target-box",),  # it never moves
+)
 
 
 class RawFolderError(ValueError):
@@ -217,10 +199,21 @@ def convert_raw_files(
 def get_converter(task: str) -> Converter:
     """Looks up how raw episodes of a task are converted.
 
+    Args:
+        task (str): name of the task.
+
     Raises:
-        ValueError: if the task is unknown.
+        ValueError: if the task is unknown, or no converter is known for it.
     """
-    return CONVERTERS[get_task(task).source]
+    facts = get_task(get_task(task).source)
+    if facts.converter is None:
+        raise ValueError(f"task {task!r} names no converter of D3IL's raw pickles; its data are TED or LeRobot folders")
+    return resolve(facts.converter, f"converter of task {task!r}")
+
+
+def _converters() -> dict[str, Converter]:
+    own = [task.name for task in TASKS.values() if task.converter is not None and not task.data]
+    return {name: get_converter(name) for name in own}
 
 
 def _other_task(file: Path, converter: Converter) -> list[str]:
@@ -229,13 +222,13 @@ def _other_task(file: Path, converter: Converter) -> list[str]:
         episode = read_raw_episode(file)
     except RawEpisodeError:
         return []
-    known = not _logs(episode, converter) and any(_logs(episode, other) for other in CONVERTERS.values())
+    known = not _logs(episode, converter) and any(_logs(episode, other) for other in _converters().values())
     return [_origin(file, episode, converter)] if known else []
 
 
 def _origin(file: Path, episode: RawEpisode, converter: Converter) -> str:
     logged = ", ".join(map(str, episode.objects)) or "no objects"
-    others = [task for task, other in CONVERTERS.items() if _logs(episode, other)]
+    others = [task for task, other in _converters().items() if _logs(episode, other)]
     origin = f"a demonstration of {others[0]!r}" if others else "of an unknown task"
     return f"{file}: {origin}: it logs {logged}, wanted {', '.join(converter.objects) or 'no objects'}"
 

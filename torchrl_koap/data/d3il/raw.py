@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """One demonstration in D3IL's raw layout: read with checks, written for other tools.
 
-One pickle per demonstration (section 9 of the specification), one row per control step, ``T`` rows::
+One pickle per demonstration (docs/d3il.md, Recordings), one row per control step, ``T`` rows::
 
     context                                              what the scene was reset to; None in Avoiding
     robot    c_pos, c_vel, des_c_pos            (T, 3)   measured velocity and pose, commanded pose of the end effector
@@ -62,6 +62,13 @@ class RawEpisode:
         robot (dict): arrays ``(T, ...)`` by name, see the module's table.
         objects (dict): for each object of the scene its arrays ``(T, ...)`` by name.
         context (optional): what the scene was reset to, plain containers and arrays.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data.d3il.raw import RawEpisode
+        >>> episode = RawEpisode(robot={"des_c_pos": np.zeros((40, 3)), "c_pos": np.zeros((40, 3))})
+        >>> len(episode), episode.objects
+        (40, {})
     """
 
     robot: Mapping[str, np.ndarray]

@@ -41,7 +41,7 @@ _CONVERSION = 2  # raise it when the same raw files convert to other data
 class D3ILExperienceReplay(BaseDatasetExperienceReplay):
     """Demonstrations of a D3IL task as a replay buffer over flat steps.
 
-    A file of ``T`` rows gives ``T - 1`` steps (specification, section 7). The entries are those of
+    A file of ``T`` rows gives ``T - 1`` steps (docs/d3il.md, Recordings). The entries are those of
     :mod:`torchrl_koap.keys`; ``state`` holds the columns that a policy may see. Also reached by
     ``torchrl.data.datasets.load_dataset("d3il:avoiding", root=...)``.
 
@@ -95,7 +95,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         label_budget: LabelBudget | None = None,
         **kwargs: Any,
     ):
-        facts, converter = get_task(task), get_converter(task)
+        facts = get_task(task)
         if is_lerobot(root):
             self.root, files, kind = Path(root).expanduser(), find_lerobot_files(root), [actions, split_file]
             convert = partial(read_lerobot, self.root, task, actions=actions, split=split_file, dtype=dtype)
@@ -103,7 +103,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
             raise ValueError(f"actions={actions!r} is for LeRobot data sets; {root} is none")
         else:
             (self.root, files), kind = find_raw_files(task, root, split_file=split_file), []
-            convert = partial(convert_raw_files, converter, files, self.root, dtype=dtype)
+            convert = partial(convert_raw_files, get_converter(task), files, self.root, dtype=dtype)
         self._cache = _cache_folder(cache)
         self._data_path = self._cache / "d3il" / f"{task}-{_fingerprint(facts, files, dtype, kind)}"
         # several processes may open the same folder at the same time: one converts, the others wait for it
@@ -168,7 +168,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         return self
 
     def _begin(self, task: Task, data: TensorDictBase, label_budget: LabelBudget | None, kwargs: dict) -> None:
-        command = task.observation[task.command]
+        command = task.command_columns
         keys.validate(data, command=command)
         for key, wanted in ((keys.OBSERVATION, task.observation_dim), (keys.ACTION, task.action_dim)):
             if data.get(key).shape[-1] != wanted:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,13 @@ class LeRobotEpisode:
         file (Path): where its first row lies.
         observation (np.ndarray): float64 ``[T, d]``.
         action (np.ndarray): float64 ``[T, a]``.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap.data.lerobot.files import LeRobotEpisode
+        >>> LeRobotEpisode(0, Path("data.parquet"), np.zeros((50, 6)), np.zeros((50, 6))).observation.shape
+        (50, 6)
     """
 
     number: int
@@ -57,6 +64,11 @@ class LeRobotFolder:
         widths (dict): columns of each observation feature, in the order in which they lie side by side.
         episodes (list of LeRobotEpisode): the sound ones, in the order of their numbers.
         problems (list of str): what is wrong with the others.
+
+    Examples:
+        >>> from torchrl_koap.data.lerobot.files import read_lerobot_folder
+        >>> read_lerobot_folder("recordings/so101").widths  # doctest: +SKIP
+        {'observation.state': 6}
     """
 
     info: Mapping[str, Any]
@@ -87,8 +99,19 @@ def find_lerobot_files(root: str | Path) -> list[Path]:
     return sorted(file for file in described if file.is_file()) + rows
 
 
-def read_lerobot_folder(root: str | Path) -> LeRobotFolder:
+def read_lerobot_folder(
+    root: str | Path, *, features: Sequence[str] | None = None, labels_needed: bool = True
+) -> LeRobotFolder:
     """Reads observations and actions of all episodes.
+
+    Args:
+        root (str or Path): folder of the data set.
+
+    Keyword Args:
+        features (sequence of str, optional): columns that are laid side by side as the observation. Default:
+            ``observation.state`` and, if there, ``observation.environment_state``.
+        labels_needed (bool): every row must have an action. If not, rows whose action is empty or NaN, and all rows
+            where there is no column ``action``, have NaN. Defaults to True.
 
     Raises:
         RawFolderError: with the problems of all files: unreadable ones, missing columns, values that are not finite.
@@ -98,10 +121,33 @@ def read_lerobot_folder(root: str | Path) -> LeRobotFolder:
     """
     root = Path(root).expanduser()
     find_lerobot_files(root)
-    info = _read_info(root)
-    rows = _read_rows(root)
+    info = read_info(root)
+    rows = _read_rows(root, features, None if labels_needed else _action_width(info))
     episodes, problems = _episodes(rows, _expected_lengths(root, info))
     return LeRobotFolder(info, rows["widths"], episodes, problems)
+
+
+def given_names(feature: Mapping[str, Any], width: int) -> list[str] | None:
+    """Names that ``info.json`` gives to a feature's columns, None if it gives none, or not as many.
+
+    Args:
+        feature (mapping): its entry in ``info.json``; names are a list, a list in a list, ``{"motors": [...]}`` or
+            ``{"pan": 0, ...}``.
+        width (int): number of its columns.
+
+    Examples:
+        >>> from torchrl_koap.data.lerobot.files import given_names
+        >>> given_names({"names": {"motors": ["pan", "lift"]}}, 2)
+        ['pan', 'lift']
+    """
+    given = feature.get("names")
+    if isinstance(given, Mapping):
+        listed = next(iter(given.values()), None)
+        given = listed if isinstance(listed, list) else sorted(given, key=given.get)
+    if isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
+        given = given[0]
+    usable = isinstance(given, list) and len(given) == width and all(isinstance(name, str) for name in given)
+    return given if usable else None
 
 
 def _parquet_files(root: Path) -> list[Path]:
@@ -117,8 +163,15 @@ def _pyarrow():
     return pyarrow
 
 
-def _read_info(root: Path) -> dict[str, Any]:
-    file = next(root / info for info in _INFO if (root / info).is_file())
+def read_info(root: str | Path) -> dict[str, Any]:
+    """Reads the description of a data set.
+
+    Raises:
+        FileNotFoundError: if the folder is no LeRobot data set.
+        ValueError: if the description is no JSON dictionary.
+    """
+    find_lerobot_files(root)
+    file = next(Path(root) / info for info in _INFO if (Path(root) / info).is_file())
     try:
         info = json.loads(file.read_text())
     except ValueError as error:
@@ -128,22 +181,38 @@ def _read_info(root: Path) -> dict[str, Any]:
     return info
 
 
-def _read_rows(root: Path) -> dict[str, Any]:
-    """The rows of all files one after the other: ``observation [N, d]``, ``action [N, a]``, numbers, and files."""
+def _action_width(info: Mapping[str, Any]) -> int:
+    """Number of action columns that ``info.json`` announces, 0 if it is silent."""
+    shape = ((info.get("features") or {}).get(ACTION) or {}).get("shape") or [0]
+    return int(shape[0]) if isinstance(shape, list) and isinstance(shape[0], int) else 0
+
+
+def _read_rows(root: Path, chosen: Sequence[str] | None, optional_width: int | None) -> dict[str, Any]:
+    """The rows of all files one after the other: ``observation [N, d]``, ``action [N, a]``, numbers, and files.
+
+    ``optional_width`` is the width of actions that may be missing, None if none may.
+    """
     pyarrow, problems, tables = _pyarrow(), [], []
+    needed = [OBSERVATIONS[0]] if chosen is None else list(chosen)
     for file in _parquet_files(root):
         try:
             present = pyarrow.parquet.read_schema(file).names
-            features = [name for name in OBSERVATIONS if name in present]
-            missing = [name for name in (OBSERVATIONS[0], ACTION, EPISODE, FRAME) if name not in present]
+            features = [name for name in OBSERVATIONS if name in present] if chosen is None else list(chosen)
+            labels = [ACTION] if optional_width is None or ACTION in present else []
+            missing = [name for name in (*needed, *labels, EPISODE, FRAME) if name not in present]
             problems += [f"{file}: missing column {name!r}; the file has {', '.join(present)}" for name in missing]
             if missing:
                 continue
-            table = pyarrow.parquet.read_table(file, columns=[*features, ACTION, EPISODE, FRAME])
+            table = pyarrow.parquet.read_table(file, columns=[*features, *labels, EPISODE, FRAME])
         except (pyarrow.ArrowException, OSError) as error:
             problems.append(f"{file}: cannot be read: {str(error).splitlines()[0]}")
             continue
-        found = {name: _column(table, name) for name in table.column_names}
+        found = {
+            name: _column(table, name, gap_width=optional_width if name == ACTION else None)
+            for name in table.column_names
+        }
+        if not labels:
+            found[ACTION] = np.full((len(table), optional_width), np.nan)
         problems += [f"{file}: column {name!r} {fault}" for name, fault in found.items() if isinstance(fault, str)]
         if not any(isinstance(column, str) for column in found.values()):
             tables.append((file, features, found))
@@ -151,6 +220,8 @@ def _read_rows(root: Path) -> dict[str, Any]:
     for (file, _, _), width in zip(tables, widths, strict=True):
         if width != widths[0]:
             problems.append(f"{file}: its columns have widths {width}, those of {tables[0][0].name} {widths[0]}")
+    if not problems and not widths[0][ACTION]:
+        problems.append("no file has actions, and info.json does not say how many columns an action has")
     if problems:
         raise RawFolderError(root, problems)
     return {
@@ -163,8 +234,8 @@ def _read_rows(root: Path) -> dict[str, Any]:
     }
 
 
-def _column(table, name: str) -> np.ndarray | str:
-    """A column as float64 ``[rows, width]``, or what is wrong with it."""
+def _column(table, name: str, *, gap_width: int | None = None) -> np.ndarray | str:
+    """A column as float64 ``[rows, width]``, or what is wrong with it; with ``gap_width`` rows may be empty or NaN."""
     types, column = _pyarrow().types, table.column(name)
     kind, chunks = column.type, column.chunks
     fixed, nested = types.is_fixed_size_list(kind), types.is_list(kind) or types.is_large_list(kind)
@@ -173,7 +244,7 @@ def _column(table, name: str) -> np.ndarray | str:
         return f"must hold numbers or lists of numbers, got {kind}"
     parts = [chunk.flatten() if fixed or nested else chunk for chunk in chunks]
     if column.null_count or any(part.null_count for part in parts):
-        return "has empty entries"
+        return "has empty entries" if gap_width is None else _with_gaps(column.to_pylist(), gap_width)
     if not len(column):
         return "has no rows"
     sizes = {kind.list_size} if fixed else {1}
@@ -183,10 +254,20 @@ def _column(table, name: str) -> np.ndarray | str:
         return f"has rows of {' and '.join(map(str, sorted(sizes)))} numbers, wanted the same number in all"
     values = np.concatenate([part.to_numpy(zero_copy_only=False) for part in parts])
     values = values.astype(np.float64).reshape(-1, *sizes)
-    bad = ~np.isfinite(values).all(1)
+    bad = ~np.isfinite(values).all(1) if gap_width is None else np.isinf(values).any(1)
     if bad.any():
         return f"is NaN or infinite in {int(bad.sum())} rows, first in row {int(np.flatnonzero(bad)[0])}"
     return values
+
+
+def _with_gaps(rows: list[Any], announced: int) -> np.ndarray | str:
+    """Rows of which some are empty, as NaN; ``announced`` is their width if all are."""
+    listed = [[row] if isinstance(row, (int, float)) else row for row in rows]
+    widths = {len(row) for row in listed if row is not None}
+    if len(widths) > 1:
+        return f"has rows of {' and '.join(map(str, sorted(widths)))} numbers, wanted the same number in all"
+    width = next(iter(widths), announced or 1)
+    return np.array([[np.nan] * width if row is None else row for row in listed], dtype=np.float64)
 
 
 def _expected_lengths(root: Path, info: Mapping) -> dict[int, int | None]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from tensordict import TensorDictBase
 from torchrl._utils import logger as torchrl_logger
 
 from torchrl_koap.data.d3il.conversion import RawFolderError
-from torchrl_koap.data.lerobot.files import LeRobotFolder, read_lerobot_folder
+from torchrl_koap.data.lerobot.files import LeRobotFolder, given_names, read_lerobot_folder
 from torchrl_koap.data.trajectories import flatten_trajectories
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import TASKS, Task, get_task
@@ -31,11 +30,7 @@ def column_names(task: Task) -> list[str]:
         >>> column_names(get_task("sorting_2"))[2:7]
         ['measured_xy_0', 'measured_xy_1', 'red_1_xy_0', 'red_1_xy_1', 'red_1_tan_yaw']
     """
-    names = []
-    for part, columns in task.observation.items():
-        size = columns.stop - columns.start
-        names += [part] if size == 1 else [f"{part}_{index}" for index in range(size)]
-    return names
+    return list(task.observation_names)
 
 
 def read_lerobot(
@@ -121,16 +116,10 @@ def _episodes_of_split(info: Mapping, split: str) -> range:
 
 def _names(folder: LeRobotFolder) -> list[str]:
     """The names that ``info.json`` gives to the observation columns; empty strings where it gives none."""
+    features = folder.info.get("features") or {}
     names = []
     for feature, width in folder.widths.items():
-        given: Any = ((folder.info.get("features") or {}).get(feature) or {}).get("names")
-        if isinstance(given, Mapping):  # {"motors": [...]} or {"x": 0, ...}
-            listed = next(iter(given.values()), None)
-            given = listed if isinstance(listed, list) else sorted(given, key=given.get)
-        if isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
-            given = given[0]
-        usable = isinstance(given, list) and len(given) == width and all(isinstance(name, str) for name in given)
-        names += given if usable else [""] * width
+        names += given_names(features.get(feature) or {}, width) or [""] * width
     return names
 
 
@@ -158,7 +147,7 @@ def _checked_actions(task: Task, frames: np.ndarray, actions: np.ndarray, kind: 
     """Changes of the desired position ``[T - 1, act]`` that lead from each row to the next one."""
     if actions.shape[1] != task.action_dim:
         raise ValueError(f"column 'action' has {actions.shape[1]} entries, task {task.name!r} has {task.action_dim}")
-    desired, size = frames[:, task.observation[task.command]], task.same_unit
+    desired, size = frames[:, task.command_columns], task.num_delta_actions
     changes = np.concatenate([np.diff(desired[:, :size], axis=0), desired[1:, size:]], 1)
     gaps = {
         "delta": np.abs(actions[:-1] - changes).max(),

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A simulated joystick player for Aligning that pushes the tray into the target pose, from inside or from outside.
+"""Scripted expert of Aligning: a joystick player that pushes the tray into the target pose, from inside or outside.
 
 The player looks at the scene, picks the contact (a corner inside the tray, or a place on one of its walls) from which
 one smooth push leads to the target, and then
@@ -25,11 +25,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_koap.envs.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 from torchrl_koap.envs.contexts import check_contexts
-from torchrl_koap.envs.experts.noise import drift
+from torchrl_koap.envs.experts.noise import ar1_noise
 from torchrl_koap.envs.experts.push_planning import LENGTH, PLAN_SIZE, arrive, improve, motion, search, two_pushes
+from torchrl_koap.envs.experts.recording import RecordingRules
 from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 
 SAFE_HEIGHT = 0.25  # TCP height (m) at which the rod passes over the walls
 PUSH_HEIGHT = (0.150, 0.130)  # inside, outside; the rod's tip is 0.12 m lower
@@ -66,7 +67,7 @@ CONTACTS = _contacts()
 
 
 class AligningExpert:
-    """Pushes trays into their target poses, each in an asked mode.
+    """Scripted expert of Aligning for a batch of episodes: pushes trays into their target poses, each in its mode.
 
     Args:
         modes (sequence of int): per episode 0 (from inside) or 1 (from outside).
@@ -87,6 +88,8 @@ class AligningExpert:
         >>> expert.act(first["observation"].numpy()).shape, expert.finished.tolist()
         ((2, 3), [False, False])
     """
+
+    rules = RecordingRules(most_rows=399)
 
     def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
         modes, seeds = [int(mode) for mode in modes], list(seeds)
@@ -155,7 +158,7 @@ class _Player:
         self.linger = generator.integers(3, 7)
         self.height = PUSH_HEIGHT[mode] + generator.uniform(-0.004, 0.004)
         self.slip = generator.normal(0.0, 0.002, 2)  # by which the rod comes down beside the intended place
-        self.wobble = drift(generator, 6, 0.00025, (_HORIZON, 2))
+        self.wobble = ar1_noise(generator, 6, 0.00025, (_HORIZON, 2))
         self._choose(context[0], context[1], None)
 
     @property

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A simulated joystick player for Avoiding that takes any of the 24 ways to the finish line.
+"""Scripted expert of Avoiding: a simulated joystick player that takes any of the 24 ways to the finish line.
 
 The player is modelled after the human demonstrations, who held a stick per axis: pauses, pushes that are held and let
 go, saturation at full deflection, and a dead zone below which nothing moves. In one control step it
@@ -21,12 +21,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES, ROW_Y
-from torchrl_koap.envs.experts.noise import drift
+from torchrl_koap.envs.experts.noise import ar1_noise
+from torchrl_koap.envs.experts.recording import Episode, RecordingRules
+from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS, ROW_Y
 
 FULL_PUSH = 0.0124  # m per control step at full deflection
 LEAST_PUSH = 0.0053  # smaller deflections fall into the dead zone
-ROD_RADIUS = 0.01
 # x of the gaps that humans take, low and high end, from small to large x (m)
 GAPS = (
     ((0.414, 0.446), (0.556, 0.597)),
@@ -54,7 +54,7 @@ def mode_gaps(mode: int) -> tuple[int, int, int]:
     """Which gap of each row a mode takes, counted from small x.
 
     Args:
-        mode (int): 0 to 23, see :func:`~torchrl_koap.envs.mode_index`.
+        mode (int): 0 to 23, see :func:`~torchrl_koap.envs.avoiding.mode_index`.
 
     Raises:
         ValueError: if there is no such mode.
@@ -69,19 +69,27 @@ def mode_gaps(mode: int) -> tuple[int, int, int]:
     return mode // 12, mode % 12 // 4, mode % 4
 
 
+def clearance(episode: Episode) -> float:
+    """Least distance of a recording between the rod, taken as upright, and any cylinder (m)."""
+    path = episode.robot["c_pos"][:, :2]
+    gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
+    return min(gaps) - ROD_RADIUS
+
+
 class AvoidingExpert:
-    """Players of a batch of episodes, one mode and one seed each.
+    """Scripted expert of Avoiding for a batch of episodes, one mode and one seed each.
 
     Args:
         modes (sequence of int): the mode each episode shall take, ``n`` numbers of 0 to 23.
         seeds (sequence): for each episode an integer or a sequence of integers, as for ``numpy.random.default_rng``.
+        contexts (None): every episode starts the same.
 
     Raises:
         ValueError: if a mode does not exist or the numbers of modes and seeds differ.
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.envs import AvoidingEnv, mode_index
+        >>> from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
         >>> from torchrl_koap.envs.experts.avoiding import AvoidingExpert
         >>> env, expert = AvoidingEnv(2, dtype=torch.float64), AvoidingExpert([0, 22], seeds=[1, 2])
         >>> def policy(td):
@@ -91,7 +99,15 @@ class AvoidingExpert:
         ([True, True], [0, 22])
     """
 
-    def __init__(self, modes: Sequence[int], seeds: Sequence):
+    # the human demonstrations have at most 104 rows and pass the cylinders at 3 mm or more
+    rules = RecordingRules(
+        most_rows=120,
+        touching=lambda env: env.obstacle_contacts().any(1),
+        clearance=clearance,
+        least_clearance=0.003,
+    )
+
+    def __init__(self, modes: Sequence[int], seeds: Sequence, contexts: None = None):
         modes, seeds = list(modes), list(seeds)
         if not modes or len(modes) != len(seeds):
             raise ValueError(f"as many seeds as modes are needed, at least one, got {len(modes)} and {len(seeds)}")
@@ -241,7 +257,7 @@ def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
     brisk = generator.random() < 0.6
     start = uniform(0.88, 1.02) if brisk else uniform(0.66, 0.88)
     warm_up = np.clip(np.arange(_HORIZON) / uniform(10, 45), 0, 1)
-    cruise = (start + (uniform(0.98, 1.06) - start) * warm_up) + drift(generator, 15, 0.05, _HORIZON)
+    cruise = (start + (uniform(0.98, 1.06) - start) * warm_up) + ar1_noise(generator, 15, 0.05, _HORIZON)
     lets_go = generator.random() < 0.35
     turns = generator.random() < 0.5
     return {
@@ -264,9 +280,7 @@ def _draw(mode: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
         "last_side": np.array(uniform(-0.008, 0.008) if turns else 0.0),
         "last_forward": np.array(uniform(-0.1, 0.2) if lets_go else 1.0),
         "cruise": np.clip(cruise, 0.4, uniform(1.0, 1.05)) * FULL_PUSH,
-        "grip": 1 + drift(generator, 8, 0.06, _HORIZON),
-        "misjudgement": np.stack(
-            [drift(generator, 12, 0.003, _HORIZON), drift(generator, 12, 0.003, _HORIZON)], axis=1
-        ),
-        "tremor": np.stack([drift(generator, 2, 0.0002, _HORIZON), drift(generator, 2, 0.0002, _HORIZON)], axis=1),
+        "grip": 1 + ar1_noise(generator, 8, 0.06, _HORIZON),
+        "misjudgement": np.stack([ar1_noise(generator, 12, 0.003, _HORIZON) for _ in range(2)], axis=1),
+        "tremor": np.stack([ar1_noise(generator, 2, 0.0002, _HORIZON) for _ in range(2)], axis=1),
     }

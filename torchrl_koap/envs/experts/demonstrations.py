@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recording demonstrations: scripted experts play the library's own environments, a batch of episodes at a time.
+"""Recording demonstrations: scripted experts play the library's own environments, all episodes in one batch.
 
 An attempt that touches what it must not, takes another mode than asked for, does not finish, or is unlike any human one
 (all but touches, takes too long) is played again with other random draws, after four attempts from another context;
@@ -20,8 +20,9 @@ from tensordict import TensorDict
 from torchrl_koap.data import RawEpisode, flatten_trajectories, write_raw_episode
 from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.experts.recording import FAULTS, RECIPES, Recipe, play
-from torchrl_koap.tasks import get_task
+from torchrl_koap.envs.experts.recording import FAULTS, Episode, PlainEpisode, RecordingRules, expert_of, play
+from torchrl_koap.envs.registry import make_env
+from torchrl_koap.tasks import Task, get_task
 
 MAX_ATTEMPTS = 20
 BATCH_SIZE = 50  # episodes that are played at once: few enough that the first are over within seconds
@@ -47,6 +48,12 @@ class RecordingReport:
             ``close`` (nearly touched a cylinder), ``slow``.
         num_modes (int): modes the task has.
         seconds (float): wall-clock time.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.demonstrations import RecordingReport
+        >>> report = RecordingReport("avoiding", 0, modes=[3, 7], rows=[80, 95], attempts=[1, 2], failures={"mode": 1})
+        >>> report.failed_attempts
+        1
     """
 
     task: str
@@ -122,13 +129,29 @@ def record_episodes(
     progress: Callable[[int, int], None] | None = None,
     *,
     batch_size: int = BATCH_SIZE,
-) -> tuple[list[RawEpisode], RecordingReport]:
-    """Records demonstrations with everything D3IL's recorder logs; arguments as in :func:`record_demonstrations`.
+) -> tuple[list[Episode], RecordingReport]:
+    """Records demonstrations with everything D3IL's recorder logs.
+
+    Args:
+        task (str): name of the task.
+        episodes (int): number of demonstrations.
+        seed (int): seed of modes and players. Same seed, same demonstrations, whatever the number of threads.
+        num_threads (int): threads that advance the physics.
+        progress (callable, optional): called with the number of demonstrations recorded and wanted.
+
+    Keyword Args:
+        batch_size (int): episodes played at once: what memory holds. The demonstrations do not depend on it.
 
     Returns:
-        tuple: the episodes, for :func:`episodes_to_ted` and :func:`write_raw_episodes`, and the report.
+        tuple: the episodes, for :func:`episodes_to_ted` and, of a task of D3IL, :func:`write_raw_episodes`, and the
+        report.
+
+    Raises:
+        ValueError: if the task is unknown or has no expert, or a number is out of range.
+        RecordingError: if an episode fails again and again.
     """
-    name = get_task(task).source
+    facts = get_task(get_task(task).source)
+    expert_of(facts)
     limits = (
         ("episodes", episodes, 1),
         ("seed", seed, 0),
@@ -139,19 +162,23 @@ def record_episodes(
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{option} must be an integer of at least {least}, got {value!r}")
     progress = progress or (lambda done, total: None)
-    return _record(name, RECIPES[name](), episodes, seed, num_threads, progress, batch_size)
+    return _record(facts, episodes, seed, num_threads, progress, None, batch_size)
 
 
-def episodes_to_ted(raw: Sequence[RawEpisode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:
+def episodes_to_ted(raw: Sequence[Episode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:
     """Converts recorded episodes to flat TED data, just as reading their raw files would.
 
     Args:
-        raw (sequence of RawEpisode): ``T`` rows each, which make ``T - 1`` steps.
+        raw (sequence of Episode): of ``T`` rows of a raw one become ``T - 1`` steps, of a plain one ``T``.
         task (str): name of the task.
         dtype (torch.dtype): floating type of the entries.
     """
-    convert = get_converter(task).convert
-    pairs = [convert(episode) for episode in raw]
+    pairs = [
+        (episode.observation, episode.action)
+        if isinstance(episode, PlainEpisode)
+        else get_converter(task).convert(episode)
+        for episode in raw
+    ]
     return flatten_trajectories(
         [torch.from_numpy(frames) for frames, _ in pairs], [torch.from_numpy(steps) for _, steps in pairs], dtype=dtype
     )
@@ -169,6 +196,7 @@ def write_raw_episodes(folder: str | Path, raw: Sequence[RawEpisode]) -> list[Pa
 
     Raises:
         FileExistsError: if the folder holds pickles already; none is touched.
+        TypeError: if episodes were recorded without D3IL's log.
 
     Examples:
         >>> import tempfile
@@ -178,6 +206,8 @@ def write_raw_episodes(folder: str | Path, raw: Sequence[RawEpisode]) -> list[Pa
         ...     [file.name for file in write_raw_episodes(folder, raw)]
         ['env_000_00.pkl']
     """
+    if any(isinstance(episode, PlainEpisode) for episode in raw):
+        raise TypeError("episodes recorded without D3IL's log cannot be written as its pickles; save them as TED data")
     folder = Path(folder)
     if folder.is_dir() and any(folder.glob("*.pkl")):
         raise FileExistsError(f"{folder} holds pickles already; they are left as they are")
@@ -191,6 +221,14 @@ def write_raw_episodes(folder: str | Path, raw: Sequence[RawEpisode]) -> list[Pa
 def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
     """Modes of a recording: each as often as any other, a remainder drawn without repetition.
 
+    Args:
+        episodes (int): number of demonstrations.
+        num_modes (int): modes of the task.
+        seed (int): seed of the remainder.
+
+    Returns:
+        list of int: mode of every demonstration.
+
     Examples:
         >>> from torchrl_koap.envs.experts.demonstrations import balanced_modes
         >>> balanced_modes(6, 3, seed=0)
@@ -202,22 +240,22 @@ def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
 
 
 def _record(
-    task: str,
-    recipe: Recipe,
+    task: Task,
     episodes: int,
     seed: int,
     num_threads: int,
     progress: Callable[[int, int], None],
-    batch_size: int,
-) -> tuple[list[RawEpisode], RecordingReport]:
+    rules: RecordingRules | None,
+    batch_size: int = BATCH_SIZE,
+) -> tuple[list[Episode], RecordingReport]:
     start = time.perf_counter()
-    modes = balanced_modes(episodes, recipe.num_modes, seed)
-    size = min(batch_size, episodes)
-    env = recipe.make_env(size, num_threads=num_threads, dtype=torch.float64)
-    raw: list[RawEpisode | None] = [None] * episodes
+    modes = balanced_modes(episodes, task.num_modes, seed)
+    size, shown = min(batch_size, episodes), 0
+    env = make_env(task, size, num_threads=num_threads, max_steps=task.max_steps, dtype=torch.float64)
+    raw: list[Episode | None] = [None] * episodes
     attempts = [0] * episodes
     failures = dict.fromkeys(FAULTS, 0)
-    shown = 0
+    contexts = None
 
     def show(over: int) -> None:  # attempts that turn out bad are played again: the bar waits for them
         nonlocal shown
@@ -227,21 +265,21 @@ def _record(
     try:
         for attempt in range(MAX_ATTEMPTS):
             # drawn for all episodes, so that none depends on how many are played at once
-            if attempt % _PER_CONTEXT == 0 and env.task.objects:
-                contexts = draw_contexts(env.task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
+            if attempt % _PER_CONTEXT == 0 and task.bodies:
+                contexts = draw_contexts(task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
             left = np.array([index for index in range(episodes) if raw[index] is None])
             for begin in range(0, len(left), size):
                 rows = left[begin : begin + size]
                 already = sum(episode is not None for episode in raw)
                 results = play(
                     env,
-                    recipe,
                     task,
                     np.arange(len(rows)),
                     [modes[row] for row in rows],
-                    contexts[rows] if env.task.objects else None,
+                    None if contexts is None else contexts[np.resize(rows, size)],  # the rest of the batch idles
                     [(seed, int(row), attempt) for row in rows],
                     lambda over, already=already: show(already + over),
+                    rules=rules,
                 )
                 for row, (episode, fault) in zip(rows, results, strict=True):
                     attempts[row] += 1
@@ -256,4 +294,4 @@ def _record(
     if missing:
         raise RecordingError(f"no good attempt out of {MAX_ATTEMPTS} for episodes {missing}: {failures}")
     rows, seconds = [len(episode) for episode in raw], time.perf_counter() - start
-    return raw, RecordingReport(task, seed, modes, rows, attempts, failures, seconds, recipe.num_modes)
+    return raw, RecordingReport(task.name, seed, modes, rows, attempts, failures, seconds, task.num_modes)

@@ -1,13 +1,15 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What simulated players have in common: a hand whose errors forget themselves."""
+"""AR(1) noise of the scripted operators."""
 
 from __future__ import annotations
 
 import numpy as np
 
 
-def drift(generator: np.random.Generator, memory: float, deviation: float, size: int | tuple[int, ...]) -> np.ndarray:
-    """Noise that forgets itself over ``memory`` steps (an autoregressive process of order one, in its steady state).
+def ar1_noise(
+    generator: np.random.Generator, memory: float, deviation: float, size: int | tuple[int, ...]
+) -> np.ndarray:
+    """Noise of an autoregressive process of order one in its steady state, with a correlation time of ``memory`` steps.
 
     Args:
         generator (np.random.Generator): where the draws come from.
@@ -20,8 +22,8 @@ def drift(generator: np.random.Generator, memory: float, deviation: float, size:
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.noise import drift
-        >>> noise = drift(np.random.default_rng(0), 5, 2.0, 20000)
+        >>> from torchrl_koap.envs.experts.noise import ar1_noise
+        >>> noise = ar1_noise(np.random.default_rng(0), 5, 2.0, 20000)
         >>> print(f"{noise.std():.1f} {np.corrcoef(noise[5:], noise[:-5])[0, 1]:.1f}")
         2.0 0.4
     """

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Travel costs in the plane: least cost of a path through a field of slowness, and distances to squares.
+"""Eikonal path planning in the plane: least cost of a path through a field of slowness, and distances to squares.
 
 The cost ``T(p)`` of the cheapest path from ``p`` to a source obeys the eikonal equation ``|grad T| = s`` with slowness
 ``s`` (cost per metre), solved on a grid by fast sweeping (Zhao 2005): Gauss-Seidel passes in alternating directions.
@@ -40,7 +40,7 @@ def square_distance(x, y, square, half):
 
 
 @njit(cache=True)
-def travel_cost(slowness, cost, sweeps=2):
+def solve_eikonal(slowness, cost, sweeps=2):
     """Cheapest cost to the sources, everywhere on the grid.
 
     Args:
@@ -53,10 +53,10 @@ def travel_cost(slowness, cost, sweeps=2):
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.path_planning import FAR, SHAPE, STEP, travel_cost
+        >>> from torchrl_koap.envs.experts.path_planning import FAR, SHAPE, STEP, solve_eikonal
         >>> cost = np.full(SHAPE, FAR)
         >>> cost[0] = 0.0
-        >>> bool(np.isclose(travel_cost(np.ones(SHAPE), cost)[5, 40], 5 * STEP))
+        >>> bool(np.isclose(solve_eikonal(np.ones(SHAPE), cost)[5, 40], 5 * STEP))
         True
     """
     width, height = cost.shape
@@ -79,7 +79,16 @@ def travel_cost(slowness, cost, sweeps=2):
 
 @njit(cache=True)
 def value_at(field, x, y):
-    """Bilinear interpolation of a field [X, Y] at a point (m), at the border outside the grid."""
+    """Bilinear interpolation of a field, constant beyond the border of the grid.
+
+    Args:
+        field (np.ndarray): values on the grid [X, Y].
+        x (float): x of the point (m).
+        y (float): y of the point (m).
+
+    Returns:
+        float: the value, NaN for a point that is NaN.
+    """
     if np.isnan(x + y):
         return np.nan
     u = min(max((x - ORIGIN[0]) / STEP, 0.0), field.shape[0] - 1.001)
@@ -93,10 +102,20 @@ def value_at(field, x, y):
 
 @njit(cache=True)
 def descent(field, x, y, reach=0.016, softness=0.002):
-    """Direction [2] in which a field is least at a distance ``reach`` (m) from a point.
+    """Direction in which a field is least at a distance from a point.
 
     Values within about ``softness`` of the least one count too, which smooths the direction; a mere gradient would
     shiver between the walls of narrow passages.
+
+    Args:
+        field (np.ndarray): values on the grid [X, Y].
+        x (float): x of the point (m).
+        y (float): y of the point (m).
+        reach (float): the distance (m).
+        softness (float): how much above the least one a value still counts, in the unit of the field.
+
+    Returns:
+        np.ndarray: unit vector [2].
     """
     values = np.empty(32)
     for k in range(32):

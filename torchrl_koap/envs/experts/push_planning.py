@@ -65,7 +65,16 @@ def motion(contact, share):
 
 @njit(cache=True)
 def arrive(pose, contact, plan):
-    """Pose ``x, y`` (m), yaw (rad) of the tray at the end of a plan that begins in ``pose`` [3]."""
+    """Pose of the tray at the end of a plan.
+
+    Args:
+        pose (np.ndarray): x, y (m), yaw (rad) of the tray at the beginning [3].
+        contact (np.ndarray): the contact [8].
+        plan (np.ndarray): the plan [4].
+
+    Returns:
+        tuple of float: x, y (m), yaw (rad).
+    """
     x, y, yaw = pose[0], pose[1], pose[2]
     step = math.exp(plan[LENGTH]) / _PIECES
     for piece in range(_PIECES):
@@ -152,9 +161,16 @@ def improve(pose, target, contact, plan, iterations):
 
 @njit(cache=True)
 def search(pose, target, contact, plan):
-    """Writes the best plan for one contact into ``plan`` [4], from 18 first guesses, and returns its cost.
+    """Searches the best plan for one contact, from 18 first guesses.
 
-    Arguments are those of :func:`improve`.
+    Args:
+        pose (np.ndarray): x, y (m), yaw (rad) of the tray now [3].
+        target (np.ndarray): where it should come to lie [3].
+        contact (np.ndarray): the contact [8].
+        plan (np.ndarray): receives the plan [4].
+
+    Returns:
+        float: its cost (:func:`improve`).
     """
     least = 1e300
     distance = max(math.hypot(target[0] - pose[0], target[1] - pose[1]), 0.01)

@@ -1,173 +1,209 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How scripted experts play: which expert, environment and demands belong to a task, and one attempt of a batch."""
+"""One attempt of a scripted expert at a batch of episodes, and what is kept of it.
+
+What an expert (``Task.expert``) has to offer::
+
+    __init__          (modes=, contexts=, seeds=) a mode, a context [bodies, 3] and a seed per episode, contexts=None in
+                      a task without bodies; Task.expert_options are further arguments
+    act(observation)  float64 [n, obs] to the next actions [n, act], once per control step
+    finished          bool [n]: which episodes are over for the expert
+    rules             RecordingRules, optional
+
+What an environment has to offer is told in :mod:`torchrl_koap.envs.registry`. One with ``raw_log()``, of a task with a
+converter, is recorded as D3IL does it (:class:`~torchrl_koap.data.RawEpisode`), any other one as what it observed and
+what was done (:class:`PlainEpisode`).
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchrl_koap import keys
 from torchrl_koap.data import RawEpisode
-from torchrl_koap.data.d3il.conversion import OBJECTS
+from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.envs.contexts import yaw_quaternions
+from torchrl_koap.envs.registry import mode_index_of
+from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.import_strings import resolve
 
-
-@dataclass(frozen=True)
-class Recipe:
-    """What it takes to record demonstrations of one task.
-
-    Args:
-        make_env (callable): environment of a number of episodes, ``num_threads`` and ``dtype``.
-        make_expert (callable): expert from modes, contexts ``[n, objects, 3]`` (None without) and seeds.
-        mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
-        num_modes (int): modes 0 to ``num_modes - 1`` are played.
-        most_rows (int): longer recordings are discarded.
-        touching (callable, optional): environments in which something forbidden is touched, bool ``[n]``.
-        clearance (callable, optional): least distance of a recording to what must not be touched (m).
-        least_clearance (float): nearer recordings are discarded (m).
-    """
-
-    make_env: Callable[..., Any]
-    make_expert: Callable[..., Any]
-    mode_index: Callable[[Tensor], Tensor]
-    num_modes: int
-    most_rows: int
-    touching: Callable[[Any], np.ndarray] | None = None
-    clearance: Callable[[RawEpisode], float] | None = None
-    least_clearance: float = 0.0
-
-
-def _avoiding() -> Recipe:
-    from torchrl_koap.envs.avoiding import OBSTACLES, AvoidingEnv, mode_index
-    from torchrl_koap.envs.experts.avoiding import ROD_RADIUS, AvoidingExpert
-
-    def clearance(episode: RawEpisode) -> float:
-        """Least distance between the rod, taken as upright, and any cylinder (m)."""
-        path = episode.robot["c_pos"][:, :2]
-        gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
-        return min(gaps) - ROD_RADIUS
-
-    return Recipe(
-        make_env=AvoidingEnv,
-        make_expert=lambda modes, contexts, seeds: AvoidingExpert(modes, seeds),
-        mode_index=mode_index,
-        num_modes=24,
-        # the human demonstrations have at most 104 rows and pass the cylinders at 3 mm or more
-        most_rows=120,
-        touching=lambda env: env.obstacle_contacts().any(1),
-        clearance=clearance,
-        least_clearance=0.003,
-    )
-
-
-def _aligning() -> Recipe:
-    from torchrl_koap.envs.aligning import AligningEnv, mode_index
-    from torchrl_koap.envs.experts.aligning import AligningExpert
-
-    return Recipe(AligningEnv, AligningExpert, mode_index, num_modes=2, most_rows=399)
-
-
-def _sorting(num_boxes: int) -> Recipe:
-    from torchrl_koap.envs.experts.sorting import SortingExpert
-    from torchrl_koap.envs.sorting import SortingEnv, mode_index
-
-    return Recipe(
-        make_env=partial(SortingEnv, num_boxes=num_boxes),
-        make_expert=partial(SortingExpert, num_boxes=num_boxes),
-        mode_index=mode_index,
-        num_modes=math.comb(num_boxes, num_boxes // 2),
-        most_rows=699,
-    )
-
-
-def _stacking() -> Recipe:
-    from torchrl_koap.envs.experts.stacking import StackingExpert
-    from torchrl_koap.envs.stacking import StackingEnv, mode_index
-
-    return Recipe(StackingEnv, StackingExpert, mode_index, num_modes=6, most_rows=999)
-
-
-# made when asked for: a simulator takes seconds to import
-RECIPES: dict[str, Callable[[], Recipe]] = {
-    "avoiding": _avoiding,
-    "aligning": _aligning,
-    "sorting": partial(_sorting, 4),
-    "sorting_2": partial(_sorting, 2),
-    "sorting_6": partial(_sorting, 6),
-    "stacking": _stacking,
-}
 FAULTS = ("collision", "unfinished", "mode", "close", "slow")
 
 
+@dataclass(frozen=True)
+class PlainEpisode:
+    """What an environment observed and what was done.
+
+    Args:
+        observation (np.ndarray): ``[T + 1, obs]``.
+        action (np.ndarray): ``[T, act]``.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.envs.experts.recording import PlainEpisode
+        >>> len(PlainEpisode(observation=np.zeros((41, 4)), action=np.zeros((40, 2))))
+        40
+    """
+
+    observation: np.ndarray
+    action: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+
+Episode = RawEpisode | PlainEpisode
+
+
+@dataclass(frozen=True)
+class RecordingRules:
+    """Which recordings of an expert are discarded, besides those without success or in another mode than asked for.
+
+    Args:
+        most_rows (int, optional): longer recordings are discarded. Default: none is.
+        touching (callable, optional): from the environment to where something forbidden is touched, bool ``[n]``.
+        clearance (callable, optional): from a recording to its least distance to what must not be touched (m).
+        least_clearance (float): nearer recordings are discarded (m).
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.recording import RecordingRules
+        >>> RecordingRules(most_rows=399).least_clearance
+        0.0
+    """
+
+    most_rows: int | None = None
+    touching: Callable[[Any], np.ndarray] | None = None
+    clearance: Callable[[Any], float] | None = None
+    least_clearance: float = 0.0
+
+
+def expert_of(task: Task) -> type:
+    """The task's scripted expert.
+
+    Args:
+        task (Task): the task.
+
+    Raises:
+        ValueError: if it has none.
+    """
+    if task.expert is None:
+        raise ValueError(f"task {task.name!r} has no scripted expert (Task.expert is None): nothing can be recorded")
+    return resolve(task.expert, f"expert of task {task.name!r}")
+
+
 def play(
-    env,
-    recipe: Recipe,
-    task: str,
+    env: Any,
+    task: Task,
     rows: np.ndarray,
     modes: Sequence[int],
     contexts: np.ndarray | None,
     seeds: Sequence,
     progress: Callable[[int], None],
-) -> list[tuple[RawEpisode | None, str]]:
+    *,
+    rules: RecordingRules | None = None,
+) -> list[tuple[Episode | None, str]]:
     """Plays one attempt of the episodes ``rows``.
 
     Args:
-        env (ManipulationEnv): one environment per episode of the recording.
-        recipe (Recipe): that of the task.
-        task (str): name of the task.
+        env (EnvBase): one environment per episode of the recording.
+        task (Task): the task.
         rows (np.ndarray): episodes to play.
         modes (sequence of int): mode asked for in each of them.
-        contexts (np.ndarray, optional): context of each of them.
-        seeds (sequence): seed of each of them.
+        contexts (np.ndarray, optional): contexts of all episodes of the environment.
+        seeds (sequence): seed of each episode that is played.
         progress (callable): called with the number of episodes that are over.
+
+    Keyword Args:
+        rules (RecordingRules, optional): what is discarded. Default: the expert's own.
 
     Returns:
         list: for each episode its recording and ``""``, or None and what went wrong, one of ``FAULTS``.
     """
-    count = env.batch_size[0]
+    count, make = env.batch_size[0], expert_of(task)
+    rules = rules or getattr(make, "rules", RecordingRules())
+    placed = None if contexts is None else contexts[rows]
+    expert = make(modes=modes, contexts=placed, seeds=seeds, **task.expert_options)
+    recorder = _RawRecorder(task) if task.converter is not None and hasattr(env, "raw_log") else _PlainRecorder()
     active = np.zeros(count, dtype=bool)
     active[rows] = True
-    expert = recipe.make_expert(modes, contexts, seeds)
-    start = torch.from_numpy(active[:, None].copy())
-    data = env.reset(env.reset().set("_reset", start), contexts=contexts) if contexts is not None else env.reset()
-    logs, touched, lengths = [], np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
+    data = env.reset() if contexts is None else env.reset(contexts=contexts)
+    index_of, touched, lengths = mode_index_of(task), np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
+    success, reached = np.zeros(count, dtype=bool), np.full(count, -1)
     for _ in range(env.max_steps):
-        action = np.zeros((count, env.task.action_dim))
-        action[rows] = expert.act(data[keys.OBSERVATION].numpy()[rows])
-        data.set(keys.ACTION, torch.from_numpy(action)).set("_step", torch.from_numpy(active[:, None].copy()))
-        data = env.step(data)["next"].clone()
-        logs.append((env.raw_log(), env.raw_objects()))
+        observation = data[keys.OBSERVATION].numpy()
+        action = np.zeros((count, task.action_dim))
+        action[rows] = expert.act(observation[rows])
+        # an environment may leave alone those that are over; what it does with them is not looked at
+        step = data.set(keys.ACTION, torch.from_numpy(action)).set("_step", torch.from_numpy(active[:, None].copy()))
+        data = env.step(step)["next"].clone()
+        recorder.add(env, observation, action, data[keys.OBSERVATION].numpy())
         lengths += active
-        if recipe.touching is not None:
-            touched |= active & recipe.touching(env)
+        success = np.where(active, data[keys.SUCCESS].squeeze(-1).numpy(), success)
+        reached = np.where(active, index_of(data[keys.MODE]).numpy(), reached)
+        if rules.touching is not None:
+            touched |= active & rules.touching(env)
         active[rows] &= ~expert.finished
         active &= ~touched
         progress(int(len(rows) - active[rows].sum() - touched.sum()))
         if not active.any():
             break
-    reached = recipe.mode_index(data[keys.MODE]).numpy()
-    success = data[keys.SUCCESS].squeeze(-1).numpy()
     results = []
     for index, row in enumerate(rows):
-        context = None if contexts is None else _raw_context(contexts[index])
-        episode = _episode(logs[: lengths[row]], row, task, context)
+        episode = recorder.episode(row, lengths[row], None if placed is None else placed[index])
         faults = {
             "collision": touched[row],
             "unfinished": active[row] or not success[row],
             "mode": reached[row] != modes[index],
-            "close": recipe.clearance is not None and recipe.clearance(episode) < recipe.least_clearance,
-            "slow": len(episode) > recipe.most_rows,
+            "close": rules.clearance is not None and rules.clearance(episode) < rules.least_clearance,
+            "slow": rules.most_rows is not None and len(episode) > rules.most_rows,
         }
         fault = next((name for name in FAULTS if faults[name]), "")
         results.append((None if fault else episode, fault))
     return results
+
+
+class _PlainRecorder:
+    """Keeps what was observed and done."""
+
+    def __init__(self):
+        self._frames: list[np.ndarray] = []
+        self._actions: list[np.ndarray] = []
+
+    def add(self, env: Any, observation: np.ndarray, action: np.ndarray, following: np.ndarray) -> None:
+        self._frames = self._frames or [observation.copy()]
+        self._frames.append(following.copy())
+        self._actions.append(action)
+
+    def episode(self, row: int, length: int, context: np.ndarray | None) -> PlainEpisode:
+        frames = np.stack([frame[row] for frame in self._frames[: length + 1]])
+        return PlainEpisode(frames, np.stack([action[row] for action in self._actions[:length]]))
+
+
+class _RawRecorder:
+    """Keeps what D3IL's recorder logs."""
+
+    def __init__(self, task: Task):
+        self._names = get_converter(task.name).objects
+        self._logs: list[tuple[dict, dict]] = []
+
+    def add(self, env: Any, observation: np.ndarray, action: np.ndarray, following: np.ndarray) -> None:
+        self._logs.append((env.raw_log(), env.raw_objects()))
+
+    def episode(self, row: int, length: int, context: np.ndarray | None) -> RawEpisode:
+        logs = self._logs[:length]
+        robot = {name: np.stack([log[name][row] for log, _ in logs]) for name in logs[0][0]}
+        # simulated time, so that files are repeatable
+        robot["wall_clock"] = np.rint(robot["time_stamp"] * 1e9).astype(np.int64)
+        objects = {}
+        for name, own in zip(self._names, logs[0][1], strict=True):
+            poses = np.stack([poses[own][row] for _, poses in logs])
+            objects[name] = {"sim_step": robot["sim_step"], "pos": poses[:, :3], "quat": poses[:, 3:]}
+        return RawEpisode(robot=robot, objects=objects, context=None if context is None else _raw_context(context))
 
 
 def _raw_context(context: np.ndarray) -> list[list[np.ndarray]]:
@@ -176,13 +212,3 @@ def _raw_context(context: np.ndarray) -> list[list[np.ndarray]]:
         [np.array([x, y, math.degrees(yaw)]), quaternion]
         for (x, y, yaw), quaternion in zip(context, yaw_quaternions(context[:, 2]), strict=True)
     ]
-
-
-def _episode(logs: list[tuple[dict, dict]], row: int, task: str, context: Any) -> RawEpisode:
-    robot = {name: np.stack([log[name][row] for log, _ in logs]) for name in logs[0][0]}
-    robot["wall_clock"] = np.rint(robot["time_stamp"] * 1e9).astype(np.int64)  # simulated, so that files are repeatable
-    objects = {}
-    for name, own in zip(OBJECTS[task], logs[0][1], strict=True):
-        poses = np.stack([poses[own][row] for _, poses in logs])
-        objects[name] = {"sim_step": robot["sim_step"], "pos": poses[:, :3], "quat": poses[:, 3:]}
-    return RawEpisode(robot=robot, objects=objects, context=context)

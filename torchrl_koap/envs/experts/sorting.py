@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A player for Sorting that pushes the boxes into their bins in any order of colours.
+"""Scripted expert of Sorting: pushes the boxes into their bins in any order of colours.
 
 It looks at the boxes anew at every control step and keeps hardly anything in mind, so similar situations give similar
 motions. In one control step it
@@ -10,8 +10,8 @@ motions. In one control step it
     3. moves the rod    around all boxes to that place, or, once behind the box, forwards; while pushing it steers
                         twice as far to the side as the box lies off, which brings the box back in front of it
 
-Ways are paths of least travel cost (:mod:`torchrl_koap.envs.experts.path_planning`): for the box with the others as
-obstacles, for the rod with all boxes as obstacles. All randomness of an episode comes from its own seed.
+Ways are paths of least cost by the eikonal equation (:mod:`torchrl_koap.envs.experts.path_planning`): for the box with
+the others as obstacles, for the rod with all boxes as obstacles. All randomness of an episode comes from its own seed.
 """
 
 from __future__ import annotations
@@ -21,18 +21,20 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from torchrl_koap.envs.experts.noise import drift
+from torchrl_koap.envs.experts.noise import ar1_noise
 from torchrl_koap.envs.experts.path_planning import (
     FAR,
     ORIGIN,
     SHAPE,
     STEP,
     descent,
+    solve_eikonal,
     square_distance,
-    travel_cost,
     value_at,
 )
-from torchrl_koap.envs.sorting import BIN_HALF, BIN_X, BOX_HALF, box_colours, mode_colours
+from torchrl_koap.envs.experts.recording import RecordingRules
+from torchrl_koap.envs.sorting import box_colours, mode_colours
+from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X, BOX_HALF
 
 ROD_RADIUS = 0.01
 ARRIVED_Y = 0.232  # m; beyond, a box has left the platform
@@ -82,7 +84,7 @@ def _box_field(boxes, yaws, obstacle, lane):
                     gap = square_distance(x, y, squares[k], BOX_HALF)
                     s += 12.0 * min(max((0.048 - gap) / 0.02, 0.0), 1.0)
             slowness[i, j] = s
-    return travel_cost(slowness, cost)
+    return solve_eikonal(slowness, cost)
 
 
 @njit(cache=True)
@@ -112,7 +114,7 @@ def _cost_from(slowness, x, y):
     for a in (i, i + 1):
         for b in (j, j + 1):
             cost[a, b] = np.hypot(x - ORIGIN[0] - a * STEP, y - ORIGIN[1] - b * STEP)
-    return travel_cost(slowness, cost)
+    return solve_eikonal(slowness, cost)
 
 
 @njit(cache=True)
@@ -212,7 +214,7 @@ def _decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
 
 
 class SortingExpert:
-    """Players of a batch of episodes, one mode and one seed each.
+    """Scripted expert of Sorting for a batch of episodes, one mode and one seed each.
 
     Args:
         modes (sequence of int): the order of colours each episode shall take, numbers as
@@ -242,6 +244,8 @@ class SortingExpert:
         >>> last["success"].squeeze(-1).tolist(), mode_index(last["mode"]).tolist()
         ([True, True], [0, 1])
     """
+
+    rules = RecordingRules(most_rows=699)
 
     def __init__(self, modes: Sequence[int], contexts, seeds: Sequence, *, num_boxes: int = 4):
         modes, seeds, contexts = list(modes), list(seeds), np.asarray(contexts)
@@ -351,5 +355,5 @@ def _draw(generator: np.random.Generator, num_boxes: int) -> dict[str, np.ndarra
         "taste": generator.normal(0, 0.03, num_boxes),
         "aim": generator.uniform(-0.015, 0.015, num_boxes),
         "pause": np.array(generator.integers(0, 6)),
-        "tempo": generator.uniform(0.95, 1.05) * (1 + drift(generator, 15, 0.04, _HORIZON)),
+        "tempo": generator.uniform(0.95, 1.05) * (1 + ar1_noise(generator, 15, 0.04, _HORIZON)),
     }

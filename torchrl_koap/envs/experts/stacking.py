@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A simulated person at the gripper who stacks the three boxes of Stacking in a wanted order.
+"""Scripted expert of Stacking: a simulated person at the gripper who stacks the three boxes in a wanted order.
 
 What it does next follows from what it sees now, so similar situations give similar motions. For every box::
 
@@ -21,14 +21,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_koap.envs.experts.noise import drift
+from torchrl_koap.envs.experts.noise import ar1_noise
+from torchrl_koap.envs.experts.recording import RecordingRules
 from torchrl_koap.envs.mujoco.inverse_kinematics import follow_pose, tcp_pose
-from torchrl_koap.envs.stacking import BOXES, TARGET
 from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.stacking import BOXES, TARGET
 
 ORDERS = tuple(itertools.permutations(range(3)))
 GRIPPER_OPEN, GRIPPER_CLOSED = 0.08, 0.06  # gripper numbers: the distances of the fingers that will result (m)
-HALF_SIZES = np.array([size[:2] for _, size, _ in BOXES])
+HALF_SIZES = np.array([size[:2] for _, size in BOXES])
 BOX_HEIGHT = 0.06
 ON_TABLE = 0.011  # height of the centre of a box that lies on the table (m)
 
@@ -44,7 +45,7 @@ _REACH, _GRASP, _CARRY, _RELEASE, _RETREAT = range(5)
 
 
 class StackingExpert:
-    """People of a batch of episodes, one order and one seed each.
+    """Scripted expert of Stacking for a batch of episodes, one order and one seed each.
 
     Args:
         modes (sequence of int): order of the boxes of each episode, 0 to 5, see
@@ -68,6 +69,8 @@ class StackingExpert:
         >>> last["success"].item(), last["mode"].tolist()
         (True, [[1, 2, 0]])
     """
+
+    rules = RecordingRules(most_rows=999)
 
     def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
         modes, seeds, shape = list(modes), list(seeds), np.shape(contexts)
@@ -109,7 +112,7 @@ class StackingExpert:
         _, turned = tcp_pose(seen["measured_joints"])
         start, _ = tcp_pose(commanded)
         boxes = np.stack(
-            [np.c_[seen[f"{name}_position"], np.arctan(seen[f"{name}_tan_yaw"])] for name, _, _ in BOXES], axis=1
+            [np.c_[seen[f"{name}_position"], np.arctan(seen[f"{name}_tan_yaw"])] for name, _ in BOXES], axis=1
         )
         poses, gripper = np.empty((len(self._people), 7)), np.empty((len(self._people), 1))
         for i, person in enumerate(self._people):
@@ -131,7 +134,7 @@ class _Person:
         self.finished = False
         self._pace = generator.uniform(0.85, 1.05)
         self._centre = np.array(TARGET) + generator.uniform(-0.004, 0.004, 2)
-        self._wobble = np.stack([drift(generator, 12, 0.0012, _HORIZON) for _ in range(3)], axis=1)
+        self._wobble = np.stack([ar1_noise(generator, 12, 0.0012, _HORIZON) for _ in range(3)], axis=1)
         self._hesitation = generator.integers(0, 4, 16)
         self._velocity, self._spin = np.zeros(3), 0.0
         self._time, self._placed, self._grasp, self._grip_width = 0, 0, None, 0.0

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The controller that runs every millisecond, compiled: inverse kinematics, joint PD and finger force (spec section 3).
+"""The compiled controller: inverse kinematics, joint PD and finger force every millisecond (docs/d3il.md, Controller).
 
 One call advances one simulation by all substeps of a control step without coming back to Python: the compiled loop
 computes the motor commands and calls ``mj_step`` of the MuJoCo library through its address. It holds no interpreter
@@ -26,7 +26,7 @@ from torchrl_koap.envs.mujoco.linear_algebra import clip, solve_clipped
 TIMESTEP = 0.001
 KP = np.array([120.0, 120.0, 120.0, 120.0, 50.0, 30.0, 10.0])
 KD = np.array([10.0, 10.0, 10.0, 10.0, 6.0, 5.0, 3.0])
-# Joint 3's upper bound is 2.0 in the original although the joint reaches 2.8973 (spec section 10.7).
+# Joint 3's upper bound is 2.0 in the original although the joint reaches 2.8973.
 Q_MIN = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 Q_MAX = np.array([2.8973, 1.7628, 2.0, -0.0698, 2.8973, 3.7525, 2.8973])
 Q_REST = np.array([0.0, 0.174, 0.0, -0.872, 0.0, 1.222, 0.785])
@@ -122,7 +122,16 @@ def _rotate(axes, index, angle):
 
 @njit(cache=True)
 def forward_kinematics(q, axes, origins, tcp, quat):
-    """Frames of the seven joints (rows 1-7), TCP position and quaternion for the joint angles ``q``."""
+    """Forward kinematics of the arm: frames of its joints and pose of the TCP, in the frame of its base.
+
+    Args:
+        q (np.ndarray): joint angles [7] (rad).
+        axes (np.ndarray): receives the axes x, y, z of the joints' frames in rows 1-7 [8, 3, 3]; row 0 ends as the
+            hand's.
+        origins (np.ndarray): receives their origins [8, 3] (m).
+        tcp (np.ndarray): receives the position of the TCP [3] (m).
+        quat (np.ndarray): receives its quaternion [4] (w, x, y, z).
+    """
     for i in range(3):
         for k in range(3):
             axes[0, i, k] = 1.0 if i == k else 0.0
@@ -180,7 +189,22 @@ def _quaternion(axes, quat):
 
 @njit(cache=True)
 def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors):
-    """Moves ``q`` in place by three damped steps towards the pose ``target`` (position and unit quaternion)."""
+    """Inverse kinematics: moves joint angles in place, by three damped steps, towards a pose of the TCP.
+
+    Args:
+        target (np.ndarray): position (m) and unit quaternion (w, x, y, z) [7].
+        q (np.ndarray): joint angles [7] (rad), overwritten.
+        axes (np.ndarray): scratch space [8, 3, 3].
+        origins (np.ndarray): scratch space [8, 3].
+        tcp (np.ndarray): scratch space [3].
+        quat (np.ndarray): scratch space [4].
+        jacobian (np.ndarray): scratch space [6, 7].
+        matrix (np.ndarray): scratch space [6, 6].
+        task (np.ndarray): scratch space [6].
+        null (np.ndarray): scratch space [7].
+        factor (np.ndarray): scratch space [6, 6].
+        vectors (np.ndarray): scratch space [6, 6].
+    """
     for _ in range(IK_ITERATIONS):
         forward_kinematics(q, axes, origins, tcp, quat)
         near = 0.0
@@ -258,7 +282,7 @@ def _write_log(row, pointers, qpos, qvel, q_des, v_des, a_des, tcp, quat):
 
 @njit(nogil=True, cache=True)
 def track_pose(step, model, data, pointers, rows, commands, widths, grasping, substeps, targets, speeds, started, log):
-    """Tracks Cartesian commands for ``substeps`` physics steps in each of the simulations ``rows`` (spec 3.1, 3.3).
+    """Tracks Cartesian commands for ``substeps`` physics steps in each of the simulations ``rows``.
 
     Args:
         step (int): address of ``mj_step``.
@@ -313,9 +337,19 @@ def track_pose(step, model, data, pointers, rows, commands, widths, grasping, su
 
 @njit(nogil=True, cache=True)
 def track_joints(step, model, data, pointers, rows, commands, widths, grasping, substeps, log):
-    """Holds joint targets for ``substeps`` physics steps in each of the simulations ``rows`` (spec 3.2, 3.3).
+    """Holds joint targets for ``substeps`` physics steps in each of the simulations ``rows``.
 
-    The arguments are those of :func:`track_pose`, except ``commands``: joint angles [n, 7] in rad.
+    Args:
+        step (int): address of ``mj_step``.
+        model (int): address of the shared mjModel.
+        data (np.ndarray): addresses of the mjData [n], int64.
+        pointers (np.ndarray): addresses of their arrays [n, NUM_POINTERS], int64.
+        rows (np.ndarray): indices of the simulations to advance, int64.
+        commands (np.ndarray): joint angles [n, 7] (rad), float64.
+        widths (np.ndarray): finger targets [n] (m).
+        grasping (np.ndarray): whether the fingers press [n], bool.
+        substeps (int): physics steps per control step.
+        log (np.ndarray): receives one row per simulation after the first substep, as in :func:`track_pose`.
     """
     zero = np.zeros(7)
     for row in rows:

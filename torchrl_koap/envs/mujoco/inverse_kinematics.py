@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Poses of the tool centre point (TCP) as joint commands, by the controller that the Cartesian tasks use (spec 3.1).
+"""Poses of the tool centre point (TCP) as joint commands, by the controller that the Cartesian tasks use.
 
 D3IL's Stacking data were recorded like this: a person commanded poses, the inverse kinematics turned them into joint
 targets, and the joint targets became the commands that policies learn.

@@ -14,7 +14,13 @@ EIGENVALUE_MIN, EIGENVALUE_MAX = 0.01, 100.0
 
 @njit(cache=True)
 def clip(value, low, high):
-    """The value, or the bound that it lies beyond."""
+    """The value, or the bound that it lies beyond.
+
+    Args:
+        value (float): the value.
+        low (float): least value returned.
+        high (float): greatest value returned.
+    """
     return min(max(value, low), high)
 
 
@@ -37,9 +43,15 @@ def _cholesky(matrix, shift, factor):
 
 @njit(cache=True)
 def solve_clipped(matrix, rhs, factor, vectors):
-    """Solves ``A x = rhs`` in place for symmetric ``A`` whose eigenvalues are clipped to [0.01, 100] first.
+    """Solves ``A x = b`` in place for symmetric ``A`` whose eigenvalues are clipped to [0.01, 100] first.
 
     Clipping is rarely active. Two cheap tests say so: ``A - 0.01 I`` has a Cholesky factor, and the trace is below 100.
+
+    Args:
+        matrix (np.ndarray): ``A`` [6, 6]; destroyed where eigenvalues have to be clipped.
+        rhs (np.ndarray): ``b`` [6], overwritten by ``x``.
+        factor (np.ndarray): scratch space [6, 6].
+        vectors (np.ndarray): scratch space [6, 6].
     """
     trace = 0.0
     for i in range(6):

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The Franka Panda arm of the D3IL benchmark as a `dm_control.mjcf` model (spec section 2).
+"""The Franka Panda arm of the D3IL benchmark as a `dm_control.mjcf` model (docs/d3il.md, Robot).
 
 The numbers are D3IL's, not those of the Panda that ships with ``gymnasium-robotics``: only the ten meshes are taken
 from that package. Lengths in m, masses in kg, inertias in kg m^2, angles in rad, quaternions (w, x, y, z).
@@ -13,8 +13,6 @@ from pathlib import Path
 
 from torchrl_koap.envs.mujoco.mjcf import mjcf
 
-NUM_ARM_JOINTS = 7
-NUM_FINGERS = 2
 TCP_OFFSET = 0.105  # tool centre point along the hand's z axis
 FLANGE_OFFSET = 0.107  # link8 along the z axis of link7
 HAND_QUAT = (0.92388, 0.0, 0.0, -0.382683)  # D3IL's rounded -45 deg about z

@@ -109,7 +109,7 @@ class SimulationBatch:
         *,
         width: float = controller.FINGER_RESET,
     ) -> None:
-        """Puts simulations into their start state (spec section 4), one substep included.
+        """Puts simulations into their start state (docs/d3il.md, Reset), one substep included.
 
         Args:
             rows (np.ndarray): indices of the simulations.
@@ -133,7 +133,7 @@ class SimulationBatch:
         self.track_joints(rows, commands, substeps=1)
 
     def track_pose(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
-        """Advances simulations by ``substeps`` while the TCP follows ``commands`` (spec section 3.1).
+        """Advances simulations by ``substeps`` while the TCP follows ``commands``.
 
         Args:
             rows (np.ndarray): indices of the simulations.
@@ -145,7 +145,13 @@ class SimulationBatch:
         self._run(controller.track_pose, rows, (commands, self.widths, self.grasping, substeps, *state))
 
     def track_joints(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
-        """Advances simulations by ``substeps`` while the joints are held at ``commands`` [n, 7] (spec section 3.2)."""
+        """Advances simulations by ``substeps`` while the joints are held at ``commands``.
+
+        Args:
+            rows (np.ndarray): indices of the simulations.
+            commands (np.ndarray): joint angles [n, 7] (rad); rows not advanced are ignored.
+            substeps (int): physics steps.
+        """
         commands = np.ascontiguousarray(commands, dtype=np.float64)
         self._run(controller.track_joints, rows, (commands, self.widths, self.grasping, substeps, self.log))
 
@@ -204,7 +210,12 @@ class SimulationBatch:
         }
 
     def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
-        """Restores what :meth:`get_state` returned; the simulation then continues bit for bit."""
+        """Restores what :meth:`get_state` returned; the simulation then continues bit for bit.
+
+        Args:
+            row (int): index of the simulation.
+            state (dict): from :meth:`get_state`, of any simulation of the same model.
+        """
         data = self.data[row]
         mujoco.mj_resetData(self.model, data)
         spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -250,7 +261,16 @@ class SimulationBatch:
         self.started[row] = False
 
     def contacts(self, row: int, geom: int, others: Sequence[int]) -> np.ndarray:
-        """Which geoms of ``others`` touched ``geom`` in the last substep, bool [len(others)]."""
+        """Which geoms touched another one in the last substep.
+
+        Args:
+            row (int): index of the simulation.
+            geom (int): id of the one geom.
+            others (sequence of int): ids of the others.
+
+        Returns:
+            np.ndarray: bool [len(others)].
+        """
         data = self.data[row]
         if not data.ncon:
             return np.zeros(len(others), dtype=bool)

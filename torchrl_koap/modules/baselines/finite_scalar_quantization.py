@@ -59,9 +59,12 @@ class FiniteScalarQuantizer(nn.Module):
         if num_codebooks < 1:
             raise ValueError(f"num_codebooks must be >= 1, got {num_codebooks}")
         self.num_codebooks, self.num_codes = num_codebooks, math.prod(levels)
-        self.register_buffer("levels", torch.tensor(tuple(levels) * num_codebooks), persistent=False)
-        basis = [math.prod(levels[:place]) for place in range(len(levels))]
-        self.register_buffer("basis", torch.tensor(basis), persistent=False)
+        self._sizes = {
+            "levels": tuple(levels) * num_codebooks,
+            "basis": tuple(math.prod(levels[:place]) for place in range(len(levels))),
+        }
+        for name, sizes in self._sizes.items():
+            self.register_buffer(name, torch.tensor(sizes), persistent=False)
         self.project_in = nn.Linear(features, len(self.levels))
         self.project_out = nn.Linear(len(self.levels), features)
 
@@ -102,3 +105,12 @@ class FiniteScalarQuantizer(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Features ``[*B, m]`` by way of their code."""
         return self.project_out(self.encode(features))
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        # what is not in the file has no numbers yet where the module was built under torch.device("meta")
+        device = self.project_in.weight.device
+        if device.type == "meta" and f"{prefix}project_in.weight" in state_dict:
+            device = state_dict[f"{prefix}project_in.weight"].device
+        for name, sizes in self._sizes.items():
+            setattr(self, name, torch.tensor(sizes, device=device))
+        super()._load_from_state_dict(state_dict, prefix, *args)

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_koap.keys import ACTION, STATE
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
-from torchrl_koap.modules.time_alignment import check_offsets, frame_index
+from torchrl_koap.modules.time_alignment import check_offsets, frame_index, frame_span
 
 
-class LinearInverseDynamics(TensorDictModuleBase):
+class LinearInverseDynamics(InverseDynamics):
     """Ridge regression from the raw frames ``x_{t-n}, ..., x_t, x_{t+k}`` to the action: no latent action at all.
 
     The control that any latent method must beat. It reads labelled frames only; there is nothing to train.
@@ -25,7 +25,7 @@ class LinearInverseDynamics(TensorDictModuleBase):
         action_dim (int): size of an action.
 
     Keyword Args:
-        history (int): frames before the current one. Defaults to ``1``.
+        num_past (int): frames before the present one. Defaults to ``1``.
         look_ahead (int or sequence of int): offsets ``k >= 2``, as for KOAP. Defaults to ``8``.
         in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
         out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
@@ -47,38 +47,39 @@ class LinearInverseDynamics(TensorDictModuleBase):
         state_dim: int,
         action_dim: int,
         *,
-        history: int = 1,
+        num_past: int = 1,
         look_ahead: int | Sequence[int] = 8,
         in_key: NestedKey = STATE,
         out_key: NestedKey = ACTION,
     ):
-        super().__init__()
-        self.in_keys, self.out_keys = [in_key], [out_key]
-        self.history, self.look_ahead = history, check_offsets(history, look_ahead)
-        self.decoder = LinearActionDecoder((history + 1 + len(self.look_ahead)) * state_dim, action_dim)
+        super().__init__(in_key=in_key, out_key=out_key)
+        self._num_past, self.look_ahead = num_past, check_offsets(num_past, look_ahead)
+        self.decoder = LinearActionDecoder((num_past + 1 + len(self.look_ahead)) * state_dim, action_dim)
         self.register_buffer("offset", torch.zeros(self.decoder.linear.in_features))
         self.register_buffer("scale", torch.ones(self.decoder.linear.in_features))
 
-    def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
-        """Renames the entries read and written."""
-        if state is not None:
-            self.in_keys = [state]
-        if action is not None:
-            self.out_keys = [action]
+    @property
+    def num_past(self) -> int:
+        """Frames before the present one that are read."""
+        return self._num_past
 
     @property
     def num_window_frames(self) -> int:
-        """Frames of the shortest complete window."""
-        return self.history + 1 + self.look_ahead[-1]
+        """Frames of the shortest window in which a frame has all it reads."""
+        return self.num_past + 1 + self.look_ahead[-1]
+
+    def span(self, num_frames: int) -> range:
+        """Frames of a window of ``num_frames`` whose look-ahead lies in it."""
+        return frame_span(num_frames, self.num_past, self.look_ahead)
 
     def _frames(self, state: Tensor) -> Tensor:
         num_frames = state.shape[-2]
-        index = frame_index(range(num_frames), num_frames, self.history, self.look_ahead, state.device)
+        index = frame_index(range(num_frames), num_frames, self.num_past, self.look_ahead, state.device)
         return (state[..., index, :].flatten(-2) - self.offset) / self.scale
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of every frame."""
-        return tensordict.set(self.out_keys[0], self.decoder.linear(self._frames(tensordict.get(self.in_keys[0]))))
+        return tensordict.set(self.out_key, self.decoder.linear(self._frames(tensordict.get(self.in_key))))
 
     @torch.no_grad()
     def fit_decoder(self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None) -> RidgeFit:
@@ -88,12 +89,18 @@ class LinearInverseDynamics(TensorDictModuleBase):
             windows (TensorDictBase): states ``[N, T, d]`` and actions ``[N, T, act]``.
             mask (Tensor): labelled frames, bool ``[N, T]``.
             groups (Tensor, optional): trajectory of every window, int64 ``[N]``.
+
+        Returns:
+            RidgeFit: the ridge chosen and its held-out error.
+
+        Raises:
+            ValueError: if no labelled frame sees its whole look-ahead.
         """
         last = mask.shape[-1] - self.look_ahead[-1]
         mask = mask.clone()
-        mask[:, : self.history], mask[:, last:] = False, False
+        mask[:, : self.num_past], mask[:, last:] = False, False
         self.offset.zero_(), self.scale.fill_(1.0)
-        frames = self._frames(windows.get(self.in_keys[0]))
+        frames = self._frames(windows.get(self.in_key))
         used = frames[mask]
         if len(used):
             spread = used.std(0, correction=0)
@@ -101,5 +108,5 @@ class LinearInverseDynamics(TensorDictModuleBase):
             self.scale.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
         groups = None if groups is None else groups.unsqueeze(-1).expand_as(mask)
         return self.decoder.fit_ridge(
-            self._frames(windows.get(self.in_keys[0])), windows.get(self.out_keys[0]), mask, groups=groups
+            self._frames(windows.get(self.in_key)), windows.get(self.out_key), mask, groups=groups
         )

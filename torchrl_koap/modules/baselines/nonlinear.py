@@ -6,12 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import LatentActionMLP
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
-from torchrl_koap.modules.networks import mlp
 
 
 class NonlinearInverseDynamics(LatentInverseDynamics):
@@ -24,7 +24,7 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
     All parts are perceptrons and trained together by :class:`~torchrl_koap.objectives.NonlinearLoss`. As in KOAP,
     ``f`` reads steps at unit scale and never ``x_{t+1}``, which the dynamics have to predict.
 
-    The first public code (``koap_release_notes`` 3.3) has LSTMs in place of ``g``, ``h`` and ``d``.
+    KOAP's first public code has LSTMs in place of ``g``, ``h`` and ``d``.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -34,7 +34,7 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         latent_dim (int): size ``m`` of a lifted state and of a latent action. Defaults to ``32``.
         hidden_dims (sequence of int): widths of ``f``, ``h`` and ``d``. Defaults to ``(128, 128)``.
         lifting_dims (sequence of int): widths of ``g`` and its inverse. Defaults to ``(64, 64)``, as KOAP's default.
-        history (int): number ``n`` of frames before the current one. Defaults to ``4``.
+        num_past (int): number ``n`` of frames before the present one. Defaults to ``4``.
         look_ahead (int or sequence of int): offsets ``k >= 2``. Defaults to ``(2, 3, 4, 5)``.
         state_normalizer (nn.Module, optional): maps raw states to the networks' units.
         action_normalizer (nn.Module, optional): its ``inverse`` maps decoded actions to raw units.
@@ -42,7 +42,7 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
 
     Raises:
-        ValueError: for a negative history or an offset below 2; at the call for states of another size.
+        ValueError: for a negative ``num_past`` or an offset below 2; at the call for states of another size.
 
     Examples:
         >>> import torch
@@ -64,26 +64,43 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         latent_dim: int = 32,
         hidden_dims: Sequence[int] = (128, 128),
         lifting_dims: Sequence[int] = (64, 64),
-        history: int = 4,
+        num_past: int = 4,
         look_ahead: int | Sequence[int] = (2, 3, 4, 5),
         **kwargs,
     ):
         reader = LatentActionMLP(
-            state_dim, latent_dim, hidden_dims=hidden_dims, history=history, look_ahead=look_ahead, relative=True
+            state_dim, latent_dim, hidden_dims=hidden_dims, num_past=num_past, look_ahead=look_ahead, relative=True
         )
-        super().__init__(reader, mlp(latent_dim, hidden_dims, action_dim), **kwargs)
+        layers = {"num_cells": hidden_dims, "activation_class": nn.ReLU}
+        super().__init__(reader, MLP(latent_dim, action_dim, **layers), **kwargs)
         self.latent_dim = latent_dim
         self.lifting = KoopmanLifting(state_dim, latent_dim, hidden_dims=lifting_dims)
-        self.dynamics = mlp(2 * latent_dim, hidden_dims, latent_dim)
+        self.dynamics = MLP(2 * latent_dim, latent_dim, **layers)
 
     def lift(self, state: Tensor) -> Tensor:
         """Lifted states ``[*B, T, m]`` of raw states ``[*B, T, d]``."""
         return self.lifting.encode(self.normalize_state(state))
 
     def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """The prediction of ``z_{t+1}``, ``[*B, T, m]``."""
+        """The prediction of ``z_{t+1}``.
+
+        Args:
+            lifted (Tensor): lifted states ``z_t``, ``[*B, T, m]``.
+            latent_action (Tensor): latent actions ``u_t``, ``[*B, T, m]``.
+
+        Returns:
+            Tensor: ``[*B, T, m]``.
+        """
         return self.dynamics(torch.cat([lifted, latent_action], -1))
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Latent actions ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
+        """Latent actions of a window of raw states.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), m]``.
+        """
         return self.reader.infer(self.reader.gather(self.normalize_state(state), frames))

@@ -7,23 +7,32 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
+from torchrl.modules import MLP
 
-from torchrl_koap.modules.inverse_dynamics import WindowController
-from torchrl_koap.modules.networks import SequenceLSTM, mlp
-from torchrl_koap.modules.transition_frames import TransitionFrames
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics
+from torchrl_koap.modules.networks import SequenceLSTM
+from torchrl_koap.modules.time_alignment import FrameGatherer
 
 
-class _Supervised(WindowController):
+class _Supervised(InverseDynamics):
     """States to actions in one step; what is predicted is the subclass's."""
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Normalised actions ``[*B, T, act]`` of raw states ``[*B, T, d]``, or of some of the window's ``frames``."""
+        """Normalised actions of a window of raw states.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to predict for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), act]``.
+        """
         raise NotImplementedError
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of every frame."""
-        return tensordict.set(self.out_keys[0], self.raw_action(self.predict(tensordict.get(self.in_keys[0]))))
+        return tensordict.set(self.out_key, self.raw_action(self.predict(tensordict.get(self.in_key))))
 
 
 class SupervisedInverseDynamics(_Supervised):
@@ -34,7 +43,7 @@ class SupervisedInverseDynamics(_Supervised):
 
     With ``look_ahead=1`` this is the inverse dynamics of Decision Diffuser, which is told the next state and nothing
     further ahead. KOAP's first public code trains an LSTM instead (:class:`RecurrentInverseDynamics`), whose first
-    outputs, those that are executed, are its worst (``koap_release_notes`` section 8).
+    outputs, those that are executed, are its worst.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -42,12 +51,12 @@ class SupervisedInverseDynamics(_Supervised):
 
     Keyword Args:
         hidden_dims (sequence of int): widths. Defaults to ``(128, 128)``.
-        history (int): frames ``n`` before the current one. Defaults to ``4``.
+        num_past (int): frames ``n`` before the present one. Defaults to ``4``.
         look_ahead (int or sequence of int): offsets ``k >= 1``. Defaults to ``1``.
-        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.WindowController`.
+        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
-        ValueError: for a negative history or an offset below 1.
+        ValueError: for a negative ``num_past`` or an offset below 1.
 
     Examples:
         >>> import torch
@@ -64,22 +73,30 @@ class SupervisedInverseDynamics(_Supervised):
         action_dim: int,
         *,
         hidden_dims: Sequence[int] = (128, 128),
-        history: int = 4,
+        num_past: int = 4,
         look_ahead: int | Sequence[int] = 1,
         **kwargs,
     ):
-        super().__init__(TransitionFrames(state_dim, history=history, look_ahead=look_ahead), **kwargs)
-        self.network = mlp(self.reader.num_features, hidden_dims, action_dim)
+        super().__init__(FrameGatherer(state_dim, num_past=num_past, look_ahead=look_ahead, least=1), **kwargs)
+        self.network = MLP(self.reader.num_features, action_dim, num_cells=hidden_dims, activation_class=nn.ReLU)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Normalised actions ``[*B, T, act]``; frames near the ends read a clamped window."""
+        """Normalised actions; frames near the ends read a clamped window.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to predict for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), act]``.
+        """
         return self.network(self.reader(self.normalize_state(state), frames))
 
 
 class RecurrentInverseDynamics(_Supervised):
     """An LSTM that reads ``a_t`` off ``x_0, ..., x_{t+1}``: the supervised controller of KOAP's first public code.
 
-    ``koap_release_notes`` section 3.4: outputs at frames ``1 .. T-1`` are the actions of frames ``0 .. T-2``; that of
+    Outputs at frames ``1 .. T-1`` are the actions of frames ``0 .. T-2``; that of
     the last frame repeats the one before.
 
     Args:
@@ -88,8 +105,8 @@ class RecurrentInverseDynamics(_Supervised):
 
     Keyword Args:
         hidden_dim (int): width of the LSTM. Defaults to ``256``.
-        history (int): frames before the current one that a policy hands over. Defaults to ``1``.
-        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.WindowController`.
+        num_past (int): frames before the present one that a policy hands over. Defaults to ``1``.
+        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Examples:
         >>> import torch
@@ -106,29 +123,37 @@ class RecurrentInverseDynamics(_Supervised):
         action_dim: int,
         *,
         hidden_dim: int = 256,
-        history: int = 1,
+        num_past: int = 1,
         **kwargs,
     ):
         super().__init__(**kwargs)
-        self._history = history
+        self._num_past = num_past
         self.network = SequenceLSTM(state_dim, hidden_dim, action_dim)
 
     @property
-    def history(self) -> int:
-        """Frames before the current one that a policy hands over."""
-        return self._history
+    def num_past(self) -> int:
+        """Frames before the present one that a policy hands over."""
+        return self._num_past
 
     @property
     def num_window_frames(self) -> int:
         """Frames of the shortest complete window."""
-        return self.history + 2
+        return self.num_past + 2
 
     def span(self, num_frames: int) -> range:
         """Frames of a window that count in the loss: all but the first and the last."""
         return range(1, num_frames - 1)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Normalised actions ``[*B, T, act]``."""
+        """Normalised actions; the last frame repeats the one before it, for it has no successor.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to predict for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), act]``.
+        """
         action = self.network(self.normalize_state(state))[..., 1:, :]
         action = torch.cat([action, action[..., -1:, :]], -2)
         return action if frames is None else action[..., frames.start : frames.stop, :]

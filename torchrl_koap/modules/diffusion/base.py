@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import torch
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.nn.probabilistic import InteractionType, interaction_type
 from tensordict.utils import NestedKey
 from torch import nn
@@ -18,8 +19,8 @@ Tensor = torch.Tensor
 class ConditionedDiffusion(TensorDictModuleBase):
     """Base of the generative models: condition, start noise and solver; subclasses say what the sequence is.
 
-    A subclass encodes and decodes the diffused sequence ``[*B, H, width]`` in units of its own, and samples it by
-    :meth:`solve`.
+    A subclass encodes and decodes the diffused sequence ``[*B, H, width]`` in units of its own (:meth:`decode`); what
+    is said here once is the condition, the start noise, the solver, the sampling and the entries.
 
     Args:
         denoiser (nn.Module): ``denoiser(sequence [*B, H, width], time [*B], condition [*B, h * d + f])``, of the shape
@@ -29,20 +30,29 @@ class ConditionedDiffusion(TensorDictModuleBase):
     Keyword Args:
         state_dim (int): number ``d`` of state columns.
         width (int): columns of the diffused sequence.
-        history (int): number ``h`` of observed frames, the current one included.
-        horizon (int): number ``H`` of frames of the sequence.
+        in_key (NestedKey): default entry of the history.
+        out_key (NestedKey): default entry of the sequence.
+        history (int): number ``h`` of observed frames, the current one included. Defaults to 2.
+        horizon (int): number ``H`` of frames of the sequence. Defaults to 14.
         relative (bool): the condition holds the older frames as displacements from the current one.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with ``num_features``.
         solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
             flow path.
-        num_steps (int): solver steps.
-        clip (float, optional): bound of the normalised sequence at every solver step.
-        in_keys (list of NestedKey): the entry of the history.
-        out_keys (list of NestedKey): the entry of the sequence.
-        noise_key (NestedKey, optional): entry of the start noise.
+        num_steps (int): solver steps. Defaults to 10.
+        clip (float, optional): bound of the normalised sequence at every solver step. Defaults to no bound.
+        in_keys (list of NestedKey, optional): the entry of the history, instead of ``in_key``.
+        out_keys (list of NestedKey, optional): the entry of the sequence, instead of ``out_key``.
+        noise_key (NestedKey, optional): entry of the start noise, read if present. Defaults to ``"noise"``.
 
     Raises:
         ValueError: for sizes below 1, several in- or out-keys, an unknown or unfit solver.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet  # a subclass, of states
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, horizon=14)
+        >>> planner.sample_shape, planner.sample(torch.zeros(3, 2, 2)).shape
+        ((14, 2), torch.Size([3, 14, 2]))
     """
 
     width_name = "state_dim"
@@ -54,23 +64,26 @@ class ConditionedDiffusion(TensorDictModuleBase):
         *,
         state_dim: int,
         width: int,
-        history: int,
-        horizon: int,
+        in_key: NestedKey,
+        out_key: NestedKey,
         relative: bool,
-        features: nn.Module | None,
-        solver: str | None,
-        num_steps: int,
-        clip: float | None,
-        in_keys: list[NestedKey],
-        out_keys: list[NestedKey],
-        noise_key: NestedKey | None,
+        history: int = 2,
+        horizon: int = 14,
+        features: nn.Module | None = None,
+        solver: str | None = None,
+        num_steps: int = 10,
+        clip: float | None = None,
+        in_keys: list[NestedKey] | None = None,
+        out_keys: list[NestedKey] | None = None,
+        noise_key: NestedKey | None = "noise",
     ):
         super().__init__()
         sizes = {"state_dim": state_dim, self.width_name: width, "history": history, "horizon": horizon}
         for name, value in sizes.items():
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
-        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
+        self.in_keys = [in_key] if in_keys is None else list(in_keys)
+        self.out_keys = [out_key] if out_keys is None else list(out_keys)
         if len(self.in_keys) != 1 or len(self.out_keys) != 1:
             raise ValueError(f"one in_key and one out_key are needed, got {self.in_keys} and {self.out_keys}")
         self.denoiser = denoiser
@@ -107,10 +120,22 @@ class ConditionedDiffusion(TensorDictModuleBase):
         self.schedule.nodes(number)
         self._num_steps = number
 
+    def _rename(self, history: NestedKey | None, sequence: NestedKey | None) -> None:
+        if history is not None:
+            self.in_keys = [history]
+        if sequence is not None:
+            self.out_keys = [sequence]
+
     @property
     def sample_shape(self) -> tuple[int, int]:
         """Shape ``(H, width)`` of one diffused sequence, and so of its start noise."""
         return self.horizon, self._width
+
+    @property
+    def noise_shape(self) -> tuple[int, ...]:
+        """Shape of everything that is drawn for one sequence: its start noise, and a stochastic solver's steps."""
+        draws = (1 + self.num_steps,) if SOLVERS[self.solver].stochastic else ()
+        return (*draws, *self.sample_shape)
 
     def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
         """Cuts windows of states ``[*B, history + horizon, d]`` into history and future."""
@@ -142,7 +167,15 @@ class ConditionedDiffusion(TensorDictModuleBase):
         return condition if self.features is None else torch.cat([condition, self.features(history)], -1)
 
     def draw_noise(self, history: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Start noise ``[*B, H, width]`` for histories ``[*B, h, d]``."""
+        """Start noise, standard normal.
+
+        Args:
+            history (Tensor): histories ``[*B, h, d]``, for shape, type and device.
+            generator (torch.Generator, optional): source of the numbers.
+
+        Returns:
+            Tensor: ``[*B, H, width]``.
+        """
         shape = (*history.shape[:-2], *self.sample_shape)
         return torch.randn(shape, dtype=history.dtype, device=history.device, generator=generator)
 
@@ -165,7 +198,51 @@ class ConditionedDiffusion(TensorDictModuleBase):
             predicted = self.denoiser(noisy, time, condition)
         return (predicted - target).square()
 
-    def solve(self, history: Tensor, noise: Tensor | None, generator: torch.Generator | None) -> Tensor:
+    def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Raw plans or actions of normalised sequences; a subclass says how.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): normalised sequences ``[*B, H, width]``.
+
+        Returns:
+            Tensor: ``[*B, H, width]`` in raw units.
+        """
+        raise NotImplementedError
+
+    def sample(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
+        """Samples sequences ``[*B, H, width]`` for histories ``[*B, h, d]``, both in raw units.
+
+        Args:
+            history (Tensor): raw history.
+            noise (Tensor, optional): as for :meth:`solve`.
+            generator (torch.Generator, optional): source of what is drawn.
+
+        Raises:
+            ValueError: for a history or noise of another shape.
+        """
+        return self.decode(history, self.solve(history, noise, generator))
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the sampled sequence into the tensordict."""
+        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        return tensordict.set(self.out_keys[0], self.sample(tensordict.get(self.in_keys[0]), noise))
+
+    def _check_sequence(self, sequence: Tensor) -> None:
+        if sequence.shape[-2:] != self.sample_shape:
+            raise ValueError(
+                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self._width}] (horizon, {self.width_name}),"
+                f" got {list(sequence.shape)}"
+            )
+
+    def solve(
+        self,
+        history: Tensor,
+        noise: Tensor | None,
+        generator: torch.Generator | None,
+        known: Tensor | None = None,
+    ) -> Tensor:
         """Samples normalised sequences ``[*B, H, width]`` for raw histories ``[*B, h, d]``.
 
         Args:
@@ -173,6 +250,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
             noise (Tensor, optional): start noise ``[*B, H, width]``, or ``[*B, 1 + num_steps, H, width]`` where the
                 rest are the draws of a stochastic solver. Default: drawn.
             generator (torch.Generator, optional): source of what is drawn.
+            known (Tensor, optional): normalised first frames ``[*B, k, width]`` that the sequence has to have.
 
         Raises:
             ValueError: for a history or noise of another shape.
@@ -199,6 +277,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
             clip=self.clip,
             step_noise=step_noise,
             generator=generator,
+            known=known,
         )
 
     def _solver_now(self, explicit: bool) -> str:
@@ -210,4 +289,4 @@ class ConditionedDiffusion(TensorDictModuleBase):
 
 def identity_normalizer(width: int) -> Normalizer:
     """A normaliser of that many columns that changes nothing until statistics are loaded or fitted."""
-    return Normalizer.fit(torch.zeros(1, width), mode="identity")
+    return Normalizer(torch.zeros(width), torch.ones(width))

@@ -25,7 +25,17 @@ def check_activation(name: str) -> None:
 
 
 def check_input(sequence: Tensor, condition: Tensor, state_dim: int, condition_dim: int) -> None:
-    """Raises a ``ValueError`` that names the axis if sequence or condition do not fit a denoiser."""
+    """Checks that sequence and condition fit a denoiser.
+
+    Args:
+        sequence (Tensor): ``[*B, H, state_dim]``.
+        condition (Tensor): ``[*B, condition_dim]``.
+        state_dim (int): columns of a sequence.
+        condition_dim (int): columns of a condition.
+
+    Raises:
+        ValueError: if they do not; the message names the axis.
+    """
     if sequence.ndim < 2 or sequence.shape[-1] != state_dim:
         raise ValueError(f"sequence must be [*B, H, {state_dim}] (state_dim), got {list(sequence.shape)}")
     if condition.shape != (*sequence.shape[:-2], condition_dim):
@@ -156,7 +166,19 @@ class MLPDenoiser(nn.Module):
             nn.init.zeros_(self.film.bias)
 
     def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Sequence ``[*B, H, d]``, time ``[*B]``, condition ``[*B, c]`` to ``[*B, H, d]``."""
+        """Predicts what the schedule asks for, from noisy sequences.
+
+        Args:
+            sequence (Tensor): noisy sequences ``[*B, H, d]``.
+            time (Tensor): ``[*B]`` in training steps.
+            condition (Tensor): ``[*B, c]``.
+
+        Returns:
+            Tensor: the prediction ``[*B, H, d]``.
+
+        Raises:
+            ValueError: for a sequence or condition of another shape.
+        """
         check_input(sequence, condition, self.state_dim, self.condition_dim)
         if sequence.shape[-2] != self.horizon:
             raise ValueError(f"sequence must have {self.horizon} steps (horizon) on axis -2, got {sequence.shape[-2]}")
@@ -226,7 +248,19 @@ class TransformerDenoiser(nn.Module):
         self.register_buffer("frequencies", torch.exp(torch.arange(half) * (-math.log(100.0) / max(half - 1, 1))))
 
     def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Sequence ``[*B, H, d]``, time ``[*B]``, condition ``[*B, c]`` to ``[*B, H, d]``."""
+        """Predicts what the schedule asks for, from noisy sequences.
+
+        Args:
+            sequence (Tensor): noisy sequences ``[*B, H, d]``.
+            time (Tensor): ``[*B]`` in training steps.
+            condition (Tensor): ``[*B, c]``.
+
+        Returns:
+            Tensor: the prediction ``[*B, H, d]``.
+
+        Raises:
+            ValueError: for a sequence or condition of another shape.
+        """
         check_input(sequence, condition, self.state_dim, self.condition_dim)
         horizon = sequence.shape[-2]
         angles = torch.arange(horizon, device=sequence.device, dtype=sequence.dtype)[:, None] * self.frequencies

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import nn
 
@@ -47,7 +45,7 @@ class StatePlanner(ConditionedDiffusion):
         horizon (int): number ``H`` of planned frames. Defaults to 14.
         relative (bool): model displacements from the current state. Defaults to True.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
-            further numbers that the condition holds, such as :class:`~torchrl_koap.tasks.relative_positions.Relations`.
+            further numbers that the condition holds, such as the relative positions of objects.
         solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
             flow path.
         num_steps (int): solver steps. Defaults to 10.
@@ -80,41 +78,29 @@ class StatePlanner(ConditionedDiffusion):
         schedule: NoiseSchedule | None = None,
         *,
         state_dim: int,
-        history: int = 2,
-        horizon: int = 14,
         relative: bool = True,
-        features: nn.Module | None = None,
-        solver: str | None = None,
-        num_steps: int = 10,
-        clip: float | None = None,
-        in_keys: list[NestedKey] | None = None,
-        out_keys: list[NestedKey] | None = None,
-        noise_key: NestedKey | None = "noise",
+        **options,
     ):
         super().__init__(
             denoiser,
             schedule,
             state_dim=state_dim,
             width=state_dim,
-            history=history,
-            horizon=horizon,
             relative=relative,
-            features=features,
-            solver=solver,
-            num_steps=num_steps,
-            clip=clip,
-            in_keys=[keys.HISTORY] if in_keys is None else in_keys,
-            out_keys=[keys.PLAN] if out_keys is None else out_keys,
-            noise_key=noise_key,
+            in_key=keys.HISTORY,
+            out_key=keys.PLAN,
+            **options,
         )
-        self.plan_normalizer = identity_normalizer(horizon * state_dim)
+        self.plan_normalizer = identity_normalizer(self.horizon * state_dim)
 
     def set_keys(self, *, history: NestedKey | None = None, plan: NestedKey | None = None) -> None:
-        """Renames the entries read and written."""
-        if history is not None:
-            self.in_keys = [history]
-        if plan is not None:
-            self.out_keys = [plan]
+        """Renames the entries read and written.
+
+        Keyword Args:
+            history (NestedKey, optional): entry of the history.
+            plan (NestedKey, optional): entry of the plan.
+        """
+        self._rename(history, plan)
 
     def fit_normalizers(self, windows: Tensor, *, mode: str = "minmax", per_step: bool = True) -> None:
         """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
@@ -139,30 +125,81 @@ class StatePlanner(ConditionedDiffusion):
         self.plan_normalizer = Normalizer.fit(plan, mode=mode).to(example)
 
     def encode_plan(self, history: Tensor, plan: Tensor) -> Tensor:
-        """Raw plan ``[*B, H, d]`` to the normalised sequence that noise is added to."""
-        if plan.shape[-2:] != (self.horizon, self.state_dim):
-            raise ValueError(
-                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self.state_dim}] (horizon, state_dim),"
-                f" got {list(plan.shape)}"
-            )
+        """Raw plans to the normalised sequences that noise is added to.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            plan (Tensor): raw plans ``[*B, H, d]``.
+
+        Returns:
+            Tensor: normalised sequences ``[*B, H, d]``.
+
+        Raises:
+            ValueError: for plans of another shape.
+        """
+        self._check_sequence(plan)
         plan = plan - history[..., -1:, :] if self.relative else plan
         return self.plan_normalizer(plan.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
 
     def decode_plan(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """Inverse of :meth:`encode_plan`."""
+        """Inverse of :meth:`encode_plan`.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): normalised sequences ``[*B, H, d]``.
+
+        Returns:
+            Tensor: raw plans ``[*B, H, d]``.
+        """
         plan = self.plan_normalizer.inverse(sequence.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
         return plan + history[..., -1:, :] if self.relative else plan
+
+    def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Raw plans of normalised sequences: :meth:`decode_plan`.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): normalised sequences ``[*B, H, d]``.
+
+        Returns:
+            Tensor: raw plans ``[*B, H, d]``.
+        """
+        return self.decode_plan(history, sequence)
 
     def scale_columns(self, plan: Tensor) -> Tensor:
         """Raw plan ``[*B, H, d]`` in units of the columns' spread, the same for all its steps."""
         return plan / self.plan_normalizer.scale.unflatten(-1, (self.horizon, self.state_dim)).mean(0)
 
-    def plan(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
-        """Samples plans ``[*B, H, d]`` for histories ``[*B, h, d]``, both in raw units; see the class for ``noise``."""
-        return self.decode_plan(history, self.solve(history, noise, generator))
+    def plan(
+        self,
+        history: Tensor,
+        noise: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        *,
+        known: Tensor | None = None,
+    ) -> Tensor:
+        """Samples plans ``[*B, H, d]`` for histories ``[*B, h, d]``, both in raw units.
 
-    @dispatch(auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the plan into the tensordict."""
-        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
-        return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise))
+        Args:
+            history (Tensor): observed states, the present one last.
+            noise (Tensor, optional): as for :meth:`solve`.
+            generator (torch.Generator, optional): source of what is drawn.
+
+        Keyword Args:
+            known (Tensor, optional): first states ``[*B, k, d]`` that the plan has to have, ``k`` below the horizon:
+                what is executed anyway while the plan is being made (real-time chunking, arXiv 2506.07339).
+
+        Raises:
+            ValueError: for a history, noise or known states of another shape.
+        """
+        if known is None:
+            return self.sample(history, noise, generator)
+        frames = known.shape[-2]
+        if not 1 <= frames < self.horizon or known.shape[-1] != self.state_dim:
+            raise ValueError(
+                f"known states must be [*B, 1..{self.horizon - 1}, {self.state_dim}] (k, state_dim),"
+                f" got {list(known.shape)}"
+            )
+        rest = known[..., -1:, :].expand(*known.shape[:-2], self.horizon - frames, -1)
+        fixed = self.encode_plan(history, torch.cat([known, rest], -2))[..., :frames, :]
+        return self.decode_plan(history, self.solve(history, noise, generator, fixed))

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import nn
 
@@ -81,42 +79,30 @@ class DiffusionPolicy(ConditionedDiffusion):
         *,
         state_dim: int,
         action_dim: int,
-        history: int = 2,
-        horizon: int = 14,
         relative: bool = False,
-        features: nn.Module | None = None,
-        solver: str | None = None,
-        num_steps: int = 10,
-        clip: float | None = None,
-        in_keys: list[NestedKey] | None = None,
-        out_keys: list[NestedKey] | None = None,
-        noise_key: NestedKey | None = "noise",
+        **options,
     ):
         super().__init__(
             denoiser,
             schedule,
             state_dim=state_dim,
             width=action_dim,
-            history=history,
-            horizon=horizon,
             relative=relative,
-            features=features,
-            solver=solver,
-            num_steps=num_steps,
-            clip=clip,
-            in_keys=[keys.HISTORY] if in_keys is None else in_keys,
-            out_keys=[ACTION_CHUNK] if out_keys is None else out_keys,
-            noise_key=noise_key,
+            in_key=keys.HISTORY,
+            out_key=ACTION_CHUNK,
+            **options,
         )
         self.action_dim = action_dim
         self.action_normalizer = identity_normalizer(action_dim)
 
     def set_keys(self, *, history: NestedKey | None = None, action_chunk: NestedKey | None = None) -> None:
-        """Renames the entries read and written."""
-        if history is not None:
-            self.in_keys = [history]
-        if action_chunk is not None:
-            self.out_keys = [action_chunk]
+        """Renames the entries read and written.
+
+        Keyword Args:
+            history (NestedKey, optional): entry of the history.
+            action_chunk (NestedKey, optional): entry of the actions.
+        """
+        self._rename(history, action_chunk)
 
     def fit_normalizers(self, windows: Tensor, actions: Tensor, *, mode: str = "minmax") -> None:
         """Takes the statistics of condition and actions from data; call it before a loss is built on the policy.
@@ -143,23 +129,21 @@ class DiffusionPolicy(ConditionedDiffusion):
 
     def encode_actions(self, actions: Tensor) -> Tensor:
         """Raw actions ``[*B, H, act]`` to the normalised sequence that noise is added to."""
-        if actions.shape[-2:] != self.sample_shape:
-            raise ValueError(
-                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self.action_dim}] (horizon, action_dim),"
-                f" got {list(actions.shape)}"
-            )
+        self._check_sequence(actions)
         return self.action_normalizer(actions)
 
     def decode_actions(self, sequence: Tensor) -> Tensor:
         """Inverse of :meth:`encode_actions`."""
         return self.action_normalizer.inverse(sequence)
 
-    def sample(self, history: Tensor, noise: Tensor | None = None, generator: torch.Generator | None = None) -> Tensor:
-        """Samples actions ``[*B, H, act]`` for histories ``[*B, h, d]``, raw units; see the class for ``noise``."""
-        return self.decode_actions(self.solve(history, noise, generator))
+    def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Raw actions of normalised sequences: :meth:`decode_actions`, which do not depend on where the state is.
 
-    @dispatch(auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the actions into the tensordict."""
-        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
-        return tensordict.set(self.out_keys[0], self.sample(tensordict.get(self.in_keys[0]), noise))
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``; not looked at.
+            sequence (Tensor): normalised sequences ``[*B, H, act]``.
+
+        Returns:
+            Tensor: raw actions ``[*B, H, act]``.
+        """
+        return self.decode_actions(sequence)

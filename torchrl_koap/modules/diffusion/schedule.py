@@ -70,7 +70,18 @@ Denoise = Callable[[Tensor, Node], tuple[Tensor, Tensor]]
 
 
 def ddpm(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Ancestral sampling with the posterior's variance (Ho et al. 2020, eq. 7); step i adds ``draws[i]``."""
+    """Ancestral sampling with the posterior's variance (Ho et al. 2020, eq. 7); step i adds ``draws[i]``.
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): standard normal noise ``[*B, H, d]``, one per step.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     for index, (node, after) in enumerate(zip(nodes[:-1], nodes[1:], strict=True)):
         sample, _ = denoise(x, node)
         keep = (node.signal / after.signal) ** 2
@@ -82,7 +93,18 @@ def ddpm(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
 
 
 def ddim(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0)."""
+    """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0).
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): not looked at: the solver is deterministic.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     for node, after in zip(nodes[:-1], nodes[1:], strict=True):
         sample, epsilon = denoise(x, node)
         x = sample * after.signal + epsilon * after.noise
@@ -90,7 +112,18 @@ def ddim(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
 
 
 def dpm_solver_2m(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2)."""
+    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2).
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): not looked at: the solver is deterministic.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     previous, previous_step = None, 0.0
     for node, after in zip(nodes[:-1], nodes[1:], strict=True):
         sample, _ = denoise(x, node)
@@ -106,7 +139,18 @@ def dpm_solver_2m(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Seq
 
 
 def euler(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Straight steps along the velocity ``eps - x_0``."""
+    """Straight steps along the velocity ``eps - x_0``.
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): not looked at: the solver is deterministic.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     for node, after in zip(nodes[:-1], nodes[1:], strict=True):
         sample, epsilon = denoise(x, node)
         x = x + (epsilon - sample) * (after.noise - node.noise)
@@ -114,7 +158,18 @@ def euler(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Te
 
 
 def heun(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
-    """Trapezoidal steps: two network calls each, one in the last step (no velocity is defined at zero noise)."""
+    """Trapezoidal steps: two network calls each, one in the last step (no velocity is defined at zero noise).
+
+    Args:
+        denoise (callable): ``denoise(x, node)`` gives the clean sequence and the noise that the network sees in ``x``,
+            both ``[*B, H, d]``.
+        x (Tensor): start noise ``[*B, H, d]``.
+        nodes (sequence of Node): stops from much noise to none, one more than steps.
+        draws (sequence of Tensor): not looked at: the solver is deterministic.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     for node, after in zip(nodes[:-1], nodes[1:], strict=True):
         sample, epsilon = denoise(x, node)
         velocity, step = epsilon - sample, after.noise - node.noise
@@ -159,8 +214,7 @@ class NoiseSchedule(nn.Module):
 
     Raises:
         ValueError: for an unknown schedule or prediction (the nearest name is suggested), and for ``"epsilon"`` on a
-        flow
-            path, whose start holds no signal, so that the plan cannot be computed from the noise.
+            flow path, whose start holds no signal, so that the plan cannot be computed from the noise.
 
     Examples:
         >>> import torch
@@ -186,19 +240,29 @@ class NoiseSchedule(nn.Module):
             raise ValueError(f"num_train_steps must be at least 1, got {num_train_steps}")
         self.schedule, self.path, self.prediction = schedule, kind.path, prediction
         self.num_train_steps = num_train_steps
-        table = kind.signal(num_train_steps)
+        with torch.device("cpu"):  # the numbers are read below, also where modules are built without storage
+            table = kind.signal(num_train_steps)
         signal, noise = (table, 1 - table) if self.path == "flow" else (table.sqrt(), (1 - table).sqrt())
         # Solvers read numbers from here: exact in every dtype, no device synchronisation, constants for torch.compile.
         self._levels = tuple(zip(signal.tolist(), noise.tolist(), strict=True))
-        self.register_buffer("signal", signal.to(torch.get_default_dtype()))
-        self.register_buffer("noise", noise.to(torch.get_default_dtype()))
+        default = {"dtype": torch.get_default_dtype(), "device": torch.get_default_device()}
+        self.register_buffer("signal", signal.to(**default))
+        self.register_buffer("noise", noise.to(**default))
 
     def extra_repr(self) -> str:
         """Shows the options in ``print(schedule)``."""
         return f"schedule={self.schedule!r}, prediction={self.prediction!r}, num_train_steps={self.num_train_steps}"
 
     def sample_time(self, like: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Draws training times, shape ``[*B]`` for ``like`` of shape ``[*B, H, d]``."""
+        """Draws training times.
+
+        Args:
+            like (Tensor): sequences ``[*B, H, d]``, for shape, type and device.
+            generator (torch.Generator, optional): source of the numbers.
+
+        Returns:
+            Tensor: ``[*B]`` in training steps.
+        """
         shape, options = like.shape[:-2], {"device": like.device, "generator": generator}
         if self.path == "flow":
             return (1 - torch.rand(shape, dtype=like.dtype, **options)) * self.num_train_steps  # never exactly zero
@@ -213,12 +277,30 @@ class NoiseSchedule(nn.Module):
         return self.signal[index].to(time.dtype), self.noise[index].to(time.dtype)
 
     def add_noise(self, sample: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """The noisy plan ``signal(t) x_0 + noise(t) eps``; plans ``[*B, H, d]``, time ``[*B]``."""
+        """The noisy plan ``signal(t) x_0 + noise(t) eps``.
+
+        Args:
+            sample (Tensor): clean plans ``x_0``, ``[*B, H, d]``.
+            noise (Tensor): noise ``eps``, ``[*B, H, d]``.
+            time (Tensor): ``[*B]`` in training steps.
+
+        Returns:
+            Tensor: ``[*B, H, d]``.
+        """
         signal, amplitude = self.levels(time)
         return signal[..., None, None] * sample + amplitude[..., None, None] * noise
 
     def target(self, sample: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """What the network should predict for the clean plan ``sample`` and the noise added to it."""
+        """What the network should predict: the noise, the clean plan or the velocity.
+
+        Args:
+            sample (Tensor): clean plans ``x_0``, ``[*B, H, d]``.
+            noise (Tensor): noise ``eps``, ``[*B, H, d]``.
+            time (Tensor): ``[*B]`` in training steps.
+
+        Returns:
+            Tensor: ``[*B, H, d]``.
+        """
         if self.prediction == "epsilon":
             return noise
         if self.prediction == "sample":
@@ -247,8 +329,18 @@ class NoiseSchedule(nn.Module):
             stops = [Node(float(time), *self._levels[int(time)]) for time in times]
         return [*stops, Node(0.0, 1.0, 0.0)]
 
-    def split(self, output: Tensor, x: Tensor, node: Node, clip: float | None = None) -> tuple[Tensor, Tensor]:
-        """Clean plan and noise that a network output stands for, the plan clipped to ``[-clip, clip]`` if asked."""
+    def split(
+        self, output: Tensor, x: Tensor, node: Node, clip: float | None = None, known: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Clean plan and noise that a network output stands for.
+
+        Args:
+            output (Tensor): of the network, ``[*B, H, d]``.
+            x (Tensor): the noisy plan it was asked about, ``[*B, H, d]``.
+            node (Node): level of its noise.
+            clip (float, optional): the clean plan is clipped to ``[-clip, clip]``.
+            known (Tensor, optional): first frames ``[*B, k, d]`` of the clean plan.
+        """
         if self.prediction == "epsilon":
             sample = (x - output * node.noise) / node.signal
         elif self.prediction == "sample":
@@ -259,7 +351,9 @@ class NoiseSchedule(nn.Module):
             sample = x * node.signal - output * node.noise
         if clip is not None:
             sample = sample.clamp(-clip, clip)
-        elif self.prediction == "epsilon":
+        if known is not None:
+            sample = torch.cat([known, sample[..., known.shape[-2] :, :]], -2)
+        elif clip is None and self.prediction == "epsilon":
             return sample, output
         return sample, (x - sample * node.signal) / node.noise
 
@@ -274,6 +368,7 @@ class NoiseSchedule(nn.Module):
         step_noise: Tensor | None = None,
         generator: torch.Generator | None = None,
         times: Sequence[float] | None = None,
+        known: Tensor | None = None,
     ) -> Tensor:
         """Turns noise into plans.
 
@@ -289,6 +384,8 @@ class NoiseSchedule(nn.Module):
             step_noise (Tensor, optional): the draws of a stochastic solver, ``[num_steps, *B, H, d]``.
             generator (torch.Generator, optional): source of those draws if ``step_noise`` is not given.
             times (sequence of float, optional): own stops instead of ``num_steps`` even ones.
+            known (Tensor, optional): first frames ``[*B, k, d]`` that the clean plan has to have: they take the place
+                of what the network says at every step, so that the rest is made to fit them.
 
         Raises:
             ValueError: for an unknown solver, one of the other path, or a number of steps out of range.
@@ -301,7 +398,7 @@ class NoiseSchedule(nn.Module):
         batch = noise.shape[:-2]
 
         def denoise(x: Tensor, node: Node) -> tuple[Tensor, Tensor]:
-            return self.split(network(x, x.new_full(batch, node.time)), x, node, clip)
+            return self.split(network(x, x.new_full(batch, node.time)), x, node, clip, known)
 
         return SOLVERS[solver].run(denoise, noise, nodes, draws)
 

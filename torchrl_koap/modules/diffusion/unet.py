@@ -123,7 +123,14 @@ class TemporalUnet(nn.Module):
 
     @classmethod
     def released(cls, state_dim: int, condition_dim: int) -> TemporalUnet:
-        """The size of KOAP's first public code: 11,881,220 parameters for 4 state columns and a history of 2 frames."""
+        """The network of KOAP's first public code.
+
+        It has 11,881,220 parameters for 4 state columns and a history of 2 frames.
+
+        Args:
+            state_dim (int): number ``d`` of columns of the sequence.
+            condition_dim (int): number ``c`` of columns of the condition.
+        """
         return cls(
             state_dim,
             condition_dim,
@@ -138,7 +145,19 @@ class TemporalUnet(nn.Module):
         )
 
     def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Sequence ``[*B, H, d]``, time ``[*B]``, condition ``[*B, c]`` to ``[*B, H, d]``."""
+        """Predicts what the schedule asks for, from noisy sequences.
+
+        Args:
+            sequence (Tensor): noisy sequences ``[*B, H, d]``.
+            time (Tensor): ``[*B]`` in training steps.
+            condition (Tensor): ``[*B, c]``.
+
+        Returns:
+            Tensor: the prediction ``[*B, H, d]``.
+
+        Raises:
+            ValueError: for a sequence or condition of another shape.
+        """
         check_input(sequence, condition, self.state_dim, self.condition_dim)
         horizon, batch = sequence.shape[-2], sequence.shape[:-2]
         x = sequence.reshape(-1, horizon, self.state_dim).transpose(1, 2).contiguous()  # [N, d, H]

@@ -23,6 +23,14 @@ class RidgeFit:
         errors (dict): root of the mean squared held-out error of every candidate, in the units of the targets.
         num_labels (int): labelled steps used.
         noise_variance (Tensor): held-out residual variance per action dimension ``[act]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import LinearActionDecoder
+        >>> latent = torch.randn(50, 4)
+        >>> fit = LinearActionDecoder(4, 2).fit_ridge(latent, latent[:, :2], torch.ones(50, dtype=torch.bool))
+        >>> fit.num_labels, fit.noise_variance.shape, fit.penalty in fit.errors
+        (50, torch.Size([2]), True)
     """
 
     penalty: float

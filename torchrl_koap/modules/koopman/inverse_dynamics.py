@@ -11,16 +11,16 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
 from torchrl_koap.keys import ACTION, STATE
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
-from torchrl_koap.modules.koopman.shared_filter import fit_shared_filter
 
 NORMALIZED_STATE = "normalized_state"
 NORMALIZED_ACTION = "normalized_action"
 
 
-class KoopmanInverseDynamics(TensorDictSequential):
+class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
     r"""Infers latent actions from a window of states and decodes them linearly to robot actions.
 
     The *sequence* is the inference path: normalise, :math:`u_t = f_\theta(\cdot)`, :math:`a_t = D u_t + b`,
@@ -38,8 +38,8 @@ class KoopmanInverseDynamics(TensorDictSequential):
             ``"normalized_state"``.
         action_normalizer (nn.Module, optional): its ``inverse`` maps decoded actions, under ``"normalized_action"``, to
             raw units.
-        state_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
-        action_key (NestedKey): raw actions ``[*B, T, act]``; frame ``t`` holds the action from ``x_t`` to
+        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
+        out_key (NestedKey): raw actions ``[*B, T, act]``; frame ``t`` holds the action from ``x_t`` to
             ``x_{t+1}``. Defaults to ``"action"``.
 
     The in-key of the network and the out-key of the decoder are set to fit.
@@ -66,8 +66,8 @@ class KoopmanInverseDynamics(TensorDictSequential):
         operator: KoopmanOperator,
         state_normalizer: nn.Module | None = None,
         action_normalizer: nn.Module | None = None,
-        state_key: NestedKey = STATE,
-        action_key: NestedKey = ACTION,
+        in_key: NestedKey = STATE,
+        out_key: NestedKey = ACTION,
     ):
         sizes = {
             "latent_action": latent_action.latent_dim,
@@ -86,65 +86,66 @@ class KoopmanInverseDynamics(TensorDictSequential):
             raise ValueError(f"latent_action writes {written!r}, but action_decoder reads {read!r}")
 
         # normalised values get entries of their own: written over raw ones they would be normalised twice
-        latent_action.in_keys = [state_key] if state_normalizer is None else [NORMALIZED_STATE]
-        action_decoder.out_keys = [action_key] if action_normalizer is None else [NORMALIZED_ACTION]
+        latent_action.in_keys = [in_key] if state_normalizer is None else [NORMALIZED_STATE]
+        action_decoder.out_keys = [out_key] if action_normalizer is None else [NORMALIZED_ACTION]
         steps = [latent_action, action_decoder]
         if state_normalizer is not None:
-            steps.insert(0, TensorDictModule(state_normalizer, [state_key], [NORMALIZED_STATE]))
+            steps.insert(0, TensorDictModule(state_normalizer, [in_key], [NORMALIZED_STATE]))
         if action_normalizer is not None:
-            steps.append(TensorDictModule(_Inverse(action_normalizer), [NORMALIZED_ACTION], [action_key]))
-        super().__init__(*steps)
+            steps.append(TensorDictModule(_Inverse(action_normalizer), [NORMALIZED_ACTION], [out_key]))
+        TensorDictSequential.__init__(self, *steps)
         self.latent_action, self.action_decoder = latent_action, action_decoder
         self.lifting, self.operator = lifting, operator
         self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
-        self.state_key, self.action_key = state_key, action_key
 
     def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
-        """Renames the entries read and written."""
+        """Renames the entries read and written.
+
+        Keyword Args:
+            state (NestedKey, optional): new entry of the window of raw states.
+            action (NestedKey, optional): new entry of the raw actions.
+        """
         if state is not None:
-            self.state_key, self.module[0].in_keys = state, [state]
+            self.module[0].in_keys = [state]
         if action is not None:
-            self.action_key, self.module[-1].out_keys = action, [action]
+            self.module[-1].out_keys = [action]
         self.in_keys, self.out_keys = self._compute_in_and_out_keys(self.module)
 
     @property
-    def history(self) -> int:
-        """Frames before the current one that are read."""
-        return self.latent_action.history
-
-    @property
-    def num_window_frames(self) -> int:
-        """Frames of the shortest complete window (:attr:`LatentActionModule.num_window_frames`)."""
-        return self.latent_action.num_window_frames
-
-    def normalize_state(self, state: Tensor) -> Tensor:
-        """Raw states to the networks' units."""
-        return state if self.state_normalizer is None else self.state_normalizer(state)
-
-    def normalize_action(self, action: Tensor) -> Tensor:
-        """Raw actions to the decoder's units."""
-        return action if self.action_normalizer is None else self.action_normalizer(action)
+    def reader(self) -> LatentActionModule:
+        """The network ``f``, which gathers what it reads."""
+        return self.latent_action
 
     def lift(self, state: Tensor) -> Tensor:
         """Lifted states ``[*B, T, m]`` of raw states ``[*B, T, d]``."""
         return self.lifting.encode(self.normalize_state(state))
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Latent actions ``[*B, T, m]`` of a window of raw states ``[*B, T, d]``, or of some of its ``frames``."""
-        return self.latent_action.infer(self.latent_action.gather(self.normalize_state(state), frames))
+        """Latent actions of a window of raw states.
 
-    @torch.no_grad()
-    def fit_scales(self, windows: Tensor) -> None:
-        """Sets input scales from windows of raw states ``[*B, T, d]`` (:meth:`LatentActionModule.fit_scales`)."""
-        self.latent_action.fit_scales(self.normalize_state(windows))
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+
+        Returns:
+            Tensor: ``[*B, len(frames), m]``.
+        """
+        return self.latent_action.infer(self.latent_action.gather(self.normalize_state(state), frames))
 
     def decode(self, latent_action: Tensor) -> Tensor:
         """Raw actions ``[*B, T, act]`` of latent actions."""
-        action = self.action_decoder.linear(latent_action)
-        return action if self.action_normalizer is None else self.action_normalizer.inverse(action)
+        return self.raw_action(self.action_decoder.linear(latent_action))
 
     def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """``K z_t + u_t``, the prediction of ``z_{t+1}``."""
+        """``K z_t + u_t``, the prediction of ``z_{t+1}``.
+
+        Args:
+            lifted (Tensor): lifted states ``z_t``, ``[*B, T, m]``.
+            latent_action (Tensor): latent actions ``u_t``, ``[*B, T, input_dim]`` of the operator.
+
+        Returns:
+            Tensor: ``[*B, T, m]``.
+        """
         return self.operator.step(lifted, latent_action)
 
     def rollout_latent(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
@@ -170,18 +171,18 @@ class KoopmanInverseDynamics(TensorDictSequential):
         mask: Tensor,
         *,
         groups: Tensor | None = None,
-        shared_axes: Sequence[int] | None = None,
+        tied_axes: Sequence[int] | None = None,
         batch_size: int = 4096,
         **kwargs,
     ) -> RidgeFit:
         """Fits the decoder in closed form on the labelled frames of windows (:meth:`LinearActionDecoder.fit_ridge`).
 
         Args:
-            windows (TensorDictBase): ``state_key`` ``[*B, T, d]`` and ``action_key`` ``[*B, T, act]``.
+            windows (TensorDictBase): states ``[*B, T, d]`` and actions ``[*B, T, act]``.
             mask (Tensor): labelled frames to use, bool ``[*B, T]``; no action outside of it is read. Frames that do
                 not count in the losses (:meth:`LatentActionModule.span`) are left out.
             groups (Tensor, optional): trajectory of every window, int64 ``[*B]``, to be left out together.
-            shared_axes (sequence of int, optional): the state column that each action entry moves. The decoder is then
+            tied_axes (sequence of int, optional): the state column that each action entry moves. The decoder is then
                 shrunk towards one filter of the steps that all axes share, instead of towards 0; needs a
                 :class:`LatentActionFourier`.
             batch_size (int): windows per forward pass.
@@ -191,9 +192,9 @@ class KoopmanInverseDynamics(TensorDictSequential):
             RidgeFit: the ridge chosen and its held-out error in normalised units.
 
         Raises:
-            ValueError: if no labelled frame counts, shapes disagree, or ``shared_axes`` do not fit.
+            ValueError: if no labelled frame counts, shapes disagree, or ``tied_axes`` do not fit.
         """
-        shape = windows.get(self.state_key).shape[:-1]
+        shape = windows.get(self.in_key).shape[:-1]
         if mask.shape != shape or mask.dtype != torch.bool:
             raise ValueError(f"mask must be bool {list(shape)} ([*B, T]), got {mask.dtype} {list(mask.shape)}")
         if groups is not None and groups.shape != shape[:-1]:
@@ -203,7 +204,7 @@ class KoopmanInverseDynamics(TensorDictSequential):
         rows = mask.any(-1)
         if not rows.any():
             raise ValueError(f"no labelled frame lies in frames {span.start}..{span.stop - 1} of any window")
-        states, action, mask = windows.get(self.state_key)[rows], windows.get(self.action_key)[rows], mask[rows]
+        states, action, mask = windows.get(self.in_key)[rows], windows.get(self.out_key)[rows], mask[rows]
         was_training = self.latent_action.training
         self.latent_action.eval()  # dropout would blur the latent actions that the decoder is fitted to
         try:
@@ -215,26 +216,67 @@ class KoopmanInverseDynamics(TensorDictSequential):
         action = self.normalize_action(torch.where(mask.unsqueeze(-1), action, 0.0))
         if groups is not None:
             groups = groups[rows].unsqueeze(-1).expand_as(mask)
-        if shared_axes is not None:
-            kwargs["prior"] = self._shared_prior(latent[mask], action[mask], shared_axes)
+        if tied_axes is not None:
+            kwargs["prior"] = self._tied_axis_prior(latent[mask], action[mask], tied_axes)
         return self.action_decoder.fit_ridge(latent, action, mask, groups=groups, **kwargs)
 
-    def _shared_prior(self, latent: Tensor, action: Tensor, axes: Sequence[int]) -> Tensor:
+    def _tied_axis_prior(self, latent: Tensor, action: Tensor, axes: Sequence[int]) -> Tensor:
         """The decoder ``[act, m]`` that applies one and the same filter to the steps of every axis."""
         if not isinstance(self.latent_action, LatentActionFourier) or len(axes) != action.shape[-1]:
             raise ValueError(
-                f"shared_axes need a LatentActionFourier and one state column per action entry ({action.shape[-1]}),"
+                f"tied_axes need a LatentActionFourier and one state column per action entry ({action.shape[-1]}),"
                 f" got {type(self.latent_action).__name__} and {list(axes)}"
             )
         entries, factors = self.latent_action.steps(axes)  # [S, act]
         size = _unit(self.state_normalizer, self.latent_action.state_dim, factors)[list(axes)]
         action_size = _unit(self.action_normalizer, action.shape[-1], factors)
         per_unit = (factors * size).double()
-        shared = fit_shared_filter(latent[:, entries].double() * per_unit, (action * action_size).double())
+        shared = fit_tied_axis_ridge(latent[:, entries].double() * per_unit, (action * action_size).double())
         prior = torch.zeros(action.shape[-1], latent.shape[-1], dtype=torch.float64, device=latent.device)
         rows = torch.arange(action.shape[-1], device=latent.device).expand_as(entries)
         prior[rows, entries] = shared[:, None] * per_unit / action_size
         return prior
+
+
+def fit_tied_axis_ridge(steps: Tensor, action: Tensor, *, penalty: float = 0.02) -> Tensor:
+    r"""Ridge regression with one filter that all axes share: the prior mean of a decoder that has few labels.
+
+    .. math::
+        a_{t,i} \approx \sum_s w_s v_{t,s,i} \qquad \text{for every axis } i
+
+    with a ridge penalty relative to the mean square of the steps. A trajectory that hardly moves along one axis says
+    little about that axis; together they determine the few numbers ``w`` well. A full decoder is then fitted around
+    this one (``prior`` of :meth:`~torchrl_koap.modules.LinearActionDecoder.fit_ridge`).
+
+    Args:
+        steps (Tensor): steps ``v`` of each axis' own coordinate, ``[N, S, act]``, raw units.
+        action (Tensor): actions ``[N, act]``, raw units.
+
+    Keyword Args:
+        penalty (float): assumed ratio of noise to signal variance. Defaults to ``0.02``.
+
+    Returns:
+        Tensor: the filter ``w`` ``[S]``.
+
+    Raises:
+        ValueError: if the axes of steps and actions differ.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.koopman.inverse_dynamics import fit_tied_axis_ridge
+        >>> steps, true = torch.randn(500, 3, 2), torch.tensor([0.5, -1.0, 2.0])
+        >>> found = fit_tied_axis_ridge(steps, torch.einsum("nsa,s->na", steps, true))
+        >>> bool((found - true).abs().max() < 0.01)
+        True
+    """
+    if steps.ndim != 3 or action.shape != (steps.shape[0], steps.shape[2]):
+        raise ValueError(
+            f"steps must be [N, S, act] and action [N, act], got {list(steps.shape)} and {list(action.shape)}"
+        )
+    rows, target = steps.mT.flatten(0, 1), action.flatten()  # [N * act, S]
+    unit = rows.square().sum(-1).mean()
+    gram = rows.mT @ rows + penalty * unit * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
+    return torch.linalg.solve(gram, rows.mT @ target)
 
 
 def _unit(normalizer: nn.Module | None, width: int, like: Tensor) -> Tensor:

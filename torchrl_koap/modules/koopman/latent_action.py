@@ -10,104 +10,59 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.modules import LSTM
+from torchrl.modules import LSTM, MLP
 
 from torchrl_koap.keys import LATENT_ACTION, STATE
-from torchrl_koap.modules.networks import mlp
-from torchrl_koap.modules.time_alignment import check_offsets, frame_index, frame_span
+from torchrl_koap.modules.time_alignment import FrameGatherer, check_offsets
 
 
-class LatentActionModule(TensorDictModuleBase):
+class LatentActionModule(FrameGatherer, TensorDictModuleBase):
     r"""Base of the latent-action networks: gathers the frames of every step and asks :meth:`infer` for ``u``.
 
     .. math::
         u_t = f_\theta(x_{t-n}, \dots, x_t, x_{t+k}), \qquad x_{t+1} \text{ is never an input}
+
+    What is gathered is drawn in :class:`~torchrl_koap.modules.time_alignment.FrameGatherer`.
 
     Args:
         state_dim (int): size ``d`` of a state.
         latent_dim (int): size ``m`` of a latent action.
 
     Keyword Args:
-        history (int): number ``n`` of frames before the current one.
-        look_ahead (int or sequence of int): offset ``k``, or several.
-        relative (bool): read, beside the current frame itself, the steps between neighbouring frames, each divided by
-            its own spread (:meth:`fit_scales`): ``x_{t-n+1} - x_{t-n}, ..., x_t, x_{t+k_1} - x_t,
-            x_{t+k_2} - x_{t+k_1}, ...``. Steps of a few millimetres then reach the network at unit scale, not as
-            differences of numbers of order one, and a decoder that weighs them all alike is a local mean velocity.
-        clamped (bool): let frames whose look-ahead is cut at the window's end count in the losses, as the released
-            code does (:func:`~torchrl_koap.modules.time_alignment.frame_span`).
+        num_past (int): number ``n`` of frames before the present one. Defaults to ``1``.
+        look_ahead (int or sequence of int): offset ``k >= 2``, or several. Defaults to ``8``.
+        relative (bool): read steps at unit scale beside the present frame, instead of frames. Defaults to ``False``.
+        clamped (bool): let frames whose look-ahead is cut at the window's end count in the losses.
         in_key (NestedKey): window of states ``[*B, T, d]``. Defaults to ``"state"``.
         out_key (NestedKey): latent actions ``[*B, T, m]``. Defaults to ``"latent_action"``.
-    """
 
-    scales: Tensor
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules.koopman.latent_action import LatentActionModule
+        >>> class Difference(LatentActionModule):  # u_t = x_{t+2} - x_t
+        ...     def infer(self, frames):  # [*B, T, F, d]
+        ...         return frames[..., -1, :] - frames[..., 0, :]
+        >>> network = Difference(1, 1, num_past=0, look_ahead=2)
+        >>> network(TensorDict({"state": torch.arange(4.0)[:, None]}))["latent_action"].flatten().tolist()
+        [2.0, 2.0, 1.0, 0.0]
+    """
 
     def __init__(
         self,
         state_dim: int,
         latent_dim: int,
         *,
-        history: int = 1,
+        num_past: int = 1,
         look_ahead: int | Sequence[int] = 8,
         relative: bool = False,
         clamped: bool = False,
         in_key: NestedKey = STATE,
         out_key: NestedKey = LATENT_ACTION,
     ):
-        super().__init__()
+        super().__init__(state_dim, num_past=num_past, look_ahead=look_ahead, relative=relative, clamped=clamped)
         self.in_keys, self.out_keys = [in_key], [out_key]
-        self.state_dim, self.latent_dim = state_dim, latent_dim
-        self.history, self.look_ahead = history, check_offsets(history, look_ahead)
-        self.relative, self.clamped = relative, clamped
-        self.num_frames = history + 1 + len(self.look_ahead)
-        self.register_buffer("scales", torch.ones(self.num_frames, state_dim))
-
-    def span(self, num_frames: int) -> range:
-        """Frames of a window of ``num_frames`` that count in the losses.
-
-        Raises:
-            ValueError: if the window is too short to hold one.
-        """
-        return frame_span(num_frames, self.history, self.look_ahead, clamped=self.clamped)
-
-    @property
-    def num_window_frames(self) -> int:
-        """Frames of the shortest window in which a frame (``history``) has all it reads and its successor."""
-        return self.history + 1 + self.look_ahead[-1]
-
-    def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """What each latent action reads.
-
-        Args:
-            state (Tensor): states ``[*B, T, d]`` in the networks' units.
-            frames (range, optional): frames of the window to gather for. Default: all ``T``.
-
-        Returns:
-            Tensor: ``[*B, len(frames), F, d]`` with ``F = history + 1 + len(look_ahead)``.
-
-        Raises:
-            ValueError: if the states have another number of columns.
-        """
-        if state.shape[-1] != self.state_dim:
-            raise ValueError(f"expected states with {self.state_dim} columns, got shape {list(state.shape)}")
-        num_frames = state.shape[-2]
-        frames = range(num_frames) if frames is None else frames
-        index = frame_index(frames, num_frames, self.history, self.look_ahead, state.device)
-        read = state[..., index, :]
-        if not self.relative:
-            return read
-        steps, n = read[..., 1:, :] - read[..., :-1, :], self.history
-        return torch.cat([steps[..., :n, :], read[..., n : n + 1, :], steps[..., n:, :]], -2) / self.scales
-
-    @torch.no_grad()
-    def fit_scales(self, windows: Tensor) -> None:
-        """Sets the spread (root mean square) of every step from windows ``[*B, T, d]``; no label is read."""
-        if not self.relative:
-            return
-        read = self.gather(windows, self.span(windows.shape[-2])).flatten(0, -3)
-        spread = read.square().mean(0).sqrt() * self.scales
-        spread[self.history] = 1.0  # the current frame stays in the normaliser's units
-        self.scales.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
+        self.latent_dim = latent_dim
 
     def infer(self, frames: Tensor) -> Tensor:
         """Latent actions ``[*B, T, m]`` from frames ``[*B, T, F, d]``."""
@@ -163,7 +118,7 @@ class LatentActionMLP(LatentActionModule):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import LatentActionMLP
-        >>> infer = LatentActionMLP(2, 8, history=4, look_ahead=(2, 4, 8), relative=True, linear_skip=True)
+        >>> infer = LatentActionMLP(2, 8, num_past=4, look_ahead=(2, 4, 8), relative=True, linear_skip=True)
         >>> infer(TensorDict({"state": torch.randn(16, 2)}, []))["latent_action"].shape
         torch.Size([16, 8])
     """
@@ -180,7 +135,7 @@ class LatentActionMLP(LatentActionModule):
     ):
         super().__init__(state_dim, latent_dim, **kwargs)
         inputs = self.num_frames * state_dim
-        self.network = mlp(inputs, hidden_dims, latent_dim, dropout=dropout)
+        self.network = MLP(inputs, latent_dim, num_cells=hidden_dims, activation_class=nn.ReLU, dropout=dropout or None)
         self.skip = nn.Linear(inputs, latent_dim, bias=False) if linear_skip else None
 
     def infer(self, frames: Tensor) -> Tensor:
@@ -217,7 +172,7 @@ class LatentActionFourier(LatentActionModule):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import LatentActionFourier
-        >>> infer = LatentActionFourier(2, 64, history=4, look_ahead=(2, 3, 4, 6, 8))
+        >>> infer = LatentActionFourier(2, 64, num_past=4, look_ahead=(2, 3, 4, 6, 8))
         >>> infer(TensorDict({"state": torch.randn(16, 2)}, []))["latent_action"].shape
         torch.Size([16, 82])
     """
@@ -232,8 +187,8 @@ class LatentActionFourier(LatentActionModule):
         position_scale: float = 4.0,
         **kwargs,
     ):
-        history, look_ahead = kwargs.get("history", 1), kwargs.get("look_ahead", 8)
-        motion_dim = (history + len(check_offsets(history, look_ahead))) * state_dim
+        num_past, look_ahead = kwargs.get("num_past", 1), kwargs.get("look_ahead", 8)
+        motion_dim = (num_past + len(check_offsets(num_past, look_ahead))) * state_dim
         super().__init__(state_dim, num_features + motion_dim, relative=True, **kwargs)
         self.motion_dim = motion_dim
         self.amplitude = math.sqrt(2 * curvature / max(num_features, 1))
@@ -249,7 +204,7 @@ class LatentActionFourier(LatentActionModule):
 
     def infer(self, frames: Tensor) -> Tensor:
         """Evaluates the observables."""
-        n = self.history
+        n = self.num_past
         motion = torch.cat([frames[..., :n, :], frames[..., n + 1 :, :]], -2).flatten(-2) / math.sqrt(self.motion_dim)
         where = torch.cat([motion / self.motion_scale, frames[..., n, :] / self.position_scale], -1)
         return torch.cat([motion, self.amplitude * torch.cos(where @ self.frequency + self.phase)], -1)
@@ -262,8 +217,8 @@ class LatentActionFourier(LatentActionModule):
 
         Returns:
             tuple of Tensor: entries of the latent action, int64 ``[S, len(axes)]``, and factors ``[S, len(axes)]`` that
-            turn them into steps in the networks' units; ``S = history + len(look_ahead)``.
+            turn them into steps in the networks' units; ``S = num_past + len(look_ahead)``.
         """
-        scales = torch.cat([self.scales[: self.history], self.scales[self.history + 1 :]])[:, list(axes)]
+        scales = torch.cat([self.scales[: self.num_past], self.scales[self.num_past + 1 :]])[:, list(axes)]
         first = torch.arange(len(scales), device=scales.device)[:, None] * self.state_dim
         return first + torch.tensor(list(axes), device=scales.device), scales * math.sqrt(self.motion_dim)

@@ -9,10 +9,11 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from torchrl_koap.keys import LATENT_ACTION, LIFTED_STATE, STATE
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.networks import SequenceLSTM, mlp
+from torchrl_koap.modules.networks import SequenceLSTM
 
 STRUCTURES = ("dense", "diagonal", "block_diagonal")
 INITS = ("identity", "normal")
@@ -24,7 +25,7 @@ class KoopmanLifting(TensorDictModuleBase):
     .. math::
         z_t = g_\theta(x_t), \qquad \hat x_t = g_\psi(z_t)
 
-    (design section 2). ``forward`` writes the lifted states; :meth:`decode` is used by the reconstruction loss.
+    ``forward`` writes the lifted states; :meth:`decode` is used by the reconstruction loss.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -77,8 +78,8 @@ class KoopmanLifting(TensorDictModuleBase):
             self.encoder = SequenceLSTM(state_dim, hidden_dims[0], latent_dim)
             self.decoder = SequenceLSTM(latent_dim, hidden_dims[0], state_dim)
         else:
-            self.encoder = mlp(state_dim, hidden_dims, learned) if learned else None
-            self.decoder = mlp(latent_dim, hidden_dims, state_dim)
+            self.encoder = MLP(state_dim, learned, num_cells=hidden_dims, activation_class=nn.ReLU) if learned else None
+            self.decoder = MLP(latent_dim, state_dim, num_cells=hidden_dims, activation_class=nn.ReLU)
 
     def encode(self, state: Tensor) -> Tensor:
         """Lifts states ``[*B, T, d]`` to ``[*B, T, m]``."""
@@ -218,7 +219,15 @@ class KoopmanOperator(TensorDictModuleBase):
         return torch.einsum("nij,...nj->...ni", weight, blocks).flatten(-2)
 
     def step(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """One step ``K z + u`` (or ``K z + B u``) for lifted states and latent actions ``[*B, T, .]``."""
+        """One step ``K z + u``, or ``K z + B u`` where the operator has an input matrix.
+
+        Args:
+            lifted (Tensor): lifted states ``z``, ``[*B, T, m]``.
+            latent_action (Tensor): latent actions ``u``, ``[*B, T, input_dim]``.
+
+        Returns:
+            Tensor: lifted states one step later, ``[*B, T, m]``.
+        """
         return self.propagate(lifted) + (latent_action if self.input is None else latent_action @ self.input.mT)
 
     def forward(self, tensordict):

@@ -24,11 +24,11 @@ PRESETS = {
         "operator_init": "identity",
         "network": "fourier",
         "num_features": 512,
-        "history": 4,
+        "num_past": 4,
         "look_ahead": (2, 3, 4, 5),
         "clamped": False,
     },
-    # design section 2: g MLP, f LSTM, dense K, look-ahead k = 8
+    # the paper: g MLP, f LSTM, dense K, look-ahead k = 8
     "paper": {
         "latent_dim": 64,
         "hidden_dim": 128,
@@ -37,14 +37,14 @@ PRESETS = {
         "structure": "dense",
         "operator_init": "identity",
         "network": "lstm",
-        "history": 1,
+        "num_past": 1,
         "look_ahead": 8,
         "relative": False,
         "clamped": True,
         "linear_skip": False,
         "dropout": 0.0,
     },
-    # koap_release_notes section 3.1: recurrent g, feed-forward f on raw states, diagonal K, k = 7 steps ahead in effect
+    # KOAP's first public code: recurrent g, feed-forward f on raw states, diagonal K, k = 7 steps ahead in effect
     "released": {
         "latent_dim": 512,
         "hidden_dim": 256,
@@ -53,7 +53,7 @@ PRESETS = {
         "structure": "diagonal",
         "operator_init": "normal",
         "network": "mlp",
-        "history": 1,
+        "num_past": 1,
         "look_ahead": 7,
         "relative": False,
         "clamped": True,
@@ -110,7 +110,7 @@ def make_koopman_inverse_dynamics(
     choice.update(overrides)
 
     latent_dim, hidden = choice["latent_dim"], choice["hidden_dim"]
-    frames = {key: choice[key] for key in ("history", "look_ahead", "clamped", *options)}
+    frames = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *options)}
     if network == "fourier":
         latent_action = LatentActionFourier(state_dim, **frames)
     elif network == "lstm":

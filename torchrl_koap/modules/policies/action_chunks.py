@@ -5,21 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import NestedKey
 from torch import Tensor
-from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_koap.keys import ACTION
 from torchrl_koap.modules.diffusion.policy import ACTION_CHUNK, DiffusionPolicy
-from torchrl_koap.modules.policies.candidates import check_candidates, sample_coherent
-from torchrl_koap.modules.policies.plan_then_control import NOISE, OBSERVATION_HISTORY
-
-STATE_HISTORY = "state_history"
+from torchrl_koap.modules.policies.candidates import sample_coherent
+from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
 
 
-class ChunkedPolicy(TensorDictModuleBase):
+class ChunkedPolicy(RecedingHorizonPolicy):
     """Executes the first ``replan_interval`` actions of every chunk of a :class:`DiffusionPolicy`.
 
     ::
@@ -28,8 +23,8 @@ class ChunkedPolicy(TensorDictModuleBase):
         chunk sampled at     0                                   4
         action               a_0      a_1      a_2      a_3      a'_0
 
-    Every environment of a batch begins a new chunk in its own rhythm, counted from its own reset
-    (:class:`torchrl.modules.MultiStepActorWrapper`). Start noise is read from the entry ``"noise"`` if it is there
+    Every environment of a batch begins a new chunk in its own rhythm, counted from its own reset; batches may have any
+    shape. Start noise is read from the entry ``"noise"`` if it is there
     (:class:`~torchrl_koap.modules.EpisodeNoise`). Use it as a
     :class:`~torchrl_koap.modules.PlanThenControl` that needs no controller, in
     :func:`~torchrl_koap.evaluation.rollouts.roll_out` and everywhere else.
@@ -80,75 +75,65 @@ class ChunkedPolicy(TensorDictModuleBase):
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
-        super().__init__()
-        if history < planner.history:
-            raise ValueError(f"the policy reads {planner.history} observed frames, history is only {history}")
-        if not 1 <= replan_interval <= planner.horizon:
-            raise ValueError(f"replan_interval must be in 1..{planner.horizon} (the horizon), got {replan_interval}")
-        columns = None if controller_columns is None else torch.as_tensor(controller_columns)
-        self.register_buffer("controller_columns", columns, persistent=False)
-        if callable(state_columns):
-            self._state_of = state_columns
-        else:
-            self.register_buffer("state_columns", torch.as_tensor(state_columns), persistent=False)
-            self._state_of = self._select
-        self.in_keys, self.out_keys = [history_key, "is_init"], [action_key, ACTION_CHUNK]
-        self.history, self.replan_interval = history, replan_interval
-        check_candidates(candidates, choice)
-        self.planner, self.candidates = planner, candidates
-        # the rest of a chunk is kept only where the next one is compared with it
-        kept = replan_interval if candidates == 1 else planner.horizon
-        self.receding = MultiStepActorWrapper(
-            _Chunk(planner, replan_interval, kept, candidates, choice),
-            n_steps=kept,
+        super().__init__(
+            planner,
+            state_columns=state_columns,
+            history=history,
             replan_interval=replan_interval,
-            action_keys=[action_key],
-            chunk_keys=[ACTION_CHUNK],
-            init_key="is_init",
+            controller_columns=controller_columns,
+            history_key=history_key,
+            action_key=action_key,
+            cached_key=action_key,
+            chunk_key=ACTION_CHUNK,
+            reader="policy",
+            candidates=candidates,
+            choice=choice,
+            # the rest of a chunk is kept only where the next one is compared with it
+            kept_steps=planner.horizon if candidates > 1 else None,
         )
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action of the current step (and the chunk that the next one continues from)."""
-        observed = tensordict.get(self.in_keys[0], None)
-        for name, value in ((self.in_keys[0], observed), ("is_init", tensordict.get("is_init", None))):
-            if value is None:
-                raise KeyError(f"the policy reads {name!r}: append policy_transforms() to the environment")
-        if observed.shape[-2] != self.history:
-            raise ValueError(
-                f"{self.in_keys[0]!r} must hold {self.history} frames on axis -2, got {list(observed.shape)}"
-            )
-        state = self._state_of(observed[..., -self.planner.history :, :])
-        if self.controller_columns is not None:
-            state = state[..., self.controller_columns]
-        return self.receding(tensordict.set(STATE_HISTORY, state))
+    def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
+        """Samples the actions of the next steps.
 
-    def _select(self, observed: Tensor) -> Tensor:
-        return observed[..., self.state_columns]
+        Args:
+            observations (Tensor): ``[*B, history, obs]``, raw units.
+            noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
 
+        Returns:
+            Tensor: ``[*B, replan_interval, act]``.
+        """
+        return self.planner.sample(self._read(self.state_of(observations)), noise)[..., : self.replan_interval, :]
 
-class _Chunk(TensorDictModuleBase):
-    """The part that runs only when a new chunk is due."""
+    def make_chunk(
+        self, history: Tensor, noise: Tensor | None, in_force: Tensor | None = None, fresh: Tensor | None = None
+    ) -> Tensor:
+        """Samples actions and keeps those that are executed, or all where the next chunk is compared with them.
 
-    def __init__(self, planner: DiffusionPolicy, interval: int, kept: int, candidates: int, choice: str):
-        super().__init__()
-        self.planner, self.interval, self.kept = planner, interval, kept
-        self.candidates, self.choice = candidates, choice
-        self.in_keys, self.out_keys = [STATE_HISTORY], [ACTION_CHUNK]
+        Args:
+            history (Tensor): observed states ``[*B, history, d]``, raw units.
+            noise (Tensor, optional): ``[*B, *noise_shape]``, standard normal. Default: random.
+            in_force (Tensor, optional): the chunk of before ``[*B, H, act]``.
+            fresh (Tensor, optional): where an episode begins, bool ``[*B]``.
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        history, noise = tensordict.get(STATE_HISTORY), tensordict.get(NOISE, None)
+        Returns:
+            Tensor: ``[*B, replan_interval, act]``; ``[*B, H, act]`` for several candidates.
+        """
+        state = self._read(history)
         if self.candidates == 1:
-            actions = self.planner.sample(history, noise)
-        else:
-            chunk = tensordict.get(ACTION_CHUNK, None)
-            actions = sample_coherent(
-                self.planner.sample,
-                self.planner.action_normalizer,
-                history,
-                noise,
-                number=self.candidates,
-                rule=self.choice,
-                in_force=None if chunk is None or self.interval == self.kept else chunk[..., self.interval :, :],
-                fresh=tensordict.get("is_init").squeeze(-1),
-            )
-        return tensordict.set(ACTION_CHUNK, actions[..., : self.kept, :])
+            return self.planner.sample(state, noise)[..., : self.replan_interval, :]
+        left = None if in_force is None else in_force[..., self.replan_interval :, :]
+        return sample_coherent(
+            self.planner.sample,
+            self.planner.action_normalizer,
+            state,
+            noise,
+            number=self.candidates,
+            rule=self.choice,
+            in_force=None if left is None or not left.shape[-2] else left,
+            fresh=fresh,
+        )
+
+    def _read(self, history: Tensor) -> Tensor:
+        """The states that the policy reads, of those observed."""
+        state = history[..., -self.planner.history :, :]
+        return state if self.controller_columns is None else state[..., self.controller_columns]

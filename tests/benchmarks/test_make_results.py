@@ -1,0 +1,81 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Pages of results are what the committed figures give, and their text holds no figure of its own."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SOURCE = ROOT / "benchmarks" / "results"
+
+
+@pytest.fixture(scope="module")
+def results():
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    spec = importlib.util.spec_from_file_location("make_results", ROOT / "benchmarks" / "make_results.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    sys.path.remove(str(ROOT / "benchmarks"))
+
+
+def test_pages_are_those_of_the_figures(results):
+    pages = results.pages()
+    assert Path("README.md") in pages and len(pages) >= 8
+    for path, text in pages.items():
+        assert (ROOT / path).read_text() == text, f"{path}: run python benchmarks/make_results.py"
+    assert {path.name for path in (ROOT / "docs" / "results").iterdir()} == {p.name for p in pages} - {"README.md"}
+
+
+def test_figures_of_the_readme_are_those_of_the_cells():
+    """Read back independently of the generator: successes, n and a Wilson interval from its formula."""
+    readme = (ROOT / "README.md").read_text()
+    with (SOURCE / "label_curves.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["study"] == "avoiding"]
+    cells = {row["method"]: row for row in rows if float(row["label_fraction"]) == 0.01}
+    found = re.findall(r"^\| `(\w+)` \| ([\d.]+) \((\d+)-(\d+)\), ([\d.]+) \|", readme, re.MULTILINE)
+    assert len(found) >= 5
+    for method, rate, low, high, entropy in found:
+        successes, n = int(cells[method]["successes"]), int(cells[method]["n"])
+        assert f"{100 * successes / n:.1f}" == rate and float(cells[method]["entropy"]) == float(entropy)
+        assert [f"{100 * end:.0f}" for end in wilson(successes, n)] == [low, high]
+    assert "58 of 60 rollouts" in readme and "88.6-99.1" in readme and "0.884" in readme
+
+
+def wilson(successes, n, z=1.959963984540054):
+    rate, weight = successes / n, z * z / n
+    centre = (rate + weight / 2) / (1 + weight)
+    spread = z / (1 + weight) * (rate * (1 - rate) / n + weight / (4 * n)) ** 0.5
+    return centre - spread, centre + spread
+
+
+@pytest.mark.parametrize("path", sorted(SOURCE.glob("*.csv")), ids=lambda path: path.stem)
+def test_figures_are_whole(path):
+    """Every row has all columns; successes lie within n, means within their range, and each comes from a command."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file, restkey="more", restval=None, strict=True))
+    assert rows
+    for row in rows:
+        assert "more" not in row and None not in row.values()
+        if row.get("successes"):
+            assert 0 <= int(row["successes"]) <= int(row["n"])
+        if row.get("entropy"):
+            assert 0 <= float(row["entropy"]) <= 1
+        if row.get("low") and (mean := row.get("error") or row.get("difference") or row.get("median")):
+            assert float(row["low"]) <= float(mean) <= float(row["high"])
+        if "command" in row and path.stem != "ablations":
+            assert row["command"]
+
+
+@pytest.mark.parametrize("path", sorted(SOURCE.glob("*.jinja")), ids=lambda path: path.name)
+def test_templates_hold_no_figure(path):
+    text = re.sub(
+        r"!\[.*?\]|95 %|\{\{.*?\}\}|\{%.*?%\}|`[^`]*`|\([^)]*\.(?:md|png)\)|D3IL", "", path.read_text(), flags=re.DOTALL
+    )
+    assert not re.findall(r"\d+(?:\.\d+)?", text)

@@ -1,0 +1,122 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A user's own arrays as a data set that holds its whole task."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.data import (
+    DamagedDataError,
+    RecordingsError,
+    load_ted,
+    make_demonstrations,
+    read_about,
+    read_task,
+    save_demonstrations,
+)
+from torchrl_koap.keys import validate
+
+RANDOM = np.random.default_rng(0)
+STATES = [RANDOM.normal(size=(30, 4)).cumsum(0) for _ in range(3)]
+ACTIONS = [np.diff(STATES[0][:, :2], axis=0), None, None]
+NAMES = ["q1", "q2", "cup_x", "cup_y"]
+
+
+def test_a_folder_holds_data_and_task(tmp_path):
+    folder = save_demonstrations(
+        tmp_path / "my arm",
+        STATES,
+        ACTIONS,
+        control_hz=20,
+        state_names=NAMES,
+        state_units=["rad", "rad", "m", "m"],
+        action_names=["dq1", "dq2"],
+        action_units="rad",
+        robot=["q1", "q2"],
+    )
+    data, task = load_ted(folder / "ted"), read_task(folder / "ted")
+    validate(data)
+    assert data["has_action"].sum() == 29 and read_about(folder / "ted")["labelled_steps"] == 29
+    assert task.name == "my_arm" and task.control_hz == 20 and task.max_steps == 45
+    assert task.observation_names == tuple(NAMES) and task.observation_units == ("rad", "rad", "m", "m")
+    assert task.actions == {"dq1": "rad", "dq2": "rad"} and task.robot == (0, 1)
+    assert task.observation_parts == {"robot": ("q1", "q2"), "surroundings": ("cup_x", "cup_y")}
+    torch.testing.assert_close(data["observation"][:29], torch.from_numpy(STATES[0][:29]).float())
+
+
+def test_commands_are_never_seen_by_what_learns():
+    data, task = make_demonstrations(STATES, ACTIONS, control_hz=20, state_names=NAMES, command=["cup_x", "cup_y"])
+    assert task.command == "command" and task.state_names == ("q1", "q2") and task.robot == (0, 1)
+    assert task.state_of(data["observation"]).shape[-1] == 2
+
+
+def test_columns_of_one_role_may_lie_apart():
+    _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, robot=[0, 3])
+    assert list(task.observation_parts) == ["robot", "surroundings", "robot_2"] and task.robot == (0, 3)
+
+
+def test_absolute_actions_are_targets_of_columns():
+    _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, robot=["state_0", "state_1"], action_kind="absolute")
+    assert task.action_targets == (0, 1)
+    _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="absolute", targets=[1, 0])
+    assert task.action_targets == (1, 0)
+
+
+def test_no_labels_at_all():
+    data, _ = make_demonstrations(STATES, control_hz=20, action_dim=7)
+    assert data["action"].shape == (87, 7) and not data["has_action"].any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"control_hz": None}, "control_hz is missing"),
+        ({"command": ["q3"]}, "unknown column in command: 'q3'; did you mean 'q1'|unknown column in command: 'q3'"),
+        ({"command": [9]}, r"command: there is no column 9, only 0..3"),
+        ({"command": [0, 2]}, "command columns must lie side by side, got q1, cup_x"),
+        ({"command": [0, 1, 2, 3]}, "every column is a command"),
+        ({"command": [0], "robot": [0]}, "column 'q1' is the robot's and a command"),
+        ({"robot": [0, 0]}, "robot holds q1 more than once"),
+        ({"action_kind": "absolute"}, "absolute actions have 2 columns, the robot's columns are 4: name in targets"),
+        ({"targets": [0, 1]}, "targets are for action_kind='absolute'"),
+        ({"action_units": ["m"]}, "action_units names 1 columns, there are 2"),
+        ({"state_units": ["m"]}, "state_units names 1 columns, there are 4"),
+    ],
+)
+def test_faults_of_the_description(options, message):
+    with pytest.raises(RecordingsError, match=message):
+        make_demonstrations(STATES, ACTIONS, **{"control_hz": 20, "state_names": NAMES} | options)
+
+
+def test_an_action_that_never_changes():
+    still = [np.column_stack([ACTIONS[0], np.full(29, 0.5)]), None, None]
+    with pytest.raises(RecordingsError, match="action 'action_2' is 0.5 in all 29 labels: nothing can be learnt"):
+        make_demonstrations(STATES, still, control_hz=20)
+
+
+def test_an_unknown_kind_of_action():
+    with pytest.raises(ValueError, match="unknown kind of action 'absolut'; did you mean 'absolute'"):
+        make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="absolut")
+
+
+def test_nothing_is_written_if_anything_is_wrong(tmp_path):
+    with pytest.raises(RecordingsError):
+        save_demonstrations(tmp_path / "arm", [*STATES, np.zeros((1, 4))], [*ACTIONS, None], control_hz=20)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_names_code_is_refused(tmp_path):
+    folder = save_demonstrations(tmp_path / "arm", STATES, ACTIONS, control_hz=20) / "ted"
+    about = json.loads((folder / "about.json").read_text())
+    about["definition"]["env"] = "os:system"
+    (folder / "about.json").write_text(json.dumps(about))
+    with pytest.raises(DamagedDataError, match="its task names code in env; register such a task by --plugin"):
+        read_task(folder)
+    about["definition"] = {"name": "arm"}
+    (folder / "about.json").write_text(json.dumps(about))
+    with pytest.raises(DamagedDataError, match="its task is damaged: .*'observation_parts' is missing"):
+        read_task(folder)

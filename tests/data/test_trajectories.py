@@ -1,0 +1,61 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Trajectories with and without actions become one flat tensordict that says which steps have a label."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchrl_koap.data import flatten_trajectories, mark_labels
+from torchrl_koap.keys import validate
+
+
+def test_none_and_nan_rows_mean_no_label():
+    frames = [torch.rand(4, 2), torch.rand(3, 2), torch.rand(5, 2)]
+    actions = torch.rand(4, 3)
+    actions[1] = math.nan
+    data = flatten_trajectories(frames, [None, torch.ones(2, 3), actions])
+    validate(data)
+    assert data["has_action"].flatten().tolist() == [False] * 3 + [True] * 2 + [True, False, True, True]
+    assert data["action"].shape == (9, 3) and torch.equal(data["action"][5], actions[0])
+    assert data["action"][[0, 1, 2, 6]].isnan().all() and data["action"].dtype == torch.float32
+    double = flatten_trajectories(frames, [None, torch.ones(2, 3), actions], dtype=torch.float64)
+    assert double["action"].dtype == torch.float64
+
+
+def test_no_actions_at_all_need_their_size():
+    frames = [torch.rand(4, 2)] * 2
+    for actions in (None, [None, None]):
+        data = flatten_trajectories(frames, actions, action_dim=7)
+        validate(data)
+        assert data["action"].shape == (6, 7) and not data["has_action"].any()
+        with pytest.raises(ValueError, match="no trajectory has actions: action_dim is needed"):
+            flatten_trajectories(frames, actions)
+
+
+def test_wrong_shapes_and_numbers_are_named():
+    frames = [torch.rand(4, 2)] * 2
+    with pytest.raises(ValueError, match="2 trajectories of observations, 1 of actions"):
+        flatten_trajectories(frames, [None])
+    with pytest.raises(ValueError, match=r"trajectory 1: wanted .* got \[4, 2\] and \[4, 3\]"):
+        flatten_trajectories(frames, [None, torch.ones(4, 3)])
+    with pytest.raises(ValueError, match=r"trajectory 1: wanted .* with T >= 2, got \[1, 2\] and \[0, 3\]"):
+        flatten_trajectories([frames[0], torch.rand(1, 2)], [torch.ones(3, 3), None])
+    with pytest.raises(ValueError, match="trajectory 1 has 2 observation and 4 action columns, wanted 2 and 3"):
+        flatten_trajectories(frames, [torch.ones(3, 3), torch.ones(3, 4)])
+    for value in (math.nan, math.inf):
+        steps = torch.ones(3, 3)
+        steps[2, 1] = value
+        with pytest.raises(ValueError, match="trajectory 1: 1 actions are infinite or NaN in some .*, first at step 2"):
+            flatten_trajectories(frames, [None, steps])
+
+
+def test_labels_are_marked_where_actions_are():
+    data = flatten_trajectories([torch.rand(4, 2)], [torch.rand(3, 2)])
+    data["action"][1] = math.nan
+    assert mark_labels(data.exclude("has_action"))["has_action"].flatten().tolist() == [True, False, True]
+    bare = mark_labels(data.exclude("has_action", "action"), action_dim=2)
+    validate(bare)
+    assert not bare["has_action"].any()

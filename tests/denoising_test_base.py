@@ -1,0 +1,91 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What the losses of planner and Diffusion Policy must do alike, as a base class, and the formula of what they fit."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from loss_test_base import LossTestBase
+from torchrl.objectives import SoftUpdate
+
+KINDS = [
+    (s, p)
+    for s in ("squared_cosine", "flow")
+    for p in ("epsilon", "sample", "velocity")
+    if (s, p) != ("flow", "epsilon")
+]
+
+
+def noised_and_target(network, schedule, prediction, clean, noise, time):
+    """Noised sequences and what the denoiser should answer, by the formulas of the two kinds of path."""
+    if schedule == "flow":
+        noise_level = (time / 50)[:, None, None]
+        signal, velocity = 1 - noise_level, noise - clean
+    else:
+        signal = network.schedule.signal.to(clean.dtype)[time.long()][:, None, None]
+        noise_level = (1 - signal**2).sqrt()
+        velocity = signal * noise - noise_level * clean
+    target = {"epsilon": noise, "sample": clean, "velocity": velocity}[prediction]
+    return signal * clean + noise_level * noise, target
+
+
+class DenoisingLossTestBase(LossTestBase):
+    """Tests of a denoising loss; a subclass also names the network."""
+
+    name = ""
+
+    def network(self, loss):
+        return getattr(loss, self.name)
+
+    def weights(self, loss):
+        return getattr(loss, f"{self.name}_params").flatten_keys(".")
+
+    def test_gradients_are_finite_and_reach_every_weight_but_not_the_statistics(self):
+        loss = self.make_loss()
+        self.total(loss(self.make_batch(16))).backward()
+        weights = dict(self.weights(loss).items())
+        trained = {name for name, value in weights.items() if value.requires_grad}
+        assert trained == {name for name, _ in self.network(loss).named_parameters()}
+        for name in trained:
+            assert weights[name].grad.isfinite().all() and weights[name].grad.abs().max() > 0, name
+
+    def test_average_of_the_weights_follows_the_formula(self):
+        loss, batch = self.make_loss(), self.make_batch(8)
+        average = SoftUpdate(loss, eps=0.9)
+        optimizer = torch.optim.SGD(loss.parameters(), lr=0.1)
+        expected = {name: value.clone() for name, value in self.weights(loss).items()}
+        for _ in range(3):
+            self.total(loss(batch)).backward()
+            optimizer.step()
+            average.step()
+            for name, value in self.weights(loss).items():
+                if value.requires_grad:
+                    expected[name] = 0.9 * expected[name] + 0.1 * value.detach()
+        target = getattr(loss, f"target_{self.name}_params").flatten_keys(".")
+        for name, value in expected.items():
+            torch.testing.assert_close(target[name], value)
+            assert not target[name].requires_grad
+        network = self.network(loss)
+        history, noise = torch.randn(3, network.history, network.state_dim), torch.randn(3, *network.sample_shape)
+        trained = network.sample(history, noise)
+        with getattr(loss, f"target_{self.name}_params").to_module(network):
+            averaged = network.sample(history, noise)
+        assert not torch.allclose(trained, averaged)
+        torch.testing.assert_close(network.sample(history, noise), trained)
+        assert any("target" in name for name in loss.state_dict())
+        assert not any("target" in name for name in self.make_loss(create_target_params=False).state_dict())
+
+    def test_noise_is_drawn_anew_at_every_call(self):
+        loss, batch = self.make_loss(), self.make_batch(8)
+        batch = batch.exclude(self.default_keys["noise"], self.default_keys["time"])
+        assert self.total(loss(batch)) != self.total(loss(batch))
+
+    def test_the_mode_reaches_the_network(self):
+        loss = self.make_loss()
+        assert not self.network(loss.eval()).training and self.network(loss.train()).training
+
+    def test_an_unknown_reduction_and_entries_set_by_hand_are_refused(self):
+        with pytest.raises(ValueError, match="reduction must be 'none', 'mean' or 'sum', got 'median'"):
+            self.make_loss(reduction="median")
+        with pytest.raises(RuntimeError, match="use set_keys"):
+            self.make_loss().in_keys = ["x"]

@@ -1,0 +1,89 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Environments of Gymnasium side by side: seeds, ends and successes of their own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import check_env_specs
+from toy_gym import NAMES, Reach
+
+from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
+from torchrl_koap.tasks import Task
+
+TASK = Task(name="arm", observation_parts={"arm": NAMES}, actions={"a": "rad", "b": "rad"}, position="arm")
+PUSH = 0.1
+
+
+def run(env, steps, seeds=None):
+    if seeds is not None:
+        env.seed_episodes(seeds)
+    env.reset()
+    frames = []
+    for _ in range(steps):
+        action = torch.full((len(env.envs), 2), PUSH)
+        frames.append(env.step(TensorDict({"action": action}, [len(env.envs)]))["next"])
+    return torch.stack(frames, 1)
+
+
+def test_specs():
+    check_env_specs(GymnasiumBatch("toy_gym:ToyReach-v0", TASK, 2))
+
+
+def test_numbers_are_those_of_the_environment_itself():
+    rollout = run(GymnasiumBatch("ToyReach-v0", TASK, 3), 5, [4, 9, 4])
+    alone = Reach()
+    first, _ = alone.reset(seed=9)
+    rows = [alone.step(np.full(2, PUSH, dtype=np.float32))[0] for _ in range(5)]
+    np.testing.assert_allclose(rollout["observation"][1].numpy(), np.stack(rows), rtol=1e-6)
+    assert torch.equal(rollout["observation"][0], rollout["observation"][2])
+    assert not torch.equal(rollout["observation"][0], rollout["observation"][1])
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "wanted"),
+    [
+        ("ToyReach-v0", None, [False, False, True, True, True, True]),
+        ("ToyReach-v0", "is_success", [False, False, True, True, True, True]),
+        ("ToyReachOwnKey-v0", "arrived", [False, False, True, True, True, True]),
+        ("ToyReachOwnKey-v0", None, [False] * 6),
+        ("ToyReachWon-v0", None, [False, False, True, True, True, True]),
+        ("ToyReachLost-v0", None, [False] * 6),
+    ],
+)
+def test_what_counts_as_success(name, key, wanted):
+    rollout = run(GymnasiumBatch(name, TASK, 2, success_key=key), 6)
+    assert rollout["success"][0].flatten().tolist() == wanted
+    over = rollout["done"][0].flatten().tolist()
+    ends = name in ("ToyReachWon-v0", "ToyReachLost-v0")
+    assert over == ([False, False, True, True, True, True] if ends else [False] * 5 + [True])
+
+
+def test_who_is_done_waits():
+    env = GymnasiumBatch("ToyReach-v0", TASK, 2, max_steps=4)
+    assert env.max_steps == 4
+    rollout = run(env, 6, [0, 1])
+    assert rollout["truncated"][0].flatten().tolist() == [False] * 3 + [True] * 3
+    assert torch.equal(rollout["observation"][:, 3], rollout["observation"][:, 5])
+    again = env.reset(rollout[:, -1].exclude("reward").set("_reset", torch.tensor([[True], [False]])))
+    assert again["done"].flatten().tolist() == [False, True]
+    assert torch.equal(again["observation"][1], rollout["observation"][1, 5])
+    assert not torch.equal(again["observation"][0], rollout["observation"][0, 5])
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="environment 'NoSuch-v0' cannot be made: Environment `NoSuch`"):
+        GymnasiumBatch("NoSuch-v0", TASK)
+    with pytest.raises(ValueError, match="environment 'no_such_package:Reach-v0' cannot be made: "):
+        GymnasiumBatch("no_such_package:Reach-v0", TASK)
+    wide = Task(name="wide", observation_parts={"arm": 5}, actions={"a": "rad", "b": "rad"}, position="arm")
+    with pytest.raises(
+        ValueError, match=r"observation of environment 'ToyReach-v0' is Box\(.*\(4,\).*, task 'wide' has 5 columns"
+    ):
+        GymnasiumBatch("ToyReach-v0", wide)
+    with pytest.raises(ValueError, match="the action of environment 'CartPole-v1' is Discrete.*, task 'arm' has 2 col"):
+        GymnasiumBatch("CartPole-v1", TASK)
+    with pytest.raises(ValueError, match="info of environment 'ToyReach-v0' has no 'arrived', it has is_success"):
+        run(GymnasiumBatch("ToyReach-v0", TASK, success_key="arrived"), 6)

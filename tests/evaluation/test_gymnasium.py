@@ -1,0 +1,82 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A run on a robot of one's own is evaluated in an environment of Gymnasium."""
+
+from __future__ import annotations
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+from tiny_runs import koap
+from toy_gym import NAMES, demonstrations
+
+from torchrl_koap import Agent, EvalConfig, TrainConfig, evaluate, load_policy, save_demonstrations, train
+from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.modules import EpisodeNoise
+from torchrl_koap.training.checkpoints import load_tensors
+
+
+@pytest.fixture(scope="module")
+def arm_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("arm")
+    states, actions = demonstrations()
+    actions = [steps if index < 2 else None for index, steps in enumerate(actions)]
+    data = save_demonstrations(folder / "data", states, actions, control_hz=30, state_names=NAMES, robot=NAMES[:2])
+    run = folder / "run"
+    train(TrainConfig(out=run, dataset=str(data), steps=10, batch_size=8, controller_steps=0, channels=(8, 16)))
+    return run
+
+
+def test_the_command(arm_run):
+    asked = ("--env", "toy_gym:ToyReachOwnKey-v0", "--success-key", "arrived", "--no-animate")
+    assert koap("eval", arm_run, "--episodes", 3, "--threads", 1, *asked) == 0
+    result = json.loads((arm_run / "eval.json").read_text())
+    assert (result["episodes"], result["success_rate"]) == (3, 1.0)
+    assert (result["success_low"], result["success_high"]) == wilson_interval(3, 3)
+    assert result["mode_entropy"] is None and result["env"] == "toy_gym:ToyReachOwnKey-v0"
+    assert [row["seed"] for row in result["episode"]] == [100, 101, 102]
+    assert {row["steps"] for row in result["episode"]} == {6}
+    page = (arm_run / "index.html").read_text()
+    assert "3 of 3 rollouts" in page and "--env toy_gym:ToyReachOwnKey-v0" in page
+
+
+def test_results_depend_on_the_seed_alone(arm_run):
+    tensors = {}
+    for size in (3, 1):
+        evaluate(arm_run, EvalConfig(episodes=3, env="toy_gym:ToyReach-v0", batch_size=size, threads=1))
+        tensors[size] = load_tensors(arm_run / "rollouts.safetensors")[0]
+    np.testing.assert_allclose(tensors[3]["action"], tensors[1]["action"], atol=1e-5)
+    np.testing.assert_allclose(tensors[3]["position"], tensors[1]["position"], atol=1e-5)
+    assert not np.allclose(tensors[3]["position"][0], tensors[3]["position"][1])
+
+
+def test_the_actions_are_those_of_an_agent(arm_run):
+    evaluate(arm_run, EvalConfig(episodes=1, seed=7, env="toy_gym:ToyReach-v0", threads=1))
+    policy = load_policy(arm_run)
+    noise = EpisodeNoise([7], policy.planner.noise_shape, num_steps=6)
+    env, agent = gymnasium.make("ToyReach-v0"), Agent(policy, noise=noise)
+    observation, _ = env.reset(seed=7)
+    agent.reset()
+    taken = []
+    for _ in range(6):
+        taken.append(agent.act(observation))
+        observation, *_ = env.step(taken[-1])
+    recorded = load_tensors(arm_run / "rollouts.safetensors")[0]["action"][0].numpy()
+    np.testing.assert_allclose(np.stack(taken), recorded, rtol=1e-4, atol=1e-6)
+
+
+def test_refusals(arm_run, capsys):
+    before = (arm_run / "config.json").read_bytes()
+    assert koap("eval", arm_run, "--env", "CartPole-v1", "--episodes", 1) != 0
+    assert (
+        "the action of environment 'CartPole-v1' is Discrete(2), task 'data' has 2 columns"
+        in capsys.readouterr().err.replace("\n", " ")
+    )
+    with pytest.raises(ValueError, match="success_key was given, but no env"):
+        evaluate(arm_run, EvalConfig(success_key="is_success"))
+    with pytest.raises(ValueError, match="rollouts_per_context was given, but an env.* has no contexts"):
+        evaluate(arm_run, EvalConfig(env="toy_gym:ToyReach-v0", rollouts_per_context=2))
+    with pytest.raises(ValueError, match="has no environment.*koap eval --env ID"):
+        evaluate(arm_run, EvalConfig(episodes=1))
+    assert (arm_run / "config.json").read_bytes() == before

@@ -1,0 +1,144 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Runs of a robot without an environment, from data to a report."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+
+import pytest
+import torch
+from offline_runs import save_arm, train_arm
+
+from torchrl_koap.commands.cli import main
+from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, suggest
+from torchrl_koap.evaluation.label_errors import summarise_errors
+from torchrl_koap.evaluation.offline import find_faults
+from torchrl_koap.reports.run_report import write_report
+from torchrl_koap.tasks import Task
+from torchrl_koap.training import RunDirectoryError
+
+FEW = EvalConfig(samples=4, threads=1)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    return save_arm(tmp_path_factory.mktemp("data") / "arm")
+
+
+@pytest.fixture(scope="module")
+def run(arm, tmp_path_factory):
+    return train_arm(tmp_path_factory.mktemp("runs") / "run", arm)
+
+
+def test_a_run_of_seven_joints(run):
+    result = evaluate(run, FEW)
+    assert result == json.loads((run / "eval.json").read_text())
+    assert result["kind"] == "offline" and "success_rate" not in result
+    (group,) = result["plan_errors"]["unit"]
+    assert group["unit"] == "rad" and len(group["columns"]) == 14 and len(group["planner"]["best_of"]["per_step"]) == 14
+    assert result["action_errors"]["outside_budget"]["note"] == "no trajectory outside the budget has labels"
+    left_out = result["action_errors"]["left_out"]
+    assert left_out["trajectories"] == 3 and [row["name"] for row in left_out["column"]] == [f"dq{n}" for n in range(7)]
+    assert result["action_errors_on"] == "left_out" and 0 < result["relative_action_error"] == left_out["relative"]
+    held_out = json.loads((run / "config.json").read_text())["validation_episodes"]
+    assert [row["episode"] for row in result["trajectory"] if row["judged"] == "plans"] == held_out
+    assert result["control_hz"] > 0 and not (run / "rollouts.safetensors").exists()
+    # 20 updates make no planner, and it is said
+    assert any(fault.startswith("plans are worse than standing still (columns in rad)") for fault in result["faults"])
+
+
+def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):
+    evaluate(run, FEW)
+    page = write_report(run).read_text()
+    pictures = {path.name for path in (run / "plots").iterdir()}
+    assert {"plan_errors.png", "action_errors.png", "demonstrations.png", "losses.png"} <= pictures
+    for word in ("plan error, energy score", "action error, 7 columns", "mrad", "plans are worse than standing still"):
+        assert word in page
+    for word in ("rollouts.png", "Executed rollouts", " mm", "x (m)", "--episodes 60", "koap inspect"):
+        assert word not in page
+
+
+def test_latent_space_and_suggestions(run):
+    verdict = inspect(run, InspectConfig(latent_only=True, threads=1)).result["verdict"]
+    assert "mrad" in verdict and " mm" not in verdict
+    assert "On labels of the budget, which the run's decoder was fitted on: a linear probe" in verdict
+    assert {row["episode"] for row in suggest(run, SuggestConfig(count=7)).suggestions} == set(range(3, 10))
+    with pytest.raises(ValueError, match="task 'arm' has no environment to make experiments in: --latent-only"):
+        inspect(run)
+
+
+def test_the_command_says_it_in_words(run, capsys):
+    assert main(["eval", str(run), "--samples", "2", "--threads", "1", "--no-report"]) == 0
+    out = capsys.readouterr().out
+    assert "plans, energy score (mrad): planner" in out and "actions, left out, RMSE (mrad): controller" in out
+    assert "FAULT: plans are worse than standing still" in out
+
+
+def test_a_single_column_with_labels_outside_the_budget(tmp_path):
+    arm = save_arm(tmp_path / "one", labelled=10, joints=1, units="")
+    run = train_arm(tmp_path / "run", arm, label_count=2, method="linear")
+    result = evaluate(run, FEW)
+    outside = result["action_errors"]["outside_budget"]
+    assert result["action_errors_on"] == "outside_budget" and outside["trajectories"] == 8
+    # the method is that ridge itself
+    assert outside["column"][0]["controller"] == pytest.approx(outside["column"][0]["ridge"], rel=1e-4)
+    assert "action_error" in json.loads((run / "summary.json").read_text())
+    page = write_report(run).read_text()
+    assert "action_errors.png" in page and "None" not in page
+
+
+def test_columns_of_several_units_and_a_method_without_a_closed_form(tmp_path):
+    arm = save_arm(tmp_path / "mixed", joints=3, units=["m", "rad", "N"])
+    run = train_arm(tmp_path / "run", arm, method="dd")
+    result = evaluate(run, FEW)
+    assert [row["unit"] for row in result["plan_errors"]["unit"]] == ["m", "rad", "N"]
+    assert "not fitted in closed form" in result["action_errors"]["left_out"]["note"]
+    assert result["relative_action_error"] is None
+    write_report(run)
+    assert (run / "plots" / "plan_errors.png").exists() and not (run / "plots" / "action_errors.png").exists()
+
+
+def test_all_trajectories_labelled(tmp_path):
+    """One is held out from the planner; its labels still count."""
+    arm = save_arm(tmp_path / "arm", labelled=10, joints=2)
+    result = evaluate(train_arm(tmp_path / "run", arm, label_fraction=1.0), FEW)
+    assert result["plan_errors"]["trajectories"] == 1 and result["action_errors"]["left_out"]["trajectories"] == 10
+
+
+def test_a_single_trajectory(tmp_path):
+    arm = save_arm(tmp_path / "arm", count=1, labelled=1, joints=2)
+    run = train_arm(tmp_path / "run", arm, label_fraction=1.0, method="linear")
+    result = evaluate(run, FEW)
+    assert result["plan_errors"]["note"].startswith("no trajectory was held out from the planner")
+    assert result["action_errors"]["left_out"]["note"] == "only one trajectory has labels: none can be left out"
+    assert result["relative_plan_error"] is result["relative_action_error"] is None and result["faults"] == []
+    write_report(run)
+
+
+def test_a_data_set_that_has_moved_or_changed(tmp_path):
+    arm = save_arm(tmp_path / "arm", joints=2)
+    run = train_arm(tmp_path / "run", arm, method="linear")
+    arm.rename(tmp_path / "elsewhere")
+    with pytest.raises(RunDirectoryError, match=r"arm' of .*run is not there \(moved.*--dataset"):
+        evaluate(run, FEW)
+    moved = EvalConfig(samples=2, threads=1, dataset=str(tmp_path / "elsewhere"))
+    assert evaluate(run, moved)["plan_errors"]["trajectories"] == 1
+    shutil.rmtree(tmp_path / "elsewhere")
+    save_arm(tmp_path / "elsewhere", joints=2, labelled=4)
+    with pytest.raises(RunDirectoryError, match="is not the one that .* trajectories or labels differ"):
+        evaluate(run, moved)
+
+
+def test_a_controller_worse_than_the_mean_is_a_fault():
+    task = Task("arm", {"q": 2}, {"a": "rad", "b": "rad"}, "q")
+    true = torch.tensor([[1.0, 1.0], [-1.0, -1.0]])
+    models = {"controller": true * torch.tensor([0.5, -1.0]), "mean_action": torch.zeros(2, 2)}
+    found = summarise_errors(models, true, torch.tensor([4, 5]), task)
+    assert found["relative"] == pytest.approx(math.sqrt((0.25 + 4) / 2))
+    assert [row["episode"] for row in found["trajectory"]] == [4, 5]
+    faults = find_faults({"note": ""}, {"left_out": found, "outside_budget": {"note": ""}})
+    assert faults == [
+        "action b is worse than always giving its mean (labelled trajectories left out): 2e+03 against 1e+03 mrad"
+    ]

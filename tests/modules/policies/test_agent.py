@@ -1,0 +1,132 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A policy in a control loop: the actions of a rollout, one robot or a batch, and clear refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import TensorDictSequential
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_koap.modules import (
+    Agent,
+    ChunkedPolicy,
+    DiffusionPolicy,
+    EpisodeNoise,
+    PlanThenControl,
+    StatePlanner,
+    TemporalUnet,
+    make_koopman_inverse_dynamics,
+    policy_transforms,
+)
+
+STEPS = 13
+
+
+class Drift(EnvBase):
+    """A point that is moved by its action; nothing is random."""
+
+    def __init__(self, num_envs):
+        super().__init__(batch_size=[num_envs])
+        self.observation_spec = Composite(observation=Unbounded((num_envs, 2)), shape=(num_envs,))
+        self.action_spec = Unbounded((num_envs, 2))
+        self.reward_spec = Unbounded((num_envs, 1))
+
+    def _reset(self, tensordict):
+        self.place = torch.arange(2.0 * self.batch_size[0]).reshape(-1, 2) / 10
+        return self._seen()
+
+    def _step(self, tensordict):
+        self.place = self.place + 0.1 * tensordict["action"]
+        return self._seen().set("reward", torch.zeros(*self.batch_size, 1))
+
+    def _seen(self):
+        flags = {name: torch.zeros(*self.batch_size, 1, dtype=torch.bool) for name in ("done", "terminated")}
+        return self.full_observation_spec.zero().update({"observation": self.place.clone(), **flags})
+
+    def _set_seed(self, seed):
+        pass
+
+
+def plan_then_control(execution="feedback"):
+    torch.manual_seed(0)
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=3)
+    controller = make_koopman_inverse_dynamics(2, 2)
+    policy = PlanThenControl(planner, controller, state_columns=(0, 1), history=5, execution=execution)
+    return policy.eval()
+
+
+def chunks():
+    torch.manual_seed(0)
+    diffusion = DiffusionPolicy(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, action_dim=2, num_steps=3)
+    return ChunkedPolicy(diffusion, state_columns=(0, 1), history=2).eval()
+
+
+POLICIES = [lambda: plan_then_control(), lambda: plan_then_control("open_loop"), chunks]
+
+
+@pytest.mark.parametrize("make", POLICIES, ids=["feedback", "open loop", "chunks"])
+@pytest.mark.parametrize("robots", [1, 3])
+def test_the_actions_of_a_rollout_bit_for_bit(make, robots):
+    policy = make()
+
+    def noise():
+        return EpisodeNoise(range(7, 7 + robots), policy.planner.noise_shape, num_steps=STEPS)
+
+    env = TransformedEnv(Drift(robots), policy_transforms(policy.history))
+    with torch.no_grad():
+        rollout = env.rollout(STEPS, TensorDictSequential(noise(), policy))
+    agent = Agent(policy, noise=noise())
+    agent.reset()
+    for step in range(STEPS):
+        action = agent.act(rollout["observation"][:, step])
+        assert torch.equal(action, rollout["action"][:, step]), step
+
+
+def test_numpy_or_torch_one_robot_or_several():
+    agent = Agent(plan_then_control(), seed=3)
+    agent.reset()
+    one = agent.act(np.array([0.1, 0.2]))
+    assert isinstance(one, np.ndarray) and one.shape == (2,) and one.dtype == np.float32
+    agent.reset()
+    several = agent.act(torch.tensor([[0.1, 0.2], [0.1, 0.2]], dtype=torch.float64))
+    assert isinstance(several, torch.Tensor) and several.shape == (2, 2) and not several.requires_grad
+    np.testing.assert_allclose(several[0].numpy(), one, rtol=1e-5)
+    assert not torch.allclose(several[0], several[1])  # a stream of noise per robot
+
+
+def test_reset_begins_anew():
+    agent, path = Agent(plan_then_control()), np.random.default_rng(0).normal(size=(6, 2))
+    runs = []
+    for _ in range(2):
+        agent.reset()
+        runs.append([agent.act(row) for row in path])
+    np.testing.assert_array_equal(*runs)
+    assert agent.latency()["steps"] == 12 and agent.latency()["p50"] <= agent.latency()["p99"] <= agent.latency()["max"]
+
+
+def test_seeds_make_a_difference():
+    actions = []
+    for seed in (0, 1):
+        agent = Agent(plan_then_control(), seed=seed)
+        agent.reset()
+        actions.append(agent.act(np.zeros(2)))
+    assert not np.allclose(*actions)
+
+
+def test_refusals():
+    agent = Agent(plan_then_control())
+    with pytest.raises(RuntimeError, match="reset.. the agent before the first act"):
+        agent.act(np.zeros(2))
+    with pytest.raises(RuntimeError, match="has not acted yet"):
+        agent.latency()
+    agent.reset()
+    agent.act(np.zeros(2))
+    with pytest.raises(ValueError, match=r"the observation is \[3\], those before were \[2\]; reset"):
+        agent.act(np.zeros(3))
+    with pytest.raises(ValueError, match=r"must be \[obs\] or \[n, obs\], got \[1, 1, 2\]"):
+        agent.act(np.zeros((1, 1, 2)))
+    with pytest.raises(ValueError, match=r"columns \[1\] of the observation are NaN or infinite"):
+        agent.act(np.array([0.0, np.nan]))

@@ -1,0 +1,106 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Plans made while the one before is executed."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import torch
+from toy_policies import CountingPlanner, EchoController
+
+from torchrl_koap.modules import Agent, AsynchronousAgent, PlanThenControl, StatePlanner, TemporalUnet
+
+
+class HeldPlanner(CountingPlanner):
+    """Gives a plan only when it is let go, and keeps what it was told."""
+
+    def __init__(self):
+        super().__init__()
+        self.let_go, self.known = threading.Event(), []
+        self.let_go.set()
+
+    def plan(self, history, noise=None, known=None):
+        self.let_go.wait(10)
+        self.known.append(known)
+        return super().plan(history, noise)
+
+
+def make_agent(interval=2, hz=30.0):
+    policy = PlanThenControl(
+        HeldPlanner(), EchoController(), state_columns=(0, 1), history=2, replan_interval=interval, blend_decay=0.0
+    )
+    policy.register_parameter("device_holder", torch.nn.Parameter(torch.zeros(1)))
+    return AsynchronousAgent(policy, control_hz=hz)
+
+
+def plan_behind(action):
+    """State at which the plan was made, and how many steps ago, from the action's view of the next planned state."""
+    ahead, made_at = action[2], action[3]
+    return float(made_at), round(float(ahead - made_at) / 1000) - 1
+
+
+def test_control_goes_on_with_the_old_plan_until_the_new_one_is_there():
+    agent = make_agent()
+    agent.reset()
+    planner = agent.policy.planner
+    seen = [plan_behind(agent.act(np.array([step, 0.0]))) for step in range(2)]
+    assert seen == [(0, 0), (0, 1)]
+    planner.let_go.clear()
+    seen = [plan_behind(agent.act(np.array([step, 0.0]))) for step in range(2, 5)]  # due at 2, not ready
+    assert seen == [(0, 2), (0, 3), (0, 4)]
+    planner.let_go.set()
+    agent._pending.result(10)
+    assert plan_behind(agent.act(np.array([5.0, 0.0]))) == (2, 3)  # begun at state 2, three steps ago
+    agent.close()
+
+
+def test_what_is_executed_meanwhile_binds_the_new_plan():
+    agent = make_agent()
+    agent.reset()
+    for step in range(3):
+        agent.act(np.array([step, 0.0]))
+    agent._pending.result(10)
+    first, second = agent.policy.planner.known
+    assert first is None
+    # one step is what a plan of a few microseconds takes; it was due after two steps of the plan made at state 0
+    torch.testing.assert_close(second, torch.tensor([[[3000.0, 0.0]]]))
+    agent.close()
+
+
+def test_the_first_plan_is_made_before_the_clock_runs():
+    agent = make_agent()
+    agent.reset(np.array([7.0, 0.0]))
+    assert agent.policy.planner.calls == [[7.0]]
+    assert plan_behind(agent.act(np.array([7.0, 0.0]))) == (7, 0)
+    assert agent.policy.planner.calls == [[7.0]]
+    agent.close()
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "sample"])
+def test_a_plan_has_the_states_that_are_known(prediction):
+    from torchrl_koap.modules import NoiseSchedule
+
+    torch.manual_seed(0)
+    planner = StatePlanner(
+        TemporalUnet(2, 4, channels=(8, 16)), NoiseSchedule(prediction=prediction), state_dim=2, num_steps=4
+    )
+    planner.fit_normalizers(torch.randn(50, 16, 2).cumsum(1))
+    history, known, noise = torch.randn(3, 2, 2), torch.randn(3, 2, 2), torch.randn(3, 14, 2)
+    with torch.no_grad():
+        free, bound = planner.plan(history, noise), planner.plan(history, noise, known=known)
+    torch.testing.assert_close(bound[:, :2], known)
+    assert not torch.allclose(free[:, 2:], bound[:, 2:])
+    with pytest.raises(ValueError, match=r"known states must be \[\*B, 1..13, 2\]"):
+        planner.plan(history, noise, known=torch.zeros(3, 14, 2))
+
+
+def test_refusals():
+    policy = make_agent().policy
+    with pytest.raises(ValueError, match="control_hz must be a positive number"):
+        AsynchronousAgent(policy, control_hz=0)
+    policy.execution = "open_loop"
+    with pytest.raises(ValueError, match="execution 'feedback' only"):
+        AsynchronousAgent(policy, control_hz=30)
+    assert issubclass(AsynchronousAgent, Agent)

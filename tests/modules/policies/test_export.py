@@ -1,0 +1,87 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Exported policies give the numbers of the policy."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import pytest
+import torch
+
+from torchrl_koap.modules import (
+    ChunkedPolicy,
+    DiffusionPolicy,
+    PlanThenControl,
+    StatePlanner,
+    TemporalUnet,
+    make_koopman_inverse_dynamics,
+)
+from torchrl_koap.modules.policies.export import SUFFIXES, ExportError, export_part, exportable
+
+
+def policy():
+    torch.manual_seed(0)
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=3)
+    controller = make_koopman_inverse_dynamics(2, 3)
+    return PlanThenControl(planner, controller, state_columns=(2, 3), history=5).eval()
+
+
+def chunks():
+    torch.manual_seed(0)
+    diffusion = DiffusionPolicy(TemporalUnet(3, 4, channels=(8, 16)), state_dim=2, action_dim=3, num_steps=2)
+    return ChunkedPolicy(diffusion, state_columns=(2, 3), history=2).eval()
+
+
+def test_the_stateless_policy_is_the_open_loop_one():
+    whole = policy()
+    what = exportable(whole, observation_dim=4)
+    with torch.no_grad():
+        actions = what.module(*what.inputs.values())
+        state = what.inputs["observations"][..., 2:]
+        plan = whole.planner.plan(state[:, -2:], what.inputs["noise"])
+    assert actions.shape == (1, 4, 3)
+    torch.testing.assert_close(actions[:, 0], whole.act(state, plan))
+
+
+@pytest.mark.parametrize("part", ["policy", "controller", "denoiser"])
+def test_every_part_comes_back_from_its_file(part, tmp_path):
+    what = exportable(policy(), part, observation_dim=4)
+    loaded = export_part(what, tmp_path / f"{part}.pt2")
+    other = [value + 0.1 for value in what.inputs.values()]
+    with torch.no_grad():
+        torch.testing.assert_close(loaded(*other), what.module(*other), atol=1e-5, rtol=1e-5)
+
+
+def test_a_diffusion_policy_is_exported_too(tmp_path):
+    what = exportable(chunks(), observation_dim=4)
+    assert export_part(what, tmp_path / "policy.pt2")(*what.inputs.values()).shape == (1, 4, 3)
+    with pytest.raises(ValueError, match="has no controller to export"):
+        exportable(chunks(), "controller", observation_dim=4)
+
+
+@pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
+    reason="ONNX is not installed (extra 'onnx')",
+)
+def test_onnx(tmp_path):
+    what = exportable(policy(), "controller", observation_dim=4)
+    loaded = export_part(what, tmp_path / "controller.onnx", kind="onnx")
+    with torch.no_grad():
+        torch.testing.assert_close(loaded(*what.inputs.values()), what.module(*what.inputs.values()))
+
+
+@pytest.mark.slow
+def test_aotinductor(tmp_path):
+    what = exportable(policy(), observation_dim=4)
+    export_part(what, tmp_path / "policy.aoti.pt2", kind="aoti")
+
+
+def test_faults(tmp_path):
+    what = exportable(policy(), "controller", observation_dim=4)
+    with pytest.raises(ValueError, match="unknown export format 'onxx'; did you mean 'onnx'"):
+        export_part(what, tmp_path / "x", kind="onxx")
+    with pytest.raises(ValueError, match="unknown part of a policy 'denoisr'; did you mean 'denoiser'"):
+        exportable(policy(), "denoisr", observation_dim=4)
+    with pytest.raises(ExportError, match="differs from the policy by"):
+        export_part(what, tmp_path / "x.pt2", tolerance=-1.0)
+    assert set(SUFFIXES) == {"torch", "onnx", "aoti"}

@@ -1,0 +1,264 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The planner's loss: closed forms, masks, keys, reductions, the averaged copy of the weights, compilation."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from denoising_test_base import KINDS, DenoisingLossTestBase, noised_and_target
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+
+from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser
+from torchrl_koap.modules.diffusion.planner import StatePlanner
+from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
+from torchrl_koap.modules.diffusion.unet import TemporalUnet
+from torchrl_koap.objectives import PlannerLoss
+
+
+def make_loss(schedule="squared_cosine", prediction=None, dtype=torch.float32, seed=0, **options):
+    torch.manual_seed(seed)
+    denoiser = MLPDenoiser(2, 4, horizon=6, width=32, depth=1)
+    planner = StatePlanner(denoiser, NoiseSchedule(schedule, prediction), state_dim=2, horizon=6)
+    planner.fit_normalizers(windows(64))
+    return PlannerLoss(planner.to(dtype), **options)
+
+
+def windows(*batch, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(3)
+    return torch.randn(*batch, 8, 2, generator=generator, dtype=dtype).cumsum(-2)
+
+
+def batch_of(*batch, dtype=torch.float32, **more):
+    generator = torch.Generator().manual_seed(5)
+    return TensorDict(
+        {
+            "state": windows(*batch, dtype=dtype),
+            "planner_noise": torch.randn(*batch, 6, 2, generator=generator, dtype=dtype),
+            "planner_time": torch.randint(1, 50, batch, generator=generator),
+            **more,
+        },
+        batch,
+    )
+
+
+class TestPlannerLoss(DenoisingLossTestBase):
+    name = "planner"
+    default_keys = {
+        "state": "state",
+        "history": "history",
+        "plan": "plan",
+        "mask": "mask",
+        "noise": "planner_noise",
+        "time": "planner_time",
+    }
+    in_names, out_keys = ("state",), ("loss_planner",)
+
+    def make_loss(self, seed=0, **options):
+        return make_loss(seed=seed, **options)
+
+    def make_batch(self, *batch):
+        return batch_of(*batch)
+
+
+class TestPlannerLossOfHistoryAndPlan(TestPlannerLoss):
+    in_names = ("history", "plan")
+    test_compiled_equals_eager = None  # compiled above, with windows
+
+    def make_loss(self, seed=0, **options):
+        return make_loss(seed=seed, window=False, **options)
+
+    def make_batch(self, *batch):
+        data = batch_of(*batch)
+        state = data.pop("state")
+        return data.set("history", state[..., :2, :]).set("plan", state[..., 2:, :])
+
+
+@pytest.mark.parametrize(("schedule", "prediction"), KINDS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_value_in_closed_form(schedule, prediction, dtype):
+    loss = make_loss(schedule, prediction, dtype, reduction="none")
+    data = batch_of(5, dtype=dtype)
+    value = loss(data)["loss_planner"]
+
+    planner, noise = loss.planner, data["planner_noise"]
+    state, time = data["state"], data["planner_time"].to(dtype)
+    clean = state[:, 2:] - state[:, 1:2]
+    clean = ((clean.flatten(1) - planner.plan_normalizer.offset) / planner.plan_normalizer.scale).reshape(5, 6, 2)
+    condition = torch.cat([state[:, 0] - state[:, 1], state[:, 1]], -1)
+    condition = (condition - planner.condition_normalizer.offset) / planner.condition_normalizer.scale
+    noisy, target = noised_and_target(planner, schedule, prediction, clean, noise, time)
+    with loss.planner_params.to_module(planner):
+        output = planner.denoiser(noisy, time, condition)
+    torch.testing.assert_close(value, (output - target) ** 2, atol=1e-4, rtol=1e-4)
+    assert value.dtype == dtype
+
+
+def test_reductions_batches_and_both_ways_of_reading_agree():
+    data = batch_of(3, 4)
+    elements = make_loss(reduction="none")(data)["loss_planner"]
+    assert elements.shape == (3, 4, 6, 2)
+    torch.testing.assert_close(make_loss(reduction="mean")(data)["loss_planner"], elements.mean())
+    torch.testing.assert_close(make_loss(reduction="sum")(data)["loss_planner"], elements.sum())
+    flat = make_loss(reduction="none")(data.reshape(-1))["loss_planner"]
+    torch.testing.assert_close(elements.flatten(0, 1), flat)
+    cut = data.exclude("state").set("history", data["state"][..., :2, :]).set("plan", data["state"][..., 2:, :])
+    torch.testing.assert_close(make_loss(window=False)(cut)["loss_planner"], elements.mean())
+
+
+@pytest.mark.parametrize("shape", [(8,), (6,), (8, 1)])
+def test_masked_steps_count_nothing_and_may_hold_nan(shape):
+    data = batch_of(5)
+    length = shape[0]
+    mask = torch.ones(5, *shape, dtype=torch.bool)
+    mask[:3, length - 2 :] = False
+    data["mask"] = mask
+    reference = make_loss(reduction="none")
+    elements = reference(data)["loss_planner"]
+    assert (elements[:3, -2:] == 0).all() and (elements[3:] > 0).all() and (elements[:, :-2] > 0).all()
+    poisoned = data.clone()
+    poisoned["state"][:3, -2:] = float("nan")
+    loss = make_loss()
+    value = loss(poisoned)["loss_planner"]
+    torch.testing.assert_close(value, elements.sum() / (5 * 12 - 3 * 4))
+    value.backward()
+    assert all(parameter.grad.isfinite().all() for parameter in loss.parameters() if parameter.requires_grad)
+    data["mask"] = torch.zeros_like(mask)
+    assert make_loss()(data)["loss_planner"] == 0
+
+
+@pytest.mark.parametrize(("schedule", "prediction"), KINDS)
+def test_loss_decreases_on_a_fixed_batch(schedule, prediction):
+    loss, data = make_loss(schedule, prediction), batch_of(32)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
+    values = []
+    for _ in range(60):
+        value = loss(data)["loss_planner"]
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+        values.append(float(value))
+    assert values[-1] < 0.5 * values[0]
+
+
+def test_training_recovers_the_mean_and_spread_of_the_data():
+    torch.manual_seed(0)
+    planner = StatePlanner(
+        MLPDenoiser(1, 1, horizon=2, width=32, depth=1),
+        NoiseSchedule("squared_cosine", "sample"),
+        state_dim=1,
+        history=1,
+        horizon=2,
+    )
+    data = torch.randn(2048, 3, 1)
+    data[:, 1:] = data[:, :1] + 2.0 + 0.5 * torch.randn(2048, 2, 1)
+    planner.fit_normalizers(data, mode="standard")
+    loss = PlannerLoss(planner)
+    average = SoftUpdate(loss, eps=0.99)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=2e-3)
+    for step in range(400):
+        optimizer.param_groups[0]["lr"] = 2e-3 * (1 - step / 400)
+        loss(TensorDict({"state": data[torch.randint(2048, (256,))]}, [256]))["loss_planner"].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        average.step()
+    history = torch.full((3000, 1, 1), 0.5)
+    with torch.no_grad(), loss.target_planner_params.to_module(planner):
+        plans = planner.plan(history)
+    assert plans.mean() == pytest.approx(2.5, abs=0.12)
+    assert plans.std() == pytest.approx(0.5, abs=0.12)
+
+
+def test_set_keys_reaches_everything():
+    loss = make_loss()
+    expected = loss(batch_of(4))["loss_planner"]
+    loss.set_keys(state=("window", "x"), noise="e", time="t", history="past", plan="future")
+    assert loss.in_keys == [("window", "x")]
+    assert loss.planner.in_keys == ["past"] and loss.planner.out_keys == ["future"]
+    data = batch_of(4)
+    renamed = TensorDict({"window": {"x": data["state"]}, "e": data["planner_noise"], "t": data["planner_time"]}, [4])
+    before = renamed.clone()
+    torch.testing.assert_close(loss(renamed)["loss_planner"], expected)
+    assert (renamed == before).all() and set(renamed.keys(True)) == set(before.keys(True))
+    with pytest.raises(ValueError, match="not an accepted tensordict key"):
+        loss.set_keys(future="x")
+
+
+def test_keys_of_the_planner_are_taken_over_and_dispatch_works():
+    planner = StatePlanner(
+        MLPDenoiser(2, 4, horizon=6, width=8, depth=1), state_dim=2, horizon=6, in_keys=["past"], out_keys=["future"]
+    )
+    loss = PlannerLoss(planner, window=False)
+    assert loss.in_keys == ["past", "future"] and loss.out_keys == ["loss_planner"]
+    state = windows(4)
+    torch.manual_seed(1)
+    by_name = loss(past=state[:, :2], future=state[:, 2:])
+    torch.manual_seed(1)
+    torch.testing.assert_close(
+        by_name, loss(TensorDict({"past": state[:, :2], "future": state[:, 2:]}, [4]))["loss_planner"]
+    )
+
+
+def test_reset_and_state_dict():
+    loss, other = make_loss(), make_loss()
+    other.reset_parameters_recursive()
+    data = batch_of(8)
+    assert not torch.allclose(loss(data)["loss_planner"], other(data)["loss_planner"])
+    other.load_state_dict(loss.state_dict())
+    torch.testing.assert_close(other(data)["loss_planner"], loss(data)["loss_planner"])
+
+
+def test_bad_input_is_explained():
+    loss = make_loss()
+    with pytest.raises(KeyError, match="needs the entry 'state'; there are"):
+        loss(TensorDict({"states": windows(4)}, [4]))
+    with pytest.raises(ValueError, match=r"windows must be \[\*B, 8, 2\]"):
+        loss(TensorDict({"state": windows(4)[:, 1:]}, [4]))
+    with pytest.raises(ValueError, match=r"'mask' must be \[\*B, 6\] \(horizon\) or \[\*B, 8\]"):
+        loss(batch_of(4, mask=torch.ones(4, 5, dtype=torch.bool)))
+
+
+@pytest.mark.parametrize("network", ["mlp", "unet"])
+def test_forward_and_plan_compile_without_a_graph_break(network):
+    torch._dynamo.reset()  # TorchRL wraps every loss in one function: their graphs share its recompilation limit
+    loss = make_loss()
+    if network == "unet":
+        planner = StatePlanner(TemporalUnet(2, 4, channels=(8,)), state_dim=2, horizon=6, num_steps=2, clip=1.0)
+        loss = PlannerLoss(planner)
+    data = batch_of(4)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(data)["loss_planner"], loss(data)["loss_planner"])
+    plan = torch.compile(loss.planner.plan, fullgraph=True, backend="aot_eager")
+    history, noise = windows(4)[:, :2], torch.randn(4, 6, 2)
+    with torch.no_grad():
+        torch.testing.assert_close(plan(history, noise), loss.planner.plan(history, noise))
+
+
+def test_first_steps_weigh_more_and_the_mean_weight_stays():
+    torch.manual_seed(0)
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8,)), state_dim=2)
+    windows = TensorDict({"state": torch.randn(6, 16, 2)}, [6])
+    windows["planner_noise"], windows["planner_time"] = torch.randn(6, 14, 2), torch.full((6,), 20.0)
+    plain = PlannerLoss(planner, reduction="none")(windows)["loss_planner"]
+    weighted = PlannerLoss(planner, reduction="none", first_steps_weight=10.0)(windows)["loss_planner"]
+    weights = (weighted / plain).detach().mean((0, 2))
+    assert weights[0] / weights[-1] == pytest.approx(10, rel=1e-4) and weights.mean() == pytest.approx(1, rel=1e-4)
+    assert (weights.diff() < 0).all()
+    with pytest.raises(ValueError, match="first_steps_weight must be > 0, got 0"):
+        PlannerLoss(planner, first_steps_weight=0)
+
+
+def test_half_precision_products_leave_weights_and_gradients_in_float32():
+    torch.manual_seed(0)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=32), state_dim=2)
+    windows = TensorDict({"state": torch.randn(64, 16, 2)}, [64])
+    windows["planner_noise"], windows["planner_time"] = torch.randn(64, 14, 2), torch.full((64,), 20.0)
+    exact = PlannerLoss(planner)(windows)["loss_planner"]
+    planner.training_dtype = torch.bfloat16
+    loss = PlannerLoss(planner)
+    rounded = loss(windows)["loss_planner"]
+    assert rounded.dtype == torch.float32
+    assert rounded.item() != exact.item() and rounded.item() == pytest.approx(exact.item(), rel=0.01)
+    rounded.backward()
+    gradients = [parameter.grad for parameter in loss.parameters() if parameter.grad is not None]
+    assert gradients and all(gradient.dtype == torch.float32 and gradient.isfinite().all() for gradient in gradients)

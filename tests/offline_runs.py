@@ -1,0 +1,56 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A toy robot without an environment: joints that follow delta commands with a lag, few of them labelled."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_koap.data import save_demonstrations
+from torchrl_koap.training import TrainConfig, train
+
+TINY = {"steps": 20, "controller_steps": 20, "batch_size": 8, "controller_batch_size": 16, "channels": (8, 16)}
+
+
+def record(count: int = 10, steps: int = 40, joints: int = 7, *, seed: int = 0):
+    """States ``[steps, 2 * joints]``, joints and where they are to go, and actions ``[steps, joints]``."""
+    generator = np.random.default_rng(seed)
+    states, actions = [], []
+    for _ in range(count):
+        joint, goal, speed = *generator.uniform(-1, 1, (2, joints)), np.zeros(joints)
+        frames, commands = [], []
+        for _ in range(steps):
+            command = 0.15 * (goal - joint) + generator.normal(0, 0.002, joints)
+            frames.append(np.r_[joint, goal])
+            commands.append(command)
+            speed = 0.6 * speed + 0.4 * command
+            joint = joint + speed
+        states.append(np.array(frames))
+        actions.append(np.array(commands))
+    return states, actions
+
+
+def save_arm(
+    folder: Path, *, count: int = 10, labelled: int = 3, joints: int = 7, units: str | list[str] = "rad"
+) -> Path:
+    """A data set of which the first trajectories have labels."""
+    states, actions = record(count, joints=joints)
+    return save_demonstrations(
+        folder,
+        states,
+        [action if number < labelled else None for number, action in enumerate(actions)],
+        name="arm",
+        control_hz=30,
+        state_names=[f"q{joint}" for joint in range(joints)] + [f"goal{joint}" for joint in range(joints)],
+        state_units=units if isinstance(units, str) else [*units, *units],
+        action_names=[f"dq{joint}" for joint in range(joints)],
+        action_units=units,
+        robot=list(range(joints)),
+    )
+
+
+def train_arm(out: Path, dataset: Path, **options) -> Path:
+    """A tiny run on it."""
+    train(TrainConfig(out=out, dataset=str(dataset), **(TINY | options)))
+    return out

@@ -1,0 +1,60 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Puck: a point robot pushes a puck around the left or the right side of a post to a goal."""
+
+from __future__ import annotations
+
+from torchrl_koap import Task, register_task
+from torchrl_koap.tasks import Body, Defaults, Modes, Scene, Shape, StartRegions
+
+GOAL, GOAL_RADIUS = (0.5, 0.4), 0.05  # m
+POST, GATE_Y = (0.5, 0.2), 0.2  # where the side is decided (m)
+PUCK_RADIUS, ROBOT_RADIUS = 0.03, 0.01  # m
+
+
+def goal_reached(task, state):
+    """Whether the puck is in the goal, bool ``[*B]`` of states ``[*B, 4]``."""
+    return (state[..., task.state_slices["puck_xy"]] - state.new_tensor(GOAL)).norm(dim=-1) < GOAL_RADIUS
+
+
+def mode_index(mode):
+    """Side on which the puck passed the post, ``[*B]`` of the leaf ``mode`` ``[*B, 1]``."""
+    return mode[..., 0].long()
+
+
+def score(result, episodes, contexts):
+    """The share of the episodes that took the left side."""
+    sides = [int(episode[-1]["next", "mode"]) for episode in episodes]
+    return {"left_rate": sides.count(0) / len(sides)}
+
+
+TASK = register_task(
+    Task(
+        name="puck",
+        observation_parts={"robot_xy": ("x", "y"), "puck_xy": ("puck_x", "puck_y")},
+        actions={"x": "m", "y": "m"},
+        position="robot_xy",
+        max_steps=200,
+        control_hz=20.0,
+        actuated=(0, 1),
+        robot=(0, 1),
+        relative_positions=(("robot_xy", "puck_xy"),),
+        goal="puck.task:goal_reached",
+        modes=Modes((("side", ("left", "right")),), index="puck.task:mode_index", entropy="solved_contexts"),
+        score="puck.task:score",
+        bodies=(Body("puck", "puck_xy", color="blue", half=(PUCK_RADIUS, PUCK_RADIUS)),),
+        start_regions=StartRegions((((0.4, 0.6), (0.05, 0.1)),)),
+        env="puck.env:PuckEnv",
+        expert="puck.expert:PuckExpert",
+        gym_id="puck/Puck-v0",
+        scene=Scene(
+            shapes=(
+                Shape("circle", GOAL, (GOAL_RADIUS, GOAL_RADIUS), "zone", label="goal"),
+                Shape("circle", POST, (0.01, 0.01), "obstacle"),
+            ),
+            x=(0.2, 0.8),
+            y=(-0.05, 0.55),
+            caption=" The puck passes the post on one side.",
+        ),
+        defaults=Defaults(demonstrations=12, planner_steps=100, channels=(16, 32)),
+    )
+)

@@ -1,0 +1,157 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Tasks from outside the package: one with simulator and expert, one with data alone."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_koap.data import trajectory_lengths
+from torchrl_koap.envs import make_env, mode_index_of
+from torchrl_koap.envs.contexts import check_contexts, draw_contexts, evaluation_contexts
+from torchrl_koap.envs.experts.demonstrations import record_demonstrations, record_episodes, write_raw_episodes
+from torchrl_koap.evaluation.diagnosis import contexts_of
+from torchrl_koap.evaluation.scores import score, task_scores
+from torchrl_koap.keys import validate
+from torchrl_koap.reports.objects import object_looks
+from torchrl_koap.reports.pictures import all_pictures
+from torchrl_koap.reports.scenes import BLUE, draw_scene
+from torchrl_koap.tasks import TASKS, Task, get_task
+from torchrl_koap.tasks.modes import mode_name
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plugins():
+    """Both tasks, registered by import, for the tests of this file alone."""
+    known = dict(TASKS)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(HERE))
+        import arm_data
+        import puck.task
+
+        TASKS.update({task.name: task for task in (arm_data.TASK, puck.task.TASK)})
+        yield
+    TASKS.clear()
+    TASKS.update(known)
+
+
+@pytest.fixture(scope="module")
+def demonstrations():
+    return record_demonstrations("puck", episodes=12, seed=1)
+
+
+def test_the_environment_is_what_torchrl_expects():
+    env = make_env("puck", 3, max_steps=20)
+    check_env_specs(env)
+    contexts = draw_contexts("puck", 3, 0)
+    np.testing.assert_allclose(env.reset(contexts=contexts)["observation"][:, 2:], contexts[:, 0, :2], rtol=1e-6)
+
+
+def test_the_expert_records_both_modes(demonstrations):
+    data, report = demonstrations
+    validate(data)
+    assert report.modes == [0, 1] * 6 and report.num_modes == 2
+    assert trajectory_lengths(data).tolist() == report.rows  # every step is kept, none lost to a conversion
+    # the robot moves as told, inside every trajectory
+    moved = data["next", "observation"][:, :2] - data["observation"][:, :2]
+    torch.testing.assert_close(moved, data["action"], rtol=0, atol=1e-6)
+    task, last = get_task("puck"), data["next", "done"].squeeze(-1)
+    assert task.goal_reached(task.state_of(data["next", "observation"][last])).all()
+    again, _ = record_demonstrations("puck", episodes=12, seed=1)
+    assert torch.equal(again["action"], data["action"])
+
+
+def test_recordings_that_no_pickle_of_d3il_can_hold_are_refused(tmp_path):
+    raw, _ = record_episodes("puck", episodes=1)
+    with pytest.raises(TypeError, match="recorded without D3IL's log"):
+        write_raw_episodes(tmp_path, raw)
+    assert not list(tmp_path.iterdir())
+
+
+def test_contexts_come_from_the_task():
+    table = evaluation_contexts("puck")
+    assert table.shape == (60, 1, 3) and np.array_equal(table, evaluation_contexts("puck"))
+    task = get_task("puck")
+    np.testing.assert_array_equal(check_contexts(task, table), table)
+    with pytest.raises(ValueError, match=r"context 0 puts 'puck' at \(0.9, 0.07\) m, outside its region: x 0.4..0.6"):
+        check_contexts(task, [[[0.9, 0.07, 0.0]]])
+    frames = make_env("puck", 2).reset(contexts=table[:2])["observation"]
+    np.testing.assert_allclose(contexts_of(task, frames)[:, 0, :2], table[:2, 0, :2], rtol=1e-6)
+
+
+def test_modes_scores_and_goal():
+    task = get_task("puck")
+    assert [mode_name(mode, "puck") for mode in (0, 1, -1)] == ["left", "right", "no mode"]
+    assert mode_index_of("puck")(torch.tensor([[1], [-1]])).tolist() == [1, -1]
+    env = make_env(task, 4, max_steps=5)
+    episodes = list(env.rollout(5, break_when_any_done=False))
+    result = score(episodes, range(4), num_modes=2, mode_index=mode_index_of(task), contexts=[0, 0, 1, 1])
+    assert result["success_rate"] == 0.0 and result["episodes"] == 4
+    assert task_scores(task, result, episodes, [0, 0, 1, 1]) == {"left_rate": 0.0}
+    assert task.goal_reached(torch.tensor([[0.0, 0.0, 0.5, 0.4], [0.5, 0.4, 0.0, 0.0]])).tolist() == [True, False]
+
+
+def test_it_is_drawn():
+    axes = draw_scene(Figure().add_subplot(), "puck")
+    assert [round(patch.get_radius(), 3) for patch in axes.patches] == [0.05, 0.01]
+    assert axes.texts[0].get_text() == "goal" and axes.get_xlim() == (0.2, 0.8)
+    (look,) = object_looks("puck", 1)
+    assert look.label == "puck" and to_rgb(look.color) == to_rgb(BLUE)
+    assert all_pictures()["rollouts.png"].caption_for("puck").endswith("passes the post on one side.")
+    assert "Squares are the objects" in all_pictures()["rollouts.gif"].caption_for("puck")
+
+
+def test_gymnasium_knows_it():
+    env = gymnasium.make("puck/Puck-v0", disable_env_checker=True)
+    observation, info = env.reset(seed=0)
+    assert observation.shape == (4,) and info["mode_index"] == -1 and info["context"].shape == (1, 3)
+    assert env.step(env.action_space.sample())[0].shape == (4,)
+    assert env.unwrapped.metadata["render_fps"] == 20
+
+
+def test_a_robot_without_simulator():
+    task = get_task("arm_data")
+    assert task.action_dim == 7 and task.num_delta_actions == 7 and task.action_unit == "rad"
+    assert task.tool_columns is None and task.tool_position is None and task.gripper is None
+    assert task.state_dim == 9 and task.state_names[-2:] == ("cup_x", "cup_y") and task.num_modes == 1
+    for ask in (lambda: make_env(task), lambda: record_episodes("arm_data", episodes=1)):
+        with pytest.raises(ValueError, match="task 'arm_data' has no (environment|scripted expert)"):
+            ask()
+    with pytest.raises(ValueError, match="task 'arm_data' has no goal"):
+        task.goal_reached(torch.zeros(1, 9))
+    with pytest.raises(ValueError, match="task 'arm_data' has no contexts"):
+        evaluation_contexts(task)
+    draw_scene(Figure().add_subplot(), "arm_data")
+
+
+@pytest.mark.parametrize("name", ["puck", "arm_data"])
+def test_it_survives_json(name):
+    task = get_task(name)
+    assert Task.from_json(json.loads(json.dumps(task.to_json()))) == task
+
+
+def test_no_file_of_the_package_knows_them():
+    package = HERE.parents[1] / "torchrl_koap"
+    assert not [file.name for file in package.rglob("*.py") if "puck" in file.read_text()]
+
+
+def test_a_fresh_process_needs_the_import_alone():
+    code = (
+        "import puck.task, sys; assert 'torch' not in sys.modules and 'mujoco' not in sys.modules;"
+        "from torchrl_koap.tasks import get_task; print(get_task('puck').env)"
+    )
+    paths = f"{HERE}:{HERE.parents[1]}"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={"PYTHONPATH": paths})
+    assert found.stdout.strip() == "puck.env:PuckEnv", found.stderr

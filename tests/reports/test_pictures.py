@@ -1,0 +1,114 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The register of pictures: one decorated function is all that a picture needs, from outside the package too."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from run_files import write_run
+
+from torchrl_koap.reports import pictures
+from torchrl_koap.reports.mode_plots import recorded_modes
+from torchrl_koap.reports.pictures import NothingToDraw, all_pictures, draw_pictures, picture
+from torchrl_koap.reports.run_report import write_report
+from torchrl_koap.reports.style import thousandths
+
+PLUGIN = """
+from torchrl_koap.reports.pictures import picture
+
+@picture("speed.png", source="rollouts.safetensors", title="How fast <it> is", caption="Metres per step & more.")
+def plot_speed(rollouts, path, *, control_hz, num_modes):
+    path.write_text(f"{rollouts['position'].ndim} {control_hz:.1f} {num_modes}")
+"""
+
+
+@pytest.fixture(autouse=True)
+def register(monkeypatch):
+    """What a test registers is forgotten afterwards."""
+    monkeypatch.setattr(pictures, "_PICTURES", dict(all_pictures()))
+
+
+def test_a_module_from_elsewhere_registers_a_picture_of_the_report(tmp_path, monkeypatch):
+    (tmp_path / "my_pictures.py").write_text(PLUGIN)
+    monkeypatch.syspath_prepend(tmp_path)
+    __import__("my_pictures")
+    (tmp_path / "run").mkdir()
+    run = write_run(tmp_path / "run")
+    page = write_report(run, animation=False).read_text()
+    assert (run / "plots" / "speed.png").read_text() == "3 28.6 24"
+    assert (
+        "How fast &lt;it&gt; is" in page and "Metres per step &amp; more." in page and 'src="plots/speed.png"' in page
+    )
+    sys.modules.pop("my_pictures")
+
+
+def test_a_second_picture_of_the_same_name_is_an_error():
+    def mine(rollouts, path): ...
+
+    with pytest.raises(ValueError, match=r"'modes.png' is registered already, by torchrl_koap.*_draw_modes; .*mine"):
+        picture("modes.png", source="rollouts.safetensors", title="", caption="")(mine)
+
+
+def test_an_unknown_fact_is_an_error():
+    with pytest.raises(ValueError, match="wants 'colour', there are only task, num_modes"):
+        picture("a.png", source="eval.json", title="", caption="")(lambda data, path, *, colour: None)
+
+
+def test_a_failure_is_told_and_the_others_are_drawn(tmp_path):
+    @picture("broken.png", source="eval.json", title="Broken", caption="")
+    def draw(evaluation, path):
+        raise ValueError(f"no entry in {len(evaluation)}")
+
+    problems = draw_pictures(write_run(tmp_path), animation=False)
+    assert list(problems) == ["broken.png"] and problems["broken.png"].startswith("eval.json: no entry in ")
+    assert (tmp_path / "plots" / "modes.png").exists()
+
+
+def test_nothing_to_draw_removes_an_earlier_picture(tmp_path):
+    @picture("none.png", source="eval.json", title="None", caption="", empty="the evaluation is short")
+    def draw(evaluation, path):
+        raise NothingToDraw
+
+    run = write_run(tmp_path)
+    (run / "plots").mkdir()
+    (run / "plots" / "none.png").write_bytes(b"of earlier data")
+    assert draw_pictures(run, animation=False) == {} and not (run / "plots" / "none.png").exists()
+    assert "None: not drawn, the evaluation is short." in write_report(run, draw=False).read_text()
+
+
+def test_every_picture_has_words_and_a_command():
+    for item in all_pictures().values():
+        assert item.title and len(item.caption) > 40 and item.command.startswith("koap ") and "{run}" in item.command
+
+
+def test_drawing_needs_neither_training_nor_simulator():
+    heavy = ("torchrl", "mujoco", "numba", "matplotlib.pyplot", "torchrl_koap.training", "torchrl_koap.envs")
+    code = (
+        "import sys; from torchrl_koap.reports.pictures import all_pictures; all_pictures();"
+        f"print([m for m in {heavy} if m in sys.modules])"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.strip() == "[]"
+
+
+def test_modes_of_recorded_paths_are_those_of_the_rule():
+    """The black ticks: rows are passed left or right of the cylinders, whatever the frames between."""
+    left = [[0.45, -0.2], [0.44, -0.11], [0.4, 0.0], [0.4, 0.07], [0.3, 0.2], [0.3, 0.27], [0.3, 0.36]]
+    right = [[0.55, -0.09], [0.6, 0.1], [0.7, 0.3]]
+    short = [[0.5, -0.3], [0.5, -0.2]]
+    data = {"position": np.array(left + right + short), "episode": np.repeat([0, 1, 2], [7, 3, 2])}
+    assert recorded_modes(data, "avoiding").tolist() == [0, 23, -1]
+    assert recorded_modes(data, "aligning") is None
+    assert recorded_modes({"mode": np.array([4, 2])}, "aligning").tolist() == [4, 2]
+
+
+def test_units():
+    assert [thousandths(unit) for unit in ("m", "rad", "", "N m")] == [
+        ("mm", 1e3),
+        ("mrad", 1e3),
+        ("", 1.0),
+        ("N m", 1.0),
+    ]

@@ -1,0 +1,70 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What `import torchrl_koap` offers, and that Python and shell do the same."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+from tiny_runs import TINY, koap
+
+import torchrl_koap
+from torchrl_koap import EvalConfig, TrainConfig, evaluate, load_policy, train
+from torchrl_koap.envs import AvoidingEnv
+from torchrl_koap.evaluation.rollouts import roll_out
+
+PLAIN = {"steps": 20, "batch_size": 8, "controller_batch_size": 8, "channels": (8, 16), "label_count": 2}
+
+
+@pytest.mark.parametrize("name", torchrl_koap.__all__)
+def test_every_name_is_there(name):
+    assert getattr(torchrl_koap, name) is not None and name in dir(torchrl_koap)
+
+
+def test_an_unknown_name_is_named():
+    with pytest.raises(AttributeError, match="module 'torchrl_koap' has no attribute 'trian'"):
+        torchrl_koap.trian  # noqa: B018
+
+
+def test_the_package_itself_loads_nothing():
+    script = "import sys, torchrl_koap; print(torchrl_koap.__version__, 'torch' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert said.split() == [torchrl_koap.__version__, "False"]
+
+
+def test_python_trains_and_evaluates_what_the_shell_does(trained_run, demonstrations, tmp_path):
+    mine, its = tmp_path / "mine", tmp_path / "its"
+    summary = train(TrainConfig(out=mine, dataset=str(demonstrations), **PLAIN), command="as called")
+    assert summary == json.loads((mine / "summary.json").read_text())
+    for name in ("planner", "controller"):
+        weights = (folder / f"{name}.safetensors" for folder in (mine, trained_run))
+        assert next(weights).read_bytes() == next(weights).read_bytes()
+    assert json.loads((mine / "config.json").read_text())["command"] == "as called"
+
+    result = evaluate(mine, EvalConfig(episodes=2, threads=1))
+    assert result == json.loads((mine / "eval.json").read_text()) and not (mine / "index.html").exists()
+    mine.rename(its)
+    assert koap("eval", its, "--episodes", 2, "--threads", 1, "--no-report") == 0
+    assert json.loads((its / "eval.json").read_text())["episode"] == result["episode"]
+
+
+def test_a_policy_acts_as_its_evaluation_did(trained_run, tmp_path):
+    policy = load_policy(trained_run, EvalConfig(replan_interval=2))
+    assert policy.replan_interval == 2
+    episodes = roll_out(policy, AvoidingEnv, [100, 101], max_steps=5)
+    again = roll_out(load_policy(str(trained_run), EvalConfig(replan_interval=2)), AvoidingEnv, [101], max_steps=5)
+    assert torch.allclose(episodes[1]["action"], again[0]["action"], atol=1e-6)
+    with pytest.raises(ValueError, match="unknown execution 'opne_loop'; did you mean 'open_loop'"):
+        load_policy(trained_run, EvalConfig(execution="opne_loop"))
+
+
+def test_a_training_without_a_command_keeps_none(demonstrations, tmp_path):
+    out = tmp_path / "run"
+    train(TrainConfig(out=out, dataset=str(demonstrations), method="linear", **PLAIN))
+    assert "command" not in json.loads((out / "config.json").read_text())
+    assert koap("train", "--out", out, "--resume") == 0  # and a shell may go on with it
+    assert "command" in json.loads((out / "config.json").read_text())
+    assert set(TINY) & {"--steps", "--label-count"}

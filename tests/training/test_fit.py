@@ -1,0 +1,142 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Fitting in memory does what `koap train` does, on data that lack labels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.data import LabelBudget, load_ted, make_demonstrations, save_demonstrations, select_state
+from torchrl_koap.keys import LayoutError
+from torchrl_koap.training import Recipe, TrainConfig, fit_controller, fit_planner, train
+from torchrl_koap.training.checkpoints import load_tensors
+
+NAMES = ["q1", "q2", "goal_1", "goal_2"]
+SMALL = {"batch_size": 8, "channels": (8, 16)}
+
+
+def record(number=6, steps=40, seed=0):
+    """A robot of two joints that follow delta commands with a lag, towards a goal."""
+    random = np.random.default_rng(seed)
+    states, actions = [], []
+    for _ in range(number):
+        joints, goal, speed = random.uniform(-1, 1, 2), random.uniform(-1, 1, 2), np.zeros(2)
+        rows, taken = [], []
+        for _ in range(steps):
+            rows.append(np.r_[joints, goal])
+            taken.append(0.15 * (goal - joints) + random.normal(0, 0.002, 2))
+            speed = 0.6 * speed + 0.4 * taken[-1]
+            joints = joints + speed
+        states.append(np.array(rows))
+        actions.append(np.array(taken))
+    return states, actions
+
+
+def few_labels(labelled=2, **options):
+    states, actions = record()
+    actions = [steps if index < labelled else None for index, steps in enumerate(actions)]
+    return {"states": states, "actions": actions, "control_hz": 30, "state_names": NAMES, "robot": NAMES[:2]} | options
+
+
+def same_weights(module, other):
+    state, other = module.state_dict(), other if isinstance(other, dict) else other.state_dict()
+    return state.keys() == other.keys() and all(torch.equal(state[name], other[name]) for name in state)
+
+
+def test_the_weights_of_a_training_bit_for_bit(tmp_path):
+    folder = save_demonstrations(tmp_path / "arm", **few_labels())
+    options = {"controller_batch_size": 8, **SMALL}
+    train(TrainConfig(out=tmp_path / "run", dataset=str(folder), steps=30, controller_steps=20, seed=3, **options))
+    data, task = load_ted(folder / "ted"), make_demonstrations(name="arm", **few_labels())[1]
+    before = torch.get_rng_state()
+    planner = fit_planner(data, task, steps=30, seed=3, progress=False, **SMALL)
+    controller = fit_controller(data, task, steps=20, seed=3, progress=False, controller_batch_size=8)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert same_weights(planner, load_tensors(tmp_path / "run" / "planner.safetensors")[0])
+    assert same_weights(controller, load_tensors(tmp_path / "run" / "controller.safetensors")[0])
+
+
+def test_how_it_was_made_is_kept():
+    data, task = make_demonstrations(**few_labels())
+    controller = fit_controller(data, task, steps=5, progress=False, controller_state="all", controller_batch_size=8)
+    recipe = controller.recipe
+    assert isinstance(recipe, Recipe) and recipe.task is task
+    assert recipe.entry["method"] == "koap" and recipe.entry["state"] == "all"
+    assert recipe.results["labels_used"] == 68 and recipe.results["updates"] == 5
+    assert not controller.training
+
+
+def test_labels_marked_missing_or_found():
+    data, task = make_demonstrations(**few_labels())
+    expected = fit_controller(data, task, method="linear", progress=False)
+    unmarked = data.exclude("has_action")
+    assert same_weights(fit_controller(unmarked, task, method="linear", progress=False), expected)
+    full, _ = make_demonstrations(**few_labels(6))
+    budgeted, _ = LabelBudget.of_episodes([0, 1]).apply(full)
+    assert same_weights(fit_controller(budgeted, task, method="linear", progress=False), expected)
+    with_state = select_state(data, task.state_of)
+    assert same_weights(fit_controller(with_state, task, method="linear", progress=False), expected)
+
+
+def test_without_a_task_every_column_is_the_robots():
+    data, _ = make_demonstrations(**few_labels())
+    planner = fit_planner(data, steps=2, progress=False, **SMALL)
+    controller = fit_controller(data, method="linear", progress=False)
+    assert planner.state_dim == 4 and controller.recipe.task.robot == ()
+    only_states = select_state(data, (0, 1))
+    assert fit_planner(only_states, steps=2, progress=False, **SMALL).recipe.task.observation_dim == 2
+
+
+def errors_of(method, task, data, gains=1.0):
+    """Action errors on trajectories that were not in the data, as shares of the actions."""
+    states, actions = record(4, seed=9)
+    windows = torch.from_numpy(np.stack(states)[..., :2]).float()
+    controller = fit_controller(data, task, method=method, steps=0, progress=False)
+    with torch.no_grad():
+        decoded = controller(TensorDict({"state": windows}, [len(windows)]))["action"][:, 4:-12]
+    true = torch.from_numpy(np.stack(actions) * gains).float()[:, 4:-12]
+    return ((decoded - true).square().mean((0, 1)) / true.square().mean((0, 1))).sqrt().max().item()
+
+
+def test_the_decoder_beats_a_ridge_on_a_lagging_robot():
+    data, task = make_demonstrations(**few_labels(3))
+    koap, ridge = (errors_of(method, task, data) for method in ("koap", "linear"))
+    assert koap < 0.08 and koap < 0.75 * ridge, (koap, ridge)
+
+
+def test_a_guess_about_axes_is_dropped_where_it_predicts_worse():
+    """Action i likely moves column i, all by one filter; here the second is reversed and ten times as strong."""
+    gains = np.array([1.0, -10.0])
+    states, actions = record()
+    scaled = [steps * gains if index < 3 else None for index, steps in enumerate(actions)]
+    data, task = make_demonstrations(**few_labels(actions=scaled))
+    guessed = fit_controller(data, task, steps=0, progress=False)
+    without = fit_controller(data, replace(task, env="none:at_all"), steps=0, progress=False)
+    assert same_weights(guessed, without)
+    tied = fit_controller(data, replace(task, actuated=(0, 1)), steps=0, progress=False)
+    assert tied.recipe.results["held_out_error"] > guessed.recipe.results["held_out_error"]
+
+
+def test_refusals():
+    data, task = make_demonstrations(**few_labels())
+    with pytest.raises(ValueError, match="unknown option of fit_planner 'chanels'; did you mean 'channels'"):
+        fit_planner(data, task, chanels=(8,))
+    with pytest.raises(ValueError, match="unknown option of fit_controller 'channels'"):
+        fit_controller(data, task, channels=(8,))
+    with pytest.raises(ValueError, match="method 'dp' is a policy of its own"):
+        fit_controller(data, task, method="dp")
+    with pytest.raises(ValueError, match="unknown method 'kaop'; did you mean 'koap'"):
+        fit_controller(data, task, method="kaop")
+    unlabelled, _ = make_demonstrations(**few_labels(0, actions=None, action_dim=2))
+    with pytest.raises(ValueError, match="none of the 234 steps has an action: there are no labels to learn from"):
+        fit_controller(unlabelled, task)
+    with pytest.raises(ValueError, match="'state' has 3 columns, task 'robot' has 4"):
+        fit_planner(select_state(data, (0, 1, 2)), task)
+    wrong = data.clone()
+    wrong["has_action"][-1] = True
+    with pytest.raises(LayoutError, match="'action' is not finite in 1 labelled steps"):
+        fit_controller(wrong, task)

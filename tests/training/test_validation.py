@@ -1,0 +1,81 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Trajectories that the planner never sees."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from offline_runs import save_arm, train_arm
+
+from torchrl_koap.data import LabelBudget, flatten_trajectories
+from torchrl_koap.training.validation import choose_validation, validation_of, without_validation
+
+
+def flat(count):
+    return flatten_trajectories([torch.zeros(5, 2)] * count, [torch.zeros(4, 1)] * count)
+
+
+def test_trajectories_without_labels_are_taken_first():
+    for seed in range(5):
+        data, _ = LabelBudget(6, seed=seed).apply(flat(10))
+        labelled = set(data["episode"][data["has_action"].squeeze(-1)].tolist())
+        chosen = choose_validation(data, 0.4, seed=seed)
+        assert len(chosen) == 4 and not labelled & set(chosen)
+    assert choose_validation(data, 0.2, seed=0) != choose_validation(data, 0.2, seed=1)
+
+
+def test_where_all_have_labels_some_of_these_are_held_out_and_lose_none():
+    data = flat(10)
+    chosen = choose_validation(data, 0.3)
+    assert len(chosen) == 3
+    assert len(without_validation(data, chosen)["episode"].unique()) == 7
+    kept = without_validation(data, chosen, keep_labelled=True)
+    assert len(kept["episode"].unique()) == 10 and kept["has_action"].all()
+
+
+@pytest.mark.parametrize(
+    ("count", "fraction", "number"), [(1, 0.1, 0), (2, 0.1, 1), (2, 0.9, 1), (50, 0.1, 5), (5, 0, 0)]
+)
+def test_one_is_held_out_at_least_and_one_is_left(count, fraction, number):
+    assert len(choose_validation(flat(count), fraction)) == number
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match=r"validation_fraction must be in \[0, 1\), got 1.5"):
+        choose_validation(flat(3), 1.5)
+    with pytest.raises(ValueError, match="all 3 trajectories that are used are held out"):
+        without_validation(flat(3), [0, 1, 2])
+
+
+def test_a_run_lists_them_resumes_and_hands_them_on(tmp_path):
+    arm = save_arm(tmp_path / "arm", labelled=9)
+    run = train_arm(tmp_path / "run", arm, method="linear")
+    config = json.loads((run / "config.json").read_text())
+    assert config["validation_fraction"] == 0.1 and config["validation_episodes"] == [9]  # the one without a label
+    weights = (run / "planner.safetensors").read_bytes()
+    for name in ("planner.safetensors", "controller.safetensors", "summary.json"):
+        (run / name).unlink()
+    train_arm(run, arm, method="linear", resume=True)
+    assert (run / "planner.safetensors").read_bytes() == weights
+    assert json.loads((run / "config.json").read_text())["validation_episodes"] == [9]
+    assert validation_of(run, str(arm)) == [9] and validation_of(run, str(tmp_path)) == []
+    again = train_arm(tmp_path / "again", arm, method="linear", planner_from=run, seed=3)
+    assert json.loads((again / "config.json").read_text())["validation_episodes"] == [9]
+
+
+def test_the_planner_does_not_depend_on_what_is_held_out(tmp_path):
+    """Nothing of these trajectories reaches it, not even through its statistics."""
+    from torchrl_koap.data import load_ted, save_ted
+    from torchrl_koap.data.ted import read_task
+
+    arm = save_arm(tmp_path / "arm", labelled=9)
+    run = train_arm(tmp_path / "run", arm, method="linear")
+    data, task = load_ted(arm / "ted", memmap=False), read_task(arm / "ted")
+    for key in ("observation", ("next", "observation")):
+        data[key][data["episode"] == 9] *= 100
+    save_ted(data, arm / "ted", task=task)
+    other = train_arm(tmp_path / "other", arm, method="linear")
+    for name in ("planner.safetensors", "controller.safetensors"):
+        assert (other / name).read_bytes() == (run / name).read_bytes()

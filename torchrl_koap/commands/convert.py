@@ -1,0 +1,93 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap convert``: recordings of one's own robot become a data set that ``koap train --dataset`` takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from torchrl_koap.commands.command import Command
+from torchrl_koap.data import read_about, read_recordings, save_demonstrations
+
+
+@dataclass(kw_only=True)
+class Convert(Command):
+    """Turn recordings of any robot, of which few or none have actions, into a data set that holds its whole task.
+
+    Attributes:
+        source: a folder of *.npz, *.csv or *.parquet files, a LeRobot data set, an HDF5 file in robomimic's layout, or
+            minari:NAME.
+        out: folder to write.
+        name: name of the task (default: that of the folder).
+        control_hz: frames per second (default: as the source says).
+        observations: features of a LeRobot data set or entries of an HDF5 file that make up the state (default: all
+            that are no images).
+        action_columns: columns of tables that are actions, if they are not named action...
+        action_dim: number of action columns, where nothing has actions.
+        robot: state columns of the robot itself, which the controller reads (default: all that are no command).
+        command: neighbouring columns that repeat the last command; nothing that learns sees them.
+        action_kind: "delta" (velocities, efforts, changes) or "absolute" (targets of state columns).
+        targets: for absolute actions the state column that each is the target of (default: the robot's).
+        action_units: unit of each action column, or one for all.
+        state_units: unit of each state column, or one for all.
+        max_steps: steps after which an episode counts as failed (default: 1.5 times the longest demonstration).
+    """
+
+    source: tyro.conf.Positional[str]
+    out: Path
+    name: str | None = None
+    control_hz: float | None = None
+    observations: tuple[str, ...] = ()
+    action_columns: tuple[str, ...] = ()
+    action_dim: int | None = None
+    robot: tuple[str, ...] = ()
+    command: tuple[str, ...] = ()
+    action_kind: str = "delta"
+    targets: tuple[str, ...] = ()
+    action_units: tuple[str, ...] = ("",)
+    state_units: tuple[str, ...] = ("",)
+    max_steps: int | None = None
+
+    def __call__(self) -> dict[str, Any]:
+        """Reads, checks and writes."""
+        if (self.out / "ted").exists():
+            raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
+        recordings = read_recordings(
+            self.source,
+            control_hz=self.control_hz,
+            observations=self.observations,
+            action_columns=self.action_columns,
+            action_dim=self.action_dim,
+        )
+        folder = save_demonstrations(
+            self.out,
+            recordings,
+            name=self.name,
+            robot=self.robot or None,
+            command=self.command,
+            action_kind=self.action_kind,
+            targets=self.targets or None,
+            action_units=_one_or_all(self.action_units),
+            state_units=_one_or_all(self.state_units),
+            max_steps=self.max_steps,
+        )
+        about = read_about(folder / "ted")
+        return {
+            "data set": str(folder),
+            "task": about["task"],
+            "trajectories": about["trajectories"],
+            "steps": about["steps"],
+            "labelled steps": about["labelled_steps"],
+            "states": ", ".join(recordings.state_names),
+            "actions": ", ".join(recordings.action_names),
+            "frames per second": recordings.control_hz,
+            "skipped": ", ".join(recordings.skipped) or "nothing",
+            "next": f"koap train --dataset {folder} --out runs/{about['task']}",
+        }
+
+
+def _one_or_all(units: tuple[str, ...]) -> str | tuple[str, ...]:
+    return units[0] if len(units) == 1 else units

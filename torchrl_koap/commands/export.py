@@ -1,0 +1,63 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap export``: a trained policy as files that run without this library."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from torchrl_koap.commands.command import Command
+from torchrl_koap.evaluation import EvalConfig, load_policy, load_run
+from torchrl_koap.evaluation.latency import time_calls
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import PlanThenControl
+from torchrl_koap.modules.policies.export import PARTS, SUFFIXES, export_part, exportable
+from torchrl_koap.training.builders import set_up_torch
+from torchrl_koap.training.progress import progress_bar
+
+
+@dataclass(kw_only=True)
+class Export(Command):
+    """Write the whole policy, its controller and its denoiser, and compare each with the original (1e-5).
+
+    Attributes:
+        run: run directory of `koap train`.
+        out: folder to write (default: RUN/exported).
+        format: "torch" (torch.export), "onnx" (ONNX Runtime) or "aoti" (AOTInductor, needs a C++ compiler).
+        solver_steps: solver steps that are unrolled (default: the run's).
+        threads: torch threads.
+        latency: time the exported parts against eager ones.
+    """
+
+    run: tyro.conf.Positional[Path]
+    out: Path | None = None
+    format: str = "torch"
+    solver_steps: int | None = None
+    threads: int = 1
+    latency: bool = True
+
+    def __call__(self) -> dict[str, Any]:
+        """Exports, compares, times."""
+        suffix = lookup(SUFFIXES, self.format, "export format")
+        set_up_torch(self.threads, "cpu")
+        trained = load_run(self.run)
+        policy = load_policy(trained, EvalConfig(solver_steps=self.solver_steps))
+        out = self.run / "exported" if self.out is None else self.out
+        out.mkdir(parents=True, exist_ok=True)
+        parts = [part for part in PARTS if part != "controller" or isinstance(policy, PlanThenControl)]
+        result: dict[str, Any] = {}
+        with progress_bar(len(parts), "export", unit="part") as bar:
+            for part in parts:
+                what = exportable(policy, part, observation_dim=trained.task.observation_dim)
+                file = out / f"{part}{suffix}"
+                loaded = export_part(what, file, kind=self.format)
+                result[part] = {"file": str(file), "kilobytes": round(file.stat().st_size / 1e3)}
+                result[part] |= {f"{name} in": list(value.shape) for name, value in what.inputs.items()}
+                if self.latency:
+                    times = time_calls({"eager": what.module, self.format: loaded}, tuple(what.inputs.values()))
+                    result[f"{part} ms"] = times
+                bar.update()
+        return result

@@ -1,0 +1,253 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A user's own demonstrations as a data set that holds its whole task: arrays in, ``koap train --dataset`` out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from tensordict import TensorDict
+
+from torchrl_koap.data.recordings import Recordings, RecordingsError, make_recordings
+from torchrl_koap.data.ted import save_ted
+from torchrl_koap.data.trajectories import flatten_trajectories
+from torchrl_koap.lookup import lookup
+from torchrl_koap.tasks import Task
+
+ACTION_KINDS = ("delta", "absolute")
+_SLACK = 1.5  # episodes may be that much longer than the longest demonstration
+
+
+def save_demonstrations(
+    folder: str | Path, states: Sequence[ArrayLike] | Recordings, actions: Any = None, **description: Any
+) -> Path:
+    """Writes demonstrations, of which few or none have actions, as a data set that ``koap train --dataset`` takes.
+
+    Args:
+        folder (str or Path): folder to create; a data set there is replaced in one step.
+        states (sequence of array, or Recordings): frames of every trajectory ``[T_i, d]``, in the units that the robot
+            reports; or what a reader of :mod:`torchrl_koap.data.recordings` found.
+        actions (sequence of array or None, optional): actions ``[T_i, a]`` or ``[T_i - 1, a]`` of every trajectory, NaN
+            where there is no label, or None for a trajectory without. Default: no labels.
+        **description: everything :func:`make_demonstrations` takes besides.
+
+    Returns:
+        Path: the folder.
+
+    Raises:
+        RecordingsError: with all faults of the arrays and of their description.
+        FileExistsError: if the folder holds something other than a data set.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap.data import read_about, save_demonstrations
+        >>> states = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(5)]
+        >>> actions = [np.diff(states[0], axis=0), None, None, None, None]
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     folder = save_demonstrations(Path(root) / "arm", states, actions, control_hz=30)
+        ...     about = read_about(folder / "ted")
+        ...     print(about["task"], about["labelled_steps"], about["steps"])
+        arm 39 195
+    """
+    folder = Path(folder)
+    name = description.pop("name", None) or re.sub(r"\W+", "_", folder.resolve().name).strip("_") or "robot"
+    data, task = make_demonstrations(states, actions, name=name, **description)
+    return save_ted(data, folder / "ted", task=task).parent
+
+
+def make_demonstrations(
+    states: Sequence[ArrayLike] | Recordings,
+    actions: Sequence[ArrayLike | None] | None = None,
+    *,
+    control_hz: float | None = None,
+    name: str = "robot",
+    state_names: Sequence[str] | None = None,
+    state_units: Sequence[str] | str = "",
+    action_names: Sequence[str] | None = None,
+    action_units: Sequence[str] | str = "",
+    action_dim: int | None = None,
+    robot: Sequence[str | int] | None = None,
+    command: Sequence[str | int] = (),
+    action_kind: str = "delta",
+    targets: Sequence[str | int] | None = None,
+    max_steps: int | None = None,
+) -> tuple[TensorDict, Task]:
+    """Demonstrations in memory: flat data and the task they are of.
+
+    Args:
+        states (sequence of array, or Recordings): as for :func:`save_demonstrations`.
+        actions (sequence of array or None, optional): likewise.
+
+    Keyword Args:
+        control_hz (float): frames per second; recordings may know it.
+        name (str): name of the task.
+        state_names (sequence of str, optional): names of the state columns. Default: ``state_0``, ...
+        state_units (sequence of str, or str): their units, or one for all.
+        action_names (sequence of str, optional): names of the action columns. Default: ``action_0``, ...
+        action_units (sequence of str, or str): their units, or one for all. Errors are averaged over columns of one
+            unit.
+        action_dim (int, optional): number of action columns, where no trajectory has actions.
+        robot (sequence of str or int, optional): state columns of the robot itself, by name or number: the controller
+            reads these. Default: all that are no command.
+        command (sequence of str or int): neighbouring columns that repeat the last command. Their differences are the
+            actions, so nothing that learns ever sees them.
+        action_kind (str): ``"delta"``, velocities, efforts or changes: small where the robot stands still; or
+            ``"absolute"``, targets of the columns ``targets``.
+        targets (sequence of str or int, optional): for absolute actions, the state column that each action is the
+            target of. Default: the robot's columns, if there are as many.
+        max_steps (int, optional): steps after which an episode counts as failed. Default: 1.5 times the longest
+            demonstration.
+
+    Returns:
+        tuple: flat data ``[N]`` in the storage layout of :mod:`torchrl_koap.keys`, and the
+        :class:`~torchrl_koap.tasks.Task`.
+
+    Raises:
+        RecordingsError: with all faults: those of :func:`~torchrl_koap.data.recordings.make_recordings`, columns that
+            do not exist or overlap, targets that do not fit, units of another number, an action that never changes.
+        ValueError: for an unknown kind of action.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data import make_demonstrations
+        >>> data, task = make_demonstrations([np.zeros((20, 3))], control_hz=30, action_dim=2, robot=[0, 1])
+        >>> task.observation_dim, task.action_dim, task.robot, bool(data["has_action"].any())
+        (3, 2, (0, 1), False)
+    """
+    lookup(ACTION_KINDS, action_kind, "kind of action")
+    recordings = states
+    if not isinstance(states, Recordings):
+        recordings = make_recordings(
+            states,
+            actions,
+            action_dim=action_dim,
+            state_names=state_names,
+            action_names=action_names,
+            control_hz=control_hz,
+        )
+    elif actions is not None:
+        raise ValueError("recordings hold their actions already; actions must be None")
+    problems: list[str] = []
+    names, acting = recordings.state_names, recordings.action_names
+    rate = control_hz or recordings.control_hz
+    if rate is None:
+        problems.append("control_hz is missing: frames per second")
+    commanded = _columns(command, names, "command", problems)
+    own = _columns(robot, names, "robot", problems) if robot is not None else None
+    if own is None:
+        own = [column for column in range(len(names)) if column not in commanded]
+    problems += [f"column {names[column]!r} is the robot's and a command" for column in own if column in commanded]
+    if commanded and commanded != list(range(min(commanded), min(commanded) + len(commanded))):
+        problems.append(f"command columns must lie side by side, got {', '.join(names[c] for c in commanded)}")
+    if len(commanded) == len(names):
+        problems.append("every column is a command: nothing is left to plan and act on")
+    reached = _targets(action_kind, targets, own, names, len(acting), problems)
+    units = _units(action_units, len(acting), "action_units", problems)
+    own_units = _units(state_units, len(names), "state_units", problems)
+    problems += _constant_actions(recordings)
+    if problems:
+        raise RecordingsError(f"task {name!r}", problems)
+    data = flatten_trajectories(
+        [torch.from_numpy(frames) for frames in recordings.states],
+        [torch.from_numpy(steps) for steps in recordings.actions],
+    )
+    state_column = {column: index for index, column in enumerate(c for c in range(len(names)) if c not in commanded)}
+    parts = _parts(names, set(own), set(commanded))
+    task = Task(
+        name=name,
+        observation_parts=parts,
+        observation_units=own_units,
+        actions=dict(zip(acting, units, strict=True)),
+        position=next(part for part in parts if part != _COMMAND),
+        max_steps=max_steps or round(_SLACK * max(len(frames) for frames in recordings.states)),
+        control_hz=float(rate),
+        command=_COMMAND if commanded else None,
+        robot=tuple(state_column[column] for column in own),
+        action_targets=tuple(state_column[column] for column in reached),
+    )
+    return data, task
+
+
+_COMMAND = "command"
+
+
+def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str, tuple[str, ...]]:
+    """Neighbouring columns with the same role as one part each."""
+
+    def role(column: int) -> str:
+        return _COMMAND if column in commanded else "robot" if column in own else "surroundings"
+
+    parts: dict[str, tuple[str, ...]] = {}
+    for kind, columns in groupby(range(len(names)), role):
+        number = sum(part.partition("_")[0] == kind for part in parts)
+        parts[f"{kind}_{number + 1}" if number else kind] = tuple(names[column] for column in columns)
+    return parts
+
+
+def _columns(given: Sequence[str | int], names: Sequence[str], what: str, problems: list[str]) -> list[int]:
+    found = []
+    for column in given:
+        if isinstance(column, str):
+            try:
+                found.append(list(names).index(lookup(names, column, f"column in {what}:")))
+            except ValueError as error:
+                problems.append(str(error))
+        elif 0 <= column < len(names):
+            found.append(int(column))
+        else:
+            problems.append(f"{what}: there is no column {column}, only 0..{len(names) - 1}")
+    repeated = sorted({names[column] for column in found if found.count(column) > 1})
+    if repeated:
+        problems.append(f"{what} holds {', '.join(repeated)} more than once")
+    return found
+
+
+def _targets(
+    kind: str,
+    given: Sequence[str | int] | None,
+    own: Sequence[int],
+    names: Sequence[str],
+    wide: int,
+    problems: list[str],
+) -> list[int]:
+    """State columns that absolute actions are the targets of."""
+    if kind == "delta":
+        if given is not None:
+            problems.append("targets are for action_kind='absolute'")
+        return []
+    columns = list(own) if given is None else _columns(given, names, "targets", problems)
+    if len(columns) != wide:
+        what = "the robot's columns are" if given is None else "targets are"
+        problems.append(
+            f"absolute actions have {wide} columns, {what} {len(columns)}: name in targets the column that each action"
+            " is the target of"
+        )
+    return columns
+
+
+def _units(given: Sequence[str] | str, wide: int, what: str, problems: list[str]) -> tuple[str, ...]:
+    units = (given,) * wide if isinstance(given, str) else tuple(given)
+    if len(units) != wide:
+        problems.append(f"{what} names {len(units)} columns, there are {wide}")
+    return units
+
+
+def _constant_actions(recordings: Recordings) -> list[str]:
+    steps = np.concatenate(recordings.actions)
+    steps = steps[np.isfinite(steps).all(-1)]
+    if len(steps) < 2:
+        return []
+    still = np.flatnonzero(np.ptp(steps, axis=0) == 0)
+    return [
+        f"action {recordings.action_names[column]!r} is {steps[0, column]:g} in all {len(steps)} labels: nothing can be"
+        " learnt of it; leave it out"
+        for column in still
+    ]

@@ -1,0 +1,167 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""How long a policy takes per control step, and how many steps of a control loop come too late."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_koap.evaluation.run import load_policy, load_run
+from torchrl_koap.modules import Agent, AsynchronousAgent
+from torchrl_koap.training.builders import set_up_torch
+from torchrl_koap.training.plugins import Plugins, load_plugins
+
+
+@dataclass
+class LatencyConfig:
+    """A control loop in real time with a trained policy, on made-up observations.
+
+    Attributes:
+        steps: control steps.
+        control_hz: steps per second (default: that of the task).
+        async_replan: make the next plan in a thread while the present one is executed.
+        threads: torch threads.
+        plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop
+        >>> measure_control_loop("runs/koap", LatencyConfig(steps=100, control_hz=20.0))  # doctest: +SKIP
+    """
+
+    steps: int = 300
+    control_hz: float | None = None
+    async_replan: bool = False
+    threads: int = 1
+    plugins: Plugins = ()
+
+
+def measure_control_loop(run: str | Path, config: LatencyConfig | None = None) -> dict[str, Any]:
+    """Runs a control loop in real time; ``koap latency`` calls this.
+
+    Args:
+        run (str or Path): a run directory.
+        config (LatencyConfig, optional): how long and how fast.
+
+    Returns:
+        dict: ``late_steps`` of ``steps``, ``p50``, ``p99`` and ``max`` of the time from an observation to its action
+        (ms), and the time that a step may take.
+
+    Raises:
+        ValueError: for fewer than one step or a rate that is not positive.
+        RunDirectoryError: if the folder is no finished run.
+    """
+    config = LatencyConfig() if config is None else config
+    if config.steps < 1:
+        raise ValueError(f"steps must be >= 1, got {config.steps}")
+    set_up_torch(config.threads, "cpu")
+    load_plugins(config.plugins)
+    trained = load_run(run)
+    rate = trained.task.control_hz if config.control_hz is None else config.control_hz
+    policy = load_policy(trained)
+    if config.async_replan:
+        agent: Any = AsynchronousAgent(policy, control_hz=rate)
+    else:
+        agent = Agent(policy)
+    observations = 0.01 * np.random.default_rng(0).standard_normal((config.steps, trained.task.observation_dim))
+    with agent if config.async_replan else nullcontext():
+        return run_control_loop(agent, observations, control_hz=rate)
+
+
+def run_control_loop(agent: Agent, observations: np.ndarray, *, control_hz: float) -> dict[str, Any]:
+    """Hands an agent an observation per tick of a clock and counts the actions that come after the next tick.
+
+    Args:
+        agent (Agent): the agent; it is reset, with the first observation if it takes one.
+        observations (np.ndarray): ``[steps, obs]``.
+
+    Keyword Args:
+        control_hz (float): ticks per second.
+
+    Returns:
+        dict: ``steps``, ``late_steps``, ``step_ms`` (what a step may take), ``p50``, ``p99`` and ``max`` (ms).
+
+    Raises:
+        ValueError: if the rate is not positive.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.evaluation.latency import run_control_loop
+        >>> class Still:
+        ...     def reset(self): pass
+        ...     def act(self, observation): return 0
+        >>> run_control_loop(Still(), np.zeros((5, 2)), control_hz=100.0)["steps"]
+        5
+    """
+    if not (np.isfinite(control_hz) and control_hz > 0):
+        raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz}")
+    agent.reset(observations[0]) if isinstance(agent, AsynchronousAgent) else agent.reset()
+    period, took = 1 / control_hz, []
+    tick = time.perf_counter()
+    for observation in observations:
+        agent.act(observation)
+        took.append(time.perf_counter() - tick)
+        tick += period
+        pause = tick - time.perf_counter()
+        if pause > 0:
+            time.sleep(pause)
+        else:  # a late step moves the clock: the next one is not late for that
+            tick = time.perf_counter()
+    times = 1e3 * np.array(took)
+    p50, p99 = np.percentile(times, (50, 99))
+    return {
+        "steps": len(times),
+        "late_steps": int((times > 1e3 * period).sum()),
+        "step_ms": 1e3 * period,
+        "p50": float(p50),
+        "p99": float(p99),
+        "max": float(times.max()),
+    }
+
+
+def time_calls(
+    functions: Mapping[str, Callable[..., Tensor]], inputs: tuple[Tensor, ...], *, repeats: int = 100
+) -> dict[str, dict[str, float]]:
+    """Time of functions that are called in turn, so that a busy machine slows all of them alike.
+
+    Args:
+        functions (mapping): name to function of the inputs.
+        inputs (tuple of Tensor): handed to each.
+
+    Keyword Args:
+        repeats (int): counted calls of each, after ten that warm up.
+
+    Returns:
+        dict: by name ``p50`` and ``p99`` in ms, and ``ratio``, the median of its time over that of the first function
+        in the same turn.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.evaluation.latency import time_calls
+        >>> sorted(time_calls({"add": torch.add, "mul": torch.mul}, (torch.ones(2), torch.ones(2)), repeats=3)["mul"])
+        ['p50', 'p99', 'ratio']
+    """
+    taken: dict[str, list[float]] = {name: [] for name in functions}
+    with torch.no_grad():
+        for turn in range(repeats + 10):
+            for name, function in functions.items():
+                began = time.perf_counter()
+                function(*inputs)
+                if turn >= 10:
+                    taken[name].append(1e3 * (time.perf_counter() - began))
+    first = np.array(next(iter(taken.values())))
+    return {
+        name: {
+            "p50": float(np.percentile(times, 50)),
+            "p99": float(np.percentile(times, 99)),
+            "ratio": float(np.median(np.array(times) / first)),
+        }
+        for name, times in taken.items()
+    }

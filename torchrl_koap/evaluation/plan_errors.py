@@ -1,0 +1,181 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""How far plans lie from what was recorded, on trajectories that the planner has not seen; no environment needed.
+
+A planner says what may come next, and more than one thing may. A single sample is then a bad measure: one that follows
+another way than the demonstrator is no mistake. Scores of the whole distribution are not fooled by that.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_koap.data import cut_windows
+from torchrl_koap.modules import StatePlanner
+from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.units import unit_groups
+
+SAMPLES = 16
+BASELINES = ("standing_still", "constant_velocity")
+_BATCH = 512  # plans that are sampled at a time
+
+
+def energy_score(samples: Tensor, true: Tensor) -> Tensor:
+    r"""Energy score of a sampled distribution, smaller is better, in the unit of the samples.
+
+    .. math:: \mathrm{ES} = \mathbb{E}\,\|X - y\| - \tfrac{1}{2}\, \mathbb{E}\,\|X - X'\|
+
+    It is least, on average, for samples of the true distribution, with all its modes; of a single certain sample it is
+    the distance. The second mean is over pairs of different samples, so that its expectation does not depend on how
+    many there are.
+
+    Args:
+        samples (Tensor): ``[S, *B, d]``.
+        true (Tensor): ``[*B, d]``.
+
+    Returns:
+        Tensor: ``[*B]``.
+
+    Raises:
+        ValueError: if shapes disagree.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.evaluation.plan_errors import energy_score
+        >>> left_or_right = torch.tensor([[-1.0], [1.0], [-1.0], [1.0]])
+        >>> energy_score(left_or_right, torch.tensor([1.0])), energy_score(torch.zeros(4, 1), torch.tensor([1.0]))
+        (tensor(0.3333), tensor(1.))
+    """
+    if samples.ndim < 2 or samples.shape[1:] != true.shape:
+        raise ValueError(f"wanted samples [S, *B, d] and true [*B, d], got {list(samples.shape)}, {list(true.shape)}")
+    count = len(samples)
+    score = (samples - true).norm(dim=-1).mean(0)
+    if count > 1:
+        apart = sum((samples - sample).norm(dim=-1).sum(0) for sample in samples)
+        score = score - 0.5 * apart / (count * (count - 1))
+    return score
+
+
+def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
+    """What a planner has to beat.
+
+    Args:
+        history (Tensor): observed states ``[*B, h, d]``, the present one last; two of them at least.
+        horizon (int): planned frames ``H``.
+
+    Returns:
+        dict: ``"standing_still"`` and ``"constant_velocity"``, ``[*B, H, d]`` each.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.evaluation.plan_errors import baseline_plans
+        >>> {name: plan.squeeze(-1).tolist() for name, plan in baseline_plans(torch.tensor([[0.0], [1.0]]), 2).items()}
+        {'standing_still': [1.0, 1.0], 'constant_velocity': [2.0, 3.0]}
+    """
+    now, before = history[..., -1:, :], history[..., -2:-1, :]
+    ahead = torch.arange(1, horizon + 1, device=history.device, dtype=history.dtype)[:, None]
+    return {
+        "standing_still": now.expand(*now.shape[:-2], horizon, -1),
+        "constant_velocity": now + ahead * (now - before),
+    }
+
+
+@torch.no_grad()
+def sample_plans(planner: StatePlanner, history: Tensor, *, samples: int = SAMPLES, seed: int = 0) -> Tensor:
+    """Several plans for each history.
+
+    Args:
+        planner (StatePlanner): the planner.
+        history (Tensor): ``[N, h, d]``.
+
+    Keyword Args:
+        samples (int): plans ``S`` per history.
+        seed (int): seed of their noise.
+
+    Returns:
+        Tensor: ``[S, N, H, d]``.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    plans = []
+    for _ in range(samples):
+        noise = torch.randn(len(history), *planner.noise_shape, generator=generator).to(history)
+        parts = zip(history.split(_BATCH), noise.split(_BATCH), strict=True)
+        plans.append(torch.cat([planner.plan(part, drawn) for part, drawn in parts]))
+    return torch.stack(plans)
+
+
+def plan_errors(
+    planner: StatePlanner, data: TensorDictBase, task: Task, *, samples: int = SAMPLES, plans: int = 500, seed: int = 0
+) -> dict[str, Any]:
+    """Scores of the planner on trajectories, beside those of standing still and of constant velocity.
+
+    Args:
+        planner (StatePlanner): in evaluation mode.
+        data (TensorDictBase): flat data ``[N]`` with ``state`` and ``episode``: trajectories that it has not seen.
+        task (Task): names and units of the state columns.
+
+    Keyword Args:
+        samples (int): plans per situation.
+        plans (int): situations at most, spread evenly over all steps that have a whole recorded future.
+        seed (int): seed of the plans' noise.
+
+    Returns:
+        dict: ``situations``, ``horizon``, ``samples``, ``unit``: a row per unit of the state columns with their names
+        (``columns``) and, per model, ``energy_score`` and ``best_of`` as ``overall`` and ``per_step`` in that unit,
+        distances over the columns of the unit together; ``relative``: the energy score as a share of that of standing
+        still, the mean over units; ``relative_of_velocity``: the same of constant velocity; ``trajectory``: the
+        relative score per trajectory.
+    """
+    horizon, history = planner.horizon, planner.history
+    windows = cut_windows(data, history + horizon, select=["state", "episode"], pad_before=history - 1)
+    if len(windows) > plans:
+        windows = windows[torch.linspace(0, len(windows) - 1, plans).round().long()]
+    past, future = planner.split_window(windows["state"].float())
+    episode = windows["episode"][:, -1].cpu()
+    device = next(iter(planner.state_dict().values())).device
+    models = {"planner": sample_plans(planner, past.to(device), samples=samples, seed=seed).cpu()}
+    past, future = past.cpu(), future.cpu()
+    models |= {name: plan[None] for name, plan in baseline_plans(past, horizon).items()}
+    rows, scores = [], []
+    for unit, columns in unit_groups(task.state_units).items():
+        row: dict[str, Any] = {"unit": unit, "columns": [task.state_names[column] for column in columns]}
+        per_situation = {}
+        for name, plan in models.items():
+            score = energy_score(plan[..., columns], future[..., columns])  # [N, H]
+            distance = (plan - future)[..., columns].norm(dim=-1)  # [S, N, H]
+            row[name] = {
+                "energy_score": _over_steps(score.mean().item(), score.mean(0)),
+                "best_of": _over_steps(distance.mean(-1).amin(0).mean().item(), distance.amin(0).mean(0)),
+            }
+            per_situation[name] = score.mean(-1)
+        rows.append(row)
+        scores.append(per_situation)
+    return {
+        "situations": len(past),
+        "horizon": horizon,
+        "samples": samples,
+        "relative": _relative(scores, "planner"),
+        "relative_of_velocity": _relative(scores, "constant_velocity"),
+        "unit": rows,
+        "trajectory": [
+            {"episode": number, "relative_plan_error": _relative(scores, "planner", episode == number)}
+            for number in episode.unique().tolist()
+        ],
+    }
+
+
+def _over_steps(overall: float, per_step: Tensor) -> dict[str, Any]:
+    return {"overall": overall, "per_step": per_step.tolist()}
+
+
+def _relative(scores: list[dict[str, Tensor]], name: str, where: Tensor | None = None) -> float | None:
+    """Score over that of standing still, the mean over units; units in which nothing moves are left out."""
+    shares = []
+    for row in scores:
+        own, still = (row[key] if where is None else row[key][where] for key in (name, "standing_still"))
+        if still.mean() > 0:
+            shares.append((own.mean() / still.mean()).item())
+    return sum(shares) / len(shares) if shares else None

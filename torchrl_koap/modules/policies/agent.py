@@ -1,0 +1,148 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A policy in a robot's control loop: observation in, action out, everything else kept inside."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_koap.keys import ACTION
+from torchrl_koap.modules.policies.receding_horizon import IS_INIT, OBSERVATION_HISTORY, RecedingHorizonPolicy
+
+
+class Agent:
+    """Acts with a policy, one robot or several at a time, without gradients.
+
+    Frames observed so far, plans in force and start noise live inside. With the same start noise the actions are bit
+    for bit those of the policy in :meth:`torchrl.envs.EnvBase.rollout`.
+
+    Args:
+        policy (RecedingHorizonPolicy): a :class:`~torchrl_koap.modules.PlanThenControl` or
+            :class:`~torchrl_koap.modules.ChunkedPolicy`.
+
+    Keyword Args:
+        seed (int): seed of the plans' start noise; robot ``i`` of a batch draws with ``seed + i``.
+        noise (TensorDictModuleBase, optional): writes the start noise instead, an
+            :class:`~torchrl_koap.modules.EpisodeNoise` for example.
+
+    Raises:
+        RuntimeError: if it is asked to act before :meth:`reset`.
+        ValueError: for observations of another width, batch or number of axes than before, or that are not finite.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.modules import Agent, PlanThenControl, StatePlanner, TemporalUnet
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> policy = PlanThenControl(
+        ...     planner, make_koopman_inverse_dynamics(2, 3), state_columns=(2, 3), history=5)
+        >>> agent = Agent(policy, seed=0)
+        >>> agent.reset()
+        >>> agent.act(np.zeros(4)).shape, agent.act(np.zeros(4)).shape
+        ((3,), (3,))
+    """
+
+    def __init__(self, policy: RecedingHorizonPolicy, *, seed: int = 0, noise: TensorDictModuleBase | None = None):
+        self.policy, self.seed, self.noise = policy, seed, noise
+        example = next(policy.parameters(), torch.empty(0))
+        self.device, self.dtype = example.device, example.dtype
+        self.latencies: list[float] = []
+        self._ready = False
+        self._forget()
+
+    def reset(self) -> None:
+        """Forgets everything: the next observation begins an episode."""
+        self._forget()
+        self._ready = True
+
+    @torch.no_grad()
+    def act(self, observation: np.ndarray | Tensor | Sequence[float]) -> np.ndarray | Tensor:
+        """The action for an observation.
+
+        Args:
+            observation (array or Tensor): ``[obs]`` of one robot or ``[n, obs]`` of several, raw units.
+
+        Returns:
+            array or Tensor: ``[act]`` or ``[n, act]``, of the kind of the observation.
+        """
+        began = time.perf_counter()
+        observed = self._checked(observation)
+        newest = observed.unsqueeze(-2)
+        if self._frames is None:
+            self._frames = newest.expand(-1, self.policy.history, -1).clone()
+        else:
+            self._frames = torch.cat([self._frames[:, 1:], newest], -2)
+        action = self._decide()
+        action = action[0] if len(self._shape) == 1 else action
+        result = action if isinstance(observation, Tensor) else action.cpu().numpy()
+        self.latencies.append(time.perf_counter() - began)
+        return result
+
+    def latency(self) -> dict[str, float]:
+        """Time per action so far in ms: ``p50``, ``p99``, ``max``, and the number of ``steps``.
+
+        Raises:
+            RuntimeError: if it has not acted yet.
+        """
+        if not self.latencies:
+            raise RuntimeError("the agent has not acted yet: there is no latency to tell")
+        times = np.array(self.latencies) * 1e3
+        p50, p99 = np.percentile(times, (50, 99))
+        return {"p50": float(p50), "p99": float(p99), "max": float(times.max()), "steps": len(times)}
+
+    def _forget(self) -> None:
+        self._carried: TensorDict | None = None  # what the policy wrote in the last step
+        self._frames: Tensor | None = None  # [n, history, obs]
+        self._generators: list[torch.Generator] = []
+        self._shape: tuple[int, ...] | None = None  # of the observations
+
+    def _decide(self) -> Tensor:
+        """The action for the frames observed by now ``[n, act]``."""
+        robots = len(self._frames)
+        td = TensorDict(batch_size=[robots], device=self.device) if self._carried is None else self._carried
+        td.set(OBSERVATION_HISTORY, self._frames)
+        td.set(IS_INIT, torch.full((robots, 1), self._carried is None, device=self.device))
+        td = self._with_noise(td)
+        td = self.policy(td)
+        self._carried = td
+        return td.get(ACTION).clone()
+
+    def _with_noise(self, td: TensorDict) -> TensorDict:
+        if self.noise is not None:
+            return self.noise(td)
+        return td.set(self.policy.planner.noise_key, self._noise_for(len(self._frames)))
+
+    def _noise_for(self, robots: int) -> Tensor:
+        """Start noise of a plan ``[n, *noise_shape]``, from a stream per robot."""
+        if not self._generators:
+            self._generators = [torch.Generator().manual_seed(self.seed + robot) for robot in range(robots)]
+        shape = self.policy.noise_shape
+        draws = [torch.randn(*shape, generator=generator) for generator in self._generators]
+        return torch.stack(draws).to(self.device, self.dtype)
+
+    def _checked(self, observation: Any) -> Tensor:
+        """The observation as ``[n, obs]`` of the policy's type."""
+        if not self._ready:
+            raise RuntimeError("reset() the agent before the first act(): it has to know where an episode begins")
+        observed = torch.as_tensor(observation)
+        shape = tuple(observed.shape)
+        if len(shape) not in (1, 2):
+            raise ValueError(f"an observation must be [obs] or [n, obs], got {list(shape)}")
+        if self._shape is not None and shape != self._shape:
+            raise ValueError(
+                f"the observation is {list(shape)}, those before were {list(self._shape)}; reset() the agent for"
+                " another robot or batch"
+            )
+        bad = ~observed.isfinite()
+        if bad.any():
+            columns = bad.reshape(-1, shape[-1]).any(0).nonzero().flatten().tolist()
+            raise ValueError(f"columns {columns} of the observation are NaN or infinite")
+        self._shape = shape
+        return observed.to(self.device, self.dtype).reshape(-1, shape[-1])

@@ -1,0 +1,378 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Denoising losses: what trains the planner on states, and the Diffusion Policy on labelled actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives.common import LossModule
+
+from torchrl_koap import keys
+from torchrl_koap.modules.diffusion.base import ConditionedDiffusion
+from torchrl_koap.modules.diffusion.planner import StatePlanner
+from torchrl_koap.modules.diffusion.policy import DiffusionPolicy
+from torchrl_koap.objectives.base import read_entry, read_mask
+
+
+class DenoisingLoss(LossModule):
+    """Mean squared error of a denoiser at random noise levels; base of the losses of planner and Diffusion Policy.
+
+    A subclass has a ``name``, under which the network, its weights and their average live (``planner``,
+    ``planner_params``, ``target_planner_params``), and says what a batch holds (:meth:`read`).
+
+    Args:
+        network (ConditionedDiffusion): network to train, its normalisers already fitted.
+
+    Keyword Args:
+        create_target_params (bool): keep an averaged copy of the weights, to be moved by
+            :class:`torchrl.objectives.SoftUpdate` and used for sampling. Defaults to True.
+        reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, width]`` that count
+            (``"none"``: 0 where they do not). Defaults to ``"mean"``.
+
+    Raises:
+        ValueError: if ``reduction`` is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
+        >>> from torchrl_koap.objectives import PlannerLoss  # a subclass
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> loss = PlannerLoss(planner, create_target_params=False, reduction="none")
+        >>> loss(TensorDict({"state": torch.randn(8, 16, 2)}, [8]))["loss_planner"].shape
+        torch.Size([8, 14, 2])
+    """
+
+    name: str
+
+    def __init__(
+        self,
+        network: ConditionedDiffusion,
+        *,
+        create_target_params: bool = True,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+    ):
+        super().__init__()
+        reduction = "mean" if reduction is None else reduction
+        if reduction not in ("none", "mean", "sum"):
+            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
+        self.reduction = reduction
+        self.step_weights: Tensor | None = None  # [H, 1], of mean 1
+        self.convert_to_functional(network, self.name, create_target_params=create_target_params)
+
+    def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Raw histories ``[*B, h, d]``, raw sequences ``[*B, H, width]``, and which of their steps count.
+
+        The mask is ``[*B, H, 1]``, or None where all do.
+        """
+        raise NotImplementedError
+
+    def encode(self, history: Tensor, sequence: Tensor, counts: Tensor | None) -> Tensor:
+        """The normalised sequences that noise is added to; a subclass says how.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): raw plans or actions ``[*B, H, width]``.
+            counts (Tensor, optional): steps that count, bool ``[*B, H, 1]``; None: all.
+
+        Returns:
+            Tensor: ``[*B, H, width]``, finite numbers also where steps do not count.
+        """
+        raise NotImplementedError
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        """There is no value estimator."""
+
+    def train(self, mode: bool = True):
+        """Sets the mode of the loss, and of the network, which is no submodule of it."""
+        super().train(mode)
+        getattr(self, self.name).train(mode)
+        return self
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries that must be there, as renamed by ``set_keys``."""
+        return self._entries()
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes the loss; the input is not changed."""
+        names, network = self.tensor_keys, getattr(self, self.name)
+        history, sequence, counts = self.read(tensordict)
+        with getattr(self, f"{self.name}_params").to_module(network, preserve_module_state=False):
+            with torch.no_grad():
+                condition = network.encode_history(history)
+                sample = self.encode(history, sequence, counts)
+                noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
+            error = network.denoising_error(condition, sample, noise, time)  # [*B, H, width]
+            if self.step_weights is not None:
+                error = error * self.step_weights.to(error)
+
+        result = TensorDict({f"loss_{self.name}": self._reduce(error, counts)}, batch_size=[])
+        self._clear_weakrefs(tensordict, result, f"{self.name}_params", f"target_{self.name}_params")
+        return result
+
+    def _reduce(self, error: Tensor, counts: Tensor | None) -> Tensor:
+        if counts is None:
+            return self._reduce_loss(error)
+        loss = torch.where(counts, error, 0.0)
+        if self.reduction == "none":
+            return loss
+        return loss.sum() / ((counts.sum() * error.shape[-1]).clamp_min(1) if self.reduction == "mean" else 1)
+
+
+class PlannerLoss(DenoisingLoss):
+    r"""Mean squared error of the denoiser at random noise levels.
+
+    With the normalised future ``x_0``, noise ``eps ~ N(0, I)`` and a random time ``t`` per plan,
+
+        L = mean | denoiser(signal(t) x_0 + noise(t) eps, t, condition) - target |^2
+
+    where the schedule's prediction type says whether the target is the noise, the clean plan or the velocity.
+
+    Args:
+        planner (StatePlanner): planner to train, its normalisers already fitted.
+
+    Keyword Args:
+        window (bool): read whole windows ``[*B, history + horizon, d]`` from the entry ``state`` and cut them (True),
+            or read the entries ``history`` and ``plan`` (False). Defaults to True.
+        first_steps_weight (float): weight of the first planned step against that of the last; it falls geometrically
+            in between, and the mean weight is 1. Defaults to 1.
+        create_target_params (bool): keep an averaged copy of the weights in ``target_planner_params``, to be moved by
+            :class:`torchrl.objectives.SoftUpdate` and used for planning. Defaults to True.
+        reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, d]``. Defaults to ``"mean"``.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if an entry has another shape than the planner needs, or ``reduction`` is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
+        >>> from torchrl_koap.objectives import PlannerLoss
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> loss = PlannerLoss(planner)
+        >>> average = SoftUpdate(loss, eps=0.99)
+        >>> loss(TensorDict({"state": torch.randn(8, 16, 2)}, [8]))["loss_planner"].backward()
+        >>> average.step()
+        >>> with loss.target_planner_params.to_module(planner):
+        ...     plan = planner(TensorDict({"history": torch.randn(3, 2, 2)}, [3]))["plan"]
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Entries of the input; the last three are read if they are there.
+
+        Attributes:
+            state (NestedKey): windows ``[*B, history + horizon, d]``. Defaults to ``"state"``.
+            history (NestedKey): observed frames ``[*B, history, d]``. Defaults to the planner's in-key.
+            plan (NestedKey): recorded future ``[*B, horizon, d]``. Defaults to the planner's out-key.
+            mask (NestedKey): bool, False where a step is padding: ``[*B, horizon]`` or ``[*B, history + horizon]``,
+                with or without a trailing 1. Defaults to ``"mask"``.
+            noise (NestedKey): noise ``[*B, horizon, d]`` instead of random. Defaults to ``"planner_noise"``.
+            time (NestedKey): time ``[*B]`` in training steps instead of random. Defaults to ``"planner_time"``.
+        """
+
+        state: NestedKey = keys.STATE
+        history: NestedKey = keys.HISTORY
+        plan: NestedKey = keys.PLAN
+        mask: NestedKey = "mask"
+        noise: NestedKey = "planner_noise"
+        time: NestedKey = "planner_time"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    name = "planner"
+    out_keys = ["loss_planner"]
+
+    planner: StatePlanner
+    planner_params: TensorDictParams
+    target_planner_params: TensorDictParams
+
+    def __init__(self, planner: StatePlanner, *, window: bool = True, first_steps_weight: float = 1.0, **options: Any):
+        super().__init__(planner, **options)
+        if first_steps_weight <= 0:
+            raise ValueError(f"first_steps_weight must be > 0, got {first_steps_weight}")
+        self.window = window
+        if first_steps_weight != 1:
+            share = torch.linspace(1, 0, planner.horizon)[:, None]
+            weights = first_steps_weight**share  # [H, 1]
+            self.step_weights = weights / weights.mean()
+        super().set_keys(history=planner.in_keys[0], plan=planner.out_keys[0])
+
+    def set_keys(self, **kwargs) -> None:
+        """Renames entries; ``history`` and ``plan`` are renamed in the planner too."""
+        super().set_keys(**kwargs)
+        self.planner.set_keys(history=kwargs.get("history"), plan=kwargs.get("plan"))
+
+    def _entries(self) -> list[NestedKey]:
+        names = self.tensor_keys
+        return [names.state] if self.window else [names.history, names.plan]
+
+    def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Histories, recorded futures and the mask of the planned steps (:meth:`DenoisingLoss.read`)."""
+        names = self.tensor_keys
+        if self.window:
+            history, plan = self.planner.split_window(read_entry(tensordict, names.state))
+        else:
+            history, plan = read_entry(tensordict, names.history), read_entry(tensordict, names.plan)
+        return history, plan, self._mask(tensordict, plan)
+
+    def encode(self, history: Tensor, sequence: Tensor, counts: Tensor | None) -> Tensor:
+        """The normalised plans; steps that do not count stay where the robot is.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): raw plans ``[*B, H, d]``.
+            counts (Tensor, optional): steps that count, bool ``[*B, H, 1]``; None: all.
+
+        Returns:
+            Tensor: ``[*B, H, d]``.
+        """
+        if counts is not None:  # before the network: padding may hold anything, and 0 * nan is nan
+            sequence = torch.where(counts, sequence, history[..., -1:, :])
+        return self.planner.encode_plan(history, sequence)
+
+    def _mask(self, tensordict: TensorDictBase, plan: Tensor) -> Tensor | None:
+        mask = tensordict.get(self.tensor_keys.mask, None)
+        if mask is None:
+            return None
+        if mask.ndim == plan.ndim and mask.shape[-1] == 1:
+            mask = mask.squeeze(-1)
+        horizon, length = self.planner.horizon, self.planner.history + self.planner.horizon
+        if mask.ndim != plan.ndim - 1 or mask.shape[-1] not in (horizon, length):
+            raise ValueError(
+                f"{self.tensor_keys.mask!r} must be [*B, {horizon}] (horizon) or [*B, {length}] (history + horizon),"
+                f" got {list(mask.shape)}"
+            )
+        return mask[..., -horizon:].bool().unsqueeze(-1)
+
+
+class DiffusionPolicyLoss(DenoisingLoss):
+    r"""Mean squared error of the denoiser of actions at random noise levels, on labelled steps.
+
+    With the normalised actions ``a`` of frames ``history - 1 .. T - 2`` of a window, noise ``eps ~ N(0, I)`` and a
+    random time ``t`` per window,
+
+        L = mean over labelled steps | denoiser(signal(t) a + noise(t) eps, t, condition) - target |^2
+
+    where the schedule's prediction type says whether the target is the noise, the clean actions or the velocity.
+
+    A step counts if it has a label and neither its frame nor the next one is padded. The denoiser sees steps that do
+    not count as the middle of the range of actions, noise added; what was stored there (NaN) reaches neither value
+    nor gradient. A batch without labels gives exactly 0. Labels are what this method lives on: draw windows with
+    ``labelled_share=1`` (:class:`~torchrl_koap.data.WindowSampler`).
+
+    Args:
+        policy (DiffusionPolicy): policy to train, its normalisers already fitted.
+
+    Keyword Args:
+        create_target_params (bool): keep an averaged copy of the weights in ``target_policy_params``, to be moved by
+            :class:`torchrl.objectives.SoftUpdate` and used for control. Defaults to True.
+        reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, act]`` that count (``"none"``:
+            0 where they do not). Defaults to ``"mean"``.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if an entry has another shape than the policy needs, or ``reduction`` is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_koap.modules import DiffusionPolicy, TemporalUnet
+        >>> from torchrl_koap.objectives import DiffusionPolicyLoss
+        >>> policy = DiffusionPolicy(TemporalUnet(3, 4), state_dim=2, action_dim=3)
+        >>> loss = DiffusionPolicyLoss(policy)
+        >>> average = SoftUpdate(loss, eps=0.99)
+        >>> batch = TensorDict({"state": torch.randn(8, 16, 2), "action": torch.randn(8, 16, 3),
+        ...                     "has_action": torch.ones(8, 16, 1, dtype=torch.bool)}, [8])
+        >>> loss(batch)["loss_policy"].backward()
+        >>> average.step()
+        >>> with loss.target_policy_params.to_module(policy):
+        ...     actions = policy.sample(torch.randn(3, 2, 2))
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Entries of the input; the last three are read if they are there.
+
+        Attributes:
+            state (NestedKey): windows of raw states ``[*B, history + horizon, d]``. Defaults to ``"state"``.
+            action (NestedKey): raw actions ``[*B, history + horizon, act]``, NaN where unlabelled. Defaults to
+                ``"action"``.
+            has_action (NestedKey): labelled frames, bool ``[*B, history + horizon, 1]``. Defaults to ``"has_action"``.
+            padded (NestedKey): frames that repeat an edge of the trajectory, bool ``[*B, history + horizon]``. Defaults
+                to ``"padded"``.
+            noise (NestedKey): noise ``[*B, horizon, act]`` instead of random. Defaults to ``"policy_noise"``.
+            time (NestedKey): time ``[*B]`` in training steps instead of random. Defaults to ``"policy_time"``.
+
+        The two masks may have a trailing 1 or not.
+        """
+
+        state: NestedKey = keys.STATE
+        action: NestedKey = keys.ACTION
+        has_action: NestedKey = keys.HAS_ACTION
+        padded: NestedKey = "padded"
+        noise: NestedKey = "policy_noise"
+        time: NestedKey = "policy_time"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    name = "policy"
+    out_keys = ["loss_policy"]
+
+    policy: DiffusionPolicy
+    policy_params: TensorDictParams
+    target_policy_params: TensorDictParams
+
+    def __init__(self, policy: DiffusionPolicy, **options):
+        super().__init__(policy, **options)
+
+    def _entries(self) -> list[NestedKey]:
+        return [self.tensor_keys.state, self.tensor_keys.action, self.tensor_keys.has_action]
+
+    def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Histories, actions from now on and which of them are labelled (:meth:`DenoisingLoss.read`)."""
+        state = read_entry(tensordict, self.tensor_keys.state)
+        history, _ = self.policy.split_window(state)
+        return history, *self._actions(tensordict, state)
+
+    def encode(self, history: Tensor, sequence: Tensor, counts: Tensor | None) -> Tensor:
+        """The normalised actions, 0 where they do not count.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): raw actions ``[*B, H, act]``.
+            counts (Tensor): steps that count, bool ``[*B, H, 1]``.
+
+        Returns:
+            Tensor: ``[*B, H, act]``.
+        """
+        # before the network and the residual: masking afterwards would leave NaN in the gradient
+        return torch.where(counts, self.policy.encode_actions(torch.where(counts, sequence, 0.0)), 0.0)
+
+    def _actions(self, tensordict: TensorDictBase, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions of the current and later steps ``[*B, H, act]``, and which of them count ``[*B, H, 1]``."""
+        names, now = self.tensor_keys, self.policy.history - 1
+        action = read_entry(tensordict, names.action)
+        wanted = (*state.shape[:-1], self.policy.action_dim)
+        if action.shape != wanted:
+            raise ValueError(f"{names.action!r} must be {list(wanted)} ([*B, T, act]), got {list(action.shape)}")
+        counts = read_mask(tensordict, names.has_action, state)[..., now:-1]
+        if tensordict.get(names.padded, None) is not None:
+            padded = read_mask(tensordict, names.padded, state)[..., now:]
+            counts = counts & ~(padded[..., 1:] | padded[..., :-1])
+        return action[..., now:-1, :], counts.unsqueeze(-1)

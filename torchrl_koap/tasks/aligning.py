@@ -1,0 +1,132 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Aligning: push a tray, from inside or outside its walls, into a target pose."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from torchrl_koap.tasks.registry import register_task
+from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.task import Defaults, Modes, Task
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+DISTANCE_TOLERANCE = 0.018  # m, between the centres, height included
+ROTATION_TOLERANCE = 0.048  # of half a turn
+ALIGNED_DISTANCE = 0.0155  # m; horizontal part of 18 mm when tray and target centres differ by 9.1 mm in height
+BASE_HALF = 0.05  # half width of the tray (m)
+REGIONS = (((0.4, 0.6), (-0.25, -0.1)), ((0.4, 0.6), (0.2, 0.35)))  # of the centres of tray and target: x, y (m)
+
+
+def goal_reached(task: Task, state: Tensor) -> Tensor:
+    """Whether the tray lies in the target pose.
+
+    Args:
+        task (Task): tells the state's columns.
+        state (Tensor): states ``[*B, 11]``, lengths in m.
+
+    Returns:
+        Tensor: bool ``[*B]``: within :data:`ALIGNED_DISTANCE` of the target, and the quaternions' cosine above that of
+        :data:`ROTATION_TOLERANCE` half turns.
+    """
+    import torch
+
+    part = {name: state[..., columns] for name, columns in task.state_slices.items()}
+    distance = (part["box_position"] - part["target_position"]).norm(dim=-1)
+    cosine = torch.nn.functional.cosine_similarity(part["box_quaternion"], part["target_quaternion"], dim=-1)
+    return (distance <= ALIGNED_DISTANCE) & (cosine >= math.cos(ROTATION_TOLERANCE * math.pi))
+
+
+def score(result: dict[str, Any], episodes: Any = None, contexts: Any = None) -> dict[str, float]:
+    """D3IL's figure: the mean of success and entropy, which needs two rollouts per context at least.
+
+    Args:
+        result (dict): figures of :func:`~torchrl_koap.evaluation.scores.score`; ``success_rate`` and ``mode_entropy``
+            are read.
+        episodes (optional): not looked at.
+        contexts (optional): not looked at.
+
+    Returns:
+        dict: ``d3il_score``; empty where the entropy is None.
+    """
+    if result["mode_entropy"] is None:
+        return {}
+    return {"d3il_score": 0.5 * (result["success_rate"] + result["mode_entropy"])}
+
+
+def _frame(region) -> Shape:
+    (left, right), (near, far) = region
+    centre, half = ((left + right) / 2, (near + far) / 2), ((right - left) / 2, (far - near) / 2)
+    return Shape("rectangle", centre, half, "region")
+
+
+register_task(
+    Task(
+        name="aligning",
+        observation_parts={
+            "desired_xyz": 3,
+            "measured_xyz": 3,
+            "box_position": 3,
+            "box_quaternion": 4,
+            "target_position": 3,
+            "target_quaternion": 4,
+        },
+        command="desired_xyz",
+        position="measured_xyz",
+        actions={"x": "m", "y": "m", "z": "m"},
+        max_steps=400,
+        actuated=(0, 1, 2),
+        robot=(0, 1, 2),
+        state={
+            "measured_xyz": "plain",
+            "box_position": "plane",
+            "box_quaternion": "quaternion",
+            "target_position": "plane",
+            "target_quaternion": "quaternion",
+        },
+        planar_parts=("measured_xyz", "box_position", "box_quaternion", "target_position", "target_quaternion"),
+        relative_positions=(
+            ("measured_xyz", "box_position", "box_quaternion"),
+            ("target_position", "box_position", "box_quaternion", "target_quaternion"),
+            ("measured_xyz", "target_position", "target_quaternion"),
+        ),
+        goal="torchrl_koap.tasks.aligning:goal_reached",
+        modes=Modes(
+            (("pushed from", ("inside", "outside")),),
+            index="torchrl_koap.envs.aligning:mode_index",
+            entropy="contexts",
+        ),
+        score="torchrl_koap.tasks.aligning:score",
+        bodies=(
+            Body("box", "box_position", "box_quaternion", "tray", "#9a5b13", (BASE_HALF, BASE_HALF), front=True),
+            Body(
+                "target",
+                "target_position",
+                "target_quaternion",
+                color="#0a7f7f",
+                half=(BASE_HALF, BASE_HALF),
+                front=True,
+                still=True,
+            ),
+        ),
+        start_regions=StartRegions(REGIONS),
+        env="torchrl_koap.envs.aligning:AligningEnv",
+        expert="torchrl_koap.envs.experts.aligning:AligningExpert",
+        gym_id="torchrl_koap/Aligning-v0",
+        converter="torchrl_koap.data.d3il.conversion:ALIGNING",
+        scene=Scene(
+            shapes=tuple(_frame(region) for region in REGIONS),
+            x=(0.21, 0.79),
+            y=(-0.39, 0.47),
+            caption=" The second panel shows the tray: where it starts (an outline with a thick far side; of many only"
+            " the centre and a line to the far side), its path, a dot where it ends and a cross if the rollout failed;"
+            " targets are drawn likewise. The dashed frames are the ranges of both centres. Look for crosses far from"
+            " any target: the tray was lost; crosses near one: the angle was wrong or time ran out.",
+            camera="cage",
+        ),
+        in_paper=True,
+        defaults=Defaults(released_epochs=200),
+    )
+)

@@ -1,0 +1,107 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Avoiding: steer a rod between six cylinders to the finish line, in any of 24 ways."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from torchrl_koap.tasks.registry import register_task
+from torchrl_koap.tasks.scene import Scene, Shape
+from torchrl_koap.tasks.task import Defaults, Modes, Task
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+FINISH_Y = 0.35  # m
+ROD_RADIUS = 0.01  # m
+ROW_Y = (-0.1, 0.08, 0.26)  # y of the rows of cylinders (m)
+# name, x, y, radius, half height (m)
+OBSTACLES = (
+    ("row1", 0.5, ROW_Y[0], 0.03, 0.07),
+    ("row2_left", 0.425, ROW_Y[1], 0.025, 0.1),
+    ("row2_right", 0.575, ROW_Y[1], 0.025, 0.1),
+    ("row3_left", 0.35, ROW_Y[2], 0.025, 0.1),
+    ("row3_mid", 0.5, ROW_Y[2], 0.025, 0.1),
+    ("row3_right", 0.65, ROW_Y[2], 0.025, 0.1),
+)
+
+
+def goal_reached(task: Task, state: Tensor) -> Tensor:
+    """Whether the tool is behind the finish line.
+
+    Args:
+        task (Task): not looked at.
+        state (Tensor): positions ``[*B, 2]`` of the tool (m).
+
+    Returns:
+        Tensor: bool ``[*B]``.
+    """
+    return state[..., 1] > FINISH_Y
+
+
+def score(result: dict[str, Any], episodes: Any = None, contexts: Any = None) -> dict[str, float]:
+    """D3IL's figure: 0.8 success + 0.2 entropy.
+
+    Args:
+        result (dict): figures of :func:`~torchrl_koap.evaluation.scores.score`; ``success_rate`` and ``mode_entropy``
+            are read.
+        episodes (optional): not looked at.
+        contexts (optional): not looked at.
+
+    Returns:
+        dict: ``d3il_score``.
+    """
+    return {"d3il_score": 0.8 * result["success_rate"] + 0.2 * result["mode_entropy"]}
+
+
+def _cylinders() -> tuple[Shape, ...]:
+    shapes = []
+    for _, x, y, radius, _ in OBSTACLES:
+        reach = radius + ROD_RADIUS
+        shapes += [
+            Shape("circle", (x, y), (reach, reach), "clearance"),
+            Shape("circle", (x, y), (radius, radius), "obstacle"),
+        ]
+    return tuple(shapes)
+
+
+register_task(
+    Task(
+        name="avoiding",
+        observation_parts={"desired_xy": 2, "measured_xy": 2},
+        command="desired_xy",
+        position="measured_xy",
+        actions={"x": "m", "y": "m"},
+        max_steps=250,
+        actuated=(0, 1),
+        robot=(0, 1),
+        collides=True,
+        goal="torchrl_koap.tasks.avoiding:goal_reached",
+        modes=Modes(
+            (
+                ("row 1", ("left", "right")),
+                ("row 2", ("left", "middle", "right")),
+                ("row 3", ("gap 1", "gap 2", "gap 3", "gap 4")),
+            ),
+            index="torchrl_koap.envs.avoiding:mode_index",
+        ),
+        score="torchrl_koap.tasks.avoiding:score",
+        env="torchrl_koap.envs.avoiding:AvoidingEnv",
+        expert="torchrl_koap.envs.experts.avoiding:AvoidingExpert",
+        gym_id="torchrl_koap/Avoiding-v0",
+        converter="torchrl_koap.data.d3il.conversion:AVOIDING",
+        scene=Scene(
+            shapes=(*_cylinders(), Shape("line", (0.5, FINISH_Y), (0.5, 0.0), "finish", label="finish")),
+            x=(0.215, 0.785),
+            y=(-0.305, 0.405),
+            caption=" Solid discs are the cylinders; the pale ring is where the rod touches. Hue tells the gap taken in"
+            " the last row, lightness the choices before it. Look for gaps nobody takes, and for paths that brush the"
+            " rings.",
+            camera="front",
+        ),
+        in_paper=True,
+        defaults=Defaults(
+            demonstrations=96, planner_steps=5000, channels=(32, 64), relative=False, released_epochs=500
+        ),
+    )
+)

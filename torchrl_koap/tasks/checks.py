@@ -1,0 +1,104 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Whether the facts of a task fit each other; every fault is collected, one error tells them all."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from torchrl_koap.tasks.state_parts import FEATURE_COLUMNS
+
+if TYPE_CHECKING:
+    from torchrl_koap.tasks.task import Task
+
+ENTROPIES = ("all", "contexts", "solved_contexts")
+
+
+def check_task(task: Task) -> None:
+    """Checks a task.
+
+    Args:
+        task (Task): the task.
+
+    Raises:
+        ValueError: with all faults, one a line, each naming the field.
+
+    Examples:
+        >>> from torchrl_koap.tasks import Task
+        >>> Task(name="toy", observation_parts={"xy": 2}, actions={"x": "m"}, position="yx")
+        Traceback (most recent call last):
+        ...
+        ValueError: 1 fault(s) in task 'toy':
+          - position: no part 'yx'; parts: xy
+    """
+    faults = [] if task.name and isinstance(task.name, str) else [f"name: wanted a name, got {task.name!r}"]
+    if not task.observation_parts:
+        faults.append("observation_parts: none")
+    if not task.actions:
+        faults.append("actions: none")
+    faults += _part_faults(task) or _column_faults(task)
+    faults += _body_faults(task)
+    if task.modes.entropy not in ENTROPIES:
+        faults.append(f"modes.entropy: wanted one of {', '.join(ENTROPIES)}, got {task.modes.entropy!r}")
+    if faults:
+        raise ValueError(f"{len(faults)} fault(s) in task {task.name!r}:\n  - " + "\n  - ".join(faults))
+
+
+def _part_faults(task: Task) -> list[str]:
+    named = {
+        "position": (task.position,),
+        "command": () if task.command is None else (task.command,),
+        "state": task.state,
+        "hidden": task.hidden,
+        "bodies": [part for body in task.bodies for part in (body.position, body.yaw) if part],
+    }
+    parts = task.observation_parts
+    faults = [
+        f"{field}: no part {part!r}; parts: {', '.join(parts)}"
+        for field, names in named.items()
+        for part in names
+        if part not in parts
+    ]
+    known = {"plain", *FEATURE_COLUMNS}
+    for part, kind in task.state.items():
+        if isinstance(kind, str) and kind not in known and ":" not in kind:
+            faults.append(f"state: part {part!r} has an unknown feature {kind!r}; known: {', '.join(sorted(known))}")
+    if task.command is not None and task.command in task.state:
+        faults.append(f"state: {task.command!r} repeats the command, which gives hidden actions away")
+    return faults
+
+
+def _column_faults(task: Task) -> list[str]:
+    if not task.state_parts:
+        return ["state: nothing remains without the command and the hidden parts"]
+    faults = []
+    names = task.observation_names
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        faults.append(f"observation_parts: columns named twice: {', '.join(twice)}")
+    if all(kind in ("plain", *FEATURE_COLUMNS) for kind in task.state_parts.values()):
+        for field in ("actuated", "robot", "action_targets"):
+            wrong = [column for column in getattr(task, field) if not 0 <= column < task.state_dim]
+            if wrong:
+                faults.append(f"{field}: the state has {task.state_dim} columns, got {wrong[0]}")
+    for field in ("actuated", "action_targets"):
+        if len(getattr(task, field)) not in (0, task.action_dim):
+            wanted = f"a state column for each of {task.action_dim} actions"
+            faults.append(f"{field}: wanted {wanted}, got {getattr(task, field)}")
+    if len(task.observation_units) not in (0, task.observation_dim):
+        wanted = f"one for each of {task.observation_dim} columns"
+        faults.append(f"observation_units: wanted {wanted}, got {len(task.observation_units)}")
+    if tuple(task.actions)[task.num_delta_actions :] != tuple(task.absolute_actions):
+        faults.append(f"absolute_actions: wanted the last of {', '.join(task.actions)}, got {task.absolute_actions}")
+    missing = [name for group in task.relative_positions for name in group if name not in task.state_parts]
+    missing += [name for name in task.planar_parts if name not in task.state_parts]
+    faults += [f"relative_positions or planar_parts: {name!r} is no part of the state" for name in missing]
+    return faults
+
+
+def _body_faults(task: Task) -> list[str]:
+    named = [name for group in task.interchangeable for name in group]
+    faults = [f"interchangeable: no body {name!r}" for name in named if name not in task.objects]
+    starts = task.start_regions
+    if starts is not None and len(starts.regions) < len(task.bodies):
+        faults.append(f"start_regions: {len(starts.regions)} regions for {len(task.bodies)} bodies")
+    return faults

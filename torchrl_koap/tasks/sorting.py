@@ -1,0 +1,179 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Sorting: push red and blue cubes over the far edge of a platform into bins of their colour.
+
+With two, four or six boxes, and with four boxes whose yaws are hidden and whose tool is measured with noise
+(PO-Sorting).
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from torchrl_koap.tasks.registry import register_task
+from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.task import Defaults, Modes, Task
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+COLOURS = ("red", "blue")
+BIN_X = (0.4, 0.625)  # centre of the red and of the blue bin (m)
+BIN_Y = 0.32
+BIN_HALF = 0.1  # a bin reaches this far to both sides
+BIN_RANGE = (0.22, 0.41)  # y between which a box counts as inside (m)
+# walls of a bin, seen from its centre: x, y, half width, half depth (m)
+BIN_WALLS = (
+    (0.0, BIN_RANGE[1] - BIN_Y, BIN_HALF, 0.01),
+    (-BIN_HALF, 0.0, 0.005, BIN_HALF),
+    (BIN_HALF, 0.0, 0.005, BIN_HALF),
+    (0.0, BIN_RANGE[0] - BIN_Y, BIN_HALF, 0.005),
+)
+BOX_HALF = 0.03  # half width of a box (m)
+PLATFORM_X, PLATFORM_Y = (0.2, 0.8), (-0.4, 0.2)  # m
+# six regions (x range, y range in m) that are dealt out to the boxes at random
+REGIONS = tuple((x, y) for x in ((0.4, 0.5), (0.55, 0.65)) for y in ((-0.15, -0.1), (-0.05, 0.0), (0.05, 0.1)))
+_CAPTION = (
+    " The second panel shows the boxes: pale outlines where they start, paths in their colours, a dot where they end, a"
+    " cross in rollouts that failed. The grey square is the platform, the coloured frames are the bins. Look for boxes"
+    " that end in a bin of the other colour, beside the bins, or nowhere near them."
+)
+
+
+def goal_reached(task: Task, state: Tensor) -> Tensor:
+    """Whether every box is in the bin of its colour.
+
+    Args:
+        task (Task): tells the boxes and the columns of their positions.
+        state (Tensor): states ``[*B, d]``, positions in m.
+
+    Returns:
+        Tensor: bool ``[*B]``.
+    """
+    import torch
+
+    done = torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
+    for box in task.objects:
+        x, y = state[..., task.state_slices[f"{box}_xy"]].unbind(-1)
+        centre = BIN_X[COLOURS.index(box.partition("_")[0])]
+        done &= (x > centre - BIN_HALF) & (x < centre + BIN_HALF) & (y > BIN_RANGE[0]) & (y < BIN_RANGE[1])
+    return done
+
+
+def score(result: dict[str, Any], episodes: Any = None, contexts: Any = None) -> dict[str, float]:
+    """D3IL's figure: success minus the divergence of the modes from equally frequent ones.
+
+    Equally frequent modes are those of our demonstrations. Two rollouts per context are needed at least.
+
+    Args:
+        result (dict): figures of :func:`~torchrl_koap.evaluation.scores.score`; ``success_rate`` and ``mode_entropy``
+            are read.
+        episodes (optional): not looked at.
+        contexts (optional): not looked at.
+
+    Returns:
+        dict: ``d3il_score``; empty where the entropy is None.
+    """
+    if result["mode_entropy"] is None:
+        return {}
+    return {"d3il_score": result["success_rate"] - (1 - result["mode_entropy"])}
+
+
+@functools.cache
+def arrival_orders(num_boxes: int) -> tuple[tuple[int, ...], ...]:
+    """Every order in which the colours (0 red, 1 blue) can arrive, in lexicographic order: the modes.
+
+    Args:
+        num_boxes (int): number of boxes, half of them red.
+
+    Examples:
+        >>> from torchrl_koap.tasks.sorting import arrival_orders
+        >>> arrival_orders(2)
+        ((0, 1), (1, 0))
+    """
+    each = num_boxes // 2
+    return tuple(sorted(set(itertools.permutations((0,) * each + (1,) * each))))
+
+
+def _walls() -> tuple[Shape, ...]:
+    return tuple(
+        Shape("rectangle", (x + across, BIN_Y + along), (width, depth), "wall", color)
+        for color, x in zip(COLOURS, BIN_X, strict=True)
+        for across, along, width, depth in BIN_WALLS
+    )
+
+
+def _sorting(num_boxes: int) -> Task:
+    boxes = [f"{colour}_{index + 1}" for colour in COLOURS for index in range(num_boxes // 2)]
+    columns = {part: size for box in boxes for part, size in ((f"{box}_xy", 2), (f"{box}_tan_yaw", 1))}
+    orders = tuple(", ".join(COLOURS[colour] for colour in order) for order in arrival_orders(num_boxes))
+    (left, right), (near, far) = PLATFORM_X, PLATFORM_Y
+    platform = Shape(
+        "rectangle", ((left + right) / 2, (near + far) / 2), ((right - left) / 2, (far - near) / 2), "platform"
+    )
+    return Task(
+        name="sorting" if num_boxes == 4 else f"sorting_{num_boxes}",
+        observation_parts={"desired_xy": 2, "measured_xy": 2} | columns,
+        command="desired_xy",
+        position="measured_xy",
+        actions={"x": "m", "y": "m"},
+        max_steps=700,
+        actuated=(0, 1),
+        robot=(0, 1),
+        state={"measured_xy": "plain"} | {name: "tan_yaw" if size == 1 else "plain" for name, size in columns.items()},
+        relative_positions=tuple(("measured_xy", f"{box}_xy") for box in boxes),
+        interchangeable=(tuple(boxes[: num_boxes // 2]), tuple(boxes[num_boxes // 2 :])),
+        goal="torchrl_koap.tasks.sorting:goal_reached",
+        modes=Modes(
+            (("order of arrival", orders),),
+            index="torchrl_koap.envs.sorting:mode_index",
+            entropy="solved_contexts",
+        ),
+        score="torchrl_koap.tasks.sorting:score",
+        bodies=tuple(
+            Body(box, f"{box}_xy", f"{box}_tan_yaw", f"{colour} boxes", colour, (BOX_HALF, BOX_HALF))
+            for box in boxes
+            for colour in (box.partition("_")[0],)
+        ),
+        start_regions=StartRegions(REGIONS, dealt=True),
+        env="torchrl_koap.envs.sorting:SortingEnv",
+        env_options={"num_boxes": num_boxes},
+        expert="torchrl_koap.envs.experts.sorting:SortingExpert",
+        expert_options={"num_boxes": num_boxes},
+        gym_id=f"torchrl_koap/Sorting{num_boxes}-v0",
+        converter=f"torchrl_koap.data.d3il.conversion:SORTING_{num_boxes}",
+        scene=Scene(shapes=(platform, *_walls()), x=(0.17, 0.83), y=(-0.43, 0.45), caption=_CAPTION, camera="cage"),
+        in_paper=num_boxes == 4,
+        defaults=Defaults(released_epochs=400),
+    )
+
+
+_BY_BOXES = {num_boxes: register_task(_sorting(num_boxes)) for num_boxes in (4, 2, 6)}
+register_task(
+    replace(
+        _BY_BOXES[4],
+        name="po_sorting",
+        max_steps=400,
+        hidden=tuple(f"{box}_tan_yaw" for box in _BY_BOXES[4].objects),
+        noise=0.002,
+        data="sorting",
+        gym_id="",
+        defaults=Defaults(released_epochs=200),
+    )
+)
+
+
+def sorting_task(num_boxes: int) -> Task:
+    """The task with so many boxes.
+
+    Args:
+        num_boxes (int): 2, 4 or 6.
+
+    Raises:
+        ValueError: for another number.
+    """
+    if num_boxes not in _BY_BOXES:
+        raise ValueError(f"num_boxes must be one of {', '.join(map(str, sorted(_BY_BOXES)))}, got {num_boxes!r}")
+    return _BY_BOXES[num_boxes]

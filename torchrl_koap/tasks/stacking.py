@@ -1,0 +1,132 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Stacking: pile three boxes on a target zone with the gripper, in any order; Stacking-1 is over with the first."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from torchrl_koap.tasks.registry import register_task
+from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.task import Defaults, Modes, Task
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+TARGET = (0.5, 0.2)  # centre of the target zone (m)
+TARGET_HALF = 0.05  # half its width (m)
+ZONE_RADIUS = 0.06  # m; a box nearer to the centre than this (horizontally) is in the zone
+HEIGHT_GAP = 0.03  # m; boxes lie on top of each other if all their heights differ by more
+# name, half sizes (m)
+BOXES = (("red", (0.03, 0.03, 0.03)), ("green", (0.03, 0.03, 0.03)), ("blue", (0.03, 0.05, 0.03)))
+NAMES = tuple(name for name, _ in BOXES)
+
+
+def _boxes_of(task: Task, state: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions of the boxes ``[*B, 3, 3]``, and whether each is in the zone."""
+    import torch
+
+    boxes = torch.stack([state[..., task.state_slices[f"{box}_position"]] for box in task.objects], -2)
+    return boxes, (boxes[..., :2] - boxes.new_tensor(TARGET)).norm(dim=-1) <= ZONE_RADIUS
+
+
+def goal_reached(task: Task, state: Tensor) -> Tensor:
+    """Whether all boxes are piled in the zone.
+
+    Args:
+        task (Task): tells the boxes and the columns of their positions.
+        state (Tensor): states ``[*B, d]``, positions in m.
+
+    Returns:
+        Tensor: bool ``[*B]``: all within :data:`ZONE_RADIUS` of its centre, heights more than :data:`HEIGHT_GAP` apart.
+    """
+    boxes, near = _boxes_of(task, state)
+    height = boxes[..., 2].sort(-1).values
+    return near.all(-1) & (height.diff(dim=-1).amin(-1) > HEIGHT_GAP)
+
+
+def first_box_reached(task: Task, state: Tensor) -> Tensor:
+    """Whether any box is in the zone.
+
+    Args:
+        task (Task): tells the boxes and the columns of their positions.
+        state (Tensor): states ``[*B, d]``, positions in m.
+
+    Returns:
+        Tensor: bool ``[*B]``.
+    """
+    return _boxes_of(task, state)[1].any(-1)
+
+
+_STACKING = register_task(
+    Task(
+        name="stacking",
+        observation_parts={"desired_joints_and_gripper": 8}
+        | {part: size for box in NAMES for part, size in ((f"{box}_position", 3), (f"{box}_tan_yaw", 1))}
+        | {"measured_joints": 7, "gripper_width": 1, "tcp_position": 3},
+        command="desired_joints_and_gripper",
+        position="tcp_position",
+        actions={f"joint {joint}": "rad" for joint in range(1, 8)} | {"gripper": "m"},
+        absolute_actions=("gripper",),
+        max_steps=1000,
+        control_hz=1 / 0.03,
+        robot=tuple(range(8)),
+        tool_kinematics="torchrl_koap.tasks.panda_kinematics:tool_position",
+        gripper=(7, 7),
+        state={"measured_joints": "plain", "gripper_width": "plain", "tcp_position": "plain"}
+        | {part: kind for box in NAMES for part, kind in ((f"{box}_position", "plain"), (f"{box}_tan_yaw", "tan_yaw"))},
+        interchangeable=(("red", "green"),),
+        relative_positions=(
+            *(("tcp_position", f"{box}_position") for box in NAMES),
+            *((f"{box}_position", f"{other}_position") for box, other in itertools.combinations(NAMES, 2)),
+        ),
+        goal="torchrl_koap.tasks.stacking:goal_reached",
+        modes=Modes(
+            (("order of arrival", tuple(", ".join(order) for order in itertools.permutations(NAMES))),),
+            index="torchrl_koap.envs.stacking:mode_index",
+            entropy="solved_contexts",
+        ),
+        score="torchrl_koap.evaluation.scores:stacking_scores",
+        bodies=tuple(
+            Body(name, f"{name}_position", f"{name}_tan_yaw", f"{name} box", name, half[:2]) for name, half in BOXES
+        ),
+        start_regions=StartRegions(
+            (((0.35, 0.45), (-0.25, -0.15)), ((0.35, 0.45), (-0.1, 0.0)), ((0.55, 0.6), (-0.2, 0.0)))
+        ),
+        env="torchrl_koap.envs.stacking:StackingEnv",
+        env_options={"num_boxes": 3},
+        expert="torchrl_koap.envs.experts.stacking:StackingExpert",
+        gym_id="torchrl_koap/Stacking-v0",
+        converter="torchrl_koap.data.d3il.conversion:STACKING",
+        scene=Scene(
+            shapes=(
+                Shape("circle", TARGET, (ZONE_RADIUS, ZONE_RADIUS), "zone", label="zone"),
+                Shape("rectangle", TARGET, (TARGET_HALF, TARGET_HALF), "target"),
+            ),
+            x=(0.28, 0.68),
+            y=(-0.3, 0.32),
+            caption=" The second panel shows the boxes: pale outlines where they start, paths in their colours, a dot"
+            " where they end, a cross in rollouts that failed. The circle is how near to the zone's centre a box must"
+            " come. A dot at its rim is a box that was still in the gripper when the rollout ended. Look for boxes that"
+            " never moved and for those dropped on the way.",
+            camera="front",
+        ),
+        # measured: a shifted arm, redundant as it is, learns to wander (benchmarks/RESULTS.md)
+        defaults=Defaults(recovery_sigma=0.0, released_epochs=400),
+    )
+)
+register_task(
+    replace(
+        _STACKING,
+        name="stacking_1",
+        max_steps=400,
+        goal="torchrl_koap.tasks.stacking:first_box_reached",
+        modes=Modes((("first box", NAMES),), "torchrl_koap.envs.stacking:first_box", "solved_contexts"),
+        score="torchrl_koap.evaluation.scores:first_box_scores",
+        env_options={"num_boxes": 1},
+        data="stacking",
+        gym_id="",
+        in_paper=True,
+    )
+)

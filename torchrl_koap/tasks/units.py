@@ -1,0 +1,42 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""In which units small values are shown, and which columns may be averaged with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+_THOUSANDTHS = {"m": "mm", "rad": "mrad", "s": "ms", "N": "mN"}
+
+
+def thousandths(unit: str) -> tuple[str, float]:
+    """Unit in which small values are shown, and the factor to it: the one place where metres become millimetres.
+
+    Args:
+        unit (str): unit of the data; one that has no thousandth of its own is shown as it is.
+
+    Returns:
+        tuple: the unit shown, and what values are multiplied with.
+
+    Examples:
+        >>> from torchrl_koap.tasks.units import thousandths
+        >>> thousandths("m"), thousandths("rad"), thousandths("volt")
+        (('mm', 1000.0), ('mrad', 1000.0), ('volt', 1.0))
+    """
+    return (_THOUSANDTHS[unit], 1e3) if unit in _THOUSANDTHS else (unit, 1.0)
+
+
+def unit_groups(units: Sequence[str]) -> dict[str, list[int]]:
+    """Columns by unit, in the order in which the units come.
+
+    Args:
+        units (sequence of str): unit of every column.
+
+    Examples:
+        >>> from torchrl_koap.tasks.units import unit_groups
+        >>> unit_groups(["m", "N", "m"])
+        {'m': [0, 2], 'N': [1]}
+    """
+    groups: dict[str, list[int]] = {}
+    for column, unit in enumerate(units):
+        groups.setdefault(unit, []).append(column)
+    return groups

@@ -1,0 +1,78 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Demonstrations of a task as one tensordict, wherever they are from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from tensordict import TensorDictBase
+
+from torchrl_koap.data import D3ILExperienceReplay, load_ted, read_about, read_task, select_state
+from torchrl_koap.tasks import Task, adopt_task, get_task
+
+DEFAULT_TASK = "avoiding"
+
+
+def find_task_of(dataset: str, name: str | None = None) -> Task:
+    """The task of a data set.
+
+    Args:
+        dataset (str): as for :func:`load_demonstrations`.
+        name (str, optional): name of a registered task, or of the one that the data set holds. Default: the task that
+            the data set holds or names, else ``"avoiding"``.
+
+    Raises:
+        ValueError: if the name is unknown, or the data set holds the definition of another task.
+        DamagedDataError: if the data set's task is damaged or names code.
+
+    Examples:
+        >>> from torchrl_koap.training.datasets import find_task_of
+        >>> find_task_of("scripted").name, find_task_of("scripted", "sorting").name
+        ('avoiding', 'sorting')
+    """
+    folder = Path(dataset) / "ted"
+    if dataset == "scripted" or not folder.is_dir():
+        return get_task(DEFAULT_TASK if name is None else name)
+    own = read_task(folder)
+    if own is None:
+        return get_task(name or read_about(folder)["task"] or DEFAULT_TASK)
+    if name not in (None, own.name):
+        raise ValueError(f"dataset {dataset!r} holds its own task {own.name!r}; --task {name} does not fit it")
+    return adopt_task(own)
+
+
+def load_demonstrations(
+    dataset: str,
+    task: Task,
+    *,
+    episodes: int | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> TensorDictBase:
+    """Demonstrations with all labels that there are, flat, with the columns that a policy may see as ``state``.
+
+    Args:
+        dataset (str): ``"scripted"``, or a folder: of D3IL's raw pickles, a LeRobot data set, or written by
+            ``koap demos``.
+        task (Task): the task.
+        episodes (int, optional): number of scripted demonstrations to record. Default: that of the task.
+        seed (int): seed of the scripted demonstrations.
+        progress (callable, optional): called with recorded and wanted scripted demonstrations.
+
+    Raises:
+        FileNotFoundError: if there is no such folder, or it holds no demonstrations.
+    """
+    if dataset == "scripted":
+        from torchrl_koap.envs.experts.demonstrations import record_demonstrations  # needs a simulator
+
+        data, _ = record_demonstrations(
+            task.name, task.defaults.demonstrations if episodes is None else episodes, seed, progress=progress
+        )
+    elif not Path(dataset).is_dir():
+        raise FileNotFoundError(f"dataset {dataset!r} is neither 'scripted' nor a folder")
+    elif (Path(dataset) / "ted").is_dir():
+        data = load_ted(Path(dataset) / "ted", task=task.source, memmap=False)
+    else:
+        data = D3ILExperienceReplay(task.name, dataset).data.clone()
+    return select_state(data, task.state_of)

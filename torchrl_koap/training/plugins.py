@@ -1,0 +1,83 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Modules outside the package that register tasks, methods or pictures, imported by name (``--plugin``)."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+# a field of options: tuple of module names, on the command line `--plugin NAME`, as often as there are any
+Plugins = Annotated[tuple[str, ...], tyro.conf.arg(name="plugin", metavar="MODULE"), tyro.conf.UseAppendAction]
+
+
+class PluginError(ValueError):
+    """A plugin that cannot be found, or whose import fails."""
+
+
+def load_plugins(names: Sequence[str]) -> None:
+    """Imports modules that register something when they are imported; a second time does nothing.
+
+    The current directory is searched after the Python path, so that a file beside the data is found, as by ``python
+    -m``.
+
+    Args:
+        names (sequence of str): dotted names of modules, ``"my_method"`` or ``"my_package.my_method"``.
+
+    Raises:
+        PluginError: if a module is not found, or fails when it is imported; the message names it, and where it was
+            looked for or what went wrong.
+
+    Examples:
+        >>> from torchrl_koap.training.plugins import load_plugins
+        >>> load_plugins(["json"])
+        >>> load_plugins(["no_such_plugin"])  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        torchrl_koap.training.plugins.PluginError: there is no plugin 'no_such_plugin'; looked for it in ...
+    """
+    if isinstance(names, str):
+        raise PluginError(f"plugins must be a sequence of module names, got the string {names!r}")
+    here = os.getcwd()
+    if names and here not in sys.path and "" not in sys.path:
+        sys.path.append(here)
+        importlib.invalidate_caches()
+    for name in names:
+        _load(name)
+
+
+def _load(name: str) -> None:
+    try:
+        importlib.import_module(name)
+    except Exception as error:
+        absent = isinstance(error, ModuleNotFoundError) and error.name is not None
+        if absent and (name == error.name or name.startswith(f"{error.name}.")):
+            places = dict.fromkeys(path or os.getcwd() for path in [os.getcwd(), *sys.path])
+            raise PluginError(f"there is no plugin {name!r}; looked for it in {', '.join(places)}") from error
+        raise PluginError(f"plugin {name!r} failed when it was imported: {type(error).__name__}: {error}") from error
+
+
+def load_entry_points(group: str) -> None:
+    """Imports what installed packages announce in an entry-point group, as ``[project.entry-points."GROUP"]`` does.
+
+    Args:
+        group (str): ``"torchrl_koap.methods"`` for instance. The value of an entry is a module, or an object in one;
+            importing it registers what it holds.
+
+    Raises:
+        PluginError: if an entry cannot be imported; the message names the entry and the group.
+    """
+    for entry in importlib.metadata.entry_points(group=group):
+        try:
+            entry.load()
+        except Exception as error:
+            raise PluginError(
+                f"entry point {entry.name!r} of group {group!r} ({entry.value}) failed when it was imported:"
+                f" {type(error).__name__}: {error}"
+            ) from error

@@ -1,0 +1,42 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What ``config.json`` keeps of a training: every option, what was built from them, the command, the versions."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from dataclasses import asdict
+from typing import Any
+
+from torchrl_koap.tasks.registry import is_adopted
+from torchrl_koap.training.config import ResolvedConfig
+
+_PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
+
+
+def to_json(resolved: ResolvedConfig, command: str | None = None) -> dict[str, Any]:
+    """Everything that ``config.json`` holds, as plain values.
+
+    Args:
+        resolved (ResolvedConfig): the options.
+        command (str, optional): how the training was called, where it was called from a shell.
+    """
+    options = asdict(resolved.options)
+    content = {name: _plain(value) for name, value in options.items()}
+    if is_adopted(resolved.task):
+        content["task_definition"] = resolved.task.to_json()  # nobody has registered it: it comes with the data
+    content |= {"planner": resolved.planner, "controller": resolved.controller}
+    if command is not None:
+        content["command"] = command
+    return content | {"versions": versions()}
+
+
+def versions() -> dict[str, str]:
+    """The versions of Python and of the packages that results depend on."""
+    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return list(value)
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)

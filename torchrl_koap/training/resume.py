@@ -1,0 +1,59 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Going on with an interrupted run: its options, and the check that nothing else is asked for now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from torchrl_koap.training.config import TrainConfig
+from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+
+# with which a run may be resumed differently; with other threads sums are rounded differently
+FREE = frozenset({"out", "threads", "checkpoint_every", "resume", "plugins", "command", "versions"})
+
+
+def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
+    """The options of a resumed run: what is not asked for otherwise is as it was.
+
+    Args:
+        run (RunDirectory): the run, which may be new.
+        config (TrainConfig): what is asked for now.
+    """
+    if not (config.resume and (run.path / "config.json").exists()):
+        return config
+    earlier = run.read_json("config.json")
+    left = [field.name for field in fields(config) if getattr(config, field.name) == field.default]
+    kept = {name: earlier[name] for name in left if name in earlier}
+    kept = {name: tuple(value) if isinstance(value, list) else value for name, value in kept.items()}
+    if kept.get("planner_from") is not None:
+        kept["planner_from"] = Path(kept["planner_from"])
+    return replace(config, **kept)
+
+
+def check_resume(run: RunDirectory, content: Mapping[str, Any], *, resume: bool) -> None:
+    """Refuses a folder that holds another run, or one that was not asked to be resumed.
+
+    Args:
+        run (RunDirectory): the folder.
+        content (mapping): what ``config.json`` is to hold (:func:`~torchrl_koap.training.provenance.to_json`).
+
+    Keyword Args:
+        resume (bool): going on is asked for.
+
+    Raises:
+        RunDirectoryError: naming what differs.
+    """
+    if not (run.path / "config.json").exists():
+        return
+    if not resume:
+        raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
+    earlier = run.read_json("config.json")
+    # a folder that is gone was moved, probably together with this run: there is nothing to compare with
+    paths = {name: earlier.get(name) for name in ("dataset", "planner_from")}
+    moved = {name for name, path in paths.items() if path not in (None, "scripted") and not Path(path).exists()}
+    changed = [key for key in content if key not in FREE | moved and content[key] != earlier.get(key)]
+    if changed:
+        raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so")
