@@ -66,7 +66,7 @@ def test_the_demo_is_the_contract():
         "trajectory",
         "scripted",
     )
-    assert (evaluation.run, evaluation.config.episodes) == (train.config.out, 60)
+    assert (Path(evaluation.run), evaluation.config.episodes) == (train.config.out, 60)
 
 
 @pytest.mark.parametrize("code", [block for language, block in BLOCKS if language == "python"])

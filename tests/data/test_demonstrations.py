@@ -114,9 +114,9 @@ def test_a_folder_that_names_code_is_refused(tmp_path):
     about = json.loads((folder / "about.json").read_text())
     about["definition"]["env"] = "os:system"
     (folder / "about.json").write_text(json.dumps(about))
-    with pytest.raises(DamagedDataError, match="its task names code in env; register such a task by --plugin"):
+    with pytest.raises(DamagedDataError, match="task 'arm' names code in env; register it by --plugin"):
         read_task(folder)
     about["definition"] = {"name": "arm"}
     (folder / "about.json").write_text(json.dumps(about))
-    with pytest.raises(DamagedDataError, match="its task is damaged: .*'observation_parts' is missing"):
+    with pytest.raises(DamagedDataError, match="the task is damaged: .*'observation_parts' is missing"):
         read_task(folder)

@@ -66,6 +66,11 @@ def test_the_actions_are_those_of_an_agent(arm_run):
     np.testing.assert_allclose(np.stack(taken), recorded, rtol=1e-4, atol=1e-6)
 
 
+def test_success_keys_are_for_environments(trained_run):
+    with pytest.raises(ValueError, match="success_key was given, but no env"):
+        evaluate(trained_run, EvalConfig(success_key="is_success"))
+
+
 def test_refusals(arm_run, capsys):
     before = (arm_run / "config.json").read_bytes()
     assert koap("eval", arm_run, "--env", "CartPole-v1", "--episodes", 1) != 0
@@ -73,10 +78,8 @@ def test_refusals(arm_run, capsys):
         "the action of environment 'CartPole-v1' is Discrete(2), task 'data' has 2 columns"
         in capsys.readouterr().err.replace("\n", " ")
     )
-    with pytest.raises(ValueError, match="success_key was given, but no env"):
-        evaluate(arm_run, EvalConfig(success_key="is_success"))
     with pytest.raises(ValueError, match="rollouts_per_context was given, but an env.* has no contexts"):
         evaluate(arm_run, EvalConfig(env="toy_gym:ToyReach-v0", rollouts_per_context=2))
-    with pytest.raises(ValueError, match="has no environment.*koap eval --env ID"):
-        evaluate(arm_run, EvalConfig(episodes=1))
+    with pytest.raises(ValueError, match="dataset is for judging without an environment"):
+        evaluate(arm_run, EvalConfig(env="toy_gym:ToyReach-v0", dataset="anywhere"))
     assert (arm_run / "config.json").read_bytes() == before

@@ -82,7 +82,8 @@ def test_order_headline_labels_pictures_commands(run):
 
 def test_pictures_are_there_with_captions_and_no_outside_resource(run):
     page = Page(run / "index.html")
-    left_out = ("film.gif", "latent.png", "inspect.png")  # this run has kept no actions and was not inspected
+    # this run has kept no actions, was not inspected, and has an environment
+    left_out = ("film.gif", "latent.png", "inspect.png", "plan_errors.png", "action_errors.png")
     expected = [picture for picture in PICTURES if picture.name not in left_out]
     assert {f"plots/{picture.name}" for picture in expected} <= set(page.links)
     for link in page.links:
@@ -227,7 +228,7 @@ def test_report_of_a_task_with_objects(task, tmp_path, monkeypatch):
     plans = get_task(task).plans_position
     expected = (
         {picture.name for picture in PICTURES}
-        - {"film.gif", "latent.png", "inspect.png"}
+        - {"film.gif", "latent.png", "inspect.png", "plan_errors.png", "action_errors.png"}
         - (set() if plans else {"plans.png"})
     )
     assert {link.removeprefix("plots/") for link in page.links} == expected

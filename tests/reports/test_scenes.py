@@ -18,7 +18,11 @@ from torchrl_koap.tasks.avoiding import OBSTACLES
 def models():
     """Compiled scenes of the environments."""
     registry = pytest.importorskip("torchrl_koap.envs.registry")
-    return {name: registry.make_env(name).sims.model for name in TASKS}
+    return {
+        name: registry.make_env(name).sims.model
+        for name in TASKS
+        if (TASKS[name].env or "").startswith("torchrl_koap.")
+    }
 
 
 def shapes(task, role):

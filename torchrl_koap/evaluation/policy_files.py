@@ -169,7 +169,7 @@ def build_policy(planner: StatePlanner, controller: nn.Module, task: Task | None
         >>> controller = torchrl_koap.fit_controller(data, task, method="linear", progress=False)
         >>> policy = torchrl_koap.build_policy(planner, controller)
         >>> policy.history, policy.description.task is task
-        (5, True)
+        (2, True)
     """
     made = {}
     for name, network in {"planner": planner, "controller": controller}.items():

@@ -305,10 +305,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     load_plugins(config.plugins)
     trained = load_run(_folder(run, config), task=config.task)
     directory, task = trained.directory, trained.task
-    if task.env is None:
+    if task.env is None and config.env is None:
         return _judge_offline(trained, config)
     if config.dataset is not None:
-        raise ValueError(f"dataset is for tasks without an environment; task {task.name!r} is rolled out in its own")
+        raise ValueError(f"dataset is for judging without an environment; task {task.name!r} is rolled out in one")
     policy = load_policy(trained, config)
     sampler = trained.controller if trained.planner is None else trained.planner
     seeds = list(range(config.seed, config.seed + config.episodes))

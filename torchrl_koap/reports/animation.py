@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from torchrl_koap.reports.mode_colors import mode_colors
 from torchrl_koap.reports.objects import object_looks, object_paths
+from torchrl_koap.reports.paths import executed_paths, has_objects, keep_inside
 from torchrl_koap.reports.pictures import NotFilmed, NothingToDraw, picture
-from torchrl_koap.reports.rollout_plots import executed_paths, has_objects, keep_inside
 from torchrl_koap.reports.scenes import draw_scene
 from torchrl_koap.reports.style import FAILURE_MARKS, INK, NO_MODE, SUCCESS, as_array, set_title
 from torchrl_koap.tasks.registry import get_task

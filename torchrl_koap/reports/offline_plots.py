@@ -59,9 +59,10 @@ _MANY = 6  # from here on names of columns are turned
     " columns of that unit together.",
     command="koap eval {run}",
     place=15,
+    recorded=True,
 )
 def _draw_plan_errors(result: Mapping[str, Any], path: Path, *, control_hz: float | None = None) -> Path:
-    plan = result.get("plan_errors", {})
+    plan = _part(result, "plan_errors")
     if "unit" not in plan:
         raise NothingToDraw("no plan was judged on recorded data")
     return plot_plan_errors(plan, path, control_hz=control_hz)
@@ -120,9 +121,10 @@ def plot_plan_errors(plan: Mapping[str, Any], path: str | Path, *, control_hz: f
     " here; planned ones are not as good.",
     command="koap eval {run}",
     place=16,
+    recorded=True,
 )
 def _draw_action_errors(result: Mapping[str, Any], path: Path) -> Path:
-    errors = result.get("action_errors", {})
+    errors = _part(result, "action_errors")
     if not any("column" in part for part in errors.values()):
         raise NothingToDraw("no action was judged on recorded data")
     return plot_action_errors(errors, path)
@@ -252,6 +254,12 @@ def plot_columns(
     ]
     figure.legend(handles=handles, fontsize=8.5, loc="outside lower center", ncols=2, frameon=False)
     return save_figure(figure, path)
+
+
+def _part(result: Any, name: str) -> Mapping[str, Any]:
+    """An entry of ``eval.json``; empty where it is absent, as in that of rollouts, or the file is damaged."""
+    part = result.get(name) if isinstance(result, Mapping) else None
+    return part if isinstance(part, Mapping) else {}
 
 
 def _list_names(names: Sequence[str]) -> str:

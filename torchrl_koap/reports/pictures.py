@@ -70,6 +70,7 @@ class Picture:
         place (int): pictures stand in the report in this order.
         caption_of (callable, optional): from the name of a task (or None) to a further sentence of the caption.
         empty (str): what the report says where the source holds nothing to draw; nothing if it is empty.
+        recorded (bool): it is of tasks without an environment alone, which are judged on recorded data.
 
     Examples:
         >>> from torchrl_koap.reports.pictures import all_pictures
@@ -87,6 +88,7 @@ class Picture:
     place: int = 1000
     caption_of: Callable[[str | None], str] | None = None
     empty: str = ""
+    recorded: bool = False
 
     def caption_for(self, task: str | None = None) -> str:
         """The caption, with what it adds for a task."""
@@ -110,6 +112,7 @@ def picture(
     place: int = 1000,
     caption_of: Callable[[str | None], str] | None = None,
     empty: str = "",
+    recorded: bool = False,
 ) -> Callable[[Callable[..., Path | None]], Callable[..., Path | None]]:
     """Registers the decorated function as the one that draws a picture of a run; the function stays as it is.
 
@@ -125,6 +128,7 @@ def picture(
         place (int): rank in the report; those of equal rank keep the order of their registration.
         caption_of (callable, optional): a further sentence of the caption for a task.
         empty (str): what the report says where the source holds nothing to draw.
+        recorded (bool): it is of tasks without an environment alone.
 
     Raises:
         ValueError: if there is a picture of that name already, or a fact is asked for that does not exist.
@@ -148,7 +152,7 @@ def picture(
             if key not in FACTS and parameter.default is parameter.empty:
                 raise ValueError(f"picture {name!r}: {where} wants {key!r}, there are only {', '.join(FACTS)}")
         usual = command or _COMMANDS.get(source, "koap train --out {run}")
-        _PICTURES[name] = Picture(name, source, title, caption, draw, usual, place, caption_of, empty)
+        _PICTURES[name] = Picture(name, source, title, caption, draw, usual, place, caption_of, empty, recorded)
         return draw
 
     return register

@@ -4,27 +4,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from torchrl_koap.reports.mode_colors import mode_colors
 from torchrl_koap.reports.mode_plots import draw_mode_table
-from torchrl_koap.reports.objects import draw_object_paths, draw_starts, legend_handles, object_looks, object_paths
+from torchrl_koap.reports.objects import legend_handles, object_looks, object_paths
 from torchrl_koap.reports.offline_plots import plot_columns
+from torchrl_koap.reports.paths import (
+    color_of,
+    draw_bodies,
+    draw_failure,
+    entry_of,
+    has_objects,
+    keep_inside,
+    read_rollouts,
+    scene_caption,
+)
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.scenes import draw_scene
 from torchrl_koap.reports.style import (
     BLUE,
     FAILURE_MARKS,
     INK,
-    NO_MODE,
     OUTCOMES,
     SUCCESS,
     as_array,
@@ -33,49 +41,6 @@ from torchrl_koap.reports.style import (
     thousandths,
 )
 from torchrl_koap.tasks.modes import mode_choices, mode_name
-from torchrl_koap.tasks.registry import find_task
-
-_MOST_ROOM = 0.5  # of the scene's own size is added on a side where paths leave it, at most
-
-
-def scene_caption(task: str | None) -> str:
-    """What the caption of the rollouts adds for a task."""
-    known = find_task(task)
-    return known.scene.caption if known else ""
-
-
-def has_objects(sentence: str) -> Callable[[str | None], str]:
-    """Adds a sentence to the caption of tasks with objects."""
-
-    def caption_of(task: str | None) -> str:
-        known = find_task(task)
-        return sentence if known and known.bodies else ""
-
-    return caption_of
-
-
-def executed_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
-    """Positions of each episode, without the padding.
-
-    Args:
-        rollouts (mapping): ``position`` [E, T, 2] (m) and ``length`` [E].
-
-    Returns:
-        list: an array [length, 2] per episode.
-
-    Raises:
-        ValueError: if an entry is missing or has a wrong shape.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.reports.rollout_plots import executed_paths
-        >>> [len(path) for path in executed_paths({"position": torch.zeros(2, 9, 2), "length": torch.tensor([4, 9])})]
-        [4, 9]
-    """
-    position = as_array("position", _entry(rollouts, "position"), [None, None, 2])
-    length = as_array("length", _entry(rollouts, "length"), [len(position)])
-    paths = [row[: max(int(number), 0)] for row, number in zip(position, length, strict=True)]
-    return [path[np.isfinite(path).all(1)] for path in paths]
 
 
 @picture(
@@ -111,7 +76,7 @@ def plot_rollouts(
         ...     plot_rollouts(one, f"{folder}/rollouts.png").name
         'rollouts.png'
     """
-    paths, mode, outcome = _read(rollouts)
+    paths, mode, outcome = read_rollouts(rollouts)
     choices, colors = mode_choices(task, num_modes), mode_colors(task, num_modes)
     bodies = object_paths(rollouts)
     good, crowded = outcome == SUCCESS, sum(map(len, paths)) > 8000
@@ -131,14 +96,14 @@ def plot_rollouts(
     axes.add_collection(
         LineCollection(
             [paths[index] for index in np.flatnonzero(good)],
-            colors=[_color(mode[index], colors) for index in np.flatnonzero(good)],
+            colors=[color_of(mode[index], colors) for index in np.flatnonzero(good)],
             linewidths=0.6 if crowded else 1.1,
             alpha=0.55 if crowded else 0.85,
             zorder=2,
         )
     )
     for index in np.flatnonzero(~good):
-        _draw_failure(axes, paths[index], outcome[index])
+        draw_failure(axes, paths[index], outcome[index])
     keep_inside(axes, paths)
     if bodies is not None:
         keep_inside(beside, [path.reshape(-1, 2) for path in bodies])
@@ -206,11 +171,11 @@ def plot_plans(
         ...     plot_plans(one, f"{folder}/plans.png").name
         'plans.png'
     """
-    paths, mode, outcome = _read(rollouts)
-    plan = as_array("plan", _entry(rollouts, "plan"), [len(paths), None, None, 2])
+    paths, mode, outcome = read_rollouts(rollouts)
+    plan = as_array("plan", entry_of(rollouts, "plan"), [len(paths), None, None, 2])
     if not plan.shape[1]:
         raise NothingToDraw("the rollouts hold no plans of positions")
-    plan_step = as_array("plan_step", _entry(rollouts, "plan_step"), plan.shape[:2])
+    plan_step = as_array("plan_step", entry_of(rollouts, "plan_step"), plan.shape[:2])
     colors, bodies = mode_colors(task, num_modes), object_paths(rollouts)
     if episodes is None:
         episodes = choose_episodes(mode, outcome, count)
@@ -222,7 +187,7 @@ def plot_plans(
     figure = Figure(figsize=(3.8 * across + 0.3, 4.25 * down + 0.3), layout="constrained")
     for place, index in enumerate(episodes):
         axes = draw_scene(figure.add_subplot(down, across, place + 1), task)
-        color = INK if outcome[index] != SUCCESS else _color(mode[index], colors)
+        color = INK if outcome[index] != SUCCESS else color_of(mode[index], colors)
         if bodies is not None:
             context = rollouts["context"][index : index + 1] if "context" in rollouts else None
             draw_bodies(axes, bodies[index : index + 1], context, task, outcome[index : index + 1] == SUCCESS)
@@ -353,9 +318,9 @@ def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, 
     if "position" in demonstrations:
         position = as_array("position", demonstrations["position"], [None, 2])
     else:
-        position = as_array("state", _entry(demonstrations, "state"), [None, None])[:, :2]
-    episode = as_array("episode", _entry(demonstrations, "episode"), [len(position)])
-    labelled = as_array("labelled", _entry(demonstrations, "labelled"), [len(position)]).astype(bool)
+        position = as_array("state", entry_of(demonstrations, "state"), [None, None])[:, :2]
+    episode = as_array("episode", entry_of(demonstrations, "episode"), [len(position)])
+    labelled = as_array("labelled", entry_of(demonstrations, "labelled"), [len(position)]).astype(bool)
     borders = np.flatnonzero(np.diff(episode) != 0) + 1
     paths = np.split(position, borders)
     if "objects" in demonstrations:
@@ -386,69 +351,3 @@ def plot_demonstrations(demonstrations: Mapping[str, Any], path: str | Path, *, 
     ]
     axes.legend(handles=handles, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False)
     return save_figure(figure, path)
-
-
-def draw_bodies(axes: Axes, paths: Sequence[np.ndarray], contexts: Any, task: str | None, good: Sequence[bool]) -> None:
-    """Start outlines (if there are contexts), paths and ends of a task's bodies.
-
-    Args:
-        axes (Axes): where to draw.
-        paths (sequence): positions [frames, objects, 2] (m) of each episode.
-        contexts (array, optional): ``[E, objects, 3]``.
-        task (str, optional): the task.
-        good (sequence of bool): whether each episode succeeded.
-    """
-    looks = object_looks(task, paths[0].shape[1] if len(paths) else 0)
-    if contexts is not None:
-        draw_starts(axes, contexts, looks)
-    draw_object_paths(axes, paths, looks, good)
-    keep_inside(axes, [path.reshape(-1, 2) for path in paths])
-
-
-def keep_inside(axes: Axes, paths: Sequence[np.ndarray]) -> None:
-    """Widens a panel until paths lie inside it, on every side by at most half of what it showed before.
-
-    Args:
-        axes (Axes): the panel; one that shows no scene yet is fitted to the paths.
-        paths (sequence): positions [n, 2] (m) each.
-    """
-    points = np.concatenate([np.zeros((0, 2)), *paths])
-    points = points[np.isfinite(points).all(1)]
-    if not len(points):
-        return
-    fresh = axes.get_autoscale_on()  # nobody has set limits
-    low, high = points.min(0), points.max(0)
-    margin = 0.03 * np.maximum(high - low, 1e-3)
-    for now, change, start, end in (
-        (axes.get_xlim(), axes.set_xlim, low[0] - margin[0], high[0] + margin[0]),
-        (axes.get_ylim(), axes.set_ylim, low[1] - margin[1], high[1] + margin[1]),
-    ):
-        if fresh:
-            change(start, end)
-        else:
-            room = _MOST_ROOM * (now[1] - now[0])
-            change(max(min(now[0], start), now[0] - room), min(max(now[1], end), now[1] + room), auto=False)
-
-
-def _draw_failure(axes: Axes, path: np.ndarray, outcome: int) -> None:
-    axes.plot(*path.T, color=INK, linewidth=1.2, zorder=4)
-    if len(path):
-        mark = FAILURE_MARKS.get(int(outcome), "D")
-        axes.scatter(*path[-1], s=75, marker=mark, color=INK, edgecolors="white", linewidths=0.9, zorder=5)
-
-
-def _read(rollouts: Mapping[str, Any]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    paths = executed_paths(rollouts)
-    mode = as_array("mode", _entry(rollouts, "mode"), [len(paths)]).astype(int)
-    outcome = as_array("outcome", _entry(rollouts, "outcome"), [len(paths)]).astype(int)
-    return paths, mode, outcome
-
-
-def _entry(data: Mapping[str, Any], key: str) -> Any:
-    if key not in data:
-        raise ValueError(f"missing entry {key!r}; got {', '.join(sorted(map(str, data))) or 'nothing'}")
-    return data[key]
-
-
-def _color(mode: int, colors: np.ndarray) -> Any:
-    return colors[mode] if 0 <= mode < len(colors) else NO_MODE

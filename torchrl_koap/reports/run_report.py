@@ -238,7 +238,7 @@ def _figures(
         if file is not None:
             moving = file.endswith((".gif", ".mp4"))
             figures.append(figure | {"source": f"{FOLDER}/{file}", "beside": moving})
-        elif (item.source in _SIMULATED) if offline else (item.source == "eval.json"):
+        elif (item.source in _SIMULATED) if offline else item.recorded:
             continue  # no command makes it for this task
         elif not (run_dir / item.source).exists():
             missing.setdefault(_filled(item.command, run_dir), []).append(item.title)

@@ -164,7 +164,7 @@ def fit_controller(
         >>> data, task = make_demonstrations(states, actions, control_hz=30)
         >>> controller = fit_controller(data, task, method="linear", progress=False)
         >>> int(data["has_action"].sum()), controller.recipe.results["labels_used"]
-        (39, 38)
+        (39, 31)
     """
     data, task = _prepared(data, task)
     _check_options(options, CONTROLLER_OPTIONS, "fit_controller")

@@ -52,6 +52,13 @@ def find_run(name: str | Path) -> Path:
 def copy_run(source: str | Path, target: str | Path) -> Path:
     """Copies what a run is made of, and nothing that an evaluation wrote, to a folder that is new or holds that run.
 
+    Args:
+        source (str or Path): run directory.
+        target (str or Path): the other folder.
+
+    Returns:
+        Path: the other folder.
+
     Raises:
         RunDirectoryError: if the source is no run, or the target holds another one.
     """

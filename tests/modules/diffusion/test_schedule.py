@@ -8,7 +8,8 @@ import math
 import pytest
 import torch
 
-from torchrl_koap.modules.diffusion.schedule import PREDICTIONS, SCHEDULES, SOLVERS, NoiseSchedule
+from torchrl_koap.modules.diffusion.schedule import PREDICTIONS, SCHEDULES, NoiseSchedule
+from torchrl_koap.modules.diffusion.solvers import SOLVERS
 
 DIFFUSION = [name for name, schedule in SCHEDULES.items() if schedule.path == "diffusion"]
 FITTING = [(s, v) for s in SCHEDULES for v in SOLVERS if SCHEDULES[s].path == SOLVERS[v].path]

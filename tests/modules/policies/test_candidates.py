@@ -92,7 +92,8 @@ class TwoGaps(nn.Module):
     """Plans lead straight to the left or the right, as the noise says; nothing observed matters."""
 
     history, horizon, num_steps, solver, state_dim = 1, 6, 1, "ddim", 1
-    sample_shape, noise_key = (6, 1), "noise"
+    sample_shape = noise_shape = (6, 1)
+    noise_key = "noise"
 
     def plan(self, history, noise=None):
         way = torch.arange(1.0, 7)[:, None]

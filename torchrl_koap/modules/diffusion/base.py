@@ -10,7 +10,8 @@ from tensordict.nn.probabilistic import InteractionType, interaction_type
 from tensordict.utils import NestedKey
 from torch import nn
 
-from torchrl_koap.modules.diffusion.schedule import SOLVERS, NoiseSchedule
+from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
+from torchrl_koap.modules.diffusion.solvers import SOLVERS
 from torchrl_koap.modules.normalizer import Normalizer
 
 Tensor = torch.Tensor

@@ -21,18 +21,42 @@ MOST_CANDIDATES = 256
 
 
 def nearest(apart: Tensor, among: Tensor) -> Tensor:
-    """The candidate nearest to the plan in force."""
+    """The candidate nearest to the plan in force.
+
+    Args:
+        apart (Tensor): distance of every candidate to the plan in force, ``[*B, N]``.
+        among (Tensor): distances of the candidates to each other, ``[*B, N, N]``.
+
+    Returns:
+        Tensor: index of the chosen candidate, ``[*B]``.
+    """
     return apart.argmin(-1)
 
 
 def quarter(apart: Tensor, among: Tensor) -> Tensor:
-    """Any one of the nearest quarter: the first that was drawn."""
+    """Any one of the nearest quarter: the first that was drawn.
+
+    Args:
+        apart (Tensor): distance of every candidate to the plan in force, ``[*B, N]``.
+        among (Tensor): distances of the candidates to each other, ``[*B, N, N]``.
+
+    Returns:
+        Tensor: index of the chosen candidate, ``[*B]``.
+    """
     kept = _nearest_share(apart, 0.25)
     return kept.int().argmax(-1)
 
 
 def typical(apart: Tensor, among: Tensor) -> Tensor:
-    """Of the nearer half the one in its middle, with the least mean distance to the rest of that half."""
+    """Of the nearer half the one in its middle, with the least mean distance to the rest of that half.
+
+    Args:
+        apart (Tensor): distance of every candidate to the plan in force, ``[*B, N]``.
+        among (Tensor): distances of the candidates to each other, ``[*B, N, N]``.
+
+    Returns:
+        Tensor: index of the chosen candidate, ``[*B]``.
+    """
     kept = _nearest_share(apart, 0.5)
     total = (among * kept.unsqueeze(-2)).sum(-1)
     return torch.where(kept, total, torch.inf).argmin(-1)
@@ -53,14 +77,33 @@ def _nearest_share(apart: Tensor, share: float) -> Tensor:
 
 
 def check_candidates(number: int, rule: str) -> None:
-    """Raises a ``ValueError`` for an unknown rule or a number of candidates out of range."""
+    """Refuses what no policy can choose by.
+
+    Args:
+        number (int): candidates.
+        rule (str): a name in ``RULES``.
+
+    Raises:
+        ValueError: for an unknown rule or a number of candidates out of range.
+    """
     lookup(RULES, rule, "rule of choice")
     if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= MOST_CANDIDATES:
         raise ValueError(f"candidates must be an integer in 1..{MOST_CANDIDATES}, got {number!r}")
 
 
 def steps_apart(candidates: Tensor, in_force: Tensor) -> Tensor:
-    """Mean square distance of candidates ``[*B, N, H, w]`` to what is left of a plan ``[*B, K, w]``, step by step."""
+    """Mean square distance of candidates to what is left of a plan, step by step.
+
+    Args:
+        candidates (Tensor): ``[*B, N, H, w]``.
+        in_force (Tensor): ``[*B, K, w]``, ``K <= H``.
+
+    Returns:
+        Tensor: ``[*B, N]``.
+
+    Raises:
+        ValueError: if the plan in force is the longer one.
+    """
     if in_force.shape[-2] > candidates.shape[-2]:
         raise ValueError(
             f"the plan in force has {in_force.shape[-2]} steps, the candidates only {candidates.shape[-2]}"
@@ -69,11 +112,18 @@ def steps_apart(candidates: Tensor, in_force: Tensor) -> Tensor:
 
 
 def paths_apart(candidates: Tensor, in_force: Tensor) -> Tensor:
-    """Mean square distance of the first ``K`` states of candidates ``[*B, N, H, w]`` to a whole plan ``[*B, L, w]``.
+    """Mean square distance of the first ``K`` states of candidates to the nearest of a whole plan.
 
     Each state is compared with the nearest one of the plan, at whatever time it was meant: a robot that lags behind
     its plan goes on with it by going the same way, not by being where the plan is. ``K`` is half of ``H``, so that a
     candidate does not reach beyond the end of the plan.
+
+    Args:
+        candidates (Tensor): ``[*B, N, H, w]``.
+        in_force (Tensor): ``[*B, L, w]``.
+
+    Returns:
+        Tensor: ``[*B, N]``.
     """
     first = candidates[..., : (candidates.shape[-2] + 1) // 2, :]  # [*B, N, K, w]
     return torch.cdist(first, in_force.unsqueeze(-3)).amin(-1).square().mean(-1)
