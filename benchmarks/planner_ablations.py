@@ -108,7 +108,6 @@ def main() -> None:
     parser.add_argument("--choice", default="quarter")
     parser.add_argument("--replan-interval", type=int, default=4)
     parser.add_argument("--blend-decay", type=float, default=0.8)
-    parser.add_argument("--tempo", type=float, default=1.0)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--note", default="")
     parser.add_argument("--table", type=Path, default=TABLE)
@@ -121,11 +120,10 @@ def main() -> None:
     }
     results = []
     for seed in options.seeds:
-        settings = {**choices, "choice": options.choice, "tempo": options.tempo}
+        settings = {**choices, "choice": options.choice}
         config = EvalConfig(episodes=options.episodes, seed=seed, threads=options.threads, **settings)
         results.append(evaluate(options.run, config))
-    note = options.note if options.tempo == 1 else f"tempo={options.tempo:g} {options.note}".strip()
-    row = row_of(options.run, results, choices, note)
+    row = row_of(options.run, results, choices, options.note)
     append(row, options.table)
     keys = ("candidates", "choice", "successes", "n", "success", "low", "high", "by_seed", "entropy", "mean_steps")
     print(options.run.name, {key: row[key] for key in keys})

@@ -29,7 +29,7 @@ from torchrl_koap.training.provenance import versions
 
 FORMAT, VERSION = "torchrl_koap policy", 1
 BLEND_DECAY = 0.8
-_OPTIONS = ("execution", "replan_interval", "blend_decay", "tempo", "candidates", "choice")
+_OPTIONS = ("execution", "replan_interval", "blend_decay", "candidates", "choice")
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,6 @@ def assemble_policy(
     execution: str = "feedback",
     replan_interval: int = REPLAN_INTERVAL,
     blend_decay: float = BLEND_DECAY,
-    tempo: float = 1.0,
     candidates: int = 1,
     choice: str = "quarter",
 ) -> RecedingHorizonPolicy:
@@ -104,7 +103,6 @@ def assemble_policy(
         execution (str): ``"feedback"`` or ``"open_loop"``; not looked at without a planner.
         replan_interval (int): control steps per plan.
         blend_decay (float): share of the distance between state and plan that is left after each step.
-        tempo (float): how much quicker than planned plans are executed.
         candidates (int): plans, or action chunks, sampled whenever one is due.
         choice (str): the rule by which one of them is taken.
 
@@ -130,7 +128,6 @@ def assemble_policy(
             execution=execution,
             replan_interval=replan_interval,
             blend_decay=blend_decay,
-            tempo=tempo,
             controller_columns=description.columns,
             action_rule=task.action_rule,
             candidates=candidates,
@@ -240,7 +237,7 @@ def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
         "versions": versions(),
     }
     if planned:
-        about |= {"execution": policy.execution, "blend_decay": policy.blend_decay, "tempo": policy.tempo}
+        about |= {"execution": policy.execution, "blend_decay": policy.blend_decay}
     save_tensors(path, tensors, about)
     return path
 

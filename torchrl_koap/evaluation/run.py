@@ -44,7 +44,6 @@ class EvalConfig:
         solver_steps: another number of solver steps.
         replan_interval: control steps per plan.
         blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are.
-        tempo: how much quicker than planned plans are executed; 1 leaves them as they are.
         candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
             the one in force (default: as the run says, else 1).
         choice: rule of that choice: "quarter", "typical" or "nearest".
@@ -74,7 +73,6 @@ class EvalConfig:
     solver_steps: int | None = None
     replan_interval: int = REPLAN_INTERVAL
     blend_decay: float = 0.8
-    tempo: float = 1.0
     candidates: int | None = None
     choice: str = "quarter"
     out: Path | None = None
@@ -176,7 +174,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     """
     given, config = config, EvalConfig() if config is None else config
     lookup(EXECUTIONS, config.execution, "execution")
-    names = ("execution", "replan_interval", "blend_decay", "tempo", "choice")
+    names = ("execution", "replan_interval", "blend_decay", "choice")
     options = {name: getattr(config, name) for name in names}
     options |= {} if config.candidates is None else {"candidates": config.candidates}
     if isinstance(run, (str, Path)) and Path(run).is_file():
@@ -342,7 +340,6 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         "solver_steps": sampler.num_steps,
         "replan_interval": config.replan_interval,
         "blend_decay": config.blend_decay,
-        "tempo": config.tempo,
         "candidates": policy.candidates,
         "episode": rows,
     }

@@ -28,7 +28,6 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
     policy_transforms,
 )
-from torchrl_koap.modules.policies.plan_then_control import quicken_plan
 
 LENGTHS = ((5, 3, 11), (9,), (1, 2, 7, 4), (12, 6), (4, 4, 8))
 
@@ -242,24 +241,3 @@ def test_a_blended_plan_leaves_from_the_present_state_and_ends_as_planned():
     torch.testing.assert_close(batched[2, 3], blended)
     uneven = torch.tensor([[1.0], [5.0], [3.0]])  # least-squares line through (1, 1), (2, 5), (3, 3): at 0 it is 1
     torch.testing.assert_close(blend_plan(torch.tensor([[1.0]]), uneven, 0.5), uneven)
-
-
-@pytest.mark.parametrize("tempo", [0.5, 0.8, 1.0, 1.1, 1.5, 2.0])
-def test_a_quicker_plan_goes_the_same_way_at_another_speed(tempo):
-    steps = torch.arange(15.0)
-    line = torch.stack([steps, 3 - 2 * steps], -1).expand(4, 15, 2)
-    history, plan = line[:, :1], line[:, 1:]
-    quick = quicken_plan(history, plan, tempo)
-    assert quick.shape == plan.shape
-    assert torch.allclose(quick[..., 0], (tempo * steps[1:]).clamp_max(14).expand(4, 14), atol=1e-5)
-    assert torch.allclose(quick[..., 1], 3 - 2 * quick[..., 0], atol=1e-4)
-
-
-def test_tempo_reaches_the_plan_in_force():
-    policy = make_policy(tempo=2.0)
-    observed = torch.full((1, 2, 3), 7.0)
-    td = policy(TensorDict({"observation_history": observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1]))
-    # CountingPlanner: 1007, 2007, 3007, ...
-    assert td["remaining_plan"][0, :3, 0].tolist() == [2007.0, 4007.0, 6007.0]
-    with pytest.raises(ValueError, match=r"tempo must be in \[0.5, 2\], got 3"):
-        make_policy(tempo=3)

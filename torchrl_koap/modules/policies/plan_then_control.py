@@ -50,8 +50,6 @@ class PlanThenControl(RecedingHorizonPolicy):
         replan_interval (int): steps per plan. Defaults to ``4``.
         blend_decay (float): share of the distance to the plan that remains after each frame. Defaults to ``0.8``; ``0``
             leaves plans as they are.
-        tempo (float): how much quicker than planned a plan is executed (:func:`quicken_plan`); ``1`` leaves plans as
-            they are. Defaults to ``1``.
         controller_columns (sequence of int, optional): columns of the state that the controller reads: its mask.
             Default: all.
         action_rule (callable, optional): ``action_rule(states [B, T, d], actions [B, T, act]) -> actions`` has the last
@@ -91,7 +89,6 @@ class PlanThenControl(RecedingHorizonPolicy):
         execution: str = "feedback",
         replan_interval: int = 4,
         blend_decay: float = 0.8,
-        tempo: float = 1.0,
         controller_columns: Sequence[int] | None = None,
         action_rule: Callable[[Tensor, Tensor], Tensor] | None = None,
         candidates: int = 1,
@@ -119,10 +116,7 @@ class PlanThenControl(RecedingHorizonPolicy):
             raise ValueError(f"several candidates need execution 'feedback', which keeps its plan; got {execution!r}")
         if not 0 <= blend_decay < 1:
             raise ValueError(f"blend_decay must be in [0, 1), got {blend_decay}")
-        if not 0.5 <= tempo <= 2:
-            raise ValueError(f"tempo must be in [0.5, 2], got {tempo}")
         self.execution, self.blend_decay, self.action_rule = execution, blend_decay, action_rule
-        self.tempo = tempo
         self.controller = controller
 
     def make_chunk(
@@ -154,7 +148,6 @@ class PlanThenControl(RecedingHorizonPolicy):
                 fresh=fresh,
                 apart=paths_apart,
             )
-        plan = quicken_plan(history, plan, self.tempo)
         return self._remaining_plans(plan) if self.execution == "feedback" else self._decode_chunk(history, plan)
 
     def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
@@ -168,8 +161,7 @@ class PlanThenControl(RecedingHorizonPolicy):
             Tensor: ``[*B, replan_interval, act]``.
         """
         history = self.state_of(observations)
-        plan = self.planner.plan(history[..., -self.planner.history :, :], noise)
-        return self._decode_chunk(history, quicken_plan(history, plan, self.tempo))
+        return self._decode_chunk(history, self.planner.plan(history[..., -self.planner.history :, :], noise))
 
     def act(self, history: Tensor, cached: Tensor) -> Tensor:
         """Decodes the action from what remains of the plan, or hands out the one decoded before.
@@ -234,31 +226,3 @@ def blend_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
     behind = history[..., -1, :] - (4 * first + second - 2 * third) / 3
     frames = torch.arange(1, plan.shape[-2] + 1, device=plan.device, dtype=plan.dtype)
     return plan + behind.unsqueeze(-2) * (decay**frames).unsqueeze(-1)
-
-
-def quicken_plan(history: Tensor, plan: Tensor, tempo: float) -> Tensor:
-    """Goes through a plan quicker (or slower), by linear interpolation between its states.
-
-    A policy that lags a little behind its plans observes a lower speed than planned, plans the next ones at that speed,
-    and so takes longer than the demonstrations.
-
-    Args:
-        history (Tensor): observed states ``[*B, h, d]``, the present one last.
-        plan (Tensor): planned states ``[*B, H, d]``. The last one is repeated where a quicker plan is over.
-        tempo (float): planned steps per executed step.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.policies.plan_then_control import quicken_plan
-        >>> plan = torch.tensor([[1.0], [2.0], [3.0], [5.0]])
-        >>> quicken_plan(torch.tensor([[0.0]]), plan, 1.5).flatten().tolist()
-        [1.5, 3.0, 5.0, 5.0]
-    """
-    if tempo == 1:
-        return plan
-    states = torch.cat([history[..., -1:, :], plan], -2)
-    last = plan.shape[-2]
-    times = (tempo * torch.arange(1, last + 1, device=plan.device, dtype=plan.dtype)).clamp_max(last)
-    before = times.floor().clamp_max(last - 1).long()
-    share = (times - before).unsqueeze(-1)
-    return states[..., before, :] * (1 - share) + states[..., before + 1, :] * share
