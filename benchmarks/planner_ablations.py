@@ -22,6 +22,7 @@ from torchrl_koap.training.run_directory import RunDirectory
 
 TABLE = Path(__file__).parent / "results" / "planner_ablations.csv"
 SIZES = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay")
+UNITS = {"trajectory": "trajectories", "window": "windows", "transition": "transitions"}
 OTHERS = ("first_steps_weight", "precision", "recovery_sigma", "planner_learning_rate")
 
 
@@ -38,7 +39,9 @@ def labels_of(config: dict) -> str:
         return f"trajectories {config['label_episodes']}"
     if config.get("label_count") is not None:
         return f"{config['label_count']} {config['label_unit']}"
-    return f"{config['label_fraction']:g} of {config['label_unit']}s"
+    if config["label_fraction"] == 1:
+        return "all"
+    return f"{config['label_fraction']:g} of {UNITS[config['label_unit']]}"
 
 
 def row_of(path: Path, results: list[dict], choices: dict, note: str) -> dict:
