@@ -17,8 +17,10 @@ from torchrl_koap.data import (
     read_about,
     read_task,
     save_demonstrations,
+    select_state,
 )
 from torchrl_koap.keys import validate
+from torchrl_koap.training import TrainConfig, resolve
 
 RANDOM = np.random.default_rng(0)
 STATES = [RANDOM.normal(size=(30, 4)).cumsum(0) for _ in range(3)]
@@ -64,6 +66,20 @@ def test_absolute_actions_are_targets_of_columns():
     assert task.action_targets == (0, 1)
     _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="absolute", targets=[1, 0])
     assert task.action_targets == (1, 0)
+
+
+def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
+    """What it is shown, and what the policy adds again, are inverse to each other."""
+    targets = [STATES[0][:-1, :2] + ACTIONS[0], None, None]
+    names = {"state_names": NAMES, "robot": ["q1", "q2"]}
+    folder = save_demonstrations(tmp_path / "reach", STATES, targets, control_hz=20, action_kind="absolute", **names)
+    resolved = resolve(TrainConfig(out=tmp_path / "run", dataset=str(folder), method="linear"))
+    data = select_state(load_ted(folder / "ted"), resolved.task.state_of)
+    view, known = resolved.controller_view(data), data["has_action"].squeeze(-1)
+    torch.testing.assert_close(view["action"][known], torch.from_numpy(ACTIONS[0]).float(), atol=1e-5, rtol=0)
+    assert view["action"][~known].isnan().all()
+    again = resolved.task.action_rule(data["state"], view["action"])
+    torch.testing.assert_close(again[known], data["action"][known], atol=1e-6, rtol=0)
 
 
 def test_no_labels_at_all():
