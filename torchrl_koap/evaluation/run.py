@@ -149,8 +149,12 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
         raise RunDirectoryError(f"{directory.path} was trained on task {trained_on!r}, not on {task!r}")
     config = directory.read_json("config.json")
     load_plugins(config.get("plugins") or ())
-    facts, method = task_of(config), method_named(entry)
-    planner, controller, columns = build_networks(facts, method, planner_entry, entry)
+    try:
+        facts, method = task_of(config), method_named(entry)
+        planner, controller, columns = build_networks(facts, method, planner_entry, entry)
+    except (KeyError, ValueError) as error:
+        problem = f"an entry {error} is missing" if isinstance(error, KeyError) else error
+        raise RunDirectoryError(f"{directory.path / 'config.json'} cannot be used: {problem}") from error
     for name, module in {"planner": planner, "controller": controller}.items():
         if module is not None:
             load_weights(directory.path / f"{name}.safetensors", module, task=facts.name)
