@@ -18,7 +18,6 @@ from pathlib import Path
 
 import filelock
 
-
 _NO_PLACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 LARGEST = 1 << 28  # bytes of a file that is read as a whole: hundreds of times what any of them has
 

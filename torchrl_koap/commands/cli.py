@@ -82,7 +82,9 @@ def _check_words(arguments: Sequence[str]) -> None:
         if word.startswith("--"):
             option = word.partition("=")[0]
         if (word == "" or word == f"{option}=") and option not in _MAY_BE_EMPTY:
-            raise ValueError(f"{option} is followed by an empty word: wanted a value; is a variable of the shell not set?")
+            raise ValueError(
+                f"{option} is followed by an empty word: wanted a value; is a variable of the shell not set?"
+            )
 
 
 def _commands() -> tuple[Any, Any, Any]:

@@ -29,8 +29,8 @@ def describe_interrupt(error: KeyboardInterrupt) -> tuple[str, int]:
     Examples:
         >>> import signal
         >>> from torchrl_koap.commands.interrupts import Interrupted, describe_interrupt
-        >>> describe_interrupt(Interrupted(signal.SIGTERM))[0].partition(";")[0], describe_interrupt(KeyboardInterrupt())[1]
-        ('interrupted by SIGTERM', 130)
+        >>> describe_interrupt(Interrupted(signal.SIGTERM))[0].partition(";")[0]
+        'interrupted by SIGTERM'
     """
     number = error.number if isinstance(error, Interrupted) else signal.SIGINT
     by = "" if number == signal.SIGINT else f" by {signal.Signals(number).name}"

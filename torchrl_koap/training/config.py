@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -83,6 +84,7 @@ class TrainConfig:
         device: "cpu" or "cuda".
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
+        force_data: resume although the demonstrations, or the version of this package, are others than at the start.
         logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
@@ -143,6 +145,7 @@ class TrainConfig:
     device: str = "cpu"
     checkpoint_every: int = 500
     resume: bool = False
+    force_data: bool = False
     logger: str = "csv"
     analysis: bool = True
     plugins: Plugins = ()
@@ -290,6 +293,11 @@ def _check(options: TrainConfig, method: Method) -> None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
     if options.steps < 1 or options.controller_steps < 0:
         raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
+    for name in ("planner_learning_rate", "controller_learning_rate"):
+        if not 0 < getattr(options, name) < math.inf:
+            raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
+    if options.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {options.seed}")
     if not 0 <= (options.validation_fraction or 0) < 1:
         raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
     for name in ("batch_size", "controller_batch_size", "checkpoint_every"):

@@ -108,5 +108,12 @@ def _words(kind: Any) -> str:
         return " or ".join(_words(part) for part in get_args(kind))
     if get_origin(kind) is tuple:
         return f"a list of {_words(get_args(kind)[0])}"
-    names = {type(None): "null", Path: "a path", dict: "an object", bool: "true or false", str: "text", float: "a number"}
+    names = {
+        type(None): "null",
+        Path: "a path",
+        dict: "an object",
+        bool: "true or false",
+        str: "text",
+        float: "a number",
+    }
     return names.get(kind, getattr(kind, "__name__", str(kind)))
