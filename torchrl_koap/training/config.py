@@ -70,6 +70,8 @@ class TrainConfig:
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
         relative: plan displacements from the current state instead of states (default: the task's).
+        forecast: plan deviations from a linear forecast, which carries over to goals not demonstrated (default: for a
+            task without an environment).
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
@@ -131,6 +133,7 @@ class TrainConfig:
     schedule: str = "squared_cosine"
     prediction: str = "sample"
     relative: bool | None = None
+    forecast: bool | None = None
     relations: bool = True
     controller_state: str = "robot"
     recovery_sigma: float | None = None
@@ -259,6 +262,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
         "relative": task.defaults.relative,
         "channels": task.defaults.channels,
         "validation_fraction": default_fraction(task),
+        "forecast": True if task.env is None and not options.released_settings else None,
     }
     return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
 
@@ -321,6 +325,7 @@ def _planner_entry(options: TrainConfig) -> dict[str, Any]:
         "depth": options.denoiser_depth,
         "frequencies": options.condition_octaves,
         "dropout": options.dropout,
+        "forecast": options.forecast or None,
     }
     # what was left out is left out here too, so that a run of before can be resumed
     return {name: value for name, value in sizes.items() if value is not None} | {
