@@ -54,9 +54,9 @@ class Cell:
         return planner_folder(self.observations) if get_method(self.method).has_planner else None
 
 
-def planner_folder(observations: float) -> str:
-    """Folder of the planner that all cells with this share of the trajectories have in common."""
-    return f"planner-{observations:.15g}"
+def planner_folder(observations: float, seed: int = 0) -> str:
+    """Folder of the planner that all cells with this share of the trajectories, and this seed of it, have in common."""
+    return f"planner-{observations:.15g}" + (f"-seed{seed}" if seed else "")
 
 
 def is_trained(folder: Path) -> bool:

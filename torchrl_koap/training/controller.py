@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -19,9 +20,9 @@ from torchrl_koap.training import released_settings
 from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.checkpoints import save_tensors, save_weights
 from torchrl_koap.training.closed_form import fit_closed_form
-from torchrl_koap.training.config import ResolvedConfig
+from torchrl_koap.training.config import ResolvedConfig, TrainConfig
 from torchrl_koap.training.loop import moving_average, train_phase
-from torchrl_koap.training.methods import LABELLED_SHARES, Method, Phase
+from torchrl_koap.training.methods import COEFFICIENTS, LABELLED_SHARES, Method, Phase
 from torchrl_koap.training.planner import planner_weight_decay, training_dtype
 from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.run_directory import RunDirectory
@@ -153,7 +154,7 @@ def _train_network(
         )
         values |= train_one(
             phase.name,
-            phase.loss(controller),
+            phase.loss(controller, **_coefficients(options, phase)),
             buffer.sample,
             num_steps=train_one.budget(phase, budget, table),
             learning_rate=options.controller_learning_rate,
@@ -165,6 +166,13 @@ def _train_network(
         columns = task.controller_columns(options.controller_state)
         fit = fit_closed_form(controller, data, shared_axes=task.actuated, guessed_axes=_likely_axes(task, columns))
     return controller, fit, values
+
+
+def _coefficients(options: TrainConfig, phase: Phase) -> dict[str, float]:
+    """The coefficients that were asked for, of those that the loss of a phase takes."""
+    takes = inspect.signature(phase.loss).parameters
+    asked = {name: getattr(options, name) for name in COEFFICIENTS if name in takes}
+    return {name: value for name, value in asked.items() if value is not None}
 
 
 def _likely_axes(task: Task, columns: Sequence[int]) -> list[int]:

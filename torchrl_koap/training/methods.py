@@ -16,6 +16,7 @@ none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action re
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ LOOK_AHEAD = (1, 2, 3, 4, 5)
 KINDS = ("controller", "policy")
 # share of every batch that has labels; None: as it comes
 LABELLED_SHARES = {"all": None, "mixed": 0.25, "labelled": 1.0}
+COEFFICIENTS = ("koopman_coeff", "action_coeff")  # of losses, that a training may be given
 GROUP = "torchrl_koap.methods"  # of entry points
 
 
@@ -171,9 +173,25 @@ def _diffusion_policy(state_dim, action_dim, features, options):
     return build_diffusion_policy(options, state_dim, action_dim, features)
 
 
-def without_actions(network: nn.Module) -> LossModule:
+def without_actions(network: nn.Module, *, koopman_coeff: float = 1.0) -> LossModule:
     """KOAP's loss on states alone."""
-    return KOAPLoss(network, action_coeff=0.0)
+    return KOAPLoss(network, action_coeff=0.0, koopman_coeff=koopman_coeff)
+
+
+def loss_coefficients(method: Method) -> set[str]:
+    """Names of the coefficients that the losses of a method take, such as ``"koopman_coeff"``.
+
+    Args:
+        method (Method): the method.
+
+    Examples:
+        >>> from torchrl_koap.training.methods import get_method, loss_coefficients
+        >>> sorted(loss_coefficients(get_method("koap_paper"))), loss_coefficients(get_method("dd"))
+        (['action_coeff', 'koopman_coeff'], set())
+    """
+    return {
+        name for phase in method.phases for name in inspect.signature(phase.loss).parameters if name in COEFFICIENTS
+    }
 
 
 _LABELS = (Phase("controller", InverseDynamicsLoss, "labelled"),)
