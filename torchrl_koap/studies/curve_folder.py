@@ -26,6 +26,7 @@ FIXED = (
     "epochs",
     "planner_from",
     "planner_observations",
+    "data_share",
     *OPTION_NAMES,
 )
 GROWS = ("methods", "fractions", "observations", "seeds")

@@ -10,10 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-from tensordict import TensorDictBase
-
-from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted, subsample_trajectories
 from torchrl_koap.studies.cell_options import (
     CellOptions,
     check_cell_options,
@@ -22,17 +18,18 @@ from torchrl_koap.studies.cell_options import (
     training_options,
 )
 from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
-from torchrl_koap.studies.curve_folder import GROWS, check_folder, dataset_of, with_earlier_plugins, write_options
+from torchrl_koap.studies.curve_data import check_budgets, demonstrations_of, first_look
+from torchrl_koap.studies.curve_folder import GROWS, check_folder, with_earlier_plugins, write_options
 from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.studies.table import write_cells
-from torchrl_koap.tasks import HISTORY, WINDOW, Task
+from torchrl_koap.tasks import Task
 from torchrl_koap.training.config import TrainConfig, resolve
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.plugins import Plugins, load_plugins
-from torchrl_koap.training.progress import count_up_to, progress_bar
+from torchrl_koap.training.progress import progress_bar
 from torchrl_koap.training.released_settings import get_released
 from torchrl_koap.training.run import check_networks
 from torchrl_koap.training.run_directory import RunDirectory
@@ -68,6 +65,8 @@ class CurveConfig(CellOptions):
             the same data, which nothing here can check.
         planner_observations: share of the trajectories that planners are trained on (default: that of the cell).
         first_seed_only: of the fractions, those that are measured with the first seed alone.
+        data_share: share of the trajectories that are used at all, drawn before any label is; `fractions` stay shares
+            of the whole (`observations` are shares of what is used).
         plugins: modules that register tasks, methods or pictures; every cell imports them, and every later call.
 
     Examples:
@@ -97,6 +96,7 @@ class CurveConfig(CellOptions):
     planner_from: Path | None = None
     planner_observations: float | None = None
     first_seed_only: str = ""
+    data_share: float = 1.0
     plugins: Plugins = ()
 
     def __post_init__(self):
@@ -120,12 +120,12 @@ def run_curve(config: CurveConfig) -> dict[str, Any]:
     """
     options, task, cells, root = check_curve(config)
     to_record = options.dataset == "scripted" and not (root.path / "demonstrations" / "ted").exists()
-    _check_budgets(cells, options, _first_look(root, options, task))
+    check_budgets(cells, options, first_look(root, options, task))
     with root.locked("koap curve", "lock"):
         check_folder(root, options)  # another one may have finished here in the meantime
-        dataset = _demonstrations(root, options, task)
+        dataset = demonstrations_of(root, options, task)
         if to_record:
-            _check_budgets(cells, options, load_demonstrations(dataset, task))
+            check_budgets(cells, options, load_demonstrations(dataset, task))
         write_options(root, options)
         reasons = _work(root, options, cells, dataset)
         rows = _rows(root, cells, options, reasons)
@@ -198,6 +198,12 @@ def _cells(options: CurveConfig) -> list[Cell]:
         for value in values:
             if not 0 < value <= 1:
                 raise ValueError(f"{name} must be in (0, 1], got {value:g}")
+    if not 0 < options.data_share <= 1:
+        raise ValueError(f"data_share must be in (0, 1], got {options.data_share:g}")
+    if max(fractions) > options.data_share:
+        raise ValueError(
+            f"labels on a share of {max(fractions):g} of all data were asked for, but only {options.data_share:g} is used"
+        )
     if options.planner_observations is not None and not 0 < options.planner_observations <= 1:
         raise ValueError(f"planner_observations must be in (0, 1], got {options.planner_observations:g}")
     once = _split("first_seed_only", options.first_seed_only, float) if options.first_seed_only else []
@@ -219,46 +225,6 @@ def _split(name: str, text: str, kind: type) -> list[Any]:
         return list(dict.fromkeys(kind(part) for part in parts))
     except ValueError:
         raise ValueError(f"{name} must be numbers with commas between, got {text!r}") from None
-
-
-def _first_look(root: RunDirectory, options: CurveConfig, task: Task) -> TensorDictBase | None:
-    """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
-    if options.dataset == "scripted" and task.env is None:
-        raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: name a --dataset")
-    if options.dataset != "scripted":
-        return load_demonstrations(dataset_of(options), task)
-    if (root.path / "demonstrations" / "ted").exists():
-        return load_demonstrations(str(root.path / "demonstrations"), task)
-    if options.units != "trajectory":
-        LabelBudget(1, unit=options.units)  # knows the units
-        return None
-    number = options.demonstrations or task.defaults.demonstrations
-    return flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number)
-
-
-def _demonstrations(root: RunDirectory, options: CurveConfig, task: Task) -> str:
-    """The data set as a folder: scripted demonstrations are recorded once for all cells."""
-    if options.dataset != "scripted":
-        return dataset_of(options)
-    folder = root.path / "demonstrations"
-    if not (folder / "ted").exists():
-        from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-
-        episodes = options.demonstrations or task.defaults.demonstrations
-        with progress_bar(episodes, "demonstrations", unit="episode") as bar:
-            data, _ = record_demonstrations(task.name, episodes, 0, progress=count_up_to(bar))
-        save_ted(data, folder / "ted", task=task.source)
-    return str(folder)
-
-
-def _check_budgets(cells: Sequence[Cell], options: CurveConfig, data: TensorDictBase | None) -> None:
-    """Refuses before any work what would fail in a cell: budgets that select nothing, shares below the labelled."""
-    if data is None:
-        return
-    # windows of another seed lie in another number of trajectories
-    for fraction, share, seed in dict.fromkeys((cell.fraction, cell.observations, cell.seed) for cell in cells):
-        budget = LabelBudget(fraction, unit=options.units, seed=seed, window=WINDOW, history=HISTORY)
-        subsample_trajectories(budget.apply(data)[0], share)
 
 
 def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:
@@ -286,6 +252,7 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
             "cell": asdict(cell),
             "planner": None if planner is None else str(planner),
             "settings": cell_settings | training_options(options, cell.method),
+            "label_fraction": cell.fraction / options.data_share,
             "evaluation": {"episodes": options.episodes, "threads": 1} | evaluation_options(options, cell.method),
         }
         needs = ()
