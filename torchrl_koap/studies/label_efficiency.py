@@ -202,7 +202,8 @@ def _cells(options: CurveConfig) -> list[Cell]:
         raise ValueError(f"data_share must be in (0, 1], got {options.data_share:g}")
     if max(fractions) > options.data_share:
         raise ValueError(
-            f"labels on a share of {max(fractions):g} of all data were asked for, but only {options.data_share:g} is used"
+            f"fractions must be at most data_share, the share of the data that is used ({options.data_share:g}),"
+            f" got {max(fractions):g}"
         )
     if options.planner_observations is not None and not 0 < options.planner_observations <= 1:
         raise ValueError(f"planner_observations must be in (0, 1], got {options.planner_observations:g}")

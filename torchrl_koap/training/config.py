@@ -240,6 +240,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         "preset": "released" if options.released_settings else options.preset or method.presets[0],
         "state": options.controller_state if method.has_planner else "all",
     }
+    if method.earlier:
+        controller["revised"] = True
     return ResolvedConfig(
         options=options,
         task=task,
