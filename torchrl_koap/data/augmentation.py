@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.keys import EPISODE, STATE
+from torchrl_koap.keys import ACTION, EPISODE, STATE
 
 
 class RecoveryAugmentation(TensorDictModuleBase):
@@ -35,7 +35,11 @@ class RecoveryAugmentation(TensorDictModuleBase):
             are then ``columns``.
         kinematics (callable, optional): the function from joints ``[*B, J]`` to the position of the tool ``[*B, 3]``,
             needed with ``tool``, such as :func:`~torchrl_koap.tasks.panda_kinematics.tool_position`.
+        moved_by (sequence of int, optional): for every action column the state column that it moves: actions are given
+            the way back too, ``a'_{t+i} = a_{t+i} + (rho^{i+1} - rho^i) delta``. Default: no action is touched.
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
+        action_key (NestedKey): actions ``[*B, T, act]``, replaced with ``moved_by``; NaN stays. Defaults to
+            ``"action"``.
 
     Examples:
         >>> import torch
@@ -55,14 +59,17 @@ class RecoveryAugmentation(TensorDictModuleBase):
         columns: Sequence[int] | None = None,
         tool: Sequence[int] | None = None,
         kinematics: Callable[[Tensor], Tensor] | None = None,
+        moved_by: Sequence[int] | None = None,
         key: NestedKey = STATE,
+        action_key: NestedKey = ACTION,
     ):
         super().__init__()
         if tool is not None and (columns is None or kinematics is None):
             raise ValueError(f"a tool follows joints: wanted columns and kinematics, got {columns} and {kinematics}")
         if sigma < 0 or not 0 <= decay < 1:
             raise ValueError(f"sigma must be >= 0 and decay in [0, 1), got {sigma} and {decay}")
-        self.in_keys, self.out_keys = [key], [key]
+        self.in_keys = self.out_keys = [key] if moved_by is None else [key, action_key]
+        self.moved_by = None if moved_by is None else list(moved_by)
         self.sigma, self.history, self.decay = sigma, history, decay
         self.columns = None if columns is None else list(columns)
         self.tool = None if tool is None else list(tool)
@@ -80,6 +87,10 @@ class RecoveryAugmentation(TensorDictModuleBase):
         frames = torch.arange(state.shape[-2], device=state.device) - (self.history - 1)
         remaining = self.decay ** frames.clamp_min(0).to(state.dtype)
         shifted = state + 2 * self.sigma * size * shift * remaining[:, None]
+        if self.moved_by is not None:
+            following = self.decay ** (frames + 1).clamp_min(0).to(state.dtype)
+            back = 2 * self.sigma * size * shift[..., self.moved_by] * (following - remaining)[:, None]
+            tensordict.set(self.in_keys[1], tensordict.get(self.in_keys[1]) + back)
         if self.tool is not None and self.sigma:
             moved = self.kinematics(shifted[..., self.columns]) - self.kinematics(state[..., self.columns])
             shifted[..., self.tool] = shifted[..., self.tool] + moved
@@ -101,7 +112,10 @@ class RandomPlanarTransform(TensorDictModuleBase):
         turn (float): standard deviation of the angle (rad); the scene turns about the first point of the last frame
             observed.
         history (int): observed frames of the window. Defaults to ``2``.
+        turned_actions (sequence of int, optional): action columns ``(x, y)`` of a displacement, turned with the scene.
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
+        action_key (NestedKey): actions ``[*B, T, act]``, replaced with ``turned_actions``; NaN stays. Defaults to
+            ``"action"``.
 
     Raises:
         ValueError: for a negative shift or turn.
@@ -125,12 +139,15 @@ class RandomPlanarTransform(TensorDictModuleBase):
         shift: float,
         turn: float,
         history: int = 2,
+        turned_actions: Sequence[int] | None = None,
         key: NestedKey = STATE,
+        action_key: NestedKey = ACTION,
     ):
         super().__init__()
         if shift < 0 or turn < 0:
             raise ValueError(f"shift and turn must be >= 0, got {shift} and {turn}")
-        self.in_keys, self.out_keys = [key], [key]
+        self.in_keys = self.out_keys = [key] if turned_actions is None else [key, action_key]
+        self.turned_actions = None if turned_actions is None else list(turned_actions)
         self.points, self.directions = [list(pair) for pair in points], [list(pair) for pair in directions]
         self.shift, self.turn, self.history = shift, turn, history
 
@@ -148,6 +165,10 @@ class RandomPlanarTransform(TensorDictModuleBase):
             moved[..., pair] = (state[..., pair] - centre) @ turn + centre + shift
         for pair in self.directions:
             moved[..., pair] = state[..., pair] @ turn
+        if self.turned_actions is not None:
+            action = tensordict.get(self.in_keys[1]).clone()
+            action[..., self.turned_actions] = action[..., self.turned_actions] @ turn
+            tensordict.set(self.in_keys[1], action)
         return tensordict.set(self.in_keys[0], moved)
 
 

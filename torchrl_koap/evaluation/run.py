@@ -193,6 +193,11 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             raise CheckpointError(f"{run} was trained on task {trained_on!r}, not on {config.task!r}")
     else:
         trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
+        if trained.planner is None and config.execution != "feedback":
+            raise ValueError(
+                f"execution {config.execution!r} was asked of {trained.directory.path}, but method"
+                f" {trained.method.name!r} is a policy of its own: it executes chunks of actions"
+            )
         description = PolicyDescription(
             trained.task,
             trained.config["planner"],
