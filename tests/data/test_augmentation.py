@@ -173,6 +173,6 @@ def test_joints_follow_the_tool_aside_and_come_back_with_it():
     jacobian = torch.func.vmap(torch.func.jacfwd(tool_position))(state[:, 1, :7])
     moved = (found - state)[:, 1, :7]
     idle = moved - (torch.linalg.pinv(jacobian) @ jacobian @ moved[..., None])[..., 0]
-    assert idle.norm(dim=-1).max() < 1e-6 < moved.norm(dim=-1).mean()
+    assert idle.norm(dim=-1).max() < 1e-4 * moved.norm(dim=-1).mean()
     with pytest.raises(ValueError, match="wanted columns and kinematics"):
         RecoveryAugmentation(0.02, columns=(0, 1), tool=(2, 3, 4))

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.keys import EPISODE, STATE
 
+_DIFFERENCE = 1e-3  # rad, of the numerical Jacobian
 _DAMPING = 1e-4  # m2 / rad2, added to the squared reach of the joints: bounds them where the arm is stretched out
 
 
@@ -95,9 +96,9 @@ class RecoveryAugmentation(TensorDictModuleBase):
     def _of_joints(self, shift: Tensor, state: Tensor) -> Tensor:
         """Shifts ``[*B, 1, d]`` whose joints move the tool by the shift's own tool columns, by the least motion."""
         joints = state[..., self.history - 1, self.columns]
-        units = torch.eye(joints.shape[-1], dtype=joints.dtype, device=joints.device)
-        ways = [torch.func.jvp(self.kinematics, (joints,), (unit.expand_as(joints),))[1] for unit in units]
-        jacobian = torch.stack(ways, -1)  # [*B, 3, J]
+        aside = _DIFFERENCE * torch.eye(joints.shape[-1], dtype=joints.dtype, device=joints.device)
+        ends = (self.kinematics(joints.unsqueeze(-2) + sign * aside) for sign in (1, -1))  # each [*B, J, 3]
+        jacobian = torch.sub(*ends).mT / (2 * _DIFFERENCE)  # [*B, 3, J]
         damped = jacobian @ jacobian.mT + _DAMPING * torch.eye(3, dtype=joints.dtype, device=joints.device)
         follow = jacobian.mT @ torch.linalg.solve(damped, shift[..., 0, self.tool].unsqueeze(-1))
         return shift.index_copy(-1, torch.tensor(self.columns, device=shift.device), follow.mT)
