@@ -87,7 +87,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
         state = tensordict.get(self.in_keys[0])
         size = torch.rand(*state.shape[:-2], 1, 1, dtype=state.dtype, device=state.device)
         shift = torch.randn(*state.shape[:-2], 1, state.shape[-1], dtype=state.dtype, device=state.device)
-        shift = 2 * self.sigma * size * (shift if self.tool is None else self._of_joints(shift, state))
+        shift = 2 * self.sigma * size * self._of_joints(shift, state)
         if self.columns is not None:
             keep = torch.zeros_like(shift)
             keep[..., self.columns] = 1
@@ -105,7 +105,9 @@ class RecoveryAugmentation(TensorDictModuleBase):
         return tensordict.set(self.in_keys[0], shifted)
 
     def _of_joints(self, shift: Tensor, state: Tensor) -> Tensor:
-        """Shifts ``[*B, 1, d]`` whose joints move the tool by the shift's own tool columns, by the least motion."""
+        """Shifts ``[*B, 1, d]`` whose joints move the tool, if there is one, by its own columns, with least motion."""
+        if self.tool is None or not self.sigma:
+            return shift
         joints = state[..., self.history - 1, self.columns]
         aside = _DIFFERENCE * torch.eye(joints.shape[-1], dtype=joints.dtype, device=joints.device)
         ends = (self.kinematics(joints.unsqueeze(-2) + sign * aside) for sign in (1, -1))  # each [*B, J, 3]
