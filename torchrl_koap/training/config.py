@@ -77,6 +77,8 @@ class TrainConfig:
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
+        recovery_response: how the augmentation leads back, "first_order" at once or "second_order" from rest, which robots
+            that follow their commands late can do (default: the task's).
         scene_shift: typical displacement (m) of whole scenes, for tasks whose place on the table does not matter.
         scene_turn: typical angle (rad) by which such scenes are turned.
         exchange: exchange objects that are alike.
@@ -141,6 +143,7 @@ class TrainConfig:
     relations: bool = True
     controller_state: str = "robot"
     recovery_sigma: float | None = None
+    recovery_response: str | None = None
     scene_shift: float = 0.05
     scene_turn: float = 0.3
     exchange: bool = True
@@ -264,6 +267,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
     defaults = {
         "steps": task.defaults.planner_steps,
         "recovery_sigma": task.defaults.recovery_sigma,
+        "recovery_response": task.defaults.recovery_response,
         "episodes": task.defaults.demonstrations,
         "relative": task.defaults.relative,
         "channels": task.defaults.channels,

@@ -32,6 +32,7 @@ PLANNER_OPTIONS = (
     *(
         "relations",
         "recovery_sigma",
+        "recovery_response",
         "scene_shift",
         "scene_turn",
         "exchange",

@@ -149,6 +149,6 @@ def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> 
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
         tool = {"tool": task.tool_columns, "kinematics": task.tool_position}
-        sigma = options.recovery_sigma
-        steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, moved_by=moved_by, **tool))
+        way = {"response": options.recovery_response, "columns": arm, "moved_by": moved_by}
+        steps.append(RecoveryAugmentation(options.recovery_sigma, history=HISTORY, **way, **tool))
     return TensorDictSequential(*steps)
