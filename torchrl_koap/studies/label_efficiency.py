@@ -8,17 +8,17 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted, subsample_trajectories
-from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
+from torchrl_koap.studies.cells import Cell, do_cell, do_planner, is_trained, planner_folder
+from torchrl_koap.studies.curve_table import CurveTable
 from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
-from torchrl_koap.studies.table import write_cells
 from torchrl_koap.tasks import HISTORY, WINDOW, Task
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.methods import get_method
@@ -26,6 +26,7 @@ from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.released_settings import get_released
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.training.saved_options import check_types
 
 ALL = "koap,koap_labelled_only,linear,dd,vae,lapo,dp,relabel,nonlinear,pretrain"
 
@@ -138,8 +139,10 @@ def run_curve(config: CurveConfig) -> dict[str, Any]:
         if to_record:
             _check_budgets(cells, options, load_demonstrations(dataset, task))
         _write_options(root, options)
-        reasons = _work(root, options, cells, dataset)
-        rows = _rows(root, cells, options, reasons)
+        known = _all_cells(root, cells, options)
+        table = CurveTable(root.path, known, task=options.task, label_unit=options.units)
+        _work(root, options, cells, dataset, table)
+        rows = table.write()
         paper = paper_points(task.name, task.label_levels) if options.units == "window" else None
         report = write_curve_report(root.path, rows, title=f"Label efficiency on {task.name}", paper=paper)
     counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
@@ -178,7 +181,7 @@ def _split(name: str, text: str, kind: type) -> list[Any]:
 
 def _check_folder(root: RunDirectory, options: CurveConfig) -> None:
     if (root.path / "curve.json").exists():
-        earlier, now = root.read_json("curve.json"), _plain(options)
+        earlier, now = _earlier(root), _plain(options)
         # an option that is younger than the folder was at its default
         earlier = {name: earlier.get(name, getattr(CurveConfig, name)) for name in _FIXED}
         changed = [f"{name} ({value})" for name, value in earlier.items() if now[name] != value]
@@ -203,7 +206,7 @@ def _write_options(root: RunDirectory, options: CurveConfig) -> None:
     """Keeps what was asked for, earlier methods, fractions and seeds included."""
     content = _plain(options)
     if (root.path / "curve.json").exists():
-        earlier = root.read_json("curve.json")
+        earlier = _earlier(root)
         for name in ("methods", "fractions", "observations"):
             content[name] = ",".join(dict.fromkeys([*str(earlier[name]).split(","), *content[name].split(",")]))
         content["seeds"] = max(earlier["seeds"], content["seeds"])
@@ -213,7 +216,7 @@ def _write_options(root: RunDirectory, options: CurveConfig) -> None:
 def _with_earlier_plugins(options: CurveConfig) -> CurveConfig:
     """The options with the plugins of earlier calls, without which methods of theirs would be unknown."""
     root = RunDirectory(options.out)
-    earlier = root.read_json("curve.json").get("plugins") or () if (root.path / "curve.json").exists() else ()
+    earlier = _earlier(root).get("plugins") or () if (root.path / "curve.json").exists() else ()
     return replace(options, plugins=tuple(dict.fromkeys([*earlier, *options.plugins])))
 
 
@@ -262,8 +265,8 @@ def _check_budgets(cells: Sequence[Cell], options: CurveConfig, data: TensorDict
         subsample_trajectories(budget.apply(data)[0], share)
 
 
-def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:
-    """Does the cells that are not done; returns why some failed."""
+def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], dataset: str, table: CurveTable) -> None:
+    """Does the cells that are not done."""
     common = {
         "task": options.task,
         "dataset": dataset,
@@ -277,7 +280,7 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
         "epochs": options.epochs,
     }
     evaluation = {"episodes": options.episodes, "threads": 1}
-    todo = [cell for cell in cells if not is_done(root.path / cell.folder)]
+    todo = [cell for cell in cells if not table.is_done(cell)]
     todo.sort(key=lambda cell: cell.planner is not None)  # those without a planner need not wait for one
     jobs, names = [], {}
     for cell in todo:
@@ -307,7 +310,6 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
     # a job of a cluster may not use all cores of its machine
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     workers = options.workers or cores
-    reasons: dict[Cell, str] = {}
     with progress_bar(len(first) + len(jobs), "cells", unit="cell", smoothing=0.1) as bar:
         ended = launch(
             [*first, *jobs],
@@ -321,23 +323,18 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
                 bar.update()
                 bar.set_postfix_str(job.name.removeprefix("cells/") + (" FAILED" if reason else ""))
                 if job.name in names:
-                    if reason is not None:
-                        reasons[names[job.name]] = reason
-                    _rows(root, cells, options, reasons)
-    return reasons
+                    table.ended(names[job.name], reason)
 
 
-def _rows(
-    root: RunDirectory, cells: Sequence[Cell], options: CurveConfig, reasons: dict[Cell, str]
-) -> list[dict[str, Any]]:
-    """Writes ``cells.csv`` from the folders of all cells, asked for now or earlier, and returns its rows."""
-    known = list(cells)
-    earlier = root.read_json("curve.json")
+def _all_cells(root: RunDirectory, cells: Sequence[Cell], options: CurveConfig) -> list[Cell]:
+    """The cells asked for now, and those asked for earlier."""
+    earlier, asked = _earlier(root), set(cells)
     grown = replace(options, **{name: earlier[name] for name in _GROWS})
-    known += [cell for cell in _cells(grown) if cell not in known and (root.path / cell.folder).exists()]
-    rows = [
-        cell_row(root.path, cell, task=options.task, label_unit=options.units, reason=reasons.get(cell))
-        for cell in known
-    ]
-    write_cells(root.path / "cells.csv", rows)
-    return rows
+    return [*cells, *(cell for cell in _cells(grown) if cell not in asked and (root.path / cell.folder).exists())]
+
+
+def _earlier(root: RunDirectory) -> dict[str, Any]:
+    """What ``curve.json`` holds, its entries of the types that they were written with."""
+    earlier = root.read_json("curve.json")
+    check_types(root.path / "curve.json", earlier, get_type_hints(CurveConfig))
+    return earlier
