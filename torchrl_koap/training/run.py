@@ -82,7 +82,8 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         if not mine:
             held.enter_context(run.locked("koap train"))
             check_resume(run, content, resume=options.resume)  # another one may have begun here in the meantime
-        forget_digests(run)
+        if options.force_data:
+            forget_digests(run)
         run.write_json("config.json", content)  # not before the data are known to be good: a wrong call leaves nothing
 
         began = time.perf_counter()
@@ -143,7 +144,8 @@ def train_shared_planner(config: TrainConfig) -> dict[str, float]:
     with run.locked("koap train"):
         check_resume(run, content, resume=options.resume)
         check_data(run, content, force=options.force_data)
-        forget_digests(run)
+        if options.force_data:
+            forget_digests(run)
         run.write_json("config.json", content)
         torch.manual_seed(options.seed)
         values = train_planner(run, resolved, without_validation(data, held_out))[1]
