@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/demo
 
-.PHONY: setup demo test slow lint clean
+.PHONY: setup demo test slow faults lint clean
 
 setup: $(VENV)/.ready
 
@@ -26,6 +26,10 @@ test: setup
 
 slow: setup
 	$(BIN)/python -m pytest -q -m slow
+
+# every fault of the ledger, and the state machines at length
+faults: setup
+	$(BIN)/python -m pytest -q -m "faults or not faults" tests/faults
 
 lint: setup
 	$(BIN)/ruff check .

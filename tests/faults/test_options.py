@@ -46,6 +46,7 @@ WRONG: dict[Any, tuple[str, ...]] = {
 RIGHT = {
     "convert": ("--name n0nsense", "--out /dev/null/below"),
     "demos": ("--seed 0",),
+    "eval": ("--seed 0",),
     "train": (
         *("--seed 0", "--controller-steps 0", "--condition-octaves 0", "--episodes -1", "--episodes 0"),
         *("--denoiser-width", "--denoiser-depth"),
@@ -57,6 +58,9 @@ SAYS = {
     "--label-count": "labelled|label-count",
     "--label-unit": "unit",
     "--controller-steps": "steps",
+    "--solver-steps": "solver-steps|num_steps",
+    "--controller-state": "part of the state",
+    "--planner-from": "/dev/null/below|planner-from",
 }
 
 

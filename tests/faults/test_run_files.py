@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from fault_damage import DAMAGE, flip
 from fault_ledger import Fault, Place, check, edit_json, meet, table
 from safetensors.torch import save_file
 
@@ -27,49 +27,6 @@ READERS = {
     "inspect": ("inspect", "{run}", "--episodes", "1", "--threads", "1"),
     "latency": ("latency", "{run}", "--steps", "2"),
     "doctor": ("doctor", "{run}"),
-}
-
-
-def flip(path: Path) -> None:
-    """One bit near the end, where the numbers are."""
-    content = bytearray(path.read_bytes())
-    content[-9] ^= 4
-    path.write_bytes(content)
-
-
-def grow(path: Path) -> None:
-    """More than any memory holds; the disk is not asked for it."""
-    with path.open("r+b") as file:
-        file.truncate(40 << 30)
-
-
-def pipe(path: Path) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
-def zeros(path: Path) -> None:
-    path.unlink()
-    path.symlink_to("/dev/zero")
-
-
-def folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-# damage to any file
-DAMAGE: dict[str, Callable[[Path], object]] = {
-    "missing": Path.unlink,
-    "empty": lambda path: path.write_bytes(b""),
-    "cut off": lambda path: os.truncate(path, path.stat().st_size // 2),
-    "cut by a byte": lambda path: os.truncate(path, path.stat().st_size - 3),
-    "of noise": lambda path: path.write_bytes(bytes(range(256)) * 8),
-    "of another kind": lambda path: path.write_text("just words\n" * 30),
-    "a folder": folder,
-    "a pipe": pipe,
-    "without end": zeros,
-    "of 40 GB": grow,
 }
 
 
@@ -153,7 +110,9 @@ def files() -> Iterator[Fault]:
             for name in STATES:
                 yield Fault(f"{name} {kind}", READERS["doctor"], name, damaged(name, damage))
                 yield Fault(f"resume {name} {kind}", RESUME, name, damaged(name, damage, finished=False))
-        yield Fault(f"resume config.json {kind}", RESUME, "config.json|--dataset|demonstrations", damaged("config.json", damage))
+        yield Fault(
+            f"resume config.json {kind}", RESUME, "config.json|--dataset|demonstrations", damaged("config.json", damage)
+        )
     for name in (*WEIGHTS, *STATES, "eigenvalues.safetensors"):
         yield Fault(f"{name} with a flipped bit", READERS["doctor"], name, damaged(name, flip))
     for name in WEIGHTS:
