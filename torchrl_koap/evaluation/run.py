@@ -193,6 +193,11 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             raise CheckpointError(f"{run} was trained on task {trained_on!r}, not on {config.task!r}")
     else:
         trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
+        if trained.planner is None and config.execution != "feedback":
+            raise ValueError(
+                f"execution {config.execution!r} was asked of {trained.directory.path}, but method"
+                f" {trained.method.name!r} is a policy of its own: it executes chunks of actions"
+            )
         description = PolicyDescription(
             trained.task,
             trained.config["planner"],
@@ -260,8 +265,6 @@ class _Place:
 def _place(task: Task, config: EvalConfig) -> _Place:
     """The task's own environment, or the one of Gymnasium that was asked for."""
     if config.env is None:
-        if config.success_key is not None:
-            raise ValueError("success_key was given, but no env: the task's own environment says what success is")
         numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
         from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
 
@@ -315,6 +318,11 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if config.seed < 0:
         raise ValueError(f"seed must be >= 0, got {config.seed}")
     lookup(EXECUTIONS, config.execution, "execution")
+    if config.success_key is not None and config.env is None:
+        raise ValueError(
+            f"success_key {config.success_key!r} was given, but no env that could report it: name an environment of"
+            " Gymnasium with --env"
+        )
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
     trained = load_run(_folder(run, config), task=config.task)

@@ -70,7 +70,8 @@ def method_named(options: Mapping[str, Any]) -> Method:
     """
     if options.get("released"):
         return get_released(options["method"]).method
-    return get_method(options["method"], options.get("decoder"))
+    method = get_method(options["method"], options.get("decoder"))
+    return get_method(method.earlier) if method.earlier and not options.get("revised") else method
 
 
 def set_up_torch(threads: int, device: str) -> None:

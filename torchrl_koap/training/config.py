@@ -16,7 +16,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.training.datasets import find_task_of
-from torchrl_koap.training.methods import Method, get_method
+from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.run_directory import RunDirectory
@@ -48,6 +48,8 @@ class TrainConfig:
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
         preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
+        koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
+        action_coeff: weight of the action term, for methods whose action decoder is trained with the rest (default: 1).
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: controller updates.
@@ -70,6 +72,8 @@ class TrainConfig:
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
         relative: plan displacements from the current state instead of states (default: the task's).
+        forecast: plan deviations from a linear forecast, which carries over to goals not demonstrated (default: for a
+            task without an environment).
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
@@ -111,6 +115,8 @@ class TrainConfig:
     released_settings: bool = False
     epochs: int | None = None
     preset: str | None = None
+    koopman_coeff: float | None = None
+    action_coeff: float | None = None
     decoder: str | None = None
     steps: int | None = None
     controller_steps: int = 500
@@ -131,6 +137,7 @@ class TrainConfig:
     schedule: str = "squared_cosine"
     prediction: str = "sample"
     relative: bool | None = None
+    forecast: bool | None = None
     relations: bool = True
     controller_state: str = "robot"
     recovery_sigma: float | None = None
@@ -239,6 +246,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         "preset": "released" if options.released_settings else options.preset or method.presets[0],
         "state": options.controller_state if method.has_planner else "all",
     }
+    if method.earlier:
+        controller["revised"] = True
     return ResolvedConfig(
         options=options,
         task=task,
@@ -259,6 +268,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
         "relative": task.defaults.relative,
         "channels": task.defaults.channels,
         "validation_fraction": default_fraction(task),
+        "forecast": True if task.env is None and not options.released_settings else None,
     }
     return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
 
@@ -297,6 +307,12 @@ def _check(options: TrainConfig, method: Method) -> None:
     lookup(("csv", "wandb"), options.logger, "logger")
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
+    for name in COEFFICIENTS:
+        value = getattr(options, name)
+        if value is not None and name not in loss_coefficients(method):
+            raise ValueError(f"{name} was given, but no loss of method {options.method!r} has it")
+        if value is not None and value < 0:
+            raise ValueError(f"{name} must be >= 0, got {value}")
     if not method.has_planner and options.planner_from is not None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
     if options.steps < 1 or options.controller_steps < 0:
@@ -336,6 +352,7 @@ def _planner_entry(options: TrainConfig) -> dict[str, Any]:
         "depth": options.denoiser_depth,
         "frequencies": options.condition_octaves,
         "dropout": options.dropout,
+        "forecast": options.forecast or None,
     }
     # what was left out is left out here too, so that a run of before can be resumed
     return {name: value for name, value in sizes.items() if value is not None} | {

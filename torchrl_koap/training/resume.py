@@ -33,6 +33,8 @@ def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
     left = [field.name for field in fields(config) if getattr(config, field.name) == field.default]
     left = [name for name in left if name not in _EVERY_TIME]
     kept = {name: earlier[name] for name in left if name in earlier}
+    if "forecast" in left and "forecast" not in earlier:
+        kept["forecast"] = False  # there was none to choose
     kept = {name: tuple(value) if isinstance(value, list) else value for name, value in kept.items()}
     if kept.get("planner_from") is not None:
         kept["planner_from"] = Path(kept["planner_from"])
@@ -63,7 +65,8 @@ def check_resume(run: RunDirectory, content: Mapping[str, Any], *, resume: bool)
     # a folder that is gone was moved, probably together with this run: there is nothing to compare with
     paths = {name: earlier.get(name) for name in ("dataset", "planner_from")}
     moved = {name for name, path in paths.items() if path not in (None, "scripted") and not Path(path).exists()}
-    changed = [key for key in content if key not in FREE | moved and content[key] != earlier.get(key)]
+    fixed = [key for key in content if key not in FREE | moved]
+    changed = [key for key in fixed if (content[key] or None) != (earlier.get(key) or None)]  # off, or not there yet
     if changed:
         raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so")
 

@@ -61,7 +61,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         set_up_torch(options.threads, options.device)
         content = to_json(resolved, command)
         check_resume(run, content, resume=options.resume)
-        _build_once(resolved)
+        check_networks(resolved)
 
         with progress_bar(None, "demonstrations", unit="episode", shown=options.dataset == "scripted") as bar:
             data = load_demonstrations(options.dataset, task, episodes=options.episodes, progress=count_up_to(bar))
@@ -163,8 +163,22 @@ def _validation(resolved: ResolvedConfig, labelled: TensorDictBase) -> list[int]
     return choose_validation(labelled, options.validation_fraction, seed=options.seed)
 
 
-def _build_once(resolved: ResolvedConfig) -> None:
-    """Finds unknown names and weights that do not fit before any work is done."""
+def check_networks(resolved: ResolvedConfig) -> None:
+    """Finds unknown names, networks that cannot read the task's state and weights that do not fit, before any work.
+
+    Args:
+        resolved (ResolvedConfig): all options.
+
+    Raises:
+        ValueError: naming what does not fit.
+        CheckpointError: if the planner to take over is of another task or size.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training.config import TrainConfig, resolve
+        >>> from torchrl_koap.training.run import check_networks
+        >>> check_networks(resolve(TrainConfig(out=Path("run"), task="sorting")))
+    """
     task, features = resolved.task, resolved.task.planner_features()
     if not resolved.method.has_planner:
         resolved.method.build(task.state_dim, task.action_dim, features, resolved.planner)
@@ -172,6 +186,7 @@ def _build_once(resolved: ResolvedConfig) -> None:
     planner = build_planner(resolved.planner, task.state_dim, features)
     if resolved.options.planner_from is not None:
         load_weights(Path(resolved.options.planner_from) / "planner.safetensors", planner, task=task.name)
+    build_controller(resolved.controller, len(resolved.columns), task.action_dim, method=resolved.method)
 
 
 def _check_lengths(resolved: ResolvedConfig, data: TensorDictBase) -> None:
