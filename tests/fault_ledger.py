@@ -26,8 +26,7 @@ LONGEST = 60  # s; a fault that takes longer counts as a hang
 EVERY = 25  # of so many faults one is met in `make test`, all of them in `make faults`
 # where a call begins with what it was called for
 WORK = (
-    "torchrl_koap.training.run.train_planner",
-    "torchrl_koap.training.run.train_controller",
+    "torchrl_koap.training.loop.warmup_cosine",
     "torchrl_koap.evaluation.run.roll_out",
     "torchrl_koap.evaluation.inspection.roll_out",
     "torchrl_koap.studies.label_efficiency.launch",
