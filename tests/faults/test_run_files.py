@@ -175,7 +175,7 @@ def entries() -> Iterator[Fault]:
                 ("label_count", "null"),
             ):
                 continue
-            yield Fault(f"config.json {path} is {kind}", EVAL, "config.json|task", entry(path, value))
+            yield Fault(f"config.json {path} is {kind}", EVAL, "config.json|task|does not fit", entry(path, value))
     for kind in ("text", "a fraction", "a list", "an object"):
         yield Fault(f"config.json plugins is {kind}", EVAL, "config.json", entry("plugins", TYPES[kind]))
     yield Fault("config.json relative was flipped", EVAL, "config.json changed", flip_relative)

@@ -63,7 +63,9 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         check_resume(run, content, resume=options.resume)
         check_networks(resolved)
 
-        with progress_bar(None, "demonstrations", unit="episode", shown=options.dataset == "scripted") as bar:
+        # files are read in a moment, unless there are thousands of them
+        wait = 0 if options.dataset == "scripted" else 3
+        with progress_bar(None, "demonstrations", unit="episode", delay=wait) as bar:
             data = load_demonstrations(options.dataset, task, episodes=options.episodes, progress=count_up_to(bar))
         resolved = resolved.with_labels_of(data)
         options = resolved.options
