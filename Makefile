@@ -29,7 +29,8 @@ slow: setup
 
 # every fault of the ledger, and the state machines at length
 faults: setup
-	$(BIN)/python -m pytest -q -m "faults or not faults" tests/faults
+	$(BIN)/python -m pytest -n 2 -q -m "faults or not faults" tests/faults
+	$(BIN)/python -m pytest -n 2 -q -m faults tests/commands tests/studies
 
 lint: setup
 	$(BIN)/ruff check .
