@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/demo
 
-.PHONY: setup demo test slow lint types docs tutorials dist clean
+.PHONY: setup demo test slow faults lint types docs tutorials dist clean
 
 setup: $(VENV)/.ready
 
@@ -26,6 +26,11 @@ test: setup
 
 slow: setup
 	$(BIN)/python -m pytest -q -m slow
+
+# every fault of the ledger, and the state machines at length
+faults: setup
+	$(BIN)/python -m pytest -n 2 -q -m "faults or not faults" tests/faults
+	$(BIN)/python -m pytest -n 2 -q -m faults tests/commands tests/studies
 
 lint: setup
 	$(BIN)/ruff check .

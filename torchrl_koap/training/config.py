@@ -299,6 +299,14 @@ def _method(options: TrainConfig) -> Method:
     return method
 
 
+_LEAST = (
+    dict.fromkeys(("batch_size", "controller_batch_size", "checkpoint_every", "candidates"), 1)
+    | dict.fromkeys(("denoiser_width", "denoiser_depth"), 1)
+    | dict.fromkeys(("condition_octaves", "dropout", "planner_weight_decay", "first_steps_weight"), 0)
+    | dict.fromkeys(("recovery_sigma", "scene_shift", "scene_turn"), 0)
+)
+
+
 def _check(options: TrainConfig, method: Method) -> None:
     lookup(("csv", "wandb"), options.logger, "logger")
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
@@ -316,13 +324,20 @@ def _check(options: TrainConfig, method: Method) -> None:
     for name in ("planner_learning_rate", "controller_learning_rate"):
         if not 0 < getattr(options, name) < math.inf:
             raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
+    if options.label_fraction is not None and not 0 < options.label_fraction <= 1:
+        raise ValueError(f"label_fraction: a fraction must be in (0, 1], got {options.label_fraction}")
     if options.seed < 0:
         raise ValueError(f"seed must be >= 0, got {options.seed}")
     if not 0 <= (options.validation_fraction or 0) < 1:
         raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
-    for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
-        if getattr(options, name) < 1:
-            raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
+    for name, least in _LEAST.items():
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise ValueError(f"{name} must be >= {least}, got {value}")
+    if options.dropout is not None and options.dropout >= 1:
+        raise ValueError(f"dropout must be in [0, 1), got {options.dropout}")
+    if not 0 < options.observation_fraction <= 1:
+        raise ValueError(f"observation_fraction: a fraction must be in (0, 1], got {options.observation_fraction}")
 
 
 def _budget(options: TrainConfig) -> LabelBudget:

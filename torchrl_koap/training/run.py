@@ -63,7 +63,9 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         check_resume(run, content, resume=options.resume)
         check_networks(resolved)
 
-        with progress_bar(None, "demonstrations", unit="episode", shown=options.dataset == "scripted") as bar:
+        # files are read in a moment, unless there are thousands of them
+        wait = 0 if options.dataset == "scripted" else 3
+        with progress_bar(None, "demonstrations", unit="episode", delay=wait) as bar:
             data = load_demonstrations(options.dataset, task, episodes=options.episodes, progress=count_up_to(bar))
         resolved = resolved.with_labels_of(data)
         options = resolved.options
@@ -82,7 +84,8 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         if not mine:
             held.enter_context(run.locked("koap train"))
             check_resume(run, content, resume=options.resume)  # another one may have begun here in the meantime
-        forget_digests(run)
+        if options.force_data:
+            forget_digests(run)
         run.write_json("config.json", content)  # not before the data are known to be good: a wrong call leaves nothing
 
         began = time.perf_counter()
@@ -143,7 +146,8 @@ def train_shared_planner(config: TrainConfig) -> dict[str, float]:
     with run.locked("koap train"):
         check_resume(run, content, resume=options.resume)
         check_data(run, content, force=options.force_data)
-        forget_digests(run)
+        if options.force_data:
+            forget_digests(run)
         run.write_json("config.json", content)
         torch.manual_seed(options.seed)
         values = train_planner(run, resolved, without_validation(data, held_out))[1]
