@@ -119,7 +119,7 @@ def test_a_policy_of_its_own_is_judged_by_its_chunks(tmp_path, capsys):
 def test_all_trajectories_labelled(tmp_path):
     """One is held out from the planner; its labels still count."""
     arm = save_arm(tmp_path / "arm", labelled=10, joints=2)
-    result = evaluate(train_arm(tmp_path / "run", arm, label_fraction=1.0), FEW)
+    result = evaluate(train_arm(tmp_path / "run", arm), FEW)  # every label there is
     assert result["plan_errors"]["trajectories"] == 1 and result["action_errors"]["left_out"]["trajectories"] == 10
 
 

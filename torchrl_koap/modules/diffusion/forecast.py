@@ -10,6 +10,7 @@ from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.normalizer import Normalizer
 
 _MOST_ROWS = 20_000  # windows that the ridge is fitted to at most, spread evenly
+_NOTHING = 1e-3  # of the range of an entry: scale of what is forecast without error
 _FEW_TRAJECTORIES = 10.0  # penalty where too few trajectories are there to choose it by: next to no forecast
 
 
@@ -67,7 +68,10 @@ class LinearForecast(nn.Module):
         )
         self.weight.copy_(ridge.linear.weight.detach())
         self.bias.copy_(ridge.linear.bias.detach())
-        self.rest = Normalizer.fit(sequence - self._forecast(condition), mode=mode).to(self.bias)
+        rest = sequence - self._forecast(condition)
+        fitted = Normalizer.fit(rest, mode=mode)
+        nothing = (rest - fitted.offset).abs().amax(0) < _NOTHING  # such as a goal that never moves
+        self.rest = Normalizer(fitted.offset, torch.where(nothing, _NOTHING, fitted.scale)).to(self.bias)
         return fit.penalty
 
     def take_off(self, condition: Tensor, sequence: Tensor) -> Tensor:
