@@ -62,19 +62,17 @@ def test_the_state_dict_holds_it_and_one_without_is_as_before():
 
 
 def test_what_does_not_carry_over_is_not_forecast():
-    """Each of a few trajectories has a shift of its own, which more columns than trajectories explain by chance."""
+    """Six trajectories, each with a condition and a sequence of its own, which have nothing to do with each other."""
     generator = torch.Generator().manual_seed(0)
-    condition = torch.randn(6, 1, 12, generator=generator).expand(6, 20, 12).reshape(120, 12)
+    condition = torch.randn(6, 1, 4, generator=generator).expand(6, 20, 4).reshape(120, 4)
     sequence = torch.randn(6, 1, 3, generator=generator).expand(6, 20, 3).reshape(120, 3)
-    forecast = LinearForecast(12, 3)
+    forecast, every_row = LinearForecast(4, 3), LinearForecast(4, 3)
     penalty = forecast.fit(condition, sequence, torch.arange(120) // 20)
-    every_row = LinearForecast(12, 3)
-    assert every_row.fit(condition, sequence) < penalty
+    assert every_row.fit(condition, sequence) < 1 < penalty
     assert forecast.weight.norm() < 0.5 * every_row.weight.norm()
 
 
 def test_two_trajectories_are_too_few_to_forecast():
-    windows = walks(2)
     model = planner(True)
-    model.fit_normalizers(windows.repeat_interleave(5, 0), groups=torch.arange(10) // 5)
-    assert model.forecast.weight.norm() < 0.5
+    model.fit_normalizers(walks(2).repeat_interleave(5, 0), groups=torch.arange(10) // 5)
+    assert model.forecast.weight.abs().max() < 1e-4

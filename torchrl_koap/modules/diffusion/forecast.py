@@ -11,7 +11,7 @@ from torchrl_koap.modules.normalizer import Normalizer
 
 _MOST_ROWS = 20_000  # windows that the ridge is fitted to at most, spread evenly
 _NOTHING = 1e-3  # of the range of an entry: scale of what is forecast without error
-_FEW_TRAJECTORIES = 10.0  # penalty where too few trajectories are there to choose it by: next to no forecast
+_PENALTIES = tuple(10.0**power for power in range(-6, 8))  # the last one leaves next to nothing
 
 
 class LinearForecast(nn.Module):
@@ -33,7 +33,7 @@ class LinearForecast(nn.Module):
         >>> from torchrl_koap.modules.diffusion.forecast import LinearForecast
         >>> condition, forecast = torch.randn(90, 3), LinearForecast(3, 2)
         >>> sequence = condition[:, :2] - 0.5 * condition[:, 2:]
-        >>> forecast.fit(condition, sequence, torch.arange(90) // 30)
+        >>> penalty = forecast.fit(condition, sequence, torch.arange(90) // 30)
         >>> torch.allclose(forecast.weight, torch.tensor([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5]]), atol=1e-3)
         True
     """
@@ -64,7 +64,12 @@ class LinearForecast(nn.Module):
         ridge = LinearActionDecoder(condition.shape[-1], sequence.shape[-1]).to(condition)
         every = torch.ones(len(condition), dtype=torch.bool, device=condition.device)
         fit = ridge.fit_ridge(
-            condition[rows], sequence[rows], every[rows], groups=groups[rows], default_penalty=_FEW_TRAJECTORIES
+            condition[rows],
+            sequence[rows],
+            every[rows],
+            groups=groups[rows],
+            penalties=_PENALTIES,
+            default_penalty=_PENALTIES[-1],  # where too few trajectories are there to choose by
         )
         self.weight.copy_(ridge.linear.weight.detach())
         self.bias.copy_(ridge.linear.bias.detach())
