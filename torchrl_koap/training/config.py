@@ -228,6 +228,10 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     released = _released(options)
     method = _method(options) if released is None else released.method
     _check(options, method)
+    if not method.has_planner:
+        if config.forecast:
+            raise ValueError(f"method {config.method!r} is a policy of its own and has no plans to forecast")
+        options = replace(options, forecast=None)
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:
