@@ -249,13 +249,18 @@ def tracking_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     return [[row[name] for name in names] for row in rows]
 
 
+def export_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """Table of the ways to call a whole policy."""
+    return [list(row.values()) for row in rows]
+
+
 def preset_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     """Table of the presets."""
     return [[row["preset"], row["decoder"], f"{row['action_error']} {row['unit']}"] for row in rows]
 
 
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
-_HELPERS = (first, label_sizes, *_TABLES, tracking_rows, preset_rows)
+_HELPERS = (first, label_sizes, *_TABLES, tracking_rows, export_rows, preset_rows)
 
 
 def commands(rows: Sequence[Mapping[str, str]]) -> str:

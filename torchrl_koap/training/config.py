@@ -22,7 +22,8 @@ from torchrl_koap.training.released_settings import POLICY, Released, get_releas
 from torchrl_koap.training.run_directory import RunDirectory
 from torchrl_koap.training.validation import default_fraction
 
-LABEL_FRACTION, ALL_LABELS = 0.02, 1.0  # defaults for data with all labels, and for data that lack some
+# defaults for data that lack labels or came without an environment, and for all others
+ALL_LABELS, LABEL_FRACTION = 1.0, 0.02
 
 
 @dataclass
@@ -35,7 +36,7 @@ class TrainConfig:
         dataset: "scripted", or a folder: written by `koap demos`, `koap convert` or save_demonstrations, of D3IL raw
             pickles, or a LeRobot data set.
         label_fraction: share of the trajectories, windows or transitions that keep their actions (default: 0.02; all
-            labels that there are, where data lack some).
+            labels that there are, where data lack some or the task has no environment).
         label_count: number of them instead of a share.
         label_episodes: these trajectories instead of a random choice, as `koap suggest` names them.
         label_unit: "trajectory", "window" (the paper's levels) or "transition".
@@ -208,7 +209,8 @@ class ResolvedConfig:
         """The same with the share of labels that is the default for these data, if none was asked for."""
         if self.options.label_fraction is not None:
             return self
-        share = ALL_LABELS if not data["has_action"].all() else LABEL_FRACTION
+        every = self.task.env is None or not data["has_action"].all()
+        share = ALL_LABELS if every else LABEL_FRACTION
         options = replace(self.options, label_fraction=share)
         return replace(self, options=options, budget=_budget(options))
 
@@ -236,6 +238,10 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     released = _released(options)
     method = _method(options) if released is None else released.method
     _check(options, method)
+    if not method.has_planner:
+        if config.forecast:
+            raise ValueError(f"method {config.method!r} is a policy of its own and has no plans to forecast")
+        options = replace(options, forecast=None)
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:

@@ -84,10 +84,12 @@ def learn_states(
     # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
     extended = extrapolate_ends(data, HORIZON - 1)
     windows = cut_windows(extended, WINDOW, select=["state", "episode"], pad_before=1)
-    planner.fit_normalizers(windows["state"], groups=windows["episode"][:, -1])
+    augment = augmentation(options, task)
+    states, groups = windows["state"], windows["episode"][:, -1]
+    seen = None if planner.forecast is None else augment(windows.clone())["state"]
+    planner.fit_normalizers(states, seen=seen, groups=groups)
     planner.to(options.device)
     buffer = make_window_buffer(extended, WINDOW, options.batch_size, select=["state"], pad_before=1)
-    augment = augmentation(options, task)
     planner.training_dtype = training_dtype(options.precision)
     weight = 1.0 if options.first_steps_weight is None else options.first_steps_weight
     loss = PlannerLoss(planner, first_steps_weight=weight)
