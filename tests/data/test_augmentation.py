@@ -170,3 +170,31 @@ def test_a_tool_follows_the_joints_and_comes_back_with_them():
     assert 0.002 < away[:, 1].mean() < 0.05 and away[:, 15].mean() < 0.02 * away[:, 1].mean()
     with pytest.raises(ValueError, match="wanted columns and kinematics"):
         RecoveryAugmentation(0.02, columns=(0, 1), tool=(2, 3, 4))
+
+
+def test_actions_follow_the_way_back_and_the_turned_scene():
+    """Actions that move the state stay its differences; labels that are hidden stay hidden."""
+    torch.manual_seed(0)
+    state = torch.randn(6, 16, 4).cumsum(1)
+    action = torch.cat([state[..., :2].diff(dim=1), torch.full((6, 1, 2), torch.nan)], 1)
+    windows = TensorDict({"state": state, "action": action}, [6])
+    recover = RecoveryAugmentation(0.1, columns=[0, 1], moved_by=[0, 1])
+    turn = RandomPlanarTransform([(0, 1), (2, 3)], [], shift=0.1, turn=0.5, turned_actions=[0, 1])
+    for augment in (recover, turn):
+        moved = augment(windows.clone())
+        torch.testing.assert_close(moved["action"][:, :-1], moved["state"][..., :2].diff(dim=1))
+        assert moved["action"][:, -1].isnan().all() and not torch.equal(moved["action"][:, :-1], action[:, :-1])
+    assert torch.equal(turn(windows.clone())["state"].isnan(), state.isnan())
+
+
+def test_states_are_moved_alike_with_actions_and_without():
+    windows = TensorDict({"state": torch.randn(6, 16, 4), "action": torch.zeros(6, 16, 2)}, [6])
+    for make, extra in (
+        (lambda **more: RecoveryAugmentation(0.1, columns=[0, 1], **more), {"moved_by": [0, 1]}),
+        (lambda **more: RandomPlanarTransform([(0, 1)], [], shift=0.1, turn=0.5, **more), {"turned_actions": [0, 1]}),
+    ):
+        states = []
+        for options in ({}, extra):
+            torch.manual_seed(3)
+            states.append(make(**options)(windows.clone())["state"])
+        assert torch.equal(*states)
