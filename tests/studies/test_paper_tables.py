@@ -81,7 +81,7 @@ def test_quick_is_small_but_what_is_asked_for_stays(asked, tmp_path):
     run_bench(BenchConfig(tmp_path / "q", table=1, quick=True, tasks="avoiding", episodes=7, denoiser_width=99))
     (curve,) = asked
     assert (curve.fractions, curve.first_seed_only, curve.seeds) == ("0.02,0.1,0.5", "0.1", 1)
-    assert (curve.episodes, curve.demonstrations, curve.steps, curve.denoiser_width) == (7, 48, 1500, 99)
+    assert (curve.episodes, curve.demonstrations, curve.steps, curve.denoiser_width) == (7, 48, 4000, 99)
 
 
 def test_planners_and_data_sets_are_named_by_task(asked, tmp_path):

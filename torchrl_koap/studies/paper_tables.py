@@ -33,7 +33,7 @@ WIDE_PLANNER = {
 }
 SMALL_PLANNER = WIDE_PLANNER | {"denoiser_width": 256, "denoiser_depth": 3, "batch_size": 128}
 # what --quick asks for where nothing else is: a table that can be read, not one to be cited
-QUICK = {"demonstrations": 48, "seeds": 1, "episodes": 10, "steps": 1500, "controller_steps": 200}
+QUICK = {"demonstrations": 48, "seeds": 1, "episodes": 10, "steps": 4000, "controller_steps": 200}
 QUICK_LEVELS = (1, 3, 5)
 
 
