@@ -37,7 +37,7 @@ class TrainConfig:
             labels that there are, where data lack some).
         label_count: number of them instead of a share.
         label_episodes: these trajectories instead of a random choice, as `koap suggest` names them.
-        label_unit: "trajectory", "window" (the paper's levels) or "transition".
+        label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
         seed: seed of label choice, initialisation and batches.
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
         validation_fraction: share of the trajectories that the planner never sees, those without labels first, for
