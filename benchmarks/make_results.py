@@ -213,7 +213,7 @@ def suggestion_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
 
 
 def level_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
-    """Table of tasks and labels, KOAP and the recurrent network side by side, and the paper's KOAP at the same share."""
+    """Table of tasks and labels: KOAP, the recurrent network, and the paper's KOAP at the same share."""
     other = {(row["task"], row["label_fraction"]): percent(row) for row in rows if row["method"] == "recurrent"}
     return [
         [row["task"] + (f", {row['goal']}" if row["goal"] else ""), share(row["label_fraction"]), percent(row)]
@@ -262,8 +262,11 @@ def bench_size(name: str) -> str:
     """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
     cells = [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
     seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
-    count = f"{len(seeds)} training seed{'s' if len(seeds) > 1 else ''}"
-    return f"{len(cells)} cells, {count}, {' or '.join(map(str, sorted(episodes)))} rollouts each, {'/'.join(units)}s labelled"
+    rollouts = " or ".join(map(str, sorted(episodes)))
+    plural = "s" if len(seeds) > 1 else ""
+    return (
+        f"{len(cells)} cells, {len(seeds)} training seed{plural}, {rollouts} rollouts each, {'/'.join(units)}s labelled"
+    )
 
 
 def env_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
