@@ -13,6 +13,9 @@ from torch import Tensor
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.keys import ACTION, EPISODE, STATE
 
+_DIFFERENCE = 1e-3  # rad, of the numerical Jacobian
+_DAMPING = 1e-4  # m2 / rad2, added to the squared reach of the joints: bounds them where the arm is stretched out
+
 
 class RecoveryAugmentation(TensorDictModuleBase):
     r"""Recovery augmentation: moves the observed frames of a window aside and lets the future come back.
@@ -24,15 +27,19 @@ class RecoveryAugmentation(TensorDictModuleBase):
     A planner trained on demonstrations alone has never seen a state beside them; executed in closed loop it drifts
     there. The augmentation shows it such states together with the way back.
 
+    An arm with more joints than its tool needs is moved aside at the tool: the tool is displaced, and the joints follow
+    by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`. Joints shifted one by one would mostly turn
+    the elbow about, and a planner that has seen that learns to wander.
+
     Args:
-        sigma (float): typical size of the shift, in the units of the state.
+        sigma (float): typical size of the shift, in the units of the state; with ``tool`` that of the tool (m).
 
     Keyword Args:
         history (int): observed frames of the window. Defaults to ``2``.
         decay (float): share ``rho`` of the shift that remains after each planned frame. Defaults to ``0.7``.
         columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
-        tool (sequence of int, optional): state columns of the tool's position; they follow the arm's joints, which
-            are then ``columns``.
+        tool (sequence of int, optional): state columns of the tool's position; the shift is drawn there, and the
+            arm's joints, which are then ``columns``, follow.
         kinematics (callable, optional): the function from joints ``[*B, J]`` to the position of the tool ``[*B, 3]``,
             needed with ``tool``, such as :func:`~torchrl_koap.tasks.panda_kinematics.tool_position`.
         moved_by (sequence of int, optional): for every action column the state column that it moves: actions are given
@@ -80,21 +87,34 @@ class RecoveryAugmentation(TensorDictModuleBase):
         state = tensordict.get(self.in_keys[0])
         size = torch.rand(*state.shape[:-2], 1, 1, dtype=state.dtype, device=state.device)
         shift = torch.randn(*state.shape[:-2], 1, state.shape[-1], dtype=state.dtype, device=state.device)
+        shift = 2 * self.sigma * size * self._of_joints(shift, state)
         if self.columns is not None:
             keep = torch.zeros_like(shift)
             keep[..., self.columns] = 1
             shift = shift * keep
         frames = torch.arange(state.shape[-2], device=state.device) - (self.history - 1)
         remaining = self.decay ** frames.clamp_min(0).to(state.dtype)
-        shifted = state + 2 * self.sigma * size * shift * remaining[:, None]
+        shifted = state + shift * remaining[:, None]
         if self.moved_by is not None:
             following = self.decay ** (frames + 1).clamp_min(0).to(state.dtype)
-            back = 2 * self.sigma * size * shift[..., self.moved_by] * (following - remaining)[:, None]
+            back = shift[..., self.moved_by] * (following - remaining)[:, None]
             tensordict.set(self.in_keys[1], tensordict.get(self.in_keys[1]) + back)
         if self.tool is not None and self.sigma:
             moved = self.kinematics(shifted[..., self.columns]) - self.kinematics(state[..., self.columns])
             shifted[..., self.tool] = shifted[..., self.tool] + moved
         return tensordict.set(self.in_keys[0], shifted)
+
+    def _of_joints(self, shift: Tensor, state: Tensor) -> Tensor:
+        """Shifts ``[*B, 1, d]`` whose joints move the tool, if there is one, by its own columns, with least motion."""
+        if self.tool is None or not self.sigma:
+            return shift
+        joints = state[..., self.history - 1, self.columns]
+        aside = _DIFFERENCE * torch.eye(joints.shape[-1], dtype=joints.dtype, device=joints.device)
+        ends = (self.kinematics(joints.unsqueeze(-2) + sign * aside) for sign in (1, -1))  # each [*B, J, 3]
+        jacobian = torch.sub(*ends).mT / (2 * _DIFFERENCE)  # [*B, 3, J]
+        damped = jacobian @ jacobian.mT + _DAMPING * torch.eye(3, dtype=joints.dtype, device=joints.device)
+        follow = jacobian.mT @ torch.linalg.solve(damped, shift[..., 0, self.tool].unsqueeze(-1))
+        return shift.index_copy(-1, torch.tensor(self.columns, device=shift.device), follow.mT)
 
 
 class RandomPlanarTransform(TensorDictModuleBase):

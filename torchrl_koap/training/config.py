@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,8 @@ class TrainConfig:
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
         relative: plan displacements from the current state instead of states (default: the task's).
+        forecast: plan deviations from a linear forecast, which carries over to goals not demonstrated (default: for a
+            task without an environment).
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
@@ -85,6 +88,7 @@ class TrainConfig:
         device: "cpu" or "cuda".
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
+        force_data: resume although the demonstrations, or the version of this package, are others than at the start.
         logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
@@ -133,6 +137,7 @@ class TrainConfig:
     schedule: str = "squared_cosine"
     prediction: str = "sample"
     relative: bool | None = None
+    forecast: bool | None = None
     relations: bool = True
     controller_state: str = "robot"
     recovery_sigma: float | None = None
@@ -147,6 +152,7 @@ class TrainConfig:
     device: str = "cpu"
     checkpoint_every: int = 500
     resume: bool = False
+    force_data: bool = False
     logger: str = "csv"
     analysis: bool = True
     plugins: Plugins = ()
@@ -262,6 +268,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
         "relative": task.defaults.relative,
         "channels": task.defaults.channels,
         "validation_fraction": default_fraction(task),
+        "forecast": True if task.env is None and not options.released_settings else None,
     }
     return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
 
@@ -302,6 +309,11 @@ def _check(options: TrainConfig, method: Method) -> None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
     if options.steps < 1 or options.controller_steps < 0:
         raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
+    for name in ("planner_learning_rate", "controller_learning_rate"):
+        if not 0 < getattr(options, name) < math.inf:
+            raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
+    if options.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {options.seed}")
     if not 0 <= (options.validation_fraction or 0) < 1:
         raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
     for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
@@ -325,6 +337,7 @@ def _planner_entry(options: TrainConfig) -> dict[str, Any]:
         "depth": options.denoiser_depth,
         "frequencies": options.condition_octaves,
         "dropout": options.dropout,
+        "forecast": options.forecast or None,
     }
     # what was left out is left out here too, so that a run of before can be resumed
     return {name: value for name, value in sizes.items() if value is not None} | {

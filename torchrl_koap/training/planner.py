@@ -83,7 +83,8 @@ def learn_states(
     """
     # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
     extended = extrapolate_ends(data, HORIZON - 1)
-    planner.fit_normalizers(cut_windows(extended, WINDOW, select=["state"], pad_before=1)["state"])
+    windows = cut_windows(extended, WINDOW, select=["state", "episode"], pad_before=1)
+    planner.fit_normalizers(windows["state"], groups=windows["episode"][:, -1])
     planner.to(options.device)
     buffer = make_window_buffer(extended, WINDOW, options.batch_size, select=["state"], pad_before=1)
     augment = augmentation(options, task)
