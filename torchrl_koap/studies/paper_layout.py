@@ -223,7 +223,11 @@ def plot_average(entries: Sequence[Entry], path: str | Path) -> Path:
     axes.set_ylabel("success (%)")
     axes.grid(axis="y", color=FAINT, linewidth=0.5)
     tasks = list(dict.fromkeys(entry.task for entry in entries))
-    title = f"success, 95 % interval: {', '.join(tasks)}" if len(tasks) == 1 else f"mean over {len(tasks)} tasks"
+    title = (
+        f"success, 95 % interval: {', '.join(tasks)}"
+        if len(tasks) == 1
+        else f"mean over {len(tasks)} tasks, 95 % interval"
+    )
     hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
     set_title(axes, title + hollow)
     tidy(axes)
