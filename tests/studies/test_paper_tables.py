@@ -80,8 +80,14 @@ def test_the_observation_study_varies_what_the_controller_knows_at_fixed_labels_
 def test_quick_is_small_but_what_is_asked_for_stays(asked, tmp_path):
     run_bench(BenchConfig(tmp_path / "q", table=1, quick=True, tasks="avoiding", episodes=7, denoiser_width=99))
     (curve,) = asked
-    assert (curve.fractions, curve.first_seed_only, curve.seeds) == ("0.02,0.1,0.5", "0.1", 1)
-    assert (curve.episodes, curve.demonstrations, curve.steps, curve.denoiser_width) == (7, 48, 4000, 99)
+    assert (curve.fractions, curve.first_seed_only, curve.seeds) == ("0.02,0.5", "", 1)
+    assert (curve.episodes, curve.demonstrations, curve.steps, curve.denoiser_width) == (7, 48, 3000, 99)
+
+
+def test_a_quick_study_has_enough_trajectories_for_one_label(asked, tmp_path):
+    run_bench(BenchConfig(tmp_path / "q", study="observations", quick=True))
+    (curve,) = asked
+    assert curve.demonstrations is None and curve.episodes == 10
 
 
 def test_planners_and_data_sets_are_named_by_task(asked, tmp_path):
