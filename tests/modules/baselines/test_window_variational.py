@@ -30,6 +30,12 @@ def test_every_frame_knows_the_whole_window():
     assert torch.equal(model.infer(state, range(1, 15)), latent[1:15])
 
 
+def test_no_window_at_all_is_read_as_none():
+    """Where every trajectory has a label there is nothing to measure hidden actions on."""
+    model = WindowVariationalInverseDynamics(3, 2, hidden_dim=8)
+    assert model(TensorDict({"state": torch.zeros(0, 16, 3)}, [0]))["action"].shape == (0, 16, 2)
+
+
 def test_states_are_reconstructed_from_the_latent_alone():
     model = WindowVariationalInverseDynamics(3, 2, hidden_dim=8)
     read = model.read(windows()["state"])
