@@ -22,6 +22,7 @@ def test_koap_paper_is_measured_as_published_unless_told_otherwise():
     told = {"execution": "feedback", "blend_decay": 0.8, "candidates": 4}
     assert evaluation_options(asked, "koap_paper") == told == evaluation_options(asked, "dd")
     assert evaluation_options(asked, "dp") == {"candidates": 4}
+    assert evaluation_options(CellOptions(candidates=4), "koap_paper") == published
     assert evaluation_options(CellOptions(), "koap") == training_options(CellOptions(), "koap") == {}
 
 
@@ -37,7 +38,7 @@ def test_coefficients_reach_those_whose_loss_has_them():
     [
         ({"execution": "open_loop"}, "koap,dp", "'open_loop' was asked of dp: a policy of its own executes chunks"),
         ({"execution": "open"}, "koap", "unknown execution 'open'"),
-        ({"candidates": 4}, "koap,koap_paper", "method 'koap_paper' is executed in open loop.*got candidates 4"),
+        ({"execution": "open_loop", "candidates": 4}, "koap", "'open_loop' goes with 1 candidate, got 4"),
         ({"joining": 1.0}, "koap", r"joining must be in \[0, 1\), got 1.0"),
         ({"koopman_coeff": 1.0}, "dd,dp", "koopman_coeff was given, but no loss of dd, dp has it"),
         ({"action_coeff": -1.0}, "koap_paper", "action_coeff must be >= 0, got -1.0"),
