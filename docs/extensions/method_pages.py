@@ -19,11 +19,13 @@ EQUATIONS = {
     "linear": r"a_t = W \, [x_{t-1}, x_t, x_{t+8}] + b",
     "dd": r"a_t = h(x_{t-4:t}, x_{t+1})",
     "dd_lookahead": r"a_t = h(x_{t-4:t}, x_{t+1:t+5})",
-    "vae": r"q(u_t \mid x_t, x_{t+1}), \quad p(x_{t+1} \mid x_t, u_t), \quad a_t = D u_t",
+    "vae": r"q(u_t \mid x_{0:T}), \quad p(x_t, x_t - x_{t-1}, x_{t+1} - x_t \mid u_t), \quad a_t = d(u_t)",
+    "vae_steps": r"q(u_t \mid x_{t-4:t+5}), \quad p(x_{t-4:t+5} \mid x_t, u_t), \quad a_t = d(u_t)",
     "lapo": r"u_t = \mathrm{quantise}(f(x_t, x_{t+1})), \quad x_{t+1} = h(x_t, u_t), \quad a_t = D u_t",
     "nonlinear": r"z_{t+1} = h(z_t, u_t), \quad a_t = d(u_t)",
     "dp": r"p(a_{t:t+H} \mid x_{t-1}, x_t)",
-    "relabel": r"p(\hat a_{t:t+H} \mid x_{t-1}, x_t), \quad \hat a \text{ of the teacher where no label is}",
+    "relabel": r"\hat a_t = h(x_{t-4:t}, x_{t+1}), \quad \text{fitted to the teacher's actions where no label is}",
+    "dp_relabel": r"p(\hat a_{t:t+H} \mid x_{t-1}, x_t), \quad \hat a \text{ of the teacher where no label is}",
 }
 LIKE_KOAP = ("koap_sgd", "koap_labelled_only", "koap_untrained", "pretrain")
 WINDOWS = {

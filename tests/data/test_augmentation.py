@@ -195,3 +195,31 @@ def test_the_second_order_way_back_sets_out_from_rest():
     torch.testing.assert_close(second[2:] - 1.4 * second[1:-1] + 0.49 * second[:-2], torch.zeros(15).double())
     with pytest.raises(ValueError, match="unknown response 'third_order'"):
         RecoveryAugmentation(0.01, response="third_order")
+
+
+def test_actions_follow_the_way_back_and_the_turned_scene():
+    """Actions that move the state stay its differences; labels that are hidden stay hidden."""
+    torch.manual_seed(0)
+    state = torch.randn(6, 16, 4).cumsum(1)
+    action = torch.cat([state[..., :2].diff(dim=1), torch.full((6, 1, 2), torch.nan)], 1)
+    windows = TensorDict({"state": state, "action": action}, [6])
+    recover = RecoveryAugmentation(0.1, columns=[0, 1], moved_by=[0, 1])
+    turn = RandomPlanarTransform([(0, 1), (2, 3)], [], shift=0.1, turn=0.5, turned_actions=[0, 1])
+    for augment in (recover, turn):
+        moved = augment(windows.clone())
+        torch.testing.assert_close(moved["action"][:, :-1], moved["state"][..., :2].diff(dim=1))
+        assert moved["action"][:, -1].isnan().all() and not torch.equal(moved["action"][:, :-1], action[:, :-1])
+    assert torch.equal(turn(windows.clone())["state"].isnan(), state.isnan())
+
+
+def test_states_are_moved_alike_with_actions_and_without():
+    windows = TensorDict({"state": torch.randn(6, 16, 4), "action": torch.zeros(6, 16, 2)}, [6])
+    for make, extra in (
+        (lambda **more: RecoveryAugmentation(0.1, columns=[0, 1], **more), {"moved_by": [0, 1]}),
+        (lambda **more: RandomPlanarTransform([(0, 1)], [], shift=0.1, turn=0.5, **more), {"turned_actions": [0, 1]}),
+    ):
+        states = []
+        for options in ({}, extra):
+            torch.manual_seed(3)
+            states.append(make(**options)(windows.clone())["state"])
+        assert torch.equal(*states)

@@ -39,7 +39,7 @@ class TrainConfig:
             labels that there are, where data lack some or the task has no environment).
         label_count: number of them instead of a share.
         label_episodes: these trajectories instead of a random choice, as `koap suggest` names them.
-        label_unit: "trajectory", "window" (the paper's levels) or "transition".
+        label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
         seed: seed of label choice, initialisation and batches.
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
         validation_fraction: share of the trajectories that the planner never sees, those without labels first, for
@@ -78,8 +78,8 @@ class TrainConfig:
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
-        recovery_response: how the augmentation leads back, "first_order" at once or "second_order" from rest, which robots
-            that follow their commands late can do (default: the task's).
+        recovery_response: how the augmentation leads back, "first_order" at once or "second_order" from rest, which
+            robots that follow their commands late can do (default: the task's).
         scene_shift: typical displacement (m) of whole scenes, for tasks whose place on the table does not matter.
         scene_turn: typical angle (rad) by which such scenes are turned.
         exchange: exchange objects that are alike.

@@ -180,7 +180,14 @@ def _diffusion_policy(state_dim, action_dim, features, options):
 
 
 def without_actions(network: nn.Module, *, koopman_coeff: float = 1.0) -> LossModule:
-    """KOAP's loss on states alone."""
+    """KOAP's loss on states alone.
+
+    Args:
+        network (nn.Module): the model.
+
+    Keyword Args:
+        koopman_coeff (float): weight of its Koopman term. Defaults to ``1``.
+    """
     return KOAPLoss(network, action_coeff=0.0, koopman_coeff=koopman_coeff)
 
 
