@@ -67,7 +67,9 @@ def write_task(task: Task) -> None:
         heading(task.name),
         f".. image:: {task.name}.png\n   :width: 420\n   :alt: {task.name} from above",
         escape(task.scene.caption.strip()),
-        code(f"koap demos --task {task.name} --out demos\nkoap train --task {task.name} --out runs/{task.name}", "bash"),
+        code(
+            f"koap demos --task {task.name} --out demos\nkoap train --task {task.name} --out runs/{task.name}", "bash"
+        ),
         table(("fact", "value"), facts),
         heading("What is observed", 1),
         table(("column", "part", "unit", "in the state as"), observation_rows(task)),
@@ -200,7 +202,9 @@ def draw(task: Task) -> None:
             axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linestyle=":", edgecolor=color))
             x, y = (x0 + x1) / 2, (y0 + y1) / 2
             axes.add_patch(
-                Rectangle((x - body.half[0], y - body.half[1]), 2 * body.half[0], 2 * body.half[1], color=color, alpha=0.6)
+                Rectangle(
+                    (x - body.half[0], y - body.half[1]), 2 * body.half[0], 2 * body.half[1], color=color, alpha=0.6
+                )
             )
     axes.autoscale_view()
     figure.savefig(path, dpi=100)

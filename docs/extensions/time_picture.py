@@ -33,7 +33,11 @@ def drawing() -> str:
         ("executed of each plan", dict.fromkeys(range(now + 1, now + 1 + REPLAN_INTERVAL), "done")),
         (
             "controller reads, now",
-            {**dict.fromkeys(range(now - past, now), "past"), now: "now", **dict.fromkeys((now + k for k in ahead), "")},
+            {
+                **dict.fromkeys(range(now - past, now), "past"),
+                now: "now",
+                **dict.fromkeys((now + k for k in ahead), ""),
+            },
         ),
         (
             "next plan observes",

@@ -40,14 +40,14 @@ class RecoveryAugmentation(TensorDictModuleBase):
     A planner trained on demonstrations alone has never seen a state beside them; executed in closed loop it drifts
     there. The augmentation shows it such states together with the way back.
 
-    With the response ``"first_order"`` the share that remains is :math:`\rho_i = \rho^i`: the way back begins at once and at
-    its full speed. A robot that follows its commands some steps late cannot move like that, and an inverse dynamics
-    that looks those steps ahead sees only the end of the way; for it there is ``"second_order"``, the critically
-    damped :math:`\rho_i = (1 - i \ln \rho)\, \rho^i`, which sets out from rest.
+    With the response ``"first_order"`` the share that remains is :math:`\rho_i = \rho^i`: the way back begins at once
+    and at its full speed. A robot that follows its commands some steps late cannot move like that, and an inverse
+    dynamics that looks those steps ahead sees only the end of the way; for it there is ``"second_order"``, the
+    critically damped :math:`\rho_i = (1 - i \ln \rho)\, \rho^i`, which sets out from rest.
 
     An arm with more joints than its tool needs is moved aside at the tool: the tool is displaced, and the joints follow
-    by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`. Joints shifted one by one would mostly turn
-    the elbow about, and a planner that has seen that learns to wander.
+    by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`. Joints shifted one by one would mostly
+    turn the elbow about, and a planner that has seen that learns to wander.
 
     Args:
         sigma (float): typical size of the shift, in the units of the state; with ``tool`` that of the tool (m).

@@ -207,7 +207,7 @@ class PlannerLoss(DenoisingLoss):
             raise ValueError(f"first_steps_weight must be > 0, got {first_steps_weight}")
         self.window = window
         if first_steps_weight != 1:
-            share = torch.linspace(1, 0, planner.horizon)[:, None]
+            share = torch.linspace(1, 0, len(planner.steps))[:, None]
             weights = first_steps_weight**share  # [H, 1]
             self.step_weights = weights / weights.mean()
         super().set_keys(history=planner.in_keys[0], plan=planner.out_keys[0])
@@ -249,6 +249,8 @@ class PlannerLoss(DenoisingLoss):
         mask = tensordict.get(self.tensor_keys.mask, None)
         if mask is None:
             return None
+        if len(self.planner.steps) != self.planner.horizon:
+            raise ValueError(f"{self.tensor_keys.mask!r} was given, but the planner models some steps of plans alone")
         if mask.ndim == plan.ndim and mask.shape[-1] == 1:
             mask = mask.squeeze(-1)
         horizon, length = self.planner.horizon, self.planner.history + self.planner.horizon

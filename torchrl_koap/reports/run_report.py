@@ -279,6 +279,7 @@ def _eval_command(run_dir: Path, evaluation: Mapping[str, Any]) -> str:
     first = episode[0] if isinstance(episode, list) and episode and isinstance(episode[0], Mapping) else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
     options |= {key: evaluation.get(key) for key in ("execution", "solver", "solver_steps", "env", "success_key")}
+    options["controller"] = "oracle" if evaluation.get("controller") == "oracle" else None
     for key, value in options.items():
         if value is not None:
             words += [f"--{key.replace('_', '-')}", str(value)]

@@ -75,6 +75,11 @@ class TrainConfig:
         relative: plan displacements from the current state instead of states (default: the task's).
         forecast: plan deviations from a linear forecast, which carries over to goals not demonstrated (default: for a
             task without an environment).
+        frame: object from which the planner sees everything, such as "target": tasks whose place on the table does not
+            matter (default: the world).
+        plan_steps: frames of the plan that are modelled, counted from 1, such as 1 2 3 4 6 8 11 14; those in between
+            lie on straight lines, and the last one is the horizon (default: all of 14).
+        observed_frames: frames that the planner sees, 1 or 2 (default: 2).
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
@@ -141,6 +146,9 @@ class TrainConfig:
     prediction: str = "sample"
     relative: bool | None = None
     forecast: bool | None = None
+    frame: str | None = None
+    plan_steps: tuple[int, ...] | None = None
+    observed_frames: int | None = None
     relations: bool = True
     controller_state: str = "robot"
     recovery_sigma: float | None = None
@@ -245,7 +253,7 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:
-        planner = _planner_entry(options)
+        planner = _planner_entry(options, task)
     if released is not None and not method.has_planner:
         planner |= POLICY
     controller = {
@@ -325,6 +333,13 @@ def _check(options: TrainConfig, method: Method) -> None:
             raise ValueError(f"{name} must be >= 0, got {value}")
     if not method.has_planner and options.planner_from is not None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
+    for name in ("frame", "plan_steps", "observed_frames"):
+        if getattr(options, name) is not None and not method.has_planner:
+            raise ValueError(f"{name} is the planner's, which method {options.method!r} does not have")
+    if options.observed_frames not in (None, *range(1, HISTORY + 1)):
+        raise ValueError(f"observed_frames must be 1 to {HISTORY}, got {options.observed_frames}")
+    if options.plan_steps is not None and (not options.plan_steps or options.plan_steps[-1] < 4):
+        raise ValueError(f"plan_steps must end at 4 or more control steps, got {list(options.plan_steps)}")
     if options.steps < 1 or options.controller_steps < 0:
         raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
     for name in ("planner_learning_rate", "controller_learning_rate"):
@@ -356,13 +371,33 @@ def _budget(options: TrainConfig) -> LabelBudget:
     return LabelBudget(amount, unit=options.label_unit, seed=options.seed, window=WINDOW, history=HISTORY)
 
 
-def _planner_entry(options: TrainConfig) -> dict[str, Any]:
+def _frame_of(task: Task, name: str) -> dict[str, list]:
+    """Columns of the frame of an object (:class:`~torchrl_koap.modules.diffusion.planar_frame.PlanarFrame`)."""
+    ends = ("_position", "_quaternion")
+    parts = [part.removesuffix(ends[0]) for part in task.planar_parts if part.endswith(ends[0])]
+    bodies = [body for body in parts if body + ends[1] in task.planar_parts]
+    if not bodies:
+        raise ValueError(f"frame was given, but in task {task.name!r} the place on the table matters")
+    lookup(bodies, name, "frame")
+    points, directions = task.planar_columns()
+    place, yaw = (task.state_slices[name + end].start for end in ends)
+    return {
+        "points": [list(pair) for pair in points],
+        "directions": [list(pair) for pair in directions],
+        "origin": [place, place + 1],
+        "heading": [yaw, yaw + 1],
+    }
+
+
+def _planner_entry(options: TrainConfig, task: Task) -> dict[str, Any]:
     sizes = {
         "width": options.denoiser_width,
         "depth": options.denoiser_depth,
         "frequencies": options.condition_octaves,
         "dropout": options.dropout,
         "forecast": options.forecast or None,
+        "frame": None if options.frame is None else _frame_of(task, options.frame),
+        "plan_steps": None if options.plan_steps is None else list(options.plan_steps),
     }
     # what was left out is left out here too, so that a run of before can be resumed
     return {name: value for name, value in sizes.items() if value is not None} | {
@@ -370,8 +405,8 @@ def _planner_entry(options: TrainConfig) -> dict[str, Any]:
         "channels": list(options.channels),
         "schedule": options.schedule,
         "prediction": options.prediction,
-        "history": HISTORY,
-        "horizon": HORIZON,
+        "history": options.observed_frames or HISTORY,
+        "horizon": options.plan_steps[-1] if options.plan_steps else HORIZON,
         "relative": options.relative,
         "relations": options.relations,
         "solver": options.solver,

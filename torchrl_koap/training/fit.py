@@ -39,6 +39,9 @@ PLANNER_OPTIONS = (
         "solver",
         "solver_steps",
         "denoiser_width",
+        "frame",
+        "plan_steps",
+        "observed_frames",
     ),
     *("denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay", "first_steps_weight", "precision"),
 )
