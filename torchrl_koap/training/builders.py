@@ -18,6 +18,7 @@ from torchrl_koap.training.released_settings import get_released
 # what every preset was designed with: how states and actions are normalised
 NORMALIZATION = {
     "default": {"state": "standard", "action": "rms"},
+    "semi_supervised": {"state": "standard", "action": "rms"},
     "paper": {"state": "minmax", "action": "minmax"},
     "released": {"state": "minmax", "action": "minmax"},
 }
