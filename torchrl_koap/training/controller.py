@@ -163,6 +163,8 @@ def _train_network(
         )
     controller.eval()
     fit: dict[str, Any] = {}
+    if hasattr(controller, "fit_unlabelled"):
+        controller.fit_unlabelled(windows["state"])
     if method.closed_form:
         columns = task.controller_columns(options.controller_state)
         fit = fit_closed_form(controller, data, shared_axes=task.actuated, guessed_axes=likely_axes(task, columns))
