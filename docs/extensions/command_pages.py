@@ -37,8 +37,8 @@ def write_command_pages() -> None:
     write_page(
         "commands/index",
         heading("Every command and option"),
-        "What ``koap COMMAND --help`` prints. Fields of a configuration in Python have the same names with underscores, "
-        "such as :class:`~torchrl_koap.training.config.TrainConfig`.",
+        "What ``koap COMMAND --help`` prints. Fields of a configuration in Python have the same names, with "
+        "underscores, as in :class:`~torchrl_koap.training.config.TrainConfig`.",
         table(("command", "what it does"), [(f":doc:`{name}`", summary(kind)) for name, kind in commands.items()]),
         toctree(commands, hidden=True),
     )

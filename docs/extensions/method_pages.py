@@ -15,7 +15,9 @@ from torchrl_koap.training.methods import METHODS, Method
 # what is decoded from what; a method without an entry is described by its network alone
 EQUATIONS = {
     "koap": r"z_t = g(x_t), \quad u_t = f(x_{t-4:t}, x_{t+2:t+5}), \quad z_{t+1} = K z_t + B u_t, \quad a_t = D u_t",
-    "koap_paper": r"z_t = g(x_t), \quad u_t = f(x_{t-1}, x_t, x_{t+8}), \quad z_{t+1} = K z_t + u_t, \quad a_t = D u_t + b",
+    "koap_paper": (
+        r"z_t = g(x_t), \quad u_t = f(x_{t-1}, x_t, x_{t+8}), \quad z_{t+1} = K z_t + u_t, \quad a_t = D u_t + b"
+    ),
     "linear": r"a_t = W \, [x_{t-1}, x_t, x_{t+8}] + b",
     "dd": r"a_t = h(x_{t-4:t}, x_{t+1})",
     "dd_lookahead": r"a_t = h(x_{t-4:t}, x_{t+1:t+5})",

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.training.datasets import find_task_of
+from torchrl_koap.training.loggers import check_logger
 from torchrl_koap.training.methods import Method, get_method
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
@@ -83,7 +83,8 @@ class TrainConfig:
         device: "cpu" or "cuda".
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
-        logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
+        logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise), "tensorboard"
+            or "mlflow" (in the run directory unless MLFLOW_TRACKING_URI says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
             reads the run.
@@ -283,9 +284,7 @@ def _method(options: TrainConfig) -> Method:
 
 
 def _check(options: TrainConfig, method: Method) -> None:
-    lookup(("csv", "wandb"), options.logger, "logger")
-    if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-        raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
+    check_logger(options.logger)
     if not method.has_planner and options.planner_from is not None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
     if options.steps < 1 or options.controller_steps < 0:
