@@ -46,7 +46,7 @@ tutorials: setup
 # wheel and sdist, tried in a fresh environment outside of the repository
 dist: setup
 	rm -rf dist build/lib
-	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m build --no-isolation --outdir dist .
 	$(BIN)/python tests/try_dist.py dist
 
 clean:

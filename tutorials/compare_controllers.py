@@ -150,8 +150,8 @@ figure.savefig("compare_controllers.png", dpi=90)
 # Conclusion
 # ----------
 # The three lines of KOAP lie on each other: with its features random, or without the 47 demonstrations that have no
-# labels, it is as good. On Avoiding the scaled inputs, the Fourier features and the closed-form decoder do the work, and
-# the Koopman loss and the unlabelled data buy nothing that is seen here; they are shown 150 updates, but the committed
+# labels, it is as good. On Avoiding the scaled inputs, the Fourier features and the closed-form decoder do the work;
+# the Koopman loss and the unlabelled data buy nothing that is seen here. They are shown 150 updates, but the committed
 # study with 1,000 says the same. A comparison without these controls would have credited the loss with all of it.
 # Supervised networks and the plain ridge need more labels for less. Small actions or large ones make no difference.
 #

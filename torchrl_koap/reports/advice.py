@@ -64,7 +64,7 @@ class Numbers:
     inspection: Mapping[str, Any] = ()  # type: ignore[assignment]
     even_entropy: float | None = None
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("config", "summary", "evaluation", "inspection"):
             object.__setattr__(self, name, dict(getattr(self, name)))
 
