@@ -84,7 +84,7 @@ def mode_index(mode: torch.Tensor) -> torch.Tensor:
         mode (torch.Tensor): leaf ``mode`` of :class:`SortingEnv`, int64 ``[*B, num_boxes]``.
 
     Returns:
-        torch.Tensor: int64 ``[*B]``: 0 to 5 with four boxes, 0 to 1 with two, 0 to 19 with six; -1 while one is missing.
+        torch.Tensor: int64 ``[*B]``: 0 to 5 with four boxes, 0 to 1 with two, 0 to 19 with six; -1 if one is missing.
 
     Raises:
         ValueError: if the last axis fits no number of boxes.
