@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.loggers import check_logger
-from torchrl_koap.training.methods import Method, get_method
+from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.run_directory import RunDirectory
@@ -47,6 +48,8 @@ class TrainConfig:
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
         preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
+        koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
+        action_coeff: weight of the action term, for methods whose action decoder is trained with the rest (default: 1).
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: controller updates.
@@ -69,6 +72,8 @@ class TrainConfig:
         schedule: "squared_cosine", "linear" or "flow".
         prediction: "sample", "epsilon" or "velocity".
         relative: plan displacements from the current state instead of states (default: the task's).
+        forecast: plan deviations from a linear forecast, which carries over to goals not demonstrated (default: for a
+            task without an environment).
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
@@ -83,6 +88,7 @@ class TrainConfig:
         device: "cpu" or "cuda".
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
+        force_data: resume although the demonstrations, or the version of this package, are others than at the start.
         logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise), "tensorboard"
             or "mlflow" (in the run directory unless MLFLOW_TRACKING_URI says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
@@ -110,6 +116,8 @@ class TrainConfig:
     released_settings: bool = False
     epochs: int | None = None
     preset: str | None = None
+    koopman_coeff: float | None = None
+    action_coeff: float | None = None
     decoder: str | None = None
     steps: int | None = None
     controller_steps: int = 500
@@ -130,6 +138,7 @@ class TrainConfig:
     schedule: str = "squared_cosine"
     prediction: str = "sample"
     relative: bool | None = None
+    forecast: bool | None = None
     relations: bool = True
     controller_state: str = "robot"
     recovery_sigma: float | None = None
@@ -144,6 +153,7 @@ class TrainConfig:
     device: str = "cpu"
     checkpoint_every: int = 500
     resume: bool = False
+    force_data: bool = False
     logger: str = "csv"
     analysis: bool = True
     plugins: Plugins = ()
@@ -237,6 +247,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         "preset": "released" if options.released_settings else options.preset or method.presets[0],
         "state": options.controller_state if method.has_planner else "all",
     }
+    if method.earlier:
+        controller["revised"] = True
     return ResolvedConfig(
         options=options,
         task=task,
@@ -257,6 +269,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
         "relative": task.defaults.relative,
         "channels": task.defaults.channels,
         "validation_fraction": default_fraction(task),
+        "forecast": True if task.env is None and not options.released_settings else None,
     }
     return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
 
@@ -285,10 +298,21 @@ def _method(options: TrainConfig) -> Method:
 
 def _check(options: TrainConfig, method: Method) -> None:
     check_logger(options.logger)
+    for name in COEFFICIENTS:
+        value = getattr(options, name)
+        if value is not None and name not in loss_coefficients(method):
+            raise ValueError(f"{name} was given, but no loss of method {options.method!r} has it")
+        if value is not None and value < 0:
+            raise ValueError(f"{name} must be >= 0, got {value}")
     if not method.has_planner and options.planner_from is not None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
     if options.steps < 1 or options.controller_steps < 0:
         raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
+    for name in ("planner_learning_rate", "controller_learning_rate"):
+        if not 0 < getattr(options, name) < math.inf:
+            raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
+    if options.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {options.seed}")
     if not 0 <= (options.validation_fraction or 0) < 1:
         raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
     for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
@@ -312,6 +336,7 @@ def _planner_entry(options: TrainConfig) -> dict[str, Any]:
         "depth": options.denoiser_depth,
         "frequencies": options.condition_octaves,
         "dropout": options.dropout,
+        "forecast": options.forecast or None,
     }
     # what was left out is left out here too, so that a run of before can be resumed
     return {name: value for name, value in sizes.items() if value is not None} | {

@@ -63,14 +63,15 @@ def build_planner(options: Mapping[str, Any], state_dim: int, features: nn.Modul
 
     Args:
         options (mapping): the ``planner`` entry of ``config.json``: denoiser, channels, schedule, prediction, history,
-            horizon, relative, solver, solver_steps, clip.
+            horizon, relative, forecast, solver, solver_steps, clip.
         state_dim (int): number of state columns.
         features (nn.Module, optional): what the condition holds besides the history, see :class:`StatePlanner`.
 
     Raises:
         ValueError: for an unknown denoiser, schedule, prediction or solver.
     """
-    return StatePlanner(**_diffusion(options, state_dim, state_dim, features))
+    forecast = options.get("forecast", False)  # runs of before have none
+    return StatePlanner(forecast=forecast, **_diffusion(options, state_dim, state_dim, features))
 
 
 def build_diffusion_policy(

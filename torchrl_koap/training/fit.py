@@ -28,8 +28,18 @@ from torchrl_koap.training.planner import learn_states
 from torchrl_koap.training.progress import without_progress_bars
 
 PLANNER_OPTIONS = (
-    *("batch_size", "planner_learning_rate", "denoiser", "channels", "schedule", "prediction", "relative", "relations"),
-    *("recovery_sigma", "scene_shift", "scene_turn", "exchange", "solver", "solver_steps"),
+    *("batch_size", "planner_learning_rate", "denoiser", "channels", "schedule", "prediction", "relative", "forecast"),
+    *(
+        "relations",
+        "recovery_sigma",
+        "scene_shift",
+        "scene_turn",
+        "exchange",
+        "solver",
+        "solver_steps",
+        "denoiser_width",
+    ),
+    *("denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay", "first_steps_weight", "precision"),
 )
 CONTROLLER_OPTIONS = ("controller_batch_size", "controller_learning_rate", "preset", "decoder", "controller_state")
 

@@ -9,6 +9,7 @@ from torch import nn
 
 from torchrl_koap import keys
 from torchrl_koap.modules.diffusion.base import ConditionedDiffusion, identity_normalizer
+from torchrl_koap.modules.diffusion.forecast import LinearForecast
 from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.normalizer import Normalizer
 
@@ -25,6 +26,9 @@ class StatePlanner(ConditionedDiffusion):
                      x_0    x_1     x_2    x_3
         condition    x_0-x_1, x_1
         plan                        x_2-x_1, x_3-x_1, ...
+
+    With ``forecast=True`` it is not the plan that is modelled but its deviation from a linear forecast
+    (:class:`~torchrl_koap.modules.diffusion.forecast.LinearForecast`), which carries over to goals never seen.
 
     Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state
     dict.
@@ -44,6 +48,7 @@ class StatePlanner(ConditionedDiffusion):
         history (int): number ``h`` of observed frames, the current one included. Defaults to 2.
         horizon (int): number ``H`` of planned frames. Defaults to 14.
         relative (bool): model displacements from the current state. Defaults to True.
+        forecast (bool): model deviations from a linear forecast. Defaults to False.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
             further numbers that the condition holds, such as the relative positions of objects.
         solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
@@ -79,6 +84,7 @@ class StatePlanner(ConditionedDiffusion):
         *,
         state_dim: int,
         relative: bool = True,
+        forecast: bool = False,
         **options,
     ):
         super().__init__(
@@ -92,6 +98,9 @@ class StatePlanner(ConditionedDiffusion):
             **options,
         )
         self.plan_normalizer = identity_normalizer(self.horizon * state_dim)
+        self.forecast = None
+        if forecast:
+            self.forecast = LinearForecast(len(self.condition_normalizer.scale), self.horizon * state_dim)
 
     def set_keys(self, *, history: NestedKey | None = None, plan: NestedKey | None = None) -> None:
         """Renames the entries read and written.
@@ -102,13 +111,17 @@ class StatePlanner(ConditionedDiffusion):
         """
         self._rename(history, plan)
 
-    def fit_normalizers(self, windows: Tensor, *, mode: str = "minmax", per_step: bool = True) -> None:
+    def fit_normalizers(
+        self, windows: Tensor, *, mode: str = "minmax", per_step: bool = True, groups: Tensor | None = None
+    ) -> None:
         """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
 
         Args:
             windows (Tensor): states in raw units, ``[*N, history + horizon, d]``.
 
         Keyword Args:
+            groups (Tensor, optional): trajectory of every window ``[*N]``, for the forecast
+                (:meth:`~torchrl_koap.modules.diffusion.forecast.LinearForecast.fit`).
             mode (str): ``"minmax"``, ``"standard"`` or ``"identity"`` (see
                 :class:`~torchrl_koap.modules.normalizer.Normalizer`).
             per_step (bool): own statistics for every planned step instead of shared ones. Defaults to True.
@@ -123,6 +136,9 @@ class StatePlanner(ConditionedDiffusion):
         example = self.plan_normalizer.scale
         self.condition_normalizer = Normalizer.fit(condition, mode=mode).to(example)
         self.plan_normalizer = Normalizer.fit(plan, mode=mode).to(example)
+        if self.forecast is not None:
+            groups = None if groups is None else groups.flatten()
+            self.forecast.fit(self.condition_normalizer(condition), self.plan_normalizer(plan), groups, mode=mode)
 
     def encode_plan(self, history: Tensor, plan: Tensor) -> Tensor:
         """Raw plans to the normalised sequences that noise is added to.
@@ -139,7 +155,10 @@ class StatePlanner(ConditionedDiffusion):
         """
         self._check_sequence(plan)
         plan = plan - history[..., -1:, :] if self.relative else plan
-        return self.plan_normalizer(plan.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
+        sequence = self.plan_normalizer(plan.flatten(-2))
+        if self.forecast is not None:
+            sequence = self.forecast.take_off(self.encode_history(history), sequence)
+        return sequence.unflatten(-1, (self.horizon, self.state_dim))
 
     def decode_plan(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Inverse of :meth:`encode_plan`.
@@ -151,7 +170,10 @@ class StatePlanner(ConditionedDiffusion):
         Returns:
             Tensor: raw plans ``[*B, H, d]``.
         """
-        plan = self.plan_normalizer.inverse(sequence.flatten(-2)).unflatten(-1, (self.horizon, self.state_dim))
+        sequence = sequence.flatten(-2)
+        if self.forecast is not None:
+            sequence = self.forecast.add(self.encode_history(history), sequence)
+        plan = self.plan_normalizer.inverse(sequence).unflatten(-1, (self.horizon, self.state_dim))
         return plan + history[..., -1:, :] if self.relative else plan
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
