@@ -36,7 +36,7 @@ types: setup
 
 # the site in build/docs/html, without network; warnings are errors, links inside are checked
 docs: setup
-	$(BIN)/python -m sphinx -W --keep-going -n -q -j auto -d build/docs/doctrees docs build/docs/html
+	$(BIN)/python -m sphinx -W --keep-going -q -j auto -d build/docs/doctrees docs build/docs/html
 	@echo "site: build/docs/html/index.html"
 
 # runs every tutorial and keeps output and pictures for the site

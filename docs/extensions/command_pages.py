@@ -12,7 +12,7 @@ from typing import Any, get_args
 import tyro
 from pages import code, heading, table, toctree, write_page
 
-from torchrl_koap.commands.cli import Subcommand
+from torchrl_koap.commands.subcommands import Subcommand
 
 
 def setup(app: Any) -> dict[str, Any]:
