@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.training.datasets import find_task_of
+from torchrl_koap.training.loggers import check_logger
 from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
@@ -97,7 +97,8 @@ class TrainConfig:
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
         force_data: resume although the demonstrations, or the version of this package, are others than at the start.
-        logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
+        logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise), "tensorboard"
+            or "mlflow" (in the run directory unless MLFLOW_TRACKING_URI says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
             reads the run.
@@ -322,9 +323,7 @@ _LEAST = (
 
 
 def _check(options: TrainConfig, method: Method) -> None:
-    lookup(("csv", "wandb"), options.logger, "logger")
-    if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-        raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
+    check_logger(options.logger)
     for name in COEFFICIENTS:
         value = getattr(options, name)
         if value is not None and name not in loss_coefficients(method):
