@@ -24,11 +24,12 @@ COLUMNS = (
 
 @pytest.fixture
 def older_run(trained_run, tmp_path):
-    """The run as the version before plugins, locks and free log columns left it."""
+    """The run as the version before plugins, locks, checksums and free log columns left it."""
     folder = tmp_path / "run"
-    shutil.copytree(trained_run, folder, ignore=shutil.ignore_patterns(".lock"))
+    shutil.copytree(trained_run, folder, ignore=shutil.ignore_patterns(".lock", "digests.json"))
     config = json.loads((folder / "config.json").read_text())
-    del config["plugins"]
+    for name in ("plugins", "data", "force_data"):
+        del config[name]
     (folder / "config.json").write_text(json.dumps(config))
     rows = RunDirectory(folder).read_metrics()
     with (folder / "metrics.csv").open("w", newline="") as file:

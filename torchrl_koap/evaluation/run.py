@@ -24,11 +24,14 @@ from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
 from torchrl_koap.training.builders import method_named, set_up_torch
 from torchrl_koap.training.checkpoints import CheckpointError, load_weights, save_tensors
+from torchrl_koap.training.digests import check_digests
 from torchrl_koap.training.methods import Method
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.pretrained import PREFIX, copy_run, find_run
 from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+
+MOST_EPISODES = 100_000
 
 
 @dataclass
@@ -137,7 +140,8 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
         task (str, optional): refuse a run of another task.
 
     Raises:
-        RunDirectoryError: if the folder is no finished run, or one of another task than asked for.
+        RunDirectoryError: if the folder is no finished run, one of another task than asked for, or one whose files are
+            not those that its training left.
         CheckpointError: if weights are damaged, of another task or without their statistics.
         PluginError: if a plugin of the run cannot be imported.
     """
@@ -149,11 +153,16 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
         raise RunDirectoryError(f"{directory.path} was trained on task {trained_on!r}, not on {task!r}")
     config = directory.read_json("config.json")
     load_plugins(config.get("plugins") or ())
-    facts, method = task_of(config), method_named(entry)
-    planner, controller, columns = build_networks(facts, method, planner_entry, entry)
+    try:
+        facts, method = task_of(config), method_named(entry)
+        planner, controller, columns = build_networks(facts, method, planner_entry, entry)
+    except (KeyError, ValueError) as error:
+        problem = f"an entry {error} is missing" if isinstance(error, KeyError) else error
+        raise RunDirectoryError(f"{directory.path / 'config.json'} cannot be used: {problem}") from error
     for name, module in {"planner": planner, "controller": controller}.items():
         if module is not None:
             load_weights(directory.path / f"{name}.safetensors", module, task=facts.name)
+    check_digests(directory)
     return TrainedRun(directory, config, facts, method, planner, controller, columns)
 
 
@@ -184,6 +193,11 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             raise CheckpointError(f"{run} was trained on task {trained_on!r}, not on {config.task!r}")
     else:
         trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
+        if trained.planner is None and config.execution != "feedback":
+            raise ValueError(
+                f"execution {config.execution!r} was asked of {trained.directory.path}, but method"
+                f" {trained.method.name!r} is a policy of its own: it executes chunks of actions"
+            )
         description = PolicyDescription(
             trained.task,
             trained.config["planner"],
@@ -226,12 +240,13 @@ def choose_contexts(
         table = evaluation_contexts(task)
     else:
         table = load_contexts(contexts_file, task)
-    numbers = [episode // rollouts_per_context for episode in range(episodes)]
-    if numbers[-1] >= len(table):
+    needed = (episodes - 1) // rollouts_per_context + 1
+    if needed > len(table):
         raise ValueError(
-            f"{episodes} episodes with {rollouts_per_context} per context need {numbers[-1] + 1}"
-            f" contexts, there are {len(table)}"
+            f"{episodes} episodes with {rollouts_per_context} per context need {needed} contexts,"
+            f" there are {len(table)}"
         )
+    numbers = [episode // rollouts_per_context for episode in range(episodes)]
     return numbers, table[numbers]
 
 
@@ -296,6 +311,12 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         value = getattr(config, name)
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
+    if config.episodes > MOST_EPISODES:
+        raise ValueError(
+            f"episodes must be at most {MOST_EPISODES:,}, which are kept in memory, got {config.episodes:,}"
+        )
+    if config.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {config.seed}")
     lookup(EXECUTIONS, config.execution, "execution")
     if config.success_key is not None and config.env is None:
         raise ValueError(

@@ -126,6 +126,7 @@ register_task(
             " any target: the tray was lost; crosses near one: the angle was wrong or time ran out.",
             camera="cage",
         ),
+        label_levels=(0.02, 0.05, 0.1, 0.25, 0.5),
         in_paper=True,
         defaults=Defaults(released_epochs=200),
     )

@@ -33,6 +33,7 @@ BIN_WALLS = (
 )
 BOX_HALF = 0.03  # half width of a box (m)
 PLATFORM_X, PLATFORM_Y = (0.2, 0.8), (-0.4, 0.2)  # m
+PO_NOISE = 0.002  # m; of PO-Sorting, in demonstrations as well as in evaluation; the paper states no figure
 # six regions (x range, y range in m) that are dealt out to the boxes at random
 REGIONS = tuple((x, y) for x in ((0.4, 0.5), (0.55, 0.65)) for y in ((-0.15, -0.1), (-0.05, 0.0), (0.05, 0.1)))
 _CAPTION = (
@@ -157,7 +158,7 @@ register_task(
         name="po_sorting",
         max_steps=400,
         hidden=tuple(f"{box}_tan_yaw" for box in _BY_BOXES[4].objects),
-        noise=0.002,
+        noise=PO_NOISE,
         data="sorting",
         gym_id="",
         defaults=Defaults(released_epochs=200),

@@ -127,7 +127,8 @@ class Task(StateParts):
         bodies (tuple of Body): what a context places: bodies that start elsewhere in every episode.
         start_regions (StartRegions, optional): where they start.
         collides (bool): an episode can end by a collision.
-        noise (float): standard deviation of the noise on the measured end effector (m).
+        noise (float): standard deviation of the noise on the measured end effector (m), in rollouts and on the
+            demonstrations as they are loaded.
         env (str, optional): import string of the environment (:mod:`torchrl_koap.envs.registry` says what it has to
             offer). None: a robot with data and no simulator.
         env_options (dict): its further keyword arguments.

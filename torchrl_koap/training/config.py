@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.training.datasets import find_task_of
-from torchrl_koap.training.methods import Method, get_method
+from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.run_directory import RunDirectory
@@ -48,6 +49,8 @@ class TrainConfig:
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
         preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
+        koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
+        action_coeff: weight of the action term, for methods whose action decoder is trained with the rest (default: 1).
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: controller updates.
@@ -86,6 +89,7 @@ class TrainConfig:
         device: "cpu" or "cuda".
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
+        force_data: resume although the demonstrations, or the version of this package, are others than at the start.
         logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
@@ -112,6 +116,8 @@ class TrainConfig:
     released_settings: bool = False
     epochs: int | None = None
     preset: str | None = None
+    koopman_coeff: float | None = None
+    action_coeff: float | None = None
     decoder: str | None = None
     steps: int | None = None
     controller_steps: int = 500
@@ -147,6 +153,7 @@ class TrainConfig:
     device: str = "cpu"
     checkpoint_every: int = 500
     resume: bool = False
+    force_data: bool = False
     logger: str = "csv"
     analysis: bool = True
     plugins: Plugins = ()
@@ -245,6 +252,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         "preset": "released" if options.released_settings else options.preset or method.presets[0],
         "state": options.controller_state if method.has_planner else "all",
     }
+    if method.earlier:
+        controller["revised"] = True
     return ResolvedConfig(
         options=options,
         task=task,
@@ -296,10 +305,21 @@ def _check(options: TrainConfig, method: Method) -> None:
     lookup(("csv", "wandb"), options.logger, "logger")
     if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
         raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
+    for name in COEFFICIENTS:
+        value = getattr(options, name)
+        if value is not None and name not in loss_coefficients(method):
+            raise ValueError(f"{name} was given, but no loss of method {options.method!r} has it")
+        if value is not None and value < 0:
+            raise ValueError(f"{name} must be >= 0, got {value}")
     if not method.has_planner and options.planner_from is not None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
     if options.steps < 1 or options.controller_steps < 0:
         raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
+    for name in ("planner_learning_rate", "controller_learning_rate"):
+        if not 0 < getattr(options, name) < math.inf:
+            raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
+    if options.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {options.seed}")
     if not 0 <= (options.validation_fraction or 0) < 1:
         raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
     for name in ("batch_size", "controller_batch_size", "checkpoint_every"):

@@ -84,7 +84,7 @@ def learn_states(
     # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
     extended = extrapolate_ends(data, HORIZON - 1)
     windows = cut_windows(extended, WINDOW, select=["state", "episode"], pad_before=1)
-    augment = _augmentation(options, task)
+    augment = augmentation(options, task)
     states, groups = windows["state"], windows["episode"][:, -1]
     seen = None if planner.forecast is None else augment(windows.clone())["state"]
     planner.fit_normalizers(states, seen=seen, groups=groups)
@@ -126,17 +126,31 @@ def planner_weight_decay(options: TrainConfig) -> float:
     return 1e-4 if options.planner_weight_decay is None else options.planner_weight_decay
 
 
-def _augmentation(options: TrainConfig, task: Task) -> TensorDictSequential:
-    """What windows undergo before the planner learns from them."""
+def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> TensorDictSequential:
+    """What windows undergo before the planner, or a policy of its own, learns from them.
+
+    Args:
+        options (TrainConfig): sizes, with the task's defaults filled in.
+        task (Task): whose windows they are.
+
+    Keyword Args:
+        actions (bool): the windows hold actions, which have to fit the states afterwards. Scenes are then moved, and
+            the robot displaced, only in tasks that say which state column every action moves (``Task.actuated``).
+    """
+    moved_by = list(task.actuated) if actions else None
     steps = []
     if options.exchange and task.interchangeable_columns():
         steps.append(ObjectPermutation(task.interchangeable_columns()))
-    if task.planar_parts and (options.scene_shift or options.scene_turn):
+    if task.planar_parts and (options.scene_shift or options.scene_turn) and (moved_by or not actions):
+        points, directions = task.planar_columns()
+        turned = None if moved_by is None else [moved_by.index(column) for column in points[0]]
         shift, turn = options.scene_shift, options.scene_turn
-        steps.append(RandomPlanarTransform(*task.planar_columns(), shift=shift, turn=turn, history=HISTORY))
-    arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
-    sigma = options.recovery_sigma
-    steps.append(
-        RecoveryAugmentation(sigma, history=HISTORY, columns=arm, tool=task.tool_columns, kinematics=task.tool_position)
-    )
+        steps.append(
+            RandomPlanarTransform(points, directions, shift=shift, turn=turn, history=HISTORY, turned_actions=turned)
+        )
+    if moved_by or not actions:
+        arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
+        tool = {"tool": task.tool_columns, "kinematics": task.tool_position}
+        sigma = options.recovery_sigma
+        steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, moved_by=moved_by, **tool))
     return TensorDictSequential(*steps)

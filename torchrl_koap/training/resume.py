@@ -8,11 +8,16 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from torchrl._utils import logger
+
 from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 # with which a run may be resumed differently; with other threads sums are rounded differently
-FREE = frozenset({"out", "threads", "checkpoint_every", "resume", "plugins", "command", "versions"})
+FREE = frozenset(
+    {"out", "threads", "checkpoint_every", "resume", "force_data", "plugins", "command", "versions", "data"}
+)
+_EVERY_TIME = ("resume", "force_data")  # asked for anew or not at all
 
 
 def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
@@ -26,6 +31,7 @@ def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
         return config
     earlier = run.read_json("config.json")
     left = [field.name for field in fields(config) if getattr(config, field.name) == field.default]
+    left = [name for name in left if name not in _EVERY_TIME]
     kept = {name: earlier[name] for name in left if name in earlier}
     if "forecast" in left and "forecast" not in earlier:
         kept["forecast"] = False  # there was none to choose
@@ -60,3 +66,42 @@ def check_resume(run: RunDirectory, content: Mapping[str, Any], *, resume: bool)
     changed = [key for key in fixed if (content[key] or None) != (earlier.get(key) or None)]  # off, or not there yet
     if changed:
         raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so")
+
+
+def check_data(run: RunDirectory, content: Mapping[str, Any], *, force: bool = False) -> None:
+    """Refuses to go on with other demonstrations, or another version of this package, than a run was begun with.
+
+    The weights would be neither those of the one nor of the other. Runs of earlier versions kept nothing to compare.
+
+    Args:
+        run (RunDirectory): the folder.
+        content (mapping): what ``config.json`` is to hold, ``data`` included
+            (:func:`~torchrl_koap.training.provenance.fingerprint`).
+
+    Keyword Args:
+        force (bool): go on all the same.
+
+    Raises:
+        RunDirectoryError: naming what differs.
+    """
+    if force or not (run.path / "config.json").exists():
+        return
+    earlier = run.read_json("config.json")
+    before, now = earlier.get("data"), content["data"]
+    if before not in (None, now):
+        sizes = (
+            f"{before.get('steps')} steps then, {now['steps']} now" if before.get("steps") != now["steps"] else "others"
+        )
+        raise RunDirectoryError(
+            f"{run.path} was started with other demonstrations than {content['dataset']} holds now ({sizes}); bring the"
+            " earlier ones back, choose another --out, or insist with --force-data"
+        )
+    then, here = (versions.get("versions") or {} for versions in (earlier, content))
+    if then.get("torchrl_koap", here["torchrl_koap"]) != here["torchrl_koap"]:
+        raise RunDirectoryError(
+            f"{run.path} was started with torchrl_koap {then['torchrl_koap']}, this is {here['torchrl_koap']}; choose"
+            " another --out, or insist with --force-data"
+        )
+    others = [f"{name} {then[name]} (now {here[name]})" for name in here if then.get(name, here[name]) != here[name]]
+    if others:
+        logger.warning("%s was started with %s: the last bits of its weights may differ", run.path, ", ".join(others))
