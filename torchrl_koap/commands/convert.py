@@ -53,6 +53,8 @@ class Convert(Command):
 
     def __call__(self) -> dict[str, Any]:
         """Reads, checks and writes."""
+        if self.max_steps is not None and self.max_steps < 1:
+            raise ValueError(f"max_steps must be >= 1, got {self.max_steps}")
         if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
         recordings = read_recordings(
