@@ -300,6 +300,11 @@ def tracking_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     return [[row[name] for name in names] for row in rows]
 
 
+def export_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """Table of the ways to call a whole policy."""
+    return [list(row.values()) for row in rows]
+
+
 def preset_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     """Table of the presets."""
     return [[row["preset"], row["decoder"], f"{row['action_error']} {row['unit']}"] for row in rows]
@@ -307,7 +312,7 @@ def preset_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
 
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
 _PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size)
-_HELPERS = (first, label_sizes, *_TABLES, tracking_rows, preset_rows, *_PAPER)
+_HELPERS = (first, label_sizes, *_TABLES, tracking_rows, export_rows, preset_rows, *_PAPER)
 
 
 def commands(rows: Sequence[Mapping[str, str]]) -> str:

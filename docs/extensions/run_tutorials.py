@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Runs tutorials and keeps what they print and draw for the site.
 
-    python docs/extensions/run_tutorials.py              # all of them
-    python docs/extensions/run_tutorials.py planners     # one
+python docs/extensions/run_tutorials.py              # all of them
+python docs/extensions/run_tutorials.py planners     # one
 """
 
 from __future__ import annotations

@@ -51,8 +51,8 @@ def write_tutorial_pages() -> None:
     write_page(
         "tutorials/index",
         heading("Tutorials"),
-        "Each is a script that tells one story, prints its numbers and ends with a picture. ``make tutorials`` runs them "
-        "all; what is shown here is what it left.",
+        "Each is a script that tells one story, prints its numbers and ends with a picture. ``make tutorials`` runs "
+        "them all; what is shown here is what it left.",
         table(("script", "story", "to begin with"), rows),
         toctree(ORDER, hidden=True),
     )

@@ -32,12 +32,16 @@ PLANNER_OPTIONS = (
     *(
         "relations",
         "recovery_sigma",
+        "recovery_response",
         "scene_shift",
         "scene_turn",
         "exchange",
         "solver",
         "solver_steps",
         "denoiser_width",
+        "frame",
+        "plan_steps",
+        "observed_frames",
     ),
     *("denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay", "first_steps_weight", "precision"),
 )
