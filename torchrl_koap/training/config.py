@@ -46,7 +46,7 @@ class TrainConfig:
             another name in torchrl_koap.training.methods.METHODS, those that plugins register included.
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
-        preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
+        preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the method's own).
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: controller updates.
