@@ -3,6 +3,7 @@
 
 A regime changes what is *observed*; motions and actions stay as they were recorded. All noise comes from a seed, and
 the weights of an embedding from the regime alone: all seeds see the same sensor.
+"""
 
 from __future__ import annotations
 
