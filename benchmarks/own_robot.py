@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from torchrl_koap import Agent, EvalConfig, TrainConfig, evaluate, load_policy, train
-from torchrl_koap.data import controller_view, make_demonstrations, save_demonstrations
+from torchrl_koap.data import controller_view, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.evaluation import load_run
 from torchrl_koap.modules import LinearInverseDynamics
 from torchrl_koap.training.action_errors import first_actions
@@ -73,8 +73,10 @@ def action_errors(run: Path, states: list[np.ndarray], actions: list[np.ndarray]
     """Errors on the demonstrations whose actions were kept back, of the controller and of a ridge (rad)."""
     trained = load_run(run)
     every, few = (
-        controller_view(make_demonstrations(states, part, control_hz=30, robot=range(JOINTS))[0], trained.columns)
-        for part in (actions, _few(actions))
+        controller_view(select_state(data, task.state_of), trained.columns)
+        for data, task in (
+            make_demonstrations(states, part, control_hz=30, robot=range(JOINTS)) for part in (actions, _few(actions))
+        )
     )
     ridge = LinearInverseDynamics(JOINTS, JOINTS).to(every["state"].dtype)
     fit_closed_form(ridge, few)

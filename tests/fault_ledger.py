@@ -31,7 +31,7 @@ WORK = (
     "torchrl_koap.evaluation.inspection.roll_out",
     "torchrl_koap.studies.label_efficiency.launch",
     "torchrl_koap.commands.export.export_part",
-    "torchrl_koap.commands.convert.save_demonstrations",
+    "torchrl_koap.data.demonstrations.save_ted",
 )
 
 

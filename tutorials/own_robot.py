@@ -76,7 +76,7 @@ data, task = torchrl_koap.make_demonstrations(
     states, actions, control_hz=30, state_names=NAMES, state_units="rad", action_units="rad/s", robot=NAMES[:2]
 )
 print(f"{len(states)} trajectories, {int(data['has_action'].sum())} of {len(data)} steps with their command")
-planner = torchrl_koap.fit_planner(data, task, steps=800, channels=(32, 64), progress=False)  # looks at no command
+planner = torchrl_koap.fit_planner(data, task, steps=500, channels=(32, 64), progress=False)  # looks at no command
 controllers = {
     name: torchrl_koap.fit_controller(data, task, method=name, steps=200, progress=False)
     for name in ("linear", "dd", "koap")

@@ -33,7 +33,7 @@ def block(writer: Any, node: nodes.math_block) -> None:
 def drawn(node: nodes.Element, as_block: bool) -> str:
     """The equation; a command that is not known is a warning."""
     try:
-        return latex2mathml.tex2mathml(node.astext(), as_block=as_block)
+        return latex2mathml.tex2mathml(node.astext().replace(r"\dots", r"\ldots"), as_block=as_block)
     except MathError as error:
         LOGGER.warning("equation %r: %s", node.astext(), error, location=node)
         return ""

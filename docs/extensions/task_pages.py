@@ -66,7 +66,7 @@ def write_task(task: Task) -> None:
         f"tasks/{task.name}",
         heading(task.name),
         f".. image:: {task.name}.png\n   :width: 420\n   :alt: {task.name} from above",
-        escape(task.scene.caption.strip()),
+        f"In the pictures of a report: {escape(task.scene.caption.strip())}" if task.scene.caption else "",
         code(
             f"koap demos --task {task.name} --out demos\nkoap train --task {task.name} --out runs/{task.name}", "bash"
         ),

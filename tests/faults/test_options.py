@@ -47,6 +47,10 @@ RIGHT = {
     "convert": ("--name n0nsense", "--out /dev/null/below"),
     "demos": ("--seed 0",),
     "eval": ("--seed 0",),
+    "inspect": ("--seed 0",),
+    "suggest": ("--seed 0",),
+    "curve": ("--condition-octaves 0",),
+    "bench": ("--condition-octaves 0",),
     "train": (
         *("--seed 0", "--controller-steps 0", "--condition-octaves 0", "--episodes -1", "--episodes 0"),
         *("--denoiser-width", "--denoiser-depth"),
@@ -59,7 +63,12 @@ SAYS = {
     "--label-unit": "unit",
     "--controller-steps": "steps",
     "--solver-steps": "solver-steps|num_steps",
-    "--controller-state": "part of the state",
+    "--controller-state": "part of the state|controller-state",
+    "--tasks": "task",
+    "--methods": "method",
+    "--units": "unit",
+    "--planners": "planners|n0nsense",
+    "--data-share": "share of the data|data-share",
     "--planner-from": "/dev/null/below|planner-from",
 }
 

@@ -58,6 +58,8 @@ class Convert(Command):
 
     def __call__(self) -> dict[str, Any]:
         """Reads, checks and writes."""
+        if self.max_steps is not None and self.max_steps < 1:
+            raise ValueError(f"max_steps must be >= 1, got {self.max_steps}")
         if self.to is not None:
             lookup(WRITERS, self.to, "format")
             return self._in_another_format(self._read(), self.to)

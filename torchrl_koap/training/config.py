@@ -48,7 +48,7 @@ class TrainConfig:
             another name in torchrl_koap.training.methods.METHODS, those that plugins register included.
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
-        preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
+        preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the method's own).
         koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
         action_coeff: weight of the action term, for methods whose action decoder is trained with the rest (default: 1).
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
@@ -346,6 +346,7 @@ def _check(options: TrainConfig, method: Method) -> None:
             raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
     if options.label_fraction is not None and not 0 < options.label_fraction <= 1:
         raise ValueError(f"label_fraction: a fraction must be in (0, 1], got {options.label_fraction}")
+    lookup(("float32", "bfloat16"), options.precision or "float32", "precision")
     if options.seed < 0:
         raise ValueError(f"seed must be >= 0, got {options.seed}")
     if not 0 <= (options.validation_fraction or 0) < 1:

@@ -23,9 +23,7 @@ def test_components_are_those_of_the_windows(num):
     model.fit_unlabelled(states)
     rows = model.reader(states, range(8, 9)).flatten(0, -2).double()
     expected = torch.linalg.svd(rows, full_matrices=False)[2][:8]
-    torch.testing.assert_close(
-        (model.basis.double() @ expected.mT).abs(), torch.eye(8).double(), atol=1e-3, rtol=0
-    )
+    torch.testing.assert_close((model.basis.double() @ expected.mT).abs(), torch.eye(8).double(), atol=1e-3, rtol=0)
 
 
 def test_the_number_of_components_is_chosen_by_labels_left_out():

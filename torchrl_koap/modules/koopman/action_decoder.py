@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from torchrl_koap.keys import ACTION, LATENT_ACTION
 
-
 # latent actions larger than this keep so many directions of their covariance: a square root of it would be gigabytes
 WIDE, DIRECTIONS = 2048, 256
 
@@ -224,7 +223,7 @@ class LinearActionDecoder(TensorDictModuleBase):
 
 
 def _thin_svd(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Singular value decomposition ``[N, r], [r], [r, m]``; of many more columns than rows by way of the rows' products.
+    """Singular value decomposition ``[N, r], [r], [r, m]``, of many columns by way of the rows' products.
 
     Directions below the rounding of the products (a millionth of the largest singular value) are left out there.
     """

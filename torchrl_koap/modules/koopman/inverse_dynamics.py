@@ -244,10 +244,13 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
 
     def _tied_axis_prior(self, latent: Tensor, action: Tensor, axes: Sequence[int]) -> Tensor:
         """The decoder ``[act, m]`` that applies one and the same filter to the steps of every axis."""
-        if not isinstance(self.latent_action, (LatentActionFourier, LatentActionSmoothed)) or len(axes) != action.shape[-1]:
+        if (
+            not isinstance(self.latent_action, (LatentActionFourier, LatentActionSmoothed))
+            or len(axes) != action.shape[-1]
+        ):
             raise ValueError(
-                f"tied_axes need a LatentActionFourier or LatentActionSmoothed and one state column per action entry ({action.shape[-1]}),"
-                f" got {type(self.latent_action).__name__} and {list(axes)}"
+                f"tied_axes need a LatentActionFourier or LatentActionSmoothed and one state column per action entry"
+                f" ({action.shape[-1]}), got {type(self.latent_action).__name__} and {list(axes)}"
             )
         entries, factors = self.latent_action.steps(axes)  # [S, act]
         size = _unit(self.state_normalizer, self.latent_action.state_dim, factors)[list(axes)]

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Latent actions of few, smoothed coordinates, which unlabelled windows determine: the network of ``semi_supervised``."""
+"""Latent actions of few, smoothed coordinates that unlabelled windows determine: the preset ``semi_supervised``."""
 
 from __future__ import annotations
 
@@ -125,9 +125,7 @@ class LatentActionSmoothed(LatentActionModule):
 
     def _frames(self, lifted: Tensor, frames: range | None) -> Tensor:
         """Frames ``[*B, T, F, m]`` that are smoothed together."""
-        reader = FrameGatherer(
-            lifted.shape[-1], num_past=self.num_past, look_ahead=self.look_ahead, relative=False
-        )
+        reader = FrameGatherer(lifted.shape[-1], num_past=self.num_past, look_ahead=self.look_ahead, relative=False)
         return reader.gather(lifted, frames)
 
     def _steps(self, smoothed: Tensor) -> Tensor:
