@@ -44,7 +44,7 @@ WRONG: dict[Any, tuple[str, ...]] = {
 }
 # values that are right after all: names of one's own, and 0 where it means "none of it"
 RIGHT = {
-    "convert": ("--name n0nsense", "--out /dev/null/below"),
+    "convert": ("--name n0nsense", "--out /dev/null/below", "--action-columns n0nsense"),
     "demos": ("--seed 0",),
     "eval": ("--seed 0",),
     "inspect": ("--seed 0",),
@@ -64,6 +64,7 @@ SAYS = {
     "--controller-steps": "steps",
     "--solver-steps": "solver-steps|num_steps",
     "--controller-state": "part of the state|controller-state",
+    "--action-kind": "kind of action",
     "--tasks": "task",
     "--methods": "method",
     "--units": "unit",

@@ -49,6 +49,13 @@ def put(name: str, make: Callable[[np.ndarray], Any]) -> Callable[[dict[str, Any
     return lambda content: content["robot"].update({name: make(content["robot"][name])})
 
 
+def without(name: str) -> Callable[[dict[str, Any]], None]:
+    def change(content):
+        del content["robot"][name]
+
+    return change
+
+
 def with_value(value: float) -> Callable[[np.ndarray], np.ndarray]:
     def change(array):
         array = array.copy()
@@ -165,9 +172,7 @@ def raw() -> Iterator[Fault]:
         for kind, make in ARRAYS.items():
             yield Fault(f"{name} {kind}", VALIDATE, FILE, written(put(name, make)))
     for name in NEEDED:
-        yield Fault(
-            f"{name} missing", VALIDATE, f"{FILE}.*{name}", written(lambda c, n=name: c["robot"].pop(n) and None)
-        )
+        yield Fault(f"{name} missing", VALIDATE, f"{FILE}.*{name}", written(without(name)))
     for kind, content in HOSTILE.items():
         yield Fault(f"hostile {kind}", VALIDATE, FILE, raw_bytes(content))
     for kind, change in CONTENT.items():

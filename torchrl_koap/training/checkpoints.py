@@ -23,6 +23,9 @@ from torchrl_koap.training.compact_weights import expand
 _SHA256 = "sha256"  # among the facts of a file: the checksum of its tensors
 
 
+_MOMENTS = {"step", "exp_avg", "exp_avg_sq"}  # what AdamW keeps of a parameter
+
+
 class CheckpointError(ValueError):
     """A file of weights that cannot be used: damaged, of another task, or without its statistics."""
 
@@ -241,8 +244,9 @@ def _moments(
         if not fits or (key != "step" and value.shape != shapes[int(index)]) or not value.isfinite().all():
             raise CheckpointError(f"{path} is damaged: {name} does not belong to any parameter, or is not finite")
         moments.setdefault(int(index), {})[key] = value
-    if len({frozenset(entries) for entries in moments.values()}) > 1:
-        raise CheckpointError(f"{path} is damaged: some parameters lack moments that others have")
+    lacking = [index for index, entries in moments.items() if entries.keys() != _MOMENTS]
+    if lacking:
+        raise CheckpointError(f"{path} is damaged: parameter {lacking[0]} lacks part of the state of its optimiser")
     return moments
 
 
