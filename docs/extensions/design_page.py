@@ -40,8 +40,8 @@ def write_design_page() -> None:
     write_page(
         "design",
         heading("The house"),
-        "Rooms are folders of the package. An arrow points to what a room may import; what is imported by way of another "
-        "room is left out of the drawing. A test reads every import and fails where one points upward, so that "
+        "Rooms are folders of the package. An arrow points to what a room may import; what is imported by way of "
+        "another room is left out of the drawing. A test reads every import and fails where one points upward, so that "
         "``import torchrl_koap.modules`` never loads a simulator.",
         ".. raw:: html\n   :file: rooms.svg",
         table(("room", "may import"), rules),
@@ -53,7 +53,7 @@ def may_import() -> dict[str, set[str]]:
     """The table of the test: only its assignments are run."""
     found: dict[str, Any] = {}
     for node in ast.parse(SOURCE.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and node.targets[0].id in ("BASE", "TRAINING", "MAY_IMPORT"):  # type: ignore[attr-defined]
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) in ("BASE", "TRAINING", "MAY_IMPORT"):
             exec(compile(ast.Module([node], []), SOURCE.name, "exec"), found)
     return found["MAY_IMPORT"]
 

@@ -39,8 +39,8 @@ def write_task_pages() -> None:
     write_page(
         "tasks/index",
         heading("Every task in numbers"),
-        "Made from the registry of tasks, ``torchrl_koap/tasks``. What the simulator does, fact by fact, and how it was "
-        "compared with the original one: :doc:`/d3il`.",
+        "Made from the registry of tasks, ``torchrl_koap/tasks``. What the simulator does, fact by fact, and how it "
+        "was compared with the original one: :doc:`/d3il`.",
         table(("task", "columns observed / planned", "actions", "modes", "limit"), rows),
         toctree(names, hidden=True),
     )
@@ -66,7 +66,7 @@ def write_task(task: Task) -> None:
         f"tasks/{task.name}",
         heading(task.name),
         f".. image:: {task.name}.png\n   :width: 420\n   :alt: {task.name} from above",
-        escape(task.scene.caption.strip()),
+        f"In the pictures of a report: {escape(task.scene.caption.strip())}" if task.scene.caption else "",
         code(
             f"koap demos --task {task.name} --out demos\nkoap train --task {task.name} --out runs/{task.name}", "bash"
         ),
@@ -129,11 +129,12 @@ def mode_blocks(task: Task) -> list[str]:
     """The ways in which it can be done."""
     if not task.modes.choices:
         return []
-    among = {"all": "all successful episodes", "contexts": "contexts", "solved_contexts": "contexts with a success"}
+    names = {"all": "all successful episodes", "contexts": "contexts", "solved_contexts": "contexts with a success"}
+    among = names.get(task.modes.entropy, task.modes.entropy)
     return [
         heading(f"{task.num_modes} modes", 1),
         table(("choice", "values"), [(choice, ", ".join(names)) for choice, names in task.modes.choices]),
-        f"Their entropy is taken over {among.get(task.modes.entropy, task.modes.entropy)}, to the base {task.num_modes}.",
+        f"Their entropy is taken over {among}, to the base {task.num_modes}.",
     ]
 
 

@@ -54,7 +54,8 @@ def drawing() -> str:
             x = LEFT + CELL * index
             parts.append(f'<rect class="{kind}" x="{x + 2}" y="{y}" width="{CELL - 4}" height="{HIGH}" rx="4"/>')
     width, height = LEFT + CELL * columns + 4, 28 + len(rows) * (HIGH + 12)
-    return f'<svg class="drawing" viewBox="0 0 {width} {height}" role="img" aria-label="frames in time">{"".join(parts)}</svg>\n'
+    head = f'<svg class="drawing" viewBox="0 0 {width} {height}" role="img" aria-label="frames in time">'
+    return head + "".join(parts) + "</svg>\n"
 
 
 def time_name(offset: int) -> str:

@@ -18,6 +18,7 @@ from typing import Any
 from torchrl_koap import __version__
 from torchrl_koap.commands.interrupts import describe_interrupt, ending_at_once, ending_like_ctrl_c
 from torchrl_koap.commands.printing import HINT, complain, discard_output, one_line, show
+from torchrl_koap.commands.sanity import check_options
 
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, RuntimeError, KeyError, OSError, MemoryError)
@@ -67,6 +68,7 @@ def _run(arguments: Sequence[str]) -> int:
     tyro, subcommand, without_progress_bars = _commands()
     with _output(), _wide_enough():
         command = tyro.cli(subcommand, args=arguments, prog="koap", description=DESCRIPTION)
+    check_options(command)
     with without_progress_bars() if command.quiet else nullcontext():
         result = command()
     if not command.quiet:

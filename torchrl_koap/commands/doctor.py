@@ -27,6 +27,7 @@ from torchrl_koap.training.checkpoints import load_tensors
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.digests import DIGESTS
 from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.training.progress import count_up_to, progress_bar
 
 _LATER = (DIGESTS, "eval.json", "inspect.json", "suggestions.json")  # files that a run may have
 
@@ -72,7 +73,8 @@ class Validate(Command):
         """
         load_plugins(self.plugins)
         task = get_task(self.task)
-        data = validate(load_demonstrations(self.dataset, task))
+        with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:
+            data = validate(load_demonstrations(self.dataset, task, progress=count_up_to(bar)))
         units = task.observation_units or _position_units(task)
         doubts = find_doubts(data, names=_files(self.dataset, task), units=units)
         lengths = data["episode"].unique(return_counts=True)[1]

@@ -41,7 +41,7 @@ def find_doubts(
         >>> find_doubts(flatten_trajectories([path, path], [still + 1, still + 1]), names=["a.pkl", "b.pkl"])
         ['b.pkl repeats a.pkl: every step is the same']
         >>> find_doubts(flatten_trajectories([1e6 * path, path], [still + 1, still]), units=["m", "m"])
-        ['trajectory 0: column 0 reaches 4e+06 m', 'trajectory 1: all 2 labelled actions are zero']
+        ['trajectory 0: column 0 reaches 2e+06 m', 'trajectory 1: all 2 labelled actions are zero']
     """
     doubts, first = [], {}
     lengths = trajectory_lengths(data).tolist()

@@ -351,7 +351,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     lookup(EXECUTIONS, config.execution, "execution")
     if config.success_key is not None and config.env is None:
         raise ValueError(
-            f"success_key {config.success_key!r} was given, but no env that could report it: name an environment of"
+            f"success_key was given, but no env that could report {config.success_key!r}: name an environment of"
             " Gymnasium with --env"
         )
     set_up_torch(config.threads, config.device)

@@ -134,7 +134,7 @@ class DenoisingLoss(LossModule):
 class PlannerLoss(DenoisingLoss):
     r"""Mean squared error of the denoiser at random noise levels.
 
-    With the normalised future ``x_0``, noise ``eps ~ N(0, I)`` and a random time ``t`` per plan,
+    With the normalised future ``x_0``, noise ``eps ~ N(0, I)`` and a random time ``t`` per plan::
 
         L = mean | denoiser(signal(t) x_0 + noise(t) eps, t, condition) - target |^2
 
@@ -266,7 +266,7 @@ class DiffusionPolicyLoss(DenoisingLoss):
     r"""Mean squared error of the denoiser of actions at random noise levels, on labelled steps.
 
     With the normalised actions ``a`` of frames ``history - 1 .. T - 2`` of a window, noise ``eps ~ N(0, I)`` and a
-    random time ``t`` per window,
+    random time ``t`` per window::
 
         L = mean over labelled steps | denoiser(signal(t) a + noise(t) eps, t, condition) - target |^2
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 from torchrl_koap.studies.cell_options import OPTION_NAMES
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.training.saved_options import check_types
 
 if TYPE_CHECKING:
     from torchrl_koap.studies.label_efficiency import CurveConfig
@@ -43,7 +44,7 @@ def check_folder(root: RunDirectory, options: CurveConfig) -> None:
         RunDirectoryError: naming what differs.
     """
     if (root.path / "curve.json").exists():
-        earlier, now = root.read_json("curve.json"), as_json(options)
+        earlier, now = read_options(root, type(options)), as_json(options)
         # an option that is younger than the folder was at its default
         earlier = {name: earlier.get(name, getattr(type(options), name)) for name in FIXED}
         changed = [f"{name} ({value})" for name, value in earlier.items() if now[name] != value]
@@ -60,6 +61,21 @@ def check_folder(root: RunDirectory, options: CurveConfig) -> None:
         raise RunDirectoryError(f"{root.path} is not empty and no folder of `koap curve`; choose another --out")
 
 
+def read_options(root: RunDirectory, kind: type) -> dict[str, Any]:
+    """What ``curve.json`` holds, its entries of the types that they were written with.
+
+    Args:
+        root (RunDirectory): folder of the curve.
+        kind (type): the dataclass that it was written from.
+
+    Raises:
+        RunDirectoryError: if it is missing or damaged.
+    """
+    earlier = root.read_json("curve.json")
+    check_types(root.path / "curve.json", earlier, get_type_hints(kind))
+    return earlier
+
+
 def as_json(options: CurveConfig) -> dict[str, Any]:
     """The options as ``curve.json`` holds them."""
     planner = None if options.planner_from is None else str(Path(options.planner_from).absolute())
@@ -67,10 +83,15 @@ def as_json(options: CurveConfig) -> dict[str, Any]:
 
 
 def write_options(root: RunDirectory, options: CurveConfig) -> None:
-    """Keeps what was asked for, earlier methods, fractions and seeds included."""
+    """Keeps what was asked for, earlier methods, fractions and seeds included.
+
+    Args:
+        root (RunDirectory): the folder.
+        options (CurveConfig): what is asked for.
+    """
     content = as_json(options)
     if (root.path / "curve.json").exists():
-        earlier = root.read_json("curve.json")
+        earlier = read_options(root, type(options))
         for name in ("methods", "fractions", "observations"):
             content[name] = ",".join(dict.fromkeys([*str(earlier[name]).split(","), *content[name].split(",")]))
         content["seeds"] = max(earlier["seeds"], content["seeds"])
@@ -80,7 +101,7 @@ def write_options(root: RunDirectory, options: CurveConfig) -> None:
 def with_earlier_plugins(options: CurveConfig) -> CurveConfig:
     """The options with the plugins of earlier calls, without which methods of theirs would be unknown."""
     root = RunDirectory(options.out)
-    earlier = root.read_json("curve.json").get("plugins") or () if (root.path / "curve.json").exists() else ()
+    earlier = read_options(root, type(options)).get("plugins") or () if (root.path / "curve.json").exists() else ()
     return replace(options, plugins=tuple(dict.fromkeys([*earlier, *options.plugins])))
 
 

@@ -17,13 +17,13 @@ from torchrl_koap.studies.cell_options import (
     planner_options,
     training_options,
 )
-from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
+from torchrl_koap.studies.cells import Cell, do_cell, do_planner, is_trained, planner_folder
 from torchrl_koap.studies.curve_data import check_budgets, demonstrations_of, first_look
-from torchrl_koap.studies.curve_folder import GROWS, check_folder, with_earlier_plugins, write_options
+from torchrl_koap.studies.curve_folder import GROWS, check_folder, read_options, with_earlier_plugins, write_options
+from torchrl_koap.studies.curve_table import CurveTable
 from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
-from torchrl_koap.studies.table import write_cells
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.config import TrainConfig, resolve
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
@@ -50,7 +50,7 @@ class CurveConfig(CellOptions):
         demonstrations: number of scripted demonstrations (default: that of the task).
         methods: names in torchrl_koap.training.methods.METHODS, with commas between.
         fractions: shares of the units that keep their labels, with commas between.
-        units: "trajectory", "window" (the paper's levels) or "transition".
+        units: "trajectory", "window" (the unit of the first public code) or "transition".
         observations: shares of the trajectories that are used at all, with commas between.
         seeds: number of seeds of label choice and training.
         episodes: rollouts per cell; all cells meet the same ones.
@@ -127,8 +127,10 @@ def run_curve(config: CurveConfig) -> dict[str, Any]:
         if to_record:
             check_budgets(cells, options, load_demonstrations(dataset, task))
         write_options(root, options)
-        reasons = _work(root, options, cells, dataset)
-        rows = _rows(root, cells, options, reasons)
+        known = _all_cells(root, cells, options)
+        table = CurveTable(root.path, known, task=options.task, label_unit=options.units)
+        _work(root, options, cells, dataset, table)
+        rows = table.write()
         paper = paper_points(task.name) if options.units == "window" else None
         report = write_curve_report(root.path, rows, title=f"Label efficiency on {task.name}", paper=paper)
     counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
@@ -228,8 +230,8 @@ def _split(name: str, text: str, kind: type) -> list[Any]:
         raise ValueError(f"{name} must be numbers with commas between, got {text!r}") from None
 
 
-def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:
-    """Does the cells that are not done; returns why some failed."""
+def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], dataset: str, table: CurveTable) -> None:
+    """Does the cells that are not done."""
     common = {
         "task": options.task,
         "dataset": dataset,
@@ -242,7 +244,7 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
         "released_settings": options.released_settings,
         "epochs": options.epochs,
     }
-    todo = [cell for cell in cells if not is_done(root.path / cell.folder)]
+    todo = [cell for cell in cells if not table.is_done(cell)]
     todo.sort(key=lambda cell: cell.planner is not None)  # those without a planner need not wait for one
     jobs, names, planners = [], {}, {}
     for cell in todo:
@@ -278,7 +280,6 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
     # a job of a cluster may not use all cores of its machine
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     workers = options.workers or cores
-    reasons: dict[Cell, str] = {}
     with progress_bar(len(first) + len(jobs), "cells", unit="cell", smoothing=0.1) as bar:
         ended = launch(
             [*first, *jobs],
@@ -292,10 +293,7 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
                 bar.update()
                 bar.set_postfix_str(job.name.removeprefix("cells/") + (" FAILED" if reason else ""))
                 if job.name in names:
-                    if reason is not None:
-                        reasons[names[job.name]] = reason
-                    _rows(root, cells, options, reasons)
-    return reasons
+                    table.ended(names[job.name], reason)
 
 
 def _planner_share(cell: Cell, options: CurveConfig) -> float:
@@ -317,17 +315,8 @@ def _planner_of(cell: Cell, root: RunDirectory, options: CurveConfig) -> Path | 
     return root.path / planner_folder(_planner_share(cell, options), _planner_seed(cell, options))
 
 
-def _rows(
-    root: RunDirectory, cells: Sequence[Cell], options: CurveConfig, reasons: dict[Cell, str]
-) -> list[dict[str, Any]]:
-    """Writes ``cells.csv`` from the folders of all cells, asked for now or earlier, and returns its rows."""
-    known = list(cells)
-    earlier = root.read_json("curve.json")
+def _all_cells(root: RunDirectory, cells: Sequence[Cell], options: CurveConfig) -> list[Cell]:
+    """The cells asked for now, and those asked for earlier."""
+    earlier, asked = read_options(root, type(options)), set(cells)
     grown = replace(options, **{name: earlier[name] for name in GROWS})
-    known += [cell for cell in _cells(grown) if cell not in known and (root.path / cell.folder).exists()]
-    rows = [
-        cell_row(root.path, cell, task=options.task, label_unit=options.units, reason=reasons.get(cell))
-        for cell in known
-    ]
-    write_cells(root.path / "cells.csv", rows)
-    return rows
+    return [*cells, *(cell for cell in _cells(grown) if cell not in asked and (root.path / cell.folder).exists())]

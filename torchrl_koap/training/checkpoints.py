@@ -20,6 +20,8 @@ from torchrl_koap.files import replacing_file
 from torchrl_koap.modules import Normalizer
 from torchrl_koap.training.compact_weights import expand
 
+_SHA256 = "sha256"  # among the facts of a file: the checksum of its tensors
+
 
 class CheckpointError(ValueError):
     """A file of weights that cannot be used: damaged, of another task, or without its statistics."""
@@ -97,7 +99,9 @@ def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with replacing_file(path) as aside:
         try:
-            save_file(tensors, aside, metadata={"about": json.dumps(about or {}), "sha256": _digest(tensors)})
+            # one entry alone: of several the order in the file would be another one every time
+            facts = {**(about or {}), _SHA256: _digest(tensors)}
+            save_file(tensors, aside, metadata={"about": json.dumps(facts)})
         except SafetensorError as error:  # it has no errno
             raise OSError(errno.EIO, str(error)) from error
 
@@ -127,7 +131,8 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         tensors = load_file(path)
     except (SafetensorError, ValueError, RecursionError, OSError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
-    if metadata.get("sha256", _digest(tensors)) != _digest(tensors):  # files of before have none
+    digest = _digest(tensors)
+    if about.pop(_SHA256, digest) != digest:  # files of before have none
         raise CheckpointError(f"{path} is damaged: its tensors are not those that were written (checksum)")
     return tensors, about
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,13 +15,15 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.training.datasets import find_task_of
+from torchrl_koap.training.loggers import check_logger
 from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.run_directory import RunDirectory
 from torchrl_koap.training.validation import default_fraction
 
-LABEL_FRACTION, ALL_LABELS = 0.02, 1.0  # defaults for data with all labels, and for data that lack some
+# defaults for data that lack labels or came without an environment, and for all others
+ALL_LABELS, LABEL_FRACTION = 1.0, 0.02
 
 
 @dataclass
@@ -35,10 +36,10 @@ class TrainConfig:
         dataset: "scripted", or a folder: written by `koap demos`, `koap convert` or save_demonstrations, of D3IL raw
             pickles, or a LeRobot data set.
         label_fraction: share of the trajectories, windows or transitions that keep their actions (default: 0.02; all
-            labels that there are, where data lack some).
+            labels that there are, where data lack some or the task has no environment).
         label_count: number of them instead of a share.
         label_episodes: these trajectories instead of a random choice, as `koap suggest` names them.
-        label_unit: "trajectory", "window" (the paper's levels) or "transition".
+        label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
         seed: seed of label choice, initialisation and batches.
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
         validation_fraction: share of the trajectories that the planner never sees, those without labels first, for
@@ -47,7 +48,7 @@ class TrainConfig:
             another name in torchrl_koap.training.methods.METHODS, those that plugins register included.
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
-        preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
+        preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the method's own).
         koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
         action_coeff: weight of the action term, for methods whose action decoder is trained with the rest (default: 1).
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
@@ -82,6 +83,8 @@ class TrainConfig:
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
+        recovery_response: how the augmentation leads back, "first_order" at once or "second_order" from rest, which
+            robots that follow their commands late can do (default: the task's).
         scene_shift: typical displacement (m) of whole scenes, for tasks whose place on the table does not matter.
         scene_turn: typical angle (rad) by which such scenes are turned.
         exchange: exchange objects that are alike.
@@ -94,7 +97,8 @@ class TrainConfig:
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
         force_data: resume although the demonstrations, or the version of this package, are others than at the start.
-        logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
+        logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise), "tensorboard"
+            or "mlflow" (in the run directory unless MLFLOW_TRACKING_URI says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
             reads the run.
@@ -149,6 +153,7 @@ class TrainConfig:
     relations: bool = True
     controller_state: str = "robot"
     recovery_sigma: float | None = None
+    recovery_response: str | None = None
     scene_shift: float = 0.05
     scene_turn: float = 0.3
     exchange: bool = True
@@ -213,7 +218,8 @@ class ResolvedConfig:
         """The same with the share of labels that is the default for these data, if none was asked for."""
         if self.options.label_fraction is not None:
             return self
-        share = ALL_LABELS if not data["has_action"].all() else LABEL_FRACTION
+        every = self.task.env is None or not data["has_action"].all()
+        share = ALL_LABELS if every else LABEL_FRACTION
         options = replace(self.options, label_fraction=share)
         return replace(self, options=options, budget=_budget(options))
 
@@ -241,6 +247,10 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     released = _released(options)
     method = _method(options) if released is None else released.method
     _check(options, method)
+    if not method.has_planner:
+        if config.forecast:
+            raise ValueError(f"method {config.method!r} is a policy of its own and has no plans to forecast")
+        options = replace(options, forecast=None)
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:
@@ -272,6 +282,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
     defaults = {
         "steps": task.defaults.planner_steps,
         "recovery_sigma": task.defaults.recovery_sigma,
+        "recovery_response": task.defaults.recovery_response,
         "episodes": task.defaults.demonstrations,
         "relative": task.defaults.relative,
         "channels": task.defaults.channels,
@@ -303,10 +314,16 @@ def _method(options: TrainConfig) -> Method:
     return method
 
 
+_LEAST = (
+    dict.fromkeys(("batch_size", "controller_batch_size", "checkpoint_every", "candidates"), 1)
+    | dict.fromkeys(("denoiser_width", "denoiser_depth"), 1)
+    | dict.fromkeys(("condition_octaves", "dropout", "planner_weight_decay", "first_steps_weight"), 0)
+    | dict.fromkeys(("recovery_sigma", "scene_shift", "scene_turn"), 0)
+)
+
+
 def _check(options: TrainConfig, method: Method) -> None:
-    lookup(("csv", "wandb"), options.logger, "logger")
-    if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-        raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
+    check_logger(options.logger)
     for name in COEFFICIENTS:
         value = getattr(options, name)
         if value is not None and name not in loss_coefficients(method):
@@ -327,13 +344,21 @@ def _check(options: TrainConfig, method: Method) -> None:
     for name in ("planner_learning_rate", "controller_learning_rate"):
         if not 0 < getattr(options, name) < math.inf:
             raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
+    if options.label_fraction is not None and not 0 < options.label_fraction <= 1:
+        raise ValueError(f"label_fraction: a fraction must be in (0, 1], got {options.label_fraction}")
+    lookup(("float32", "bfloat16"), options.precision or "float32", "precision")
     if options.seed < 0:
         raise ValueError(f"seed must be >= 0, got {options.seed}")
     if not 0 <= (options.validation_fraction or 0) < 1:
         raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
-    for name in ("batch_size", "controller_batch_size", "checkpoint_every"):
-        if getattr(options, name) < 1:
-            raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
+    for name, least in _LEAST.items():
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise ValueError(f"{name} must be >= {least}, got {value}")
+    if options.dropout is not None and options.dropout >= 1:
+        raise ValueError(f"dropout must be in [0, 1), got {options.dropout}")
+    if not 0 < options.observation_fraction <= 1:
+        raise ValueError(f"observation_fraction: a fraction must be in (0, 1], got {options.observation_fraction}")
 
 
 def _budget(options: TrainConfig) -> LabelBudget:

@@ -59,7 +59,8 @@ def load_demonstrations(
         task (Task): the task.
         episodes (int, optional): number of scripted demonstrations to record. Default: that of the task.
         seed (int): seed of the scripted demonstrations.
-        progress (callable, optional): called with recorded and wanted scripted demonstrations.
+        progress (callable, optional): called with the number of demonstrations that were recorded, or read from raw
+            files, and that of all.
 
     Raises:
         FileNotFoundError: if there is no such folder, or it holds no demonstrations.
@@ -75,7 +76,7 @@ def load_demonstrations(
     elif (Path(dataset) / "ted").is_dir():
         data = load_ted(Path(dataset) / "ted", task=task.source, memmap=False)
     else:
-        data = D3ILExperienceReplay(task.name, dataset).data.clone()
+        data = D3ILExperienceReplay(task.name, dataset, progress=progress).data.clone()
     if task.noise:
         data = with_noise(data, task.observation[task.position], task.noise)
     return select_state(data, task.state_of)

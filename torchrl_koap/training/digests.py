@@ -1,17 +1,21 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Checksums of what a finished run is made of: a bit that has flipped, or an option edited since, does not go unseen.
 
-``digests.json`` is the last file of a training and is taken away before the next one begins in the folder, so that what
-it says is always of one piece. Runs of earlier versions have none.
+``digests.json`` is the last file of a training. A run that is resumed ends with the same bytes, so that it stays true;
+it is taken away only where other data are insisted on. Runs of earlier versions have none.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+
 from torchrl_koap.files import sha256_of
+from torchrl_koap.training.resume import FREE
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 DIGESTS = "digests.json"
-OF = ("config.json", "summary.json", "planner.safetensors", "controller.safetensors", "eigenvalues.safetensors")
+OF = ("config.json", "planner.safetensors", "controller.safetensors", "eigenvalues.safetensors")
 
 
 def write_digests(run: RunDirectory) -> None:
@@ -20,11 +24,11 @@ def write_digests(run: RunDirectory) -> None:
     Args:
         run (RunDirectory): the run.
     """
-    run.write_json(DIGESTS, {name: sha256_of(run.path / name) for name in OF if (run.path / name).is_file()})
+    run.write_json(DIGESTS, {name: _digest(run, name) for name in OF if (run.path / name).is_file()})
 
 
 def forget_digests(run: RunDirectory) -> None:
-    """Takes the checksums away, before the files they are of are written anew.
+    """Takes the checksums away, before other files are written than those they are of.
 
     Args:
         run (RunDirectory): the run.
@@ -50,12 +54,13 @@ def changed_files(run: RunDirectory) -> list[str]:
         >>> from torchrl_koap.training.run_directory import RunDirectory
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     run = RunDirectory(folder)
-        ...     run.write_json("summary.json", {"steps": 3})
+        ...     run.write_json("config.json", {"steps": 3, "threads": 1})
         ...     write_digests(run)
+        ...     run.write_json("config.json", {"steps": 3, "threads": 2})  # it may be resumed so
         ...     before = changed_files(run)
-        ...     run.write_json("summary.json", {"steps": 4})
+        ...     run.write_json("config.json", {"steps": 4, "threads": 1})
         ...     before, changed_files(run)
-        ([], ['summary.json'])
+        ([], ['config.json'])
     """
     if not (run.path / DIGESTS).exists():
         return []
@@ -81,4 +86,7 @@ def check_digests(run: RunDirectory) -> None:
 
 
 def _digest(run: RunDirectory, name: str) -> str | None:
-    return sha256_of(run.path / name) if (run.path / name).is_file() else None
+    if name != "config.json":
+        return sha256_of(run.path / name) if (run.path / name).is_file() else None
+    content = {key: value for key, value in run.read_json(name).items() if key not in FREE}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -86,10 +86,12 @@ def learn_states(
     length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
     extended = extrapolate_ends(data, planner.horizon - 1)
     windows = cut_windows(extended, length, select=["state", "episode"], pad_before=1)
-    planner.fit_normalizers(windows["state"][:, unseen:], groups=windows["episode"][:, -1])
+    augment = augmentation(options, task)
+    states, groups = windows["state"][:, unseen:], windows["episode"][:, -1]
+    seen = None if planner.forecast is None else augment(windows.clone())["state"][:, unseen:]
+    planner.fit_normalizers(states, seen=seen, groups=groups)
     planner.to(options.device)
     buffer = make_window_buffer(extended, length, options.batch_size, select=["state"], pad_before=1)
-    augment = augmentation(options, task)
 
     def draw() -> TensorDictBase:
         return augment(buffer.sample())[:, unseen:]
@@ -155,6 +157,6 @@ def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> 
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
         tool = {"tool": task.tool_columns, "kinematics": task.tool_position}
-        sigma = options.recovery_sigma
-        steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, moved_by=moved_by, **tool))
+        way = {"response": options.recovery_response, "columns": arm, "moved_by": moved_by}
+        steps.append(RecoveryAugmentation(options.recovery_sigma, history=HISTORY, **way, **tool))
     return TensorDictSequential(*steps)

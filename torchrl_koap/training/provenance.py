@@ -15,6 +15,8 @@ from tensordict import TensorDictBase
 from torchrl_koap.tasks.registry import is_adopted
 from torchrl_koap.training.config import ResolvedConfig
 
+# what is derived from these may differ from version to version
+_RECORDED = ("observation", "action", "has_action", "episode", "step_count", ("next", "observation"), ("next", "done"))
 _PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
 
 
@@ -36,7 +38,7 @@ def to_json(resolved: ResolvedConfig, command: str | None = None) -> dict[str, A
 
 
 def fingerprint(data: TensorDictBase) -> dict[str, Any]:
-    """What tells data from others: their size, and a checksum of every entry.
+    """What tells data from others: their size, and a checksum of what was recorded.
 
     Args:
         data (TensorDictBase): flat data ``[N]``, on any device.
@@ -50,8 +52,8 @@ def fingerprint(data: TensorDictBase) -> dict[str, Any]:
         (True, False)
     """
     digest = hashlib.sha256()
-    names = sorted(data.keys(True, True), key=str)
-    for name in names:
+    present = set(data.keys(True, True))
+    for name in [name for name in _RECORDED if name in present]:
         value = data.get(name).detach().cpu().contiguous()
         digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
         digest.update(value.reshape(-1).view(torch.uint8).numpy())

@@ -55,6 +55,9 @@ def check_resume(run: RunDirectory, content: Mapping[str, Any], *, resume: bool)
         RunDirectoryError: naming what differs.
     """
     if not (run.path / "config.json").exists():
+        left = [name for name in ("planner.safetensors", "controller.safetensors", "checkpoints") if _is_in(run, name)]
+        if left:
+            raise RunDirectoryError(f"{run.path} holds {', '.join(left)} but no config.json; choose another --out")
         return
     if not resume:
         raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
@@ -66,6 +69,10 @@ def check_resume(run: RunDirectory, content: Mapping[str, Any], *, resume: bool)
     changed = [key for key in fixed if (content[key] or None) != (earlier.get(key) or None)]  # off, or not there yet
     if changed:
         raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so")
+
+
+def _is_in(run: RunDirectory, name: str) -> bool:
+    return (run.path / name).exists()
 
 
 def check_data(run: RunDirectory, content: Mapping[str, Any], *, force: bool = False) -> None:

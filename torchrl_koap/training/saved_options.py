@@ -31,8 +31,16 @@ PLANNER = {
     "depth": int,
     "frequencies": int,
     "dropout": float,
+    "forecast": bool,
 }
-CONTROLLER = {"method": str, "decoder": str | None, "released": bool | None, "preset": str, "state": str}
+CONTROLLER = {
+    "method": str,
+    "decoder": str | None,
+    "released": bool | None,
+    "preset": str,
+    "state": str,
+    "revised": bool,
+}
 _LARGEST = 2**63 - 1
 
 

@@ -144,7 +144,13 @@ class StatePlanner(ConditionedDiffusion):
         self._rename(history, plan)
 
     def fit_normalizers(
-        self, windows: Tensor, *, mode: str = "minmax", per_step: bool = True, groups: Tensor | None = None
+        self,
+        windows: Tensor,
+        *,
+        mode: str = "minmax",
+        per_step: bool = True,
+        seen: Tensor | None = None,
+        groups: Tensor | None = None,
     ) -> None:
         """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
 
@@ -152,11 +158,13 @@ class StatePlanner(ConditionedDiffusion):
             windows (Tensor): states in raw units, ``[*N, history + horizon, d]``.
 
         Keyword Args:
-            groups (Tensor, optional): trajectory of every window ``[*N]``, for the forecast
-                (:meth:`~torchrl_koap.modules.diffusion.forecast.LinearForecast.fit`).
             mode (str): ``"minmax"``, ``"standard"`` or ``"identity"`` (see
                 :class:`~torchrl_koap.modules.normalizer.Normalizer`).
             per_step (bool): own statistics for every planned step instead of shared ones. Defaults to True.
+            seen (Tensor, optional): the windows as training augments them, which the forecast is fitted to. Default:
+                as they are.
+            groups (Tensor, optional): trajectory of every window ``[*N]``, for the forecast
+                (:meth:`~torchrl_koap.modules.diffusion.forecast.LinearForecast.fit`).
         """
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
         plan = self._modelled(history, plan)
@@ -169,8 +177,10 @@ class StatePlanner(ConditionedDiffusion):
         self.condition_normalizer = Normalizer.fit(condition, mode=mode).to(example)
         self.plan_normalizer = Normalizer.fit(plan, mode=mode).to(example)
         if self.forecast is not None:
+            history, plan = self.split_window((windows if seen is None else seen).reshape(-1, *windows.shape[-2:]))
+            plan = plan - history[..., -1:, :] if self.relative else plan
             groups = None if groups is None else groups.flatten()
-            self.forecast.fit(self.condition_normalizer(condition), self.plan_normalizer(plan), groups, mode=mode)
+            self.forecast.fit(self.encode_history(history), self.plan_normalizer(plan.flatten(-2)), groups, mode=mode)
 
     def _modelled(self, history: Tensor, plan: Tensor) -> Tensor:
         """What is modelled of raw plans ``[*B, H, d]``: the steps, seen in the frame, from the present state."""
