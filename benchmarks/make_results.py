@@ -116,7 +116,7 @@ def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
     body = [
         [
             row["labels"],
-            f"`{row['method']}`",
+            "*oracle*" if row.get("controller") == "oracle" else f"`{row['method']}`",
             row["denoiser"],
             f"{row['updates']} x {row['batch']}",
             row["training_seed"],

@@ -63,7 +63,7 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
         groups = defaultdict(list)
         for row in rows:
             groups[row["context"]] += [row["mode"]] * (row["outcome"] == "success" and row["mode"] >= 0)
-        unsolved = "zero" if task.entropy == "contexts" else "skip"
+        unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
         entropy = conditional_entropy(list(groups.values()), task.num_modes, unsolved=unsolved)
     seconds = summary["train_seconds"]
     return {
@@ -122,13 +122,11 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=1)
     parser.add_argument("--choice", default="quarter")
     parser.add_argument("--replan-interval", type=int, default=4)
-    parser.add_argument("--blend-decay", type=float, help="default: 0.8, under the oracle controller 0")
+    parser.add_argument("--blend-decay", type=float, default=BLEND_DECAY)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--note", default="")
     parser.add_argument("--table", type=Path, default=TABLE)
     options = parser.parse_args()
-    if options.blend_decay is None:
-        options.blend_decay = 0.0 if options.controller == "oracle" else BLEND_DECAY
     choices = {
         "candidates": options.candidates,
         "choice": options.choice if options.candidates > 1 else "",

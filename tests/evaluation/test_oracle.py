@@ -89,7 +89,7 @@ def test_the_command(runs):
     options = ("--episodes", 1, "--threads", 1, "--no-report", "--controller", "oracle", "--out", runs / "out")
     assert koap("eval", runs / "koap", *options) == 0
     result = json.loads((runs / "out" / "eval.json").read_text())
-    assert result["controller"] == "oracle" and result["blend_decay"] == 0 and result["plan_ms"] > 0
+    assert result["controller"] == "oracle" and result["blend_decay"] == 0.8 and result["plan_ms"] > 0
 
 
 @pytest.mark.parametrize(

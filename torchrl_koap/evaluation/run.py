@@ -55,8 +55,7 @@ class EvalConfig:
         solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
         solver_steps: another number of solver steps.
         replan_interval: control steps per plan.
-        blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are
-            (default: 0.8, under the oracle controller 0).
+        blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are.
         candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
             the one in force (default: as the run says, else 1).
         choice: rule of that choice: "quarter", "typical" or "nearest".
@@ -86,7 +85,7 @@ class EvalConfig:
     solver: str | None = None
     solver_steps: int | None = None
     replan_interval: int = REPLAN_INTERVAL
-    blend_decay: float | None = None
+    blend_decay: float = BLEND_DECAY
     candidates: int | None = None
     choice: str = "quarter"
     out: Path | None = None
@@ -196,9 +195,8 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     lookup(EXECUTIONS, config.execution, "execution")
     lookup(CONTROLLERS, config.controller, "controller")
     oracle = config.controller == "oracle"
-    names = ("execution", "replan_interval", "choice")
+    names = ("execution", "replan_interval", "blend_decay", "choice")
     options = {name: getattr(config, name) for name in names}
-    options["blend_decay"] = (0.0 if oracle else BLEND_DECAY) if config.blend_decay is None else config.blend_decay
     options |= {} if config.candidates is None else {"candidates": config.candidates}
     if oracle:
         policy = _oracle(run if isinstance(run, TrainedRun) else load_run(run, task=config.task), options)
@@ -401,7 +399,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         "solver": sampler.solver,
         "solver_steps": sampler.num_steps,
         "replan_interval": config.replan_interval,
-        "blend_decay": getattr(policy, "blend_decay", None),
+        "blend_decay": config.blend_decay,
         "candidates": policy.candidates,
         "episode": rows,
     }
