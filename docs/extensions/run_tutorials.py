@@ -29,7 +29,7 @@ def run(name: str) -> float:
     """
     script, began = FOLDER / f"{name}.py", time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        env = {**os.environ, "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1"}
+        env = {**os.environ, "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1", "RL_LOGGING_LEVEL": "WARNING"}
         done = subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True, env=env)
         if done.returncode:
             raise SystemExit(f"{script.name} failed:\n{done.stderr[-3000:]}")
