@@ -82,3 +82,18 @@ def test_what_is_refused(options, message):
 def test_steps_out_of_order_are_refused_when_the_networks_are_made():
     with pytest.raises(ValueError, match="steps must rise"):
         planner_of(plan_steps=(4, 2, 14))
+
+
+def test_a_task_brings_its_own_planner_unless_one_is_named():
+    def options(**given):
+        return resolve(TrainConfig(out=Path("run"), label_count=1, **given)).options
+
+    aligning, named = options(task="aligning"), options(task="aligning", denoiser="unet")
+    assert (aligning.denoiser, aligning.denoiser_width, aligning.batch_size) == ("mlp", 512, 512)
+    assert (named.denoiser, named.denoiser_width, named.batch_size, named.planner_learning_rate) == (
+        *("unet", None, 128),
+        3e-3,
+    )
+    assert options(task="stacking", denoiser_width=64).denoiser_width == 64
+    assert options(task="sorting", batch_size=16).batch_size == 16
+    assert options(task="avoiding").denoiser == options(task="aligning", released_settings=True).denoiser == "unet"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
-from torchrl_koap.tasks.task import Defaults, Modes, Task
+from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -128,6 +128,6 @@ register_task(
         ),
         label_levels=(0.02, 0.05, 0.1, 0.25, 0.5),
         in_paper=True,
-        defaults=Defaults(demonstrations=1000, released_epochs=200),
+        defaults=Defaults(demonstrations=1000, planner_steps=24000, planner=WIDE_MLP, released_epochs=200),
     )
 )

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
-from torchrl_koap.tasks.task import Defaults, Modes, Task
+from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -147,7 +147,7 @@ def _sorting(num_boxes: int) -> Task:
         converter=f"torchrl_koap.data.d3il.conversion:SORTING_{num_boxes}",
         scene=Scene(shapes=(platform, *_walls()), x=(0.17, 0.83), y=(-0.43, 0.45), caption=_CAPTION, camera="cage"),
         in_paper=num_boxes == 4,
-        defaults=Defaults(demonstrations=1000, released_epochs=400),
+        defaults=Defaults(demonstrations=1000, planner_steps=18000, planner=WIDE_MLP, released_epochs=400),
     )
 
 
@@ -161,7 +161,7 @@ register_task(
         noise=PO_NOISE,
         data="sorting",
         gym_id="",
-        defaults=Defaults(demonstrations=1000, released_epochs=200),
+        defaults=Defaults(demonstrations=1000, planner_steps=18000, planner=WIDE_MLP, released_epochs=200),
     )
 )
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
-from torchrl_koap.tasks.task import Defaults, Modes, Task
+from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -112,8 +112,7 @@ _STACKING = register_task(
             " never moved and for those dropped on the way.",
             camera="front",
         ),
-        # measured: a shifted arm, redundant as it is, learns to wander (benchmarks/RESULTS.md)
-        defaults=Defaults(demonstrations=1000, recovery_sigma=0.0, released_epochs=400),
+        defaults=Defaults(demonstrations=1000, planner_steps=18000, planner=WIDE_MLP, released_epochs=400),
     )
 )
 _STACKING_1 = register_task(

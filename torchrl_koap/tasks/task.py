@@ -9,7 +9,7 @@ data set, and neither simulator nor torch is imported before they are used.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,15 @@ if TYPE_CHECKING:
     from torchrl_koap.tasks.relative_positions import RelativePositionFeatures
 
 CONTROL_HZ = 1 / 0.035
+# what wins on the tasks with objects: capacity and many samples (docs/results/planners.md)
+WIDE_MLP = {
+    "denoiser": "mlp",
+    "denoiser_width": 512,
+    "denoiser_depth": 4,
+    "condition_octaves": 1,
+    "batch_size": 512,
+    "planner_learning_rate": 1e-3,
+}
 # planner and controller see the same window in every task: 2 observed frames, 14 planned ones; 4 actions of each plan
 # are executed
 HISTORY, HORIZON, REPLAN_INTERVAL = 2, 14, 4
@@ -69,6 +78,8 @@ class Defaults:
         channels (tuple of int): widths of the planner's U-Net.
         relative (bool): plans are displacements from the present state.
         recovery_sigma (float): typical shift of the recovery augmentation, in the units of the robot's columns.
+        planner (dict): options of `koap train` for the planner's network and its training that are used together where
+            no denoiser is asked for: ``denoiser``, its sizes, ``batch_size``, ``planner_learning_rate``.
         recovery_response (str): how that augmentation leads back, ``"first_order"`` or ``"second_order"``.
         released_epochs (int): epochs of a controller in KOAP's first public code.
 
@@ -84,6 +95,7 @@ class Defaults:
     relative: bool = True
     recovery_sigma: float = 0.004
     recovery_response: str = "first_order"
+    planner: Mapping[str, Any] = field(default_factory=dict)
     released_epochs: int = 400
 
 

@@ -54,9 +54,9 @@ class TrainConfig:
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: controller updates.
-        batch_size: windows per planner update.
+        batch_size: windows per planner update (default: 128, or the task's).
         controller_batch_size: windows per controller update.
-        planner_learning_rate: peak learning rate of the planner.
+        planner_learning_rate: peak learning rate of the planner (default: 3e-3, or the task's).
         controller_learning_rate: peak learning rate of the controller.
         denoiser: "unet", "mlp", "film" (an mlp that the condition also scales and shifts), "transformer" or "released"
             (11.9 M parameters).
@@ -129,11 +129,11 @@ class TrainConfig:
     decoder: str | None = None
     steps: int | None = None
     controller_steps: int = 500
-    batch_size: int = 128
+    batch_size: int | None = None
     controller_batch_size: int = 256
-    planner_learning_rate: float = 3e-3
+    planner_learning_rate: float | None = None
     controller_learning_rate: float = 1e-3
-    denoiser: str = "unet"
+    denoiser: str | None = None
     denoiser_width: int | None = None
     denoiser_depth: int | None = None
     condition_octaves: int | None = None
@@ -278,17 +278,26 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     )
 
 
+_UNET = {"denoiser": "unet", "batch_size": 128, "planner_learning_rate": 3e-3}
+
+
 def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
-    defaults = {
-        "steps": task.defaults.planner_steps,
-        "recovery_sigma": task.defaults.recovery_sigma,
-        "recovery_response": task.defaults.recovery_response,
-        "episodes": task.defaults.demonstrations,
-        "relative": task.defaults.relative,
-        "channels": task.defaults.channels,
-        "validation_fraction": default_fraction(task),
-        "forecast": True if task.env is None and not options.released_settings else None,
-    }
+    # a network that is asked for by name, or that of the first public code, comes with its own sizes
+    own = task.defaults.planner if options.denoiser is None and not options.released_settings else {}
+    defaults = (
+        _UNET
+        | dict(own)
+        | {
+            "steps": task.defaults.planner_steps,
+            "recovery_sigma": task.defaults.recovery_sigma,
+            "recovery_response": task.defaults.recovery_response,
+            "episodes": task.defaults.demonstrations,
+            "relative": task.defaults.relative,
+            "channels": task.defaults.channels,
+            "validation_fraction": default_fraction(task),
+            "forecast": True if task.env is None and not options.released_settings else None,
+        }
+    )
     return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
 
 

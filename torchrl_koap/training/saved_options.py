@@ -32,6 +32,8 @@ PLANNER = {
     "frequencies": int,
     "dropout": float,
     "forecast": bool,
+    "frame": dict,
+    "plan_steps": tuple[int, ...],
 }
 CONTROLLER = {
     "method": str,
