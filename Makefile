@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/demo
 
-.PHONY: setup demo test slow lint clean
+.PHONY: setup demo test slow faults lint types docs tutorials dist clean
 
 setup: $(VENV)/.ready
 
@@ -27,9 +27,32 @@ test: setup
 slow: setup
 	$(BIN)/python -m pytest -q -m slow
 
+# every fault of the ledger, and the state machines at length
+faults: setup
+	$(BIN)/python -m pytest -n 2 -q -m "faults or not faults" tests/faults
+	$(BIN)/python -m pytest -n 2 -q -m faults tests/commands tests/studies
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
+types: setup
+	$(BIN)/mypy
+
+# the site in build/docs/html, without network; warnings are errors, links inside are checked
+docs: setup
+	$(BIN)/python -m sphinx -W --keep-going -q -j auto -d build/docs/doctrees docs build/docs/html
+	@echo "site: build/docs/html/index.html"
+
+# runs every tutorial and keeps output and pictures for the site
+tutorials: setup
+	$(BIN)/python docs/extensions/run_tutorials.py
+
+# wheel and sdist, tried in a fresh environment outside of the repository
+dist: setup
+	rm -rf dist build/lib
+	$(BIN)/python -m build --no-isolation --outdir dist .
+	$(BIN)/python tests/try_dist.py dist
+
 clean:
-	rm -rf $(VENV) runs build *.egg-info
+	rm -rf $(VENV) runs build dist docs/generated *.egg-info

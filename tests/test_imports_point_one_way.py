@@ -45,7 +45,7 @@ def imports(node: ast.AST, inside: bool = False) -> Iterator[tuple[str, bool]]:
 
 def test_only_rooms_and_three_files_are_at_the_top():
     names = {path.name for path in PACKAGE.iterdir() if path.name != "__pycache__"}
-    assert names == {"__init__.py", *(f"{name}.py" for name in BASE), *(set(MAY_IMPORT) - BASE)}
+    assert names == {"__init__.py", "py.typed", *(f"{name}.py" for name in BASE), *(set(MAY_IMPORT) - BASE)}
 
 
 @pytest.mark.parametrize("room", MAY_IMPORT)

@@ -13,7 +13,7 @@ import pytest
 import tyro
 
 import torchrl_koap
-from torchrl_koap.commands.cli import Subcommand
+from torchrl_koap.commands.subcommands import Subcommand
 from torchrl_koap.reports import pictures
 
 ROOT = Path(__file__).parents[1]

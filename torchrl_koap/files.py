@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Saving that never damages an earlier result: write aside, then rename.
+"""Saving that never damages an earlier result (write aside, then rename), and reading that always comes to an end.
 
 A full disk or an interrupt in the middle of a save leaves what was there before, and no half-written rest.
 """
@@ -7,13 +7,94 @@ A full disk or an interrupt in the middle of a save leaves what was there before
 from __future__ import annotations
 
 import contextlib
+import errno
+import hashlib
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import filelock
+
+_NO_PLACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
+LARGEST = 1 << 28  # bytes of a file that is read as a whole: hundreds of times what any of them has
+
+
+def check_file(path: str | Path, *, largest: int = LARGEST) -> None:
+    """Refuses what is no plain file (a pipe never ends, nor does a device), and files beyond all measure.
+
+    Args:
+        path (str or Path): the file; a link is followed.
+
+    Keyword Args:
+        largest (int): bytes it may have.
+
+    Raises:
+        OSError: naming the file and what it is.
+
+    Examples:
+        >>> from torchrl_koap.files import check_file
+        >>> try:
+        ...     check_file("/dev/null")
+        ... except OSError as error:
+        ...     str(error)
+        '/dev/null is no plain file'
+    """
+    about = os.stat(path)
+    if not stat.S_ISREG(about.st_mode):
+        raise OSError(f"{path} is no plain file")
+    if about.st_size > largest:
+        raise OSError(f"{path} has {about.st_size:,} bytes; more than {largest:,} are not read")
+
+
+def read_bytes(path: str | Path, *, largest: int = LARGEST) -> bytes:
+    """The content of a plain file.
+
+    Args:
+        path (str or Path): the file.
+
+    Keyword Args:
+        largest (int): bytes it may have.
+
+    Raises:
+        OSError: as :func:`check_file`, or if it cannot be read.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from torchrl_koap.files import read_bytes
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "a").write_bytes(b"content")
+        ...     read_bytes(f"{folder}/a")
+        b'content'
+    """
+    check_file(path, largest=largest)
+    return Path(path).read_bytes()
+
+
+def sha256_of(path: str | Path) -> str:
+    """Checksum of a file of any size, in hexadecimal.
+
+    Args:
+        path (str or Path): the file.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from torchrl_koap.files import sha256_of
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = (Path(folder) / "empty").write_bytes(b"")
+        ...     sha256_of(f"{folder}/empty")[:12]
+        'e3b0c44298fc'
+    """
+    check_file(path, largest=1 << 40)
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while part := file.read(1 << 20):
+            digest.update(part)
+    return digest.hexdigest()
 
 
 @contextlib.contextmanager
@@ -25,6 +106,9 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
 
     Yields:
         Path: a new, empty file in the same folder.
+
+    Raises:
+        OSError: naming the file, if the disk is full or refuses; what was there before is kept.
 
     Examples:
         >>> import tempfile
@@ -39,16 +123,17 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, aside = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-    os.close(handle)
-    aside = Path(aside)
-    try:
-        yield aside
-        aside.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
-        os.replace(aside, path)
-    except BaseException:
-        aside.unlink(missing_ok=True)
-        raise
+    with _naming(path):
+        handle, aside = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+        os.close(handle)
+        aside = Path(aside)
+        try:
+            yield aside
+            aside.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
+            os.replace(aside, path)
+        except BaseException:
+            aside.unlink(missing_ok=True)
+            raise
 
 
 @contextlib.contextmanager
@@ -82,6 +167,18 @@ def replacing_folder(path: str | Path) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(aside, ignore_errors=True)
         raise
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Says which file could not be written, and that nothing was lost."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _NO_PLACE:
+            raise
+        kept = "what was there before is kept" if path.exists() else "nothing of it is left"
+        raise OSError(error.errno, f"{path} could not be written: {error.strerror}; {kept}") from error
 
 
 class LockedError(RuntimeError):

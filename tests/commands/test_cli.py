@@ -510,7 +510,8 @@ def test_a_full_disk_damages_no_earlier_evaluation(copied_run, monkeypatch, caps
     monkeypatch.setattr(os, "replace", full_disk)
     assert koap("eval", copied_run, "--episodes", 2, "--threads", 1) == 1
     line = capsys.readouterr().err.strip().splitlines()[-1]
-    assert line == f"koap: [Errno 28] No space left on device ({HINT})"
+    where = f"{copied_run / 'rollouts.safetensors'} could not be written: No space left on device"
+    assert line == f"koap: [Errno 28] {where}; what was there before is kept ({HINT})"
     assert contents(copied_run) == before
 
 

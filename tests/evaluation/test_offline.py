@@ -29,7 +29,7 @@ def arm(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(arm, tmp_path_factory):
-    return train_arm(tmp_path_factory.mktemp("runs") / "run", arm)
+    return train_arm(tmp_path_factory.mktemp("runs") / "run", arm, forecast=False)
 
 
 def test_a_run_of_seven_joints(run):
@@ -47,6 +47,16 @@ def test_a_run_of_seven_joints(run):
     assert result["control_hz"] > 0 and not (run / "rollouts.safetensors").exists()
     # 20 updates make no planner, and it is said
     assert any(fault.startswith("plans are worse than standing still (columns in rad)") for fault in result["faults"])
+
+
+def test_a_forecast_is_the_default_and_carries_over(tmp_path):
+    """To the validation trajectories, whose goals the planner has not seen; after 20 updates already."""
+    arm = save_arm(tmp_path / "arm", count=30, joints=2)
+    run = train_arm(tmp_path / "run", arm, method="linear")
+    assert json.loads((run / "config.json").read_text())["planner"]["forecast"] is True
+    result = evaluate(run, FEW)
+    assert result["relative_plan_error"] < 0.1
+    assert not any(fault.startswith("plans") for fault in result["faults"])
 
 
 def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):
@@ -100,10 +110,26 @@ def test_columns_of_several_units_and_a_method_without_a_closed_form(tmp_path):
     assert (run / "plots" / "plan_errors.png").exists() and not (run / "plots" / "action_errors.png").exists()
 
 
+def test_a_policy_of_its_own_is_judged_by_its_chunks(tmp_path, capsys):
+    arm = save_arm(tmp_path / "arm", labelled=6, joints=2)
+    run = train_arm(tmp_path / "run", arm, method="dp", label_count=3, steps=30)
+    assert main(["eval", str(run), "--samples", "3", "--threads", "1"]) == 0
+    assert "whole chunks of actions, energy score (mrad): policy" in capsys.readouterr().out
+    result = json.loads((run / "eval.json").read_text())
+    outside = result["action_errors"]["outside_budget"]
+    assert result["action_errors_on"] == "outside_budget" and outside["trajectories"] == 3
+    assert outside["labels"] == 3 * 26 and result["relative_action_error"] == outside["relative"] > 0
+    (row,) = outside["chunk"]["unit"]
+    assert row["columns"] == ["dq0", "dq1"] and len(row["policy"]["best_of"]["per_step"]) == 14
+    assert row["policy"]["best_of"]["overall"] > 0
+    assert "trained again without each trajectory" in result["action_errors"]["left_out"]["note"]
+    assert (run / "plots" / "action_errors.png").exists()
+
+
 def test_all_trajectories_labelled(tmp_path):
     """One is held out from the planner; its labels still count."""
     arm = save_arm(tmp_path / "arm", labelled=10, joints=2)
-    result = evaluate(train_arm(tmp_path / "run", arm, label_fraction=1.0), FEW)
+    result = evaluate(train_arm(tmp_path / "run", arm), FEW)  # every label there is
     assert result["plan_errors"]["trajectories"] == 1 and result["action_errors"]["left_out"]["trajectories"] == 10
 
 

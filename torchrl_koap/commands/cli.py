@@ -1,117 +1,154 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The command line ``koap``: sub-commands are dataclasses, their fields are the options, calling one does the work."""
+"""The command line ``koap``: whatever goes wrong, one line on stderr says what, and the exit status says so too.
+
+The commands themselves are imported when they are needed, so that a signal or a wrong setting while that happens is
+met here as well.
+"""
 
 from __future__ import annotations
 
-import json
+import contextlib
 import os
+import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from torchrl_koap import __version__
-from torchrl_koap.commands.bench import Bench
-from torchrl_koap.commands.convert import Convert
-from torchrl_koap.commands.curve import Curve
-from torchrl_koap.commands.demos import Demos
-from torchrl_koap.commands.doctor import Doctor, Validate
-from torchrl_koap.commands.eval import Eval
-from torchrl_koap.commands.export import Export
-from torchrl_koap.commands.inspect import Inspect
-from torchrl_koap.commands.latency import Latency
-from torchrl_koap.commands.suggest import Suggest
-from torchrl_koap.commands.train import Train
-from torchrl_koap.training.progress import without_progress_bars
+from torchrl_koap.commands.interrupts import describe_interrupt, ending_at_once, ending_like_ctrl_c
+from torchrl_koap.commands.printing import HINT, complain, discard_output, one_line, show
+from torchrl_koap.commands.sanity import check_options
 
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
-EXPECTED = (ValueError, RuntimeError, KeyError, OSError)
-HINT = "KOAP_TRACEBACK=1 shows where"
+EXPECTED = (ValueError, RuntimeError, KeyError, OSError, MemoryError)
 DESCRIPTION = "Imitation learning with few action labels. `koap --version` prints the version."
+_MAY_BE_EMPTY = ("--action-units", "--state-units")  # the unit of a number without one
+_LEAST_COLUMNS = 40  # the help of a terminal with a single column never ends
 
-Subcommand = (
-    Annotated[Convert, tyro.conf.subcommand("convert")]
-    | Annotated[Demos, tyro.conf.subcommand("demos")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Eval, tyro.conf.subcommand("eval")]
-    | Annotated[Curve, tyro.conf.subcommand("curve")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-    | Annotated[Inspect, tyro.conf.subcommand("inspect")]
-    | Annotated[Suggest, tyro.conf.subcommand("suggest")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Latency, tyro.conf.subcommand("latency")]
-    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
-    | Annotated[Validate, tyro.conf.subcommand("validate")]
-)
+
+class _ReadEnough(Exception):
+    """Whoever reads what is printed has gone."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a sub-command; returns the exit status.
 
-    It is 1 for a job that could not be done, or not all of it, and 130 for one that was interrupted, each with one
-    line that says why. A wrong call leaves with 2. ``KOAP_TRACEBACK=1`` shows where an error is from.
+    It is 1 for a job that could not be done, or not all of it, and 128 and the signal's number for one that was
+    interrupted (130 after Ctrl-C), each with one line that says why. A wrong call leaves with 2. ``KOAP_TRACEBACK=1``
+    shows where an error is from.
 
     Args:
         arguments (sequence of str, optional): the words of the command line. Default: those of the process.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if arguments == ["--version"]:
-        print(f"koap {__version__}")
-        return 0
-    command = tyro.cli(Subcommand, args=arguments, prog="koap", description=DESCRIPTION)
     try:
-        with without_progress_bars() if command.quiet else nullcontext():
-            result = command()
-    except EXPECTED as error:
-        if os.environ.get("KOAP_TRACEBACK"):
+        with ending_like_ctrl_c():
+            return _run(arguments)
+    except _ReadEnough:  # `koap ... | head`
+        discard_output()
+        return 141
+    except KeyboardInterrupt as error:
+        message, status = describe_interrupt(error)
+        complain(message)
+        return status
+    except Exception as error:
+        if os.environ.get("KOAP_TRACEBACK") or not _is_expected(error):
             raise
-        print(f"koap: {one_line(error)} ({HINT})", file=sys.stderr)
+        complain(f"{one_line(error)} ({HINT})")
         return 1
-    except KeyboardInterrupt:
-        print(
-            "koap: interrupted; `koap train --resume` goes on from its last checkpoint, `koap curve` when called again",
-            file=sys.stderr,
-        )
-        return 130
+
+
+def _run(arguments: Sequence[str]) -> int:
+    if arguments == ["--version"]:
+        with _output():
+            print(f"koap {__version__}")
+        return 0
+    _check_words(arguments)
+    tyro, subcommand, without_progress_bars = _commands()
+    with _output(), _wide_enough():
+        command = tyro.cli(subcommand, args=arguments, prog="koap", description=DESCRIPTION)
+    check_options(command)
+    with without_progress_bars() if command.quiet else nullcontext():
+        result = command()
     if not command.quiet:
-        show(result)
+        with _output():
+            show(result)
     return 1 if isinstance(result, Mapping) and result.get("failed") else 0
 
 
-def one_line(error: Exception) -> str:
-    """The message of an error, the problems it lists one after the other."""
-    message = str(error.args[0] if isinstance(error, KeyError) and error.args else error)
-    return "; ".join(line.strip().removeprefix("- ") for line in message.splitlines()) or type(error).__name__
+def _check_words(arguments: Sequence[str]) -> None:
+    """Refuses empty words: an unset variable of the shell would silently mean the present folder."""
+    option = arguments[0] if arguments else ""
+    for word in arguments:
+        if word.startswith("--"):
+            option = word.partition("=")[0]
+        if (word == "" or word == f"{option}=") and option not in _MAY_BE_EMPTY:
+            raise ValueError(
+                f"{option} is followed by an empty word: wanted a value; is a variable of the shell not set?"
+            )
 
 
-def show(result: Any) -> None:
-    """Prints a result: a table of names and values, without the rows of single episodes."""
-    if not isinstance(result, Mapping):
-        print(result)
+def _commands() -> tuple[Any, Any, Any]:
+    """What takes seconds to import."""
+    if sys.flags.optimize > 1:
+        raise RuntimeError(
+            "Python runs with -OO (or PYTHONOPTIMIZE=2), which removes docstrings that torch and the options of"
+            " `koap` are made of; use -O or nothing"
+        )
+    loaded = "torchrl_koap.commands.subcommands" in sys.modules
+    with nullcontext() if loaded else ending_at_once():
+        try:
+            import tyro
+
+            from torchrl_koap.commands.subcommands import Subcommand
+            from torchrl_koap.training.progress import without_progress_bars
+        except (ImportError, AttributeError) as error:
+            graphics = os.environ.get("MUJOCO_GL")
+            hint = f"; is MUJOCO_GL={graphics} possible on this machine?" if graphics else ""
+            raise RuntimeError(f"a part of the installation cannot be imported: {error}{hint}") from error
+        except ValueError as error:
+            backend = os.environ.get("MPLBACKEND")
+            if backend and backend in str(error):
+                raise ValueError(f"MPLBACKEND={backend} is no backend of matplotlib; unset it") from error
+            raise
+    return tyro, Subcommand, without_progress_bars
+
+
+def _is_expected(error: Exception) -> bool:
+    # the simulator's own error for a machine that has too little memory or no graphics derives from nothing else
+    return isinstance(error, EXPECTED) or type(error).__module__.partition(".")[0] == "mujoco"
+
+
+@contextlib.contextmanager
+def _output() -> Iterator[None]:
+    """What is printed inside has arrived when the block ends, or an error says that it has not."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        raise _ReadEnough from None
+    except OSError as error:
+        discard_output()
+        raise OSError(f"the output could not be written: {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def _wide_enough() -> Iterator[None]:
+    """Inside the block a terminal has a few columns at least."""
+    earlier = os.environ.get("COLUMNS")
+    if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
+        yield
         return
-    lines = [line for key, value in result.items() if key != "episode" for line in _lines(key, value)]
-    width = min(max(len(name) for name, _ in lines), 45)
-    for name, text in lines:
-        print(f"{name:<{width}}  {text}")
-
-
-def _lines(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """A line per value; a mapping of plain values is one line, a nested one a line for each of its entries."""
-    if isinstance(value, Mapping) and any(isinstance(entry, Mapping) for entry in value.values()):
-        for key, entry in value.items():
-            yield from _lines(f"{name} {key}", entry)
-    elif isinstance(value, Mapping):
-        yield name, json.dumps({key: _short(entry) for key, entry in value.items()})
-    else:
-        yield name, _short(value)
-
-
-def _short(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_short(entry) for entry in value]
-    return float(f"{value:.4g}") if isinstance(value, float) else value
+    os.environ["COLUMNS"] = str(_LEAST_COLUMNS)
+    try:
+        yield
+    finally:
+        os.environ.pop("COLUMNS")
+        if earlier is not None:
+            os.environ["COLUMNS"] = earlier
 
 
 if __name__ == "__main__":

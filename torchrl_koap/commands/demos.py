@@ -7,14 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchrl_koap.commands.command import Command
-from torchrl_koap.data import save_ted
-from torchrl_koap.envs.experts.demonstrations import (
-    BATCH_SIZE,
-    RecordingReport,
-    episodes_to_ted,
-    record_episodes,
-    write_raw_episodes,
-)
+from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
+from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE
+from torchrl_koap.envs.experts.recording_report import RecordingReport
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
@@ -24,6 +19,8 @@ from torchrl_koap.training.progress import count_up_to, progress_bar
 class Demos(Command):
     """Record scripted demonstrations, as memory-mapped TED and as D3IL raw pickles.
 
+    Every demonstration is written as it comes (OUT/unfinished); the same command goes on with an interrupted recording.
+
     Attributes:
         out: folder to write: OUT/ted and OUT/raw. Must not hold demonstrations yet.
         task: name of the task.
@@ -31,6 +28,8 @@ class Demos(Command):
         seed: seed of the players' variation.
         threads: simulator threads.
         batch_size: episodes played at once; the demonstrations do not depend on it.
+        disturbance: share of the demonstrations in which the operator is disturbed now and then (pushes, slips, late
+            turns); those from which it recovers are kept, and OUT/ted/about.json says how often it did.
         plugins: modules that register tasks; imported before anything else.
     """
 
@@ -40,30 +39,31 @@ class Demos(Command):
     seed: int = 0
     threads: int = 2
     batch_size: int = BATCH_SIZE
+    disturbance: float = 0.0
     plugins: Plugins = ()
 
     def __call__(self) -> RecordingReport:
         """Records and writes; returns the account of attempts.
 
         Raises:
-            FileExistsError: if the folder holds demonstrations already.
+            FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.
             ValueError: if the task has no environment or no scripted expert.
+            RecordingError: if the operator fails again and again.
         """
         load_plugins(self.plugins)
         task = get_task(self.task)
         if task.env is None or task.expert is None:
             lacks = "environment" if task.env is None else "scripted expert"
             raise ValueError(f"task {task.name!r} has no {lacks}: there is nothing to record demonstrations with")
-        for name in ("ted", "raw"):
-            if (self.out / name).exists():
-                raise FileExistsError(f"{self.out / name} exists already; choose another --out")
         episodes = task.defaults.demonstrations if self.episodes is None else self.episodes
         with progress_bar(episodes, "recording", unit="episode") as bar:
-            raw, report = record_episodes(
-                task.name, episodes, self.seed, self.threads, count_up_to(bar), batch_size=self.batch_size
+            return record_to_folder(
+                self.out,
+                task,
+                episodes,
+                self.seed,
+                self.threads,
+                count_up_to(bar),
+                batch_size=self.batch_size,
+                disturbance=self.disturbance,
             )
-        data = episodes_to_ted(raw, task.name)
-        save_ted(data, self.out / "ted", task=task.source, notes={"seed": self.seed, "modes": list(report.modes)})
-        if task.converter is not None:
-            write_raw_episodes(self.out / "raw", raw)
-        return report

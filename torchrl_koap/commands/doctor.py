@@ -7,30 +7,53 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
 
 from torchrl_koap.commands.command import Command
+from torchrl_koap.data.d3il.conversion import find_raw_files
+from torchrl_koap.data.doubts import find_doubts
+from torchrl_koap.data.lerobot.files import is_lerobot
+from torchrl_koap.evaluation import load_run
 from torchrl_koap.keys import validate
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.training import RunDirectory, RunDirectoryError
+from torchrl_koap.training.checkpoints import load_tensors
 from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.training.digests import DIGESTS
 from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.training.progress import count_up_to, progress_bar
+
+_LATER = (DIGESTS, "eval.json", "inspect.json", "suggestions.json")  # files that a run may have
 
 
 @dataclass(kw_only=True)
 class Doctor(Command):
-    """Print versions, processors, graphics and optional packages: the first thing to attach to a question."""
+    """Print versions, processors, graphics and optional packages, or check every file of a run.
+
+    Attributes:
+        run: run directory of `koap train` to check instead of this machine.
+    """
+
+    run: tyro.conf.Positional[Path | None] = None
 
     def __call__(self) -> dict[str, str]:
-        """Facts about this machine, name to value."""
-        return machine_facts()
+        """Facts about this machine, or about a run, name to value.
+
+        Raises:
+            RunDirectoryError: with all problems of a run.
+        """
+        return machine_facts() if self.run is None else check_run(self.run)
 
 
 @dataclass(kw_only=True)
 class Validate(Command):
-    """Check a folder of demonstrations and report every problem found.
+    """Check a folder of demonstrations and report every problem found, and what is right in form but doubtful.
 
     Attributes:
         dataset: folder of D3IL raw pickles, a LeRobot data set, or a folder written by `koap demos`.
@@ -50,15 +73,33 @@ class Validate(Command):
         """
         load_plugins(self.plugins)
         task = get_task(self.task)
-        data = validate(load_demonstrations(self.dataset, task))
+        with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:
+            data = validate(load_demonstrations(self.dataset, task, progress=count_up_to(bar)))
+        units = task.observation_units or _position_units(task)
+        doubts = find_doubts(data, names=_files(self.dataset, task), units=units)
         lengths = data["episode"].unique(return_counts=True)[1]
         return {
             "trajectories": str(len(lengths)),
             "steps": str(len(data)),
             "shortest, longest": f"{int(lengths.min())}, {int(lengths.max())}",
             "observation, action columns": f"{data['observation'].shape[-1]}, {data['action'].shape[-1]}",
-            "verdict": "no problem found",
+            **{f"doubt {number}": doubt for number, doubt in enumerate(doubts, 1)},
+            "verdict": f"no problem found, {len(doubts)} doubt(s)" if doubts else "no problem found",
         }
+
+
+def _position_units(task: Task) -> list[str]:
+    """Metres for the columns that are positions for certain; the others have units of their own."""
+    position = task.observation[task.position]
+    inside = range(*position.indices(task.observation_dim))
+    return ["m" if task.env is not None and column in inside else "" for column in range(task.observation_dim)]
+
+
+def _files(dataset: str, task: Task) -> list[str]:
+    """Names of the files that trajectories are from, where each has its own."""
+    if dataset == "scripted" or (Path(dataset) / "ted").is_dir() or is_lerobot(dataset):
+        return []
+    return [str(file) for file in find_raw_files(task.name, dataset)[1]]
 
 
 def machine_facts() -> dict[str, str]:
@@ -86,6 +127,46 @@ def machine_facts() -> dict[str, str]:
         found = importlib.util.find_spec(module) is not None
         facts[f"extra {extra}"] = "installed" if found else f"not installed (pip install 'torchrl_koap[{extra}]')"
     return facts
+
+
+def check_run(folder: Path) -> dict[str, str]:
+    """Reads every file of a run that a command would read, and compares those that have checksums with them.
+
+    Args:
+        folder (Path): run directory.
+
+    Returns:
+        dict: file to what was found.
+
+    Raises:
+        RunDirectoryError: with all problems.
+    """
+    run, problems, found = RunDirectory(folder), [], {}
+    for name in ("config.json", "summary.json", *_LATER):
+        if name in _LATER and not (folder / name).exists():
+            continue
+        problem = _problem(lambda name=name: run.read_json(name))
+        found[name] = "readable"
+        problems += problem
+    if not problems:  # its networks are made of what config.json says
+        problems += _problem(lambda: load_run(folder))
+    problems += _problem(run.read_metrics)
+    for path in sorted([*folder.glob("*.safetensors"), *folder.glob("checkpoints/*.safetensors")]):
+        problems += _problem(lambda path=path: load_tensors(path))
+        found[str(path.relative_to(folder))] = "readable"
+    if problems:
+        said = "; ".join(dict.fromkeys(problems))
+        raise RunDirectoryError(f"{folder}: {len(dict.fromkeys(problems))} problem(s): {said}")
+    found["checksums"] = "as the training left it" if (folder / DIGESTS).exists() else "none were kept (an older run)"
+    return found | {"verdict": "no problem found"}
+
+
+def _problem(look: Callable[[], Any]) -> list[str]:
+    try:
+        look()
+    except (ValueError, OSError, RuntimeError) as error:
+        return [str(error)]
+    return []
 
 
 def _rendering() -> str:

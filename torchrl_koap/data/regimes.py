@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Harder observations of the same demonstrations: noise, wide redundant columns, distractors, small pictures.
 
-A regime changes what is *observed*; motions and actions stay as they were recorded. All noise comes from a seed, and the
-weights of an embedding from the regime alone: all seeds see the same sensor.
+A regime changes what is *observed*; motions and actions stay as they were recorded. All noise comes from a seed, and
+the weights of an embedding from the regime alone: all seeds see the same sensor.
 """
 
 from __future__ import annotations

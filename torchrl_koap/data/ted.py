@@ -12,7 +12,6 @@ The folder is written aside and renamed. When it is read, every file is compared
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,8 +21,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 
 from torchrl_koap import keys
+from torchrl_koap.data.ted_guard import steps_problem
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.files import replacing_folder
+from torchrl_koap.files import read_bytes, replacing_folder, sha256_of
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.json_format import plain_task_from_json
 from torchrl_koap.tasks.registry import find_task
@@ -107,10 +107,10 @@ def read_about(folder: str | Path) -> dict[str, Any]:
     """
     path = Path(folder) / _ABOUT
     try:
-        about = json.loads(path.read_text())
+        about = json.loads(read_bytes(path))
     except FileNotFoundError:
         raise DamagedDataError(f"{folder} holds no data set ({_ABOUT} is missing)") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DamagedDataError(f"{path} cannot be read: {error}") from error
     if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("sha256"), dict):
         raise DamagedDataError(f"{path} is no description of a data set in format {FORMAT}")
@@ -160,7 +160,7 @@ def load_ted(folder: str | Path, *, task: str | None = None, memmap: bool = True
         TensorDict: flat data ``[N]``.
 
     Raises:
-        DamagedDataError: if files are missing, changed, or not those that were written.
+        DamagedDataError: if files are missing, changed, not those that were written, or lead out of the folder.
         ValueError: if the data belong to another task.
 
     Examples:
@@ -170,6 +170,9 @@ def load_ted(folder: str | Path, *, task: str | None = None, memmap: bool = True
     about = read_about(folder)
     if task is not None and about["task"] != task:
         raise ValueError(f"{folder} holds demonstrations of {about['task']!r}, wanted {task!r}")
+    problem = steps_problem(folder / _STEPS)
+    if problem is not None:
+        raise DamagedDataError(problem)
     found = _checksums(folder)
     for name in sorted(found.keys() | about["sha256"].keys()):
         if found.get(name) != about["sha256"].get(name):
@@ -186,7 +189,7 @@ def load_ted(folder: str | Path, *, task: str | None = None, memmap: bool = True
 
 def _checksums(folder: Path) -> dict[str, str]:
     return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        path.relative_to(folder).as_posix(): sha256_of(path)
         for path in sorted((folder / _STEPS).rglob("*"))
         if path.is_file()
     }

@@ -242,6 +242,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
     """
     config = SuggestConfig() if config is None else config
     lookup(CRITERIA, config.criterion, "criterion")
+    if config.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {config.seed}")
     set_up_torch(config.threads, "cpu")
     load_plugins(config.plugins)
     trained = load_run(run)

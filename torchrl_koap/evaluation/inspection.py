@@ -108,6 +108,8 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
     for name in ("episodes", "latent_steps"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(config, name)}")
+    if config.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {config.seed}")
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
     trained = load_run(run)

@@ -11,9 +11,11 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import controller_view
+from torchrl_koap.evaluation.chunk_errors import errors_of_chunks
 from torchrl_koap.evaluation.label_errors import errors_left_out, errors_outside_budget
 from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.training.closed_form import likely_axes
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.run_directory import RunDirectoryError
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 KIND = "offline"
 SPLITS = ("outside_budget", "left_out")
+_CHUNKS = ("policy", "mean_action")
 
 
 def evaluate_offline(
@@ -32,7 +35,8 @@ def evaluate_offline(
     Plans are scored on the validation trajectories, which the planner has not seen
     (:func:`~torchrl_koap.evaluation.plan_errors.plan_errors`). Actions are decoded from recorded states and compared
     with labels outside the budget, if there are any, and with those inside it, a trajectory left out at a time
-    (:mod:`~torchrl_koap.evaluation.label_errors`).
+    (:mod:`~torchrl_koap.evaluation.label_errors`). A policy of its own is asked for chunks of actions in the situations
+    outside the budget instead (:mod:`~torchrl_koap.evaluation.chunk_errors`).
 
     Args:
         trained (TrainedRun): the run.
@@ -61,7 +65,7 @@ def evaluate_offline(
             " trained on: its trajectories or labels differ"
         )
     plan = _plans(trained, data, samples=samples, plans=plans, seed=seed)
-    action = _actions(trained, data, labelled)
+    action = _actions(trained, data, labelled, samples=samples, chunks=plans, seed=seed)
     split = next((name for name in SPLITS if "relative" in action[name]), None)
     return {
         "kind": KIND,
@@ -106,18 +110,26 @@ def _plans(trained: TrainedRun, data: TensorDictBase, **options: Any) -> dict[st
     return {"trajectories": len(held_out)} | plan_errors(trained.planner, unseen, trained.task, **options)
 
 
-def _actions(trained: TrainedRun, data: TensorDictBase, labelled: TensorDictBase) -> dict[str, Any]:
+def _actions(trained: TrainedRun, data: TensorDictBase, labelled: TensorDictBase, **options: Any) -> dict[str, Any]:
     task = trained.task
     if trained.planner is None:
-        note = {"note": f"method {trained.config['method']!r} is a policy of its own: it decodes no recorded states"}
-        return dict.fromkeys(SPLITS, note)
+        outside = errors_of_chunks(trained.controller, data, labelled, task, **options)
+        note = f"method {trained.config['method']!r} would have to be trained again without each trajectory"
+        hint = "; train it on fewer labels than there are (--label-count): the others tell how good it is"
+        return {"outside_budget": outside, "left_out": {"note": note + (hint if "note" in outside else "")}}
     view, seen = (
         controller_view(part, trained.columns, action_targets=task.action_targets) for part in (data, labelled)
     )
     controller = trained.controller.cpu()
     return {
         "outside_budget": errors_outside_budget(controller, view, seen, task),
-        "left_out": errors_left_out(controller, seen, task, closed_form=trained.method.closed_form),
+        "left_out": errors_left_out(
+            controller,
+            seen,
+            task,
+            closed_form=trained.method.closed_form,
+            guessed_axes=likely_axes(task, trained.columns),
+        ),
     }
 
 
@@ -191,4 +203,16 @@ def describe_offline(result: Mapping[str, Any]) -> str:
                 f"{name.replace('_', ' ')} {factor * row[name]:.4g}" for name in ("controller", "ridge", "mean_action")
             ]
             lines.append(f"{head}, RMSE{f' ({shown})' if shown else ''}: {', '.join(values)}")
+        lines += _describe_chunks(action[split].get("chunk", {}))
     return "\n".join([*lines, *(f"FAULT: {fault}" for fault in result["faults"])])
+
+
+def _describe_chunks(chunk: Mapping[str, Any]) -> list[str]:
+    lines = []
+    for row in chunk.get("unit", ()):
+        shown, factor = thousandths(row["unit"])
+        values = [f"{name.replace('_', ' ')} {factor * row[name]['energy_score']['overall']:.4g}" for name in _CHUNKS]
+        best = f"best of {chunk['samples']} {factor * row['policy']['best_of']['overall']:.4g}"
+        unit = f" ({shown})" if shown else ""
+        lines.append(f"whole chunks of actions, energy score{unit}: {', '.join(values)}; {best}")
+    return lines

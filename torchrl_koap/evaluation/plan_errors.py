@@ -7,6 +7,7 @@ another way than the demonstrator is no mistake. Scores of the whole distributio
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -98,13 +99,34 @@ def sample_plans(planner: StatePlanner, history: Tensor, *, samples: int = SAMPL
     Returns:
         Tensor: ``[S, N, H, d]``.
     """
+    return sample_sequences(planner.plan, planner.noise_shape, history, samples=samples, seed=seed)
+
+
+@torch.no_grad()
+def sample_sequences(
+    sample: Callable[[Tensor, Tensor], Tensor], noise_shape: Sequence[int], history: Tensor, *, samples: int, seed: int
+) -> Tensor:
+    """Several sampled sequences for each history.
+
+    Args:
+        sample (callable): ``sample(history [n, h, d], noise [n, *noise_shape]) -> [n, H, w]``.
+        noise_shape (sequence of int): of one draw.
+        history (Tensor): ``[N, h, d]``.
+
+    Keyword Args:
+        samples (int): sequences ``S`` per history.
+        seed (int): seed of their noise.
+
+    Returns:
+        Tensor: ``[S, N, H, w]``.
+    """
     generator = torch.Generator().manual_seed(seed)
-    plans = []
+    drawn = []
     for _ in range(samples):
-        noise = torch.randn(len(history), *planner.noise_shape, generator=generator).to(history)
+        noise = torch.randn(len(history), *noise_shape, generator=generator).to(history)
         parts = zip(history.split(_BATCH), noise.split(_BATCH), strict=True)
-        plans.append(torch.cat([planner.plan(part, drawn) for part, drawn in parts]))
-    return torch.stack(plans)
+        drawn.append(torch.cat([sample(part, start) for part, start in parts]))
+    return torch.stack(drawn)
 
 
 def plan_errors(
@@ -139,20 +161,7 @@ def plan_errors(
     models = {"planner": sample_plans(planner, past.to(device), samples=samples, seed=seed).cpu()}
     past, future = past.cpu(), future.cpu()
     models |= {name: plan[None] for name, plan in baseline_plans(past, horizon).items()}
-    rows, scores = [], []
-    for unit, columns in unit_groups(task.state_units).items():
-        row: dict[str, Any] = {"unit": unit, "columns": [task.state_names[column] for column in columns]}
-        per_situation = {}
-        for name, plan in models.items():
-            score = energy_score(plan[..., columns], future[..., columns])  # [N, H]
-            distance = (plan - future)[..., columns].norm(dim=-1)  # [S, N, H]
-            row[name] = {
-                "energy_score": _over_steps(score.mean().item(), score.mean(0)),
-                "best_of": _over_steps(distance.mean(-1).amin(0).mean().item(), distance.amin(0).mean(0)),
-            }
-            per_situation[name] = score.mean(-1)
-        rows.append(row)
-        scores.append(per_situation)
+    rows, scores = score_sequences(models, future, task.state_names, task.state_units)
     return {
         "situations": len(past),
         "horizon": horizon,
@@ -165,6 +174,44 @@ def plan_errors(
             for number in episode.unique().tolist()
         ],
     }
+
+
+def score_sequences(
+    models: Mapping[str, Tensor], true: Tensor, names: Sequence[str], units: Sequence[str]
+) -> tuple[list[dict[str, Any]], list[dict[str, Tensor]]]:
+    """Energy score and best of the samples, a row per unit.
+
+    Args:
+        models (mapping): name to sampled sequences ``[S, N, H, d]``.
+        true (Tensor): what was recorded, ``[N, H, d]``.
+        names (sequence of str): the columns.
+        units (sequence of str): their units.
+
+    Returns:
+        tuple: rows as in :func:`plan_errors`, and per unit the energy score of every model in every situation ``[N]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.evaluation.plan_errors import score_sequences
+        >>> (row,), _ = score_sequences({"still": torch.zeros(1, 5, 2, 1)}, torch.ones(5, 2, 1), ["q"], ["rad"])
+        >>> row["still"]["energy_score"]
+        {'overall': 1.0, 'per_step': [1.0, 1.0]}
+    """
+    rows, scores = [], []
+    for unit, columns in unit_groups(units).items():
+        row: dict[str, Any] = {"unit": unit, "columns": [names[column] for column in columns]}
+        per_situation = {}
+        for name, sampled in models.items():
+            score = energy_score(sampled[..., columns], true[..., columns])  # [N, H]
+            distance = (sampled - true)[..., columns].norm(dim=-1)  # [S, N, H]
+            row[name] = {
+                "energy_score": _over_steps(score.mean().item(), score.mean(0)),
+                "best_of": _over_steps(distance.mean(-1).amin(0).mean().item(), distance.amin(0).mean(0)),
+            }
+            per_situation[name] = score.mean(-1)
+        rows.append(row)
+        scores.append(per_situation)
+    return rows, scores
 
 
 def _over_steps(overall: float, per_step: Tensor) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task, get_task
 from torchrl_koap.tasks.json_format import import_strings_of, plain_task_from_json
 from torchrl_koap.training.builders import build_controller, method_named
-from torchrl_koap.training.checkpoints import CheckpointError, load_tensors, save_tensors
+from torchrl_koap.training.checkpoints import CheckpointError, check_weights, load_tensors, save_tensors
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.fit import Recipe
 from torchrl_koap.training.methods import Method
@@ -302,3 +302,4 @@ def _load_part(path: str | Path, name: str, network: nn.Module, tensors: dict[st
     except RuntimeError as error:
         problems = " ".join(str(error).split("\n", 1)[-1].split())
         raise CheckpointError(f"{path}: the weights do not fit the {name}: {problems}") from error
+    check_weights(path, network)

@@ -22,6 +22,8 @@ from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
 from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
 from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
 
+AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
+
 
 def make_policy(
     planner: StatePlanner,
@@ -89,7 +91,8 @@ def roll_out(
 
     Keyword Args:
         max_steps (int): control steps at most.
-        batch_size (int, optional): episodes at a time. Default: all. Outcomes do not depend on it.
+        batch_size (int, optional): episodes at a time. Default: all, but for :data:`AT_ONCE` at most, so that memory is
+            bounded. Outcomes do not depend on it.
         contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
         futures (Tensor, optional): recorded futures ``[E, steps, H, d]`` for a policy whose planner is a
             :class:`~torchrl_koap.modules.policies.replay.RecordedPlanner`.
@@ -106,7 +109,7 @@ def roll_out(
     if contexts is not None and len(contexts) != len(seeds):
         raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
     device = _device_of(policy)
-    size, episodes = batch_size or len(seeds), []
+    size, episodes = batch_size or min(len(seeds), AT_ONCE), []
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
@@ -117,6 +120,8 @@ def roll_out(
             noise = RecordedFutures(futures[begin : begin + size])
         else:
             noise = EpisodeNoise(part, policy.noise_shape, num_steps=max_steps)
+        if hasattr(policy, "attach"):  # it reads the simulation
+            policy.attach(env)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(

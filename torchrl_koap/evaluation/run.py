@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,13 @@ from torch import nn
 
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.evaluation.offline import evaluate_offline
-from torchrl_koap.evaluation.policy_files import PolicyDescription, assemble_policy, build_networks, read_policy
+from torchrl_koap.evaluation.policy_files import (
+    BLEND_DECAY,
+    PolicyDescription,
+    assemble_policy,
+    build_networks,
+    read_policy,
+)
 from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.lookup import lookup
@@ -24,11 +30,15 @@ from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
 from torchrl_koap.training.builders import method_named, set_up_torch
 from torchrl_koap.training.checkpoints import CheckpointError, load_weights, save_tensors
+from torchrl_koap.training.digests import check_digests
 from torchrl_koap.training.methods import Method
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.pretrained import PREFIX, copy_run, find_run
 from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+
+CONTROLLERS = ("learned", "oracle")
+MOST_EPISODES = 100_000
 
 
 @dataclass
@@ -39,6 +49,8 @@ class EvalConfig:
         episodes: number of rollouts; tasks with contexts take the fixed ones of the evaluation table in turn.
         rollouts_per_context: rollouts in each context; from 2 on the entropy of the modes per context is known.
         seed: seed of the first rollout; the others count on from it.
+        controller: "learned", or "oracle": the simulator's own inverse map, which takes the tool where the plan says:
+            what fails then is the planner's.
         execution: "feedback" (decode at every step) or "open_loop" (decode once per plan).
         solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
         solver_steps: another number of solver steps.
@@ -68,11 +80,12 @@ class EvalConfig:
     episodes: int = 60
     rollouts_per_context: int = 1
     seed: int = 100
+    controller: str = "learned"
     execution: str = "feedback"
     solver: str | None = None
     solver_steps: int | None = None
     replan_interval: int = REPLAN_INTERVAL
-    blend_decay: float = 0.8
+    blend_decay: float = BLEND_DECAY
     candidates: int | None = None
     choice: str = "quarter"
     out: Path | None = None
@@ -137,7 +150,8 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
         task (str, optional): refuse a run of another task.
 
     Raises:
-        RunDirectoryError: if the folder is no finished run, or one of another task than asked for.
+        RunDirectoryError: if the folder is no finished run, one of another task than asked for, or one whose files are
+            not those that its training left.
         CheckpointError: if weights are damaged, of another task or without their statistics.
         PluginError: if a plugin of the run cannot be imported.
     """
@@ -149,11 +163,16 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
         raise RunDirectoryError(f"{directory.path} was trained on task {trained_on!r}, not on {task!r}")
     config = directory.read_json("config.json")
     load_plugins(config.get("plugins") or ())
-    facts, method = task_of(config), method_named(entry)
-    planner, controller, columns = build_networks(facts, method, planner_entry, entry)
+    try:
+        facts, method = task_of(config), method_named(entry)
+        planner, controller, columns = build_networks(facts, method, planner_entry, entry)
+    except (KeyError, ValueError) as error:
+        problem = f"an entry {error} is missing" if isinstance(error, KeyError) else error
+        raise RunDirectoryError(f"{directory.path / 'config.json'} cannot be used: {problem}") from error
     for name, module in {"planner": planner, "controller": controller}.items():
         if module is not None:
             load_weights(directory.path / f"{name}.safetensors", module, task=facts.name)
+    check_digests(directory)
     return TrainedRun(directory, config, facts, method, planner, controller, columns)
 
 
@@ -174,16 +193,25 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     """
     given, config = config, EvalConfig() if config is None else config
     lookup(EXECUTIONS, config.execution, "execution")
+    lookup(CONTROLLERS, config.controller, "controller")
+    oracle = config.controller == "oracle"
     names = ("execution", "replan_interval", "blend_decay", "choice")
     options = {name: getattr(config, name) for name in names}
     options |= {} if config.candidates is None else {"candidates": config.candidates}
-    if isinstance(run, (str, Path)) and Path(run).is_file():
+    if oracle:
+        policy = _oracle(run if isinstance(run, TrainedRun) else load_run(run, task=config.task), options)
+    elif isinstance(run, (str, Path)) and Path(run).is_file():
         policy = read_policy(run, plugins=config.plugins, **({} if given is None else options))
         trained_on = policy.description.task.name
         if config.task not in (None, trained_on):
             raise CheckpointError(f"{run} was trained on task {trained_on!r}, not on {config.task!r}")
     else:
         trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
+        if trained.planner is None and config.execution != "feedback":
+            raise ValueError(
+                f"execution {config.execution!r} was asked of {trained.directory.path}, but method"
+                f" {trained.method.name!r} is a policy of its own: it executes chunks of actions"
+            )
         description = PolicyDescription(
             trained.task,
             trained.config["planner"],
@@ -198,6 +226,23 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     if config.solver_steps is not None:
         policy.planner.num_steps = config.solver_steps
     return policy.to(config.device)
+
+
+def _oracle(trained: TrainedRun, options: dict[str, Any]) -> RecedingHorizonPolicy:
+    """The run's planner with the simulator's inverse map."""
+    if trained.planner is None:
+        raise ValueError(
+            f"{trained.directory.path} was trained with method {trained.method.name!r}, which has no planner: there is"
+            " nothing that the oracle controller could follow"
+        )
+    if trained.task.env is None:
+        raise ValueError(f"task {trained.task.name!r} has no environment, whose simulation the oracle controller reads")
+    from torchrl_koap.evaluation.oracle import OracleControl
+
+    kept = {"candidates": trained.config.get("candidates") or 1}
+    history = max(trained.planner.history, getattr(trained.controller, "num_past", 0) + 1)
+    rule = trained.task.action_rule if trained.task.gripper is not None else None
+    return OracleControl(trained.planner, trained.task, history=history, action_rule=rule, **kept | options)
 
 
 def choose_contexts(
@@ -226,12 +271,13 @@ def choose_contexts(
         table = evaluation_contexts(task)
     else:
         table = load_contexts(contexts_file, task)
-    numbers = [episode // rollouts_per_context for episode in range(episodes)]
-    if numbers[-1] >= len(table):
+    needed = (episodes - 1) // rollouts_per_context + 1
+    if needed > len(table):
         raise ValueError(
-            f"{episodes} episodes with {rollouts_per_context} per context need {numbers[-1] + 1}"
-            f" contexts, there are {len(table)}"
+            f"{episodes} episodes with {rollouts_per_context} per context need {needed} contexts,"
+            f" there are {len(table)}"
         )
+    numbers = [episode // rollouts_per_context for episode in range(episodes)]
     return numbers, table[numbers]
 
 
@@ -250,8 +296,6 @@ class _Place:
 def _place(task: Task, config: EvalConfig) -> _Place:
     """The task's own environment, or the one of Gymnasium that was asked for."""
     if config.env is None:
-        if config.success_key is not None:
-            raise ValueError("success_key was given, but no env: the task's own environment says what success is")
         numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
         from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
 
@@ -298,13 +342,27 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         value = getattr(config, name)
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
+    if config.episodes > MOST_EPISODES:
+        raise ValueError(
+            f"episodes must be at most {MOST_EPISODES:,}, which are kept in memory, got {config.episodes:,}"
+        )
+    if config.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {config.seed}")
     lookup(EXECUTIONS, config.execution, "execution")
+    if config.success_key is not None and config.env is None:
+        raise ValueError(
+            f"success_key was given, but no env that could report {config.success_key!r}: name an environment of"
+            " Gymnasium with --env"
+        )
     set_up_torch(config.threads, config.device)
+    lookup(CONTROLLERS, config.controller, "controller")
     load_plugins(config.plugins)
     trained = load_run(_folder(run, config), task=config.task)
     directory, task = trained.directory, trained.task
     if task.env is None and config.env is None:
         return _judge_offline(trained, config)
+    if config.controller == "oracle" and config.env is not None:
+        raise ValueError("the oracle controller reads the task's own simulation; it cannot be combined with env")
     if config.dataset is not None:
         raise ValueError(f"dataset is for judging without an environment; task {task.name!r} is rolled out in one")
     policy = load_policy(trained, config)
@@ -333,8 +391,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if config.env is None:
         result |= task_scores(task, result, episodes, place.numbers)
     rows = result.pop("episode")
-    result |= measure_latency(policy, task.observation_dim)
+    timed = policy if config.controller == "learned" else load_policy(trained, replace(config, controller="learned"))
+    result |= measure_latency(timed, task.observation_dim)
     result |= {
+        "controller": config.controller,
         "execution": "chunks" if trained.planner is None else config.execution,
         "solver": sampler.solver,
         "solver_steps": sampler.num_steps,

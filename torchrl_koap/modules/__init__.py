@@ -8,6 +8,7 @@ from torchrl_koap.modules.baselines.principal import PrincipalInverseDynamics
 from torchrl_koap.modules.baselines.quantized import QuantizedInverseDynamics
 from torchrl_koap.modules.baselines.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
+from torchrl_koap.modules.baselines.window_variational import WindowVariationalInverseDynamics
 from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser, TransformerDenoiser
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.diffusion.policy import DiffusionPolicy
@@ -73,6 +74,7 @@ __all__ = [
     "TemporalUnet",
     "TransformerDenoiser",
     "VariationalInverseDynamics",
+    "WindowVariationalInverseDynamics",
     "blend_plan",
     "make_koopman_inverse_dynamics",
     "policy_transforms",

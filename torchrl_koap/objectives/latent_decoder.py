@@ -22,7 +22,12 @@ class LatentDecoderLoss(WindowLoss):
     Keyword Args:
         train_encoder (bool): let the gradient reach what infers the latents, as the first public code does. Defaults
             to ``False``: the decoder is fitted to latents that stay as they are.
+        samples (bool): decode samples of the latents, of a network with ``sample``, instead of what it infers.
+            Defaults to ``False``.
         reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+
+    Raises:
+        ValueError: for samples of a network that has none.
 
     Examples:
         >>> import torch
@@ -44,8 +49,18 @@ class LatentDecoderLoss(WindowLoss):
     out_keys = ["loss_action"]
     uses_labels = True
 
-    def __init__(self, network: LatentInverseDynamics, *, train_encoder: bool = False, reduction: str = "mean"):
+    def __init__(
+        self,
+        network: LatentInverseDynamics,
+        *,
+        train_encoder: bool = False,
+        samples: bool = False,
+        reduction: str = "mean",
+    ):
         super().__init__(network, reduction=reduction)
+        if samples and not hasattr(network, "sample"):
+            raise ValueError(f"samples were asked for, but {type(network).__name__} has no latents to sample")
+        self.samples = samples
         self.train_encoder = train_encoder
 
     @dispatch
@@ -55,7 +70,7 @@ class LatentDecoderLoss(WindowLoss):
         span = self.network.span(state.shape[-2])
         target, counts = self._targets(tensordict, state, recorded, span)
         with self.network_params.to_module(self.network, preserve_module_state=False):
-            latent = self.network.infer(state, span)
+            latent = (self.network.sample if self.samples else self.network.infer)(state, span)
             latent = latent if self.train_encoder else latent.detach()
             error = (self.network.decode(latent) - target).square().mean(-1)
         return TensorDict({"loss_action": self._reduce(error, counts)})

@@ -54,9 +54,14 @@ class Cell:
         return planner_folder(self.observations) if get_method(self.method).has_planner else None
 
 
-def planner_folder(observations: float) -> str:
-    """Folder of the planner that all cells with this share of the trajectories have in common."""
-    return f"planner-{observations:.15g}"
+def planner_folder(observations: float, seed: int = 0) -> str:
+    """Folder of the planner that all cells with this share of the trajectories, and this seed of it, have in common.
+
+    Args:
+        observations (float): share of the trajectories that it is trained on.
+        seed (int): its seed. Defaults to ``0``.
+    """
+    return f"planner-{observations:.15g}" + (f"-seed{seed}" if seed else "")
 
 
 def is_trained(folder: Path) -> bool:
@@ -98,7 +103,13 @@ def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) ->
 
 
 def do_cell(
-    *, folder: str, cell: dict[str, Any], planner: str | None, settings: dict[str, Any], evaluation: dict[str, Any]
+    *,
+    folder: str,
+    cell: dict[str, Any],
+    planner: str | None,
+    settings: dict[str, Any],
+    evaluation: dict[str, Any],
+    label_fraction: float | None = None,
 ) -> None:
     """Trains and evaluates a cell, from where it was left.
 
@@ -108,6 +119,7 @@ def do_cell(
         planner (str, optional): folder of the planner to share.
         settings (dict): options of :class:`~torchrl_koap.training.TrainConfig`.
         evaluation (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig`.
+        label_fraction (float, optional): share of the labels of the data at hand, where the cell's is a share of more.
     """
     path, this = Path(folder), Cell(**cell)
     began = time.perf_counter()
@@ -116,7 +128,7 @@ def do_cell(
             TrainConfig(
                 out=path,
                 method=this.method,
-                label_fraction=this.fraction,
+                label_fraction=this.fraction if label_fraction is None else label_fraction,
                 observation_fraction=this.observations,
                 seed=this.seed,
                 planner_from=None if planner is None else Path(planner),

@@ -10,28 +10,35 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import torch
-from tensordict import TensorDictBase
-
-from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted, subsample_trajectories
-from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
+from torchrl_koap.studies.cell_options import (
+    CellOptions,
+    check_cell_options,
+    evaluation_options,
+    planner_options,
+    training_options,
+)
+from torchrl_koap.studies.cells import Cell, do_cell, do_planner, is_trained, planner_folder
+from torchrl_koap.studies.curve_data import check_budgets, demonstrations_of, first_look
+from torchrl_koap.studies.curve_folder import GROWS, check_folder, read_options, with_earlier_plugins, write_options
+from torchrl_koap.studies.curve_table import CurveTable
 from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
-from torchrl_koap.studies.table import write_cells
-from torchrl_koap.tasks import HISTORY, WINDOW, Task
+from torchrl_koap.tasks import Task
+from torchrl_koap.training.config import TrainConfig, resolve
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.plugins import Plugins, load_plugins
-from torchrl_koap.training.progress import count_up_to, progress_bar
+from torchrl_koap.training.progress import progress_bar
 from torchrl_koap.training.released_settings import get_released
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.training.run import check_networks
+from torchrl_koap.training.run_directory import RunDirectory
 
 ALL = "koap,koap_labelled_only,linear,dd,vae,lapo,dp,relabel,nonlinear,pretrain"
 
 
 @dataclass
-class CurveConfig:
+class CurveConfig(CellOptions):
     """Measure success against the number of labels: methods x label fractions x seeds.
 
     Attributes:
@@ -43,7 +50,7 @@ class CurveConfig:
         demonstrations: number of scripted demonstrations (default: that of the task).
         methods: names in torchrl_koap.training.methods.METHODS, with commas between.
         fractions: shares of the units that keep their labels, with commas between.
-        units: "trajectory", "window" (the paper's levels) or "transition".
+        units: "trajectory", "window" (the unit of the first public code) or "transition".
         observations: shares of the trajectories that are used at all, with commas between.
         seeds: number of seeds of label choice and training.
         episodes: rollouts per cell; all cells meet the same ones.
@@ -54,6 +61,12 @@ class CurveConfig:
         workers: cells at a time (default: one per core; a cluster given by its address decides for itself).
         launcher: "local" or "ray".
         address: of a Ray cluster (default: one on this machine).
+        planner_from: finished run whose planner all cells share instead of training one; it must have been trained on
+            the same data, which nothing here can check.
+        planner_observations: share of the trajectories that planners are trained on (default: that of the cell).
+        first_seed_only: of the fractions, those that are measured with the first seed alone.
+        data_share: share of the trajectories that are used at all, drawn before any label is; `fractions` stay shares
+            of the whole (`observations` are shares of what is used).
         plugins: modules that register tasks, methods or pictures; every cell imports them, and every later call.
 
     Examples:
@@ -80,25 +93,14 @@ class CurveConfig:
     workers: int | None = None
     launcher: str = "local"
     address: str | None = None
+    planner_from: Path | None = None
+    planner_observations: float | None = None
+    first_seed_only: str = ""
+    data_share: float = 1.0
     plugins: Plugins = ()
 
     def __post_init__(self):
         self.out = Path(self.out)  # so that a string will do in Python
-
-
-# what all cells of a folder must have in common; the rest may grow
-_FIXED = (
-    "task",
-    "dataset",
-    "demonstrations",
-    "units",
-    "episodes",
-    "steps",
-    "controller_steps",
-    "released_settings",
-    "epochs",
-)
-_GROWS = ("methods", "fractions", "observations", "seeds")
 
 
 def run_curve(config: CurveConfig) -> dict[str, Any]:
@@ -116,7 +118,38 @@ def run_curve(config: CurveConfig) -> dict[str, Any]:
             on.
         PluginError: if a plugin cannot be imported.
     """
-    options = _with_earlier_plugins(config)
+    options, task, cells, root = check_curve(config)
+    to_record = options.dataset == "scripted" and not (root.path / "demonstrations" / "ted").exists()
+    check_budgets(cells, options, first_look(root, options, task))
+    with root.locked("koap curve", "lock"):
+        check_folder(root, options)  # another one may have finished here in the meantime
+        dataset = demonstrations_of(root, options, task)
+        if to_record:
+            check_budgets(cells, options, load_demonstrations(dataset, task))
+        write_options(root, options)
+        known = _all_cells(root, cells, options)
+        table = CurveTable(root.path, known, task=options.task, label_unit=options.units)
+        _work(root, options, cells, dataset, table)
+        rows = table.write()
+        paper = paper_points(task.name) if options.units == "window" else None
+        report = write_curve_report(root.path, rows, title=f"Label efficiency on {task.name}", paper=paper)
+    counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
+    return counts | {"report": str(report)}
+
+
+def check_curve(config: CurveConfig) -> tuple[CurveConfig, Task, list[Cell], RunDirectory]:
+    """Refuses what cannot be done of a curve without looking at any data; nothing is written.
+
+    Args:
+        config (CurveConfig): what to compare on what.
+
+    Returns:
+        tuple: the options with what earlier calls in the folder add, the task, all cells, the folder.
+
+    Raises:
+        ValueError, RunDirectoryError, PluginError: as :func:`run_curve`.
+    """
+    options = with_earlier_plugins(config)
     load_plugins(options.plugins)
     cells = _cells(options)
     task = find_task_of(options.dataset, options.task)
@@ -127,23 +160,33 @@ def run_curve(config: CurveConfig) -> dict[str, Any]:
             raise ValueError(f"{name} must be >= 1, got {value}")
     if options.epochs is not None and not options.released_settings:
         raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
+    methods = list(dict.fromkeys(cell.method for cell in cells))
+    check_cell_options(options, [get_method(name) for name in methods])
     check_launcher(options.launcher, address=options.address)
     root = RunDirectory(options.out.absolute())
-    _check_folder(root, options)
-    to_record = options.dataset == "scripted" and not (root.path / "demonstrations" / "ted").exists()
-    _check_budgets(cells, options, _first_look(root, options, task))
-    with root.locked("koap curve", "lock"):
-        _check_folder(root, options)  # another one may have finished here in the meantime
-        dataset = _demonstrations(root, options, task)
-        if to_record:
-            _check_budgets(cells, options, load_demonstrations(dataset, task))
-        _write_options(root, options)
-        reasons = _work(root, options, cells, dataset)
-        rows = _rows(root, cells, options, reasons)
-        paper = paper_points(task.name, task.label_levels) if options.units == "window" else None
-        report = write_curve_report(root.path, rows, title=f"Label efficiency on {task.name}", paper=paper)
-    counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
-    return counts | {"report": str(report)}
+    check_folder(root, options)
+    for name in methods:
+        _check_method(name, options, task)
+    return options, task, cells, root
+
+
+def _check_method(name: str, options: CurveConfig, task: Task) -> None:
+    """Refuses a method whose networks cannot be built for the task, or for the planner that is to be shared."""
+    method = get_method(name)
+    settings = {
+        "out": options.out,
+        "task": task.name,
+        "method": name,
+        "steps": options.steps,
+        "released_settings": options.released_settings,
+        "planner_from": options.planner_from if method.has_planner else None,
+    }
+    resolved = resolve(TrainConfig(**settings, **training_options(options, name)), task)
+    try:
+        check_networks(resolved)
+    except ValueError as error:
+        read = f"the columns {resolved.options.controller_state!r} of " if method.has_planner else ""
+        raise ValueError(f"method {name!r} cannot read {read}task {task.name!r}: {error}") from error
 
 
 def _cells(options: CurveConfig) -> list[Cell]:
@@ -157,11 +200,22 @@ def _cells(options: CurveConfig) -> list[Cell]:
         for value in values:
             if not 0 < value <= 1:
                 raise ValueError(f"{name} must be in (0, 1], got {value:g}")
+    if not 0 < options.data_share <= 1:
+        raise ValueError(f"data_share must be in (0, 1], got {options.data_share:g}")
+    if max(fractions) > options.data_share:
+        raise ValueError(
+            f"fractions must be at most data_share, the share of the data that is used ({options.data_share:g}),"
+            f" got {max(fractions):g}"
+        )
+    if options.planner_observations is not None and not 0 < options.planner_observations <= 1:
+        raise ValueError(f"planner_observations must be in (0, 1], got {options.planner_observations:g}")
+    once = _split("first_seed_only", options.first_seed_only, float) if options.first_seed_only else []
     return [
         Cell(method, fraction, share, seed)
         for seed in range(options.seeds)
         for share in observations
         for fraction in fractions
+        if not (seed and fraction in once)
         for method in methods
     ]
 
@@ -176,94 +230,8 @@ def _split(name: str, text: str, kind: type) -> list[Any]:
         raise ValueError(f"{name} must be numbers with commas between, got {text!r}") from None
 
 
-def _check_folder(root: RunDirectory, options: CurveConfig) -> None:
-    if (root.path / "curve.json").exists():
-        earlier, now = root.read_json("curve.json"), _plain(options)
-        # an option that is younger than the folder was at its default
-        earlier = {name: earlier.get(name, getattr(CurveConfig, name)) for name in _FIXED}
-        changed = [f"{name} ({value})" for name, value in earlier.items() if now[name] != value]
-        if changed:
-            raise RunDirectoryError(
-                f"{root.path} holds a curve with another {', '.join(changed)}; choose another --out"
-            )
-        return
-    if root.path.exists() and not root.path.is_dir():
-        raise RunDirectoryError(f"{root.path} is a file; choose another --out")
-    # what a curve leaves that was killed before it came to write its options
-    own = ("lock", "demonstrations", ".curve.json.")
-    if root.path.exists() and not all(path.name.startswith(own) for path in root.path.iterdir()):
-        raise RunDirectoryError(f"{root.path} is not empty and no folder of `koap curve`; choose another --out")
-
-
-def _plain(options: CurveConfig) -> dict[str, Any]:
-    return asdict(options) | {"out": str(options.out), "dataset": _dataset(options)}
-
-
-def _write_options(root: RunDirectory, options: CurveConfig) -> None:
-    """Keeps what was asked for, earlier methods, fractions and seeds included."""
-    content = _plain(options)
-    if (root.path / "curve.json").exists():
-        earlier = root.read_json("curve.json")
-        for name in ("methods", "fractions", "observations"):
-            content[name] = ",".join(dict.fromkeys([*str(earlier[name]).split(","), *content[name].split(",")]))
-        content["seeds"] = max(earlier["seeds"], content["seeds"])
-    root.write_json("curve.json", content)
-
-
-def _with_earlier_plugins(options: CurveConfig) -> CurveConfig:
-    """The options with the plugins of earlier calls, without which methods of theirs would be unknown."""
-    root = RunDirectory(options.out)
-    earlier = root.read_json("curve.json").get("plugins") or () if (root.path / "curve.json").exists() else ()
-    return replace(options, plugins=tuple(dict.fromkeys([*earlier, *options.plugins])))
-
-
-def _dataset(options: CurveConfig) -> str:
-    """The data set by its whole path: a cell may run in another working directory."""
-    return options.dataset if options.dataset == "scripted" else str(Path(options.dataset).absolute())
-
-
-def _first_look(root: RunDirectory, options: CurveConfig, task: Task) -> TensorDictBase | None:
-    """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
-    if options.dataset == "scripted" and task.env is None:
-        raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: name a --dataset")
-    if options.dataset != "scripted":
-        return load_demonstrations(_dataset(options), task)
-    if (root.path / "demonstrations" / "ted").exists():
-        return load_demonstrations(str(root.path / "demonstrations"), task)
-    if options.units != "trajectory":
-        LabelBudget(1, unit=options.units)  # knows the units
-        return None
-    number = options.demonstrations or task.defaults.demonstrations
-    return flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number)
-
-
-def _demonstrations(root: RunDirectory, options: CurveConfig, task: Task) -> str:
-    """The data set as a folder: scripted demonstrations are recorded once for all cells."""
-    if options.dataset != "scripted":
-        return _dataset(options)
-    folder = root.path / "demonstrations"
-    if not (folder / "ted").exists():
-        from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-
-        episodes = options.demonstrations or task.defaults.demonstrations
-        with progress_bar(episodes, "demonstrations", unit="episode") as bar:
-            data, _ = record_demonstrations(task.name, episodes, 0, progress=count_up_to(bar))
-        save_ted(data, folder / "ted", task=task.source)
-    return str(folder)
-
-
-def _check_budgets(cells: Sequence[Cell], options: CurveConfig, data: TensorDictBase | None) -> None:
-    """Refuses before any work what would fail in a cell: budgets that select nothing, shares below the labelled."""
-    if data is None:
-        return
-    # windows of another seed lie in another number of trajectories
-    for fraction, share, seed in dict.fromkeys((cell.fraction, cell.observations, cell.seed) for cell in cells):
-        budget = LabelBudget(fraction, unit=options.units, seed=seed, window=WINDOW, history=HISTORY)
-        subsample_trajectories(budget.apply(data)[0], share)
-
-
-def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], dataset: str) -> dict[Cell, str]:
-    """Does the cells that are not done; returns why some failed."""
+def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], dataset: str, table: CurveTable) -> None:
+    """Does the cells that are not done."""
     common = {
         "task": options.task,
         "dataset": dataset,
@@ -276,38 +244,42 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
         "released_settings": options.released_settings,
         "epochs": options.epochs,
     }
-    evaluation = {"episodes": options.episodes, "threads": 1}
-    todo = [cell for cell in cells if not is_done(root.path / cell.folder)]
+    todo = [cell for cell in cells if not table.is_done(cell)]
     todo.sort(key=lambda cell: cell.planner is not None)  # those without a planner need not wait for one
-    jobs, names = [], {}
+    jobs, names, planners = [], {}, {}
     for cell in todo:
         folder = root.path / cell.folder
-        planner = None if cell.planner is None else root.path / cell.planner
+        planner = _planner_of(cell, root, options)
         arguments = {
             "folder": str(folder),
             "cell": asdict(cell),
             "planner": None if planner is None else str(planner),
-            "settings": cell_settings,
-            "evaluation": evaluation,
+            "settings": cell_settings | training_options(options, cell.method),
+            "label_fraction": cell.fraction / options.data_share,
+            "evaluation": {"episodes": options.episodes, "threads": 1} | evaluation_options(options, cell.method),
         }
-        needs = () if planner is None or is_trained(planner) else (cell.planner,)
+        needs = ()
+        if planner is not None and options.planner_from is None and not is_trained(planner):
+            planners[planner.name] = (planner, _planner_share(cell, options), _planner_seed(cell, options))
+            needs = (planner.name,)
         jobs.append(Job(cell.folder, do_cell, arguments, folder / "log.txt", needs))
         names[cell.folder] = cell
-    planners = dict.fromkeys(need for job in jobs for need in job.needs)
-    shares = {planner_folder(cell.observations): cell.observations for cell in todo}
     first = [
         Job(
             name,
             do_planner,
-            {"folder": str(root.path / name), "observations": shares[name], "settings": common},
-            root.path / name / "log.txt",
+            {
+                "folder": str(folder),
+                "observations": share,
+                "settings": common | planner_options(options) | ({"seed": seed} if seed else {}),
+            },
+            folder / "log.txt",
         )
-        for name in planners
+        for name, (folder, share, seed) in planners.items()
     ]
     # a job of a cluster may not use all cores of its machine
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     workers = options.workers or cores
-    reasons: dict[Cell, str] = {}
     with progress_bar(len(first) + len(jobs), "cells", unit="cell", smoothing=0.1) as bar:
         ended = launch(
             [*first, *jobs],
@@ -321,23 +293,30 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
                 bar.update()
                 bar.set_postfix_str(job.name.removeprefix("cells/") + (" FAILED" if reason else ""))
                 if job.name in names:
-                    if reason is not None:
-                        reasons[names[job.name]] = reason
-                    _rows(root, cells, options, reasons)
-    return reasons
+                    table.ended(names[job.name], reason)
 
 
-def _rows(
-    root: RunDirectory, cells: Sequence[Cell], options: CurveConfig, reasons: dict[Cell, str]
-) -> list[dict[str, Any]]:
-    """Writes ``cells.csv`` from the folders of all cells, asked for now or earlier, and returns its rows."""
-    known = list(cells)
-    earlier = root.read_json("curve.json")
-    grown = replace(options, **{name: earlier[name] for name in _GROWS})
-    known += [cell for cell in _cells(grown) if cell not in known and (root.path / cell.folder).exists()]
-    rows = [
-        cell_row(root.path, cell, task=options.task, label_unit=options.units, reason=reasons.get(cell))
-        for cell in known
-    ]
-    write_cells(root.path / "cells.csv", rows)
-    return rows
+def _planner_share(cell: Cell, options: CurveConfig) -> float:
+    """Share of the trajectories that the planner of a cell is trained on."""
+    return cell.observations if options.planner_observations is None else options.planner_observations
+
+
+def _planner_seed(cell: Cell, options: CurveConfig) -> int:
+    """Seed of the planner of a cell."""
+    return cell.seed % options.planner_seeds
+
+
+def _planner_of(cell: Cell, root: RunDirectory, options: CurveConfig) -> Path | None:
+    """The run whose planner a cell takes over, None for a method without one."""
+    if not get_method(cell.method).has_planner:
+        return None
+    if options.planner_from is not None:
+        return Path(options.planner_from).absolute()
+    return root.path / planner_folder(_planner_share(cell, options), _planner_seed(cell, options))
+
+
+def _all_cells(root: RunDirectory, cells: Sequence[Cell], options: CurveConfig) -> list[Cell]:
+    """The cells asked for now, and those asked for earlier."""
+    earlier, asked = read_options(root, type(options)), set(cells)
+    grown = replace(options, **{name: earlier[name] for name in GROWS})
+    return [*cells, *(cell for cell in _cells(grown) if cell not in asked and (root.path / cell.folder).exists())]

@@ -13,7 +13,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from multiprocessing import connection
+from multiprocessing import connection, forkserver
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -174,13 +174,28 @@ def _in_words(error: Exception) -> str:
     return f"{type(error).__name__}: {lines[0][:_LONGEST]}".removesuffix(": ")
 
 
+@contextlib.contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """What is started inside never sees Ctrl-C, which is this process's to handle, not even while it starts."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
+
+
 class _LocalPool:
     """Processes that are copies of a server which has imported everything: a job starts in a fraction of a second."""
 
     def __init__(self, workers: int, address: str | None, preload: Sequence[str] = ()):
         self.workers = workers
         self.context = multiprocessing.get_context("forkserver")
-        self.context.set_forkserver_preload(list(preload))
+        self.context.set_forkserver_preload(["torchrl_koap.studies.end_with_parent", *preload])
+        with _without_ctrl_c():
+            forkserver.ensure_running()
         self.running: dict[Any, tuple[Job, Any, Any]] = {}
 
     @property

@@ -1,13 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The paper's figures as data, to be drawn beside measured ones.
+"""Both tables of the paper as data, to be set beside measured figures: 165 cells, with its levels of labels.
 
-``paper_results.json`` holds only figures that were seen in a source, and names it with each. So far that is KOAP's
-success on Aligning, Sorting, PO-Sorting and the first box of Stacking at the lowest and the highest label level. Absent
-are the levels between, Avoiding, the other methods, the ablations, spreads and entropies: the file lists them under
-``missing``. What is absent is None here, never an estimate.
-
-To add a figure, append an entry to ``results`` with table, task, method, level, success (in percent) and source (which
-table of which version of the paper), and take it off the list of what is missing; the tests check every entry.
+A cell is a mean success and what the paper prints after its ``+-``, presumably the standard deviation over seeds. The
+paper's Stacking, which counts one box, is :data:`~torchrl_koap.tasks.TASKS`' ``stacking_unobserved_joints`` (its state)
+and, with the joints observed, ``stacking_1``. What the paper does not have is None here, never an estimate.
 """
 
 from __future__ import annotations
@@ -15,88 +11,170 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
 from torchrl_koap.lookup import lookup
 
-_KEYS = ("table", "task", "method", "level", "success", "source")
+
+@dataclass(frozen=True)
+class PaperCell:
+    """A cell of the paper's tables.
+
+    Args:
+        table (int): 1 (methods) or 2 (variants of KOAP).
+        task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
+        method (str): name of the method.
+        level (int): label level, 1 for the fewest labels.
+        label_share (float): share of the labels at this level.
+        success (float): mean success in 0..1.
+        spread (float): what is printed after the ``+-``, in the same unit.
+
+    Examples:
+        >>> from torchrl_koap.studies.paper_results import paper_cell
+        >>> paper_cell("avoiding", "koap", 1).text
+        '78.0 +- 8.6'
+    """
+
+    table: int
+    task: str
+    method: str
+    level: int
+    label_share: float
+    success: float
+    spread: float
+
+    @property
+    def text(self) -> str:
+        """Success and spread in percent."""
+        return f"{100 * self.success:.1f} +- {100 * self.spread:.1f}"
 
 
 @functools.cache
-def _results() -> tuple[dict[str, Any], ...]:
-    content = json.loads(files("torchrl_koap.studies").joinpath("paper_results.json").read_text(encoding="utf-8"))
-    for number, row in enumerate(content["results"]):
-        if set(row) != set(_KEYS):
-            raise ValueError(
-                f"paper_results.json, result {number}: expected the keys {', '.join(_KEYS)}, got {list(row)}"
-            )
-    return tuple(content["results"])
+def _content() -> dict[str, Any]:
+    return json.loads(files("torchrl_koap.studies").joinpath("paper_results.json").read_text(encoding="utf-8"))
 
 
-def paper_success(task: str, method: str, level: int) -> float | None:
-    """Success rate that the paper gives.
+def _task_entry(task: str) -> tuple[str, dict[str, Any]] | None:
+    """The paper's name of a task of ours, and what is known of it; None if the paper does not have the task."""
+    return next(((name, entry) for name, entry in _content()["tasks"].items() if task in entry["tasks"]), None)
+
+
+def paper_levels(task: str) -> tuple[float, ...]:
+    """Shares of labels of the paper's levels, the fewest first; empty for a task that is not in the paper.
+
+    Args:
+        task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
+
+    Examples:
+        >>> from torchrl_koap.studies.paper_results import paper_levels
+        >>> paper_levels("avoiding"), paper_levels("sorting_6")
+        ((0.02, 0.05, 0.1, 0.25, 0.5), ())
+    """
+    found = _task_entry(task)
+    return () if found is None else tuple(percent / 100 for percent in found[1]["label_percent"])
+
+
+def paper_share(task: str) -> float | None:
+    """Share of the demonstrations that the paper uses at all, by one reading of its text; None if it has no such task.
+
+    Args:
+        task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
+
+    Examples:
+        >>> from torchrl_koap.studies.paper_results import paper_share
+        >>> paper_share("avoiding"), paper_share("sorting")
+        (0.5, 0.25)
+    """
+    found = _task_entry(task)
+    return None if found is None else found[1]["used_share"]
+
+
+def paper_cells(table: int) -> list[PaperCell]:
+    """All cells of a table; a task that stands for one of the paper's in several ways has them in each.
+
+    Args:
+        table (int): 1 or 2.
+
+    Raises:
+        ValueError: for another table.
+
+    Examples:
+        >>> from torchrl_koap.studies.paper_results import paper_cells
+        >>> len([cell for cell in paper_cells(1) + paper_cells(2) if cell.task != "stacking_1"])
+        165
+    """
+    tables = _content()["tables"]
+    lookup(tuple(tables), str(table), "table of the paper")
+    return [
+        PaperCell(table, task, method, level, shares[level - 1] / 100, round(success / 100, 4), round(spread / 100, 4))
+        for name, methods in tables[str(table)].items()
+        for task in _content()["tasks"][name]["tasks"]
+        for method, cells in methods.items()
+        for shares in (_content()["tasks"][name]["label_percent"],)
+        for level, (success, spread) in enumerate(cells, start=1)
+    ]
+
+
+def paper_cell(task: str, method: str, level: int) -> PaperCell | None:
+    """A cell of the paper, None if it has no such one; of both tables the first that has it.
 
     Args:
         task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
         method (str): name of the method.
         level (int): label level, 1 for the fewest labels.
 
-    Returns:
-        float or None: the rate in 0..1; None if it is not known to this package.
-
     Examples:
-        >>> from torchrl_koap.studies.paper_results import paper_success
-        >>> paper_success("aligning", "koap", 1), paper_success("aligning", "koap", 3)
-        (0.8, None)
+        >>> from torchrl_koap.studies.paper_results import paper_cell
+        >>> paper_cell("aligning", "koap", 1).success, paper_cell("aligning", "koap_untrained", 1)
+        (0.8028, None)
     """
-    for row in paper_rows("success"):
-        if (row["task"], row["method"], row["level"]) == (task, method, level):
-            return row["success"]
-    return None
+    return _by_place().get((task, method, level))
 
 
-def paper_rows(table: str = "success") -> list[dict[str, Any]]:
-    """All known figures of a table: ``task``, ``method``, ``level``, ``success`` in 0..1 and ``source``.
+@functools.cache
+def _by_place() -> dict[tuple[str, str, int], PaperCell]:
+    cells = [cell for table in (2, 1) for cell in paper_cells(table)]  # table 1 goes before
+    return {(cell.task, cell.method, cell.level): cell for cell in cells}
+
+
+def paper_success(task: str, method: str, level: int) -> float | None:
+    """Success rate that the paper gives in 0..1, None if it has no such cell (:func:`paper_cell`).
 
     Args:
-        table (str): name of the table.
-
-    Raises:
-        ValueError: for an unknown table.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper_results import paper_rows
-        >>> {row["method"] for row in paper_rows()}
-        {'koap'}
+        task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
+        method (str): name of the method.
+        level (int): label level, 1 for the fewest labels.
     """
-    lookup(sorted({row["table"] for row in _results()}), table, "table of the paper")
-    return [
-        {name: row[name] for name in _KEYS[1:]} | {"success": row["success"] / 100}
-        for row in _results()
-        if row["table"] == table
-    ]
+    cell = paper_cell(task, method, level)
+    return None if cell is None else cell.success
 
 
-def paper_points(task: str, label_levels: Sequence[float]) -> list[dict[str, Any]]:
-    """Known success rates of a task at the shares of labels that a benchmark uses for the paper's levels.
+def paper_points(task: str, fractions: Sequence[float] | None = None) -> list[dict[str, Any]]:
+    """The paper's figures of a task at its own shares of labels, for pictures and tables beside measured ones.
 
     Args:
         task (str): name of the task.
-        label_levels (sequence of float): the share of labels of level 1, 2, ...: ``Task.label_levels``.
+        fractions (sequence of float, optional): only those at these shares. Default: all.
 
     Returns:
-        list: ``task``, ``method``, ``fraction``, ``success`` in 0..1 and ``source``, as
+        list: ``task``, ``method``, ``fraction``, ``success`` and ``spread`` in 0..1, as
         :func:`~torchrl_koap.studies.report.write_curve_report` takes them.
 
     Examples:
         >>> from torchrl_koap.studies.paper_results import paper_points
-        >>> [(row["fraction"], row["success"]) for row in paper_points("sorting", (0.01, 0.02, 0.05, 0.1, 0.25))]
-        [(0.01, 0.62), (0.25, 0.66)]
+        >>> [(row["method"], row["success"]) for row in paper_points("sorting", [0.25]) if row["method"] == "koap"]
+        [('koap', 0.6583)]
     """
     return [
-        {"task": task, "method": row["method"], "fraction": label_levels[row["level"] - 1]}
-        | {"success": row["success"], "source": row["source"]}
-        for row in paper_rows("success")
-        if row["task"] == task and row["level"] <= len(label_levels)
+        {
+            "task": task,
+            "method": cell.method,
+            "fraction": cell.label_share,
+            "success": cell.success,
+            "spread": cell.spread,
+        }
+        for (name, _, _), cell in _by_place().items()
+        if name == task and (fractions is None or cell.label_share in fractions)
     ]

@@ -7,7 +7,7 @@ beside the ends of the lines.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,8 +31,26 @@ AXES = {
 
 
 @dataclass
-class _Line:
-    """A named curve: places, values and their intervals, and how to draw it."""
+class Line:
+    """A named curve: places, values and their intervals, and how to draw it.
+
+    Args:
+        name (str): what stands beside its end.
+        x (list of float): places.
+        y (list of float): values.
+        low (list of float): lower ends of their intervals.
+        high (list of float): upper ends.
+        paper (list): ``(place, value)`` of the paper, drawn hollow.
+        color (str): of line and marker.
+        marker (str): of matplotlib.
+        dash (optional): of matplotlib.
+        end (float): place of its last point, set when it is drawn.
+
+    Examples:
+        >>> from torchrl_koap.studies.plots import Line
+        >>> Line("koap", x=[1.0], y=[90.0], low=[80.0], high=[95.0]).marker
+        'o'
+    """
 
     name: str
     x: list[float] = field(default_factory=list)
@@ -116,7 +134,7 @@ def plot_success(
     figure = Figure(figsize=(1.9 + 4.1 * len(panels), 4.1), layout="constrained")
     for index, (name, lines) in enumerate(panels):
         axes = figure.add_subplot(1, len(panels), index + 1)
-        _draw(axes, lines)
+        draw_lines(axes, lines)
         axes.set_ylim(-3, 103)
         axes.set_yticks(range(0, 101, 20))
         axes.set_xlabel(AXES[name] + (f" ({label})" if label and name == "fraction" else ""))
@@ -130,7 +148,7 @@ def plot_success(
         set_title(axes, title if index == 0 else "")
         tidy(axes)
         if index == len(panels) - 1 or {line.name for line in lines} - {line.name for line in panels[-1][1]}:
-            _name_lines(axes, lines)
+            name_lines(axes, lines)
     return save_figure(figure, path)
 
 
@@ -172,7 +190,7 @@ def plot_action_error(
     axes.set_ylim(low / wide, high * wide)
     _log_y_ticks(axes)
     axes.grid(axis="y", which="both", color=FAINT, linewidth=0.5)
-    _name_lines(axes, lines)
+    name_lines(axes, lines)
     return save_figure(figure, path)
 
 
@@ -199,15 +217,15 @@ def plot_entropy(
     figure, axes = _from_best_to_worst(lines, label, "entropy of the modes")
     axes.set_ylim(-0.03, 1.03)
     axes.grid(axis="y", color=FAINT, linewidth=0.5)
-    _name_lines(axes, lines)
+    name_lines(axes, lines)
     return save_figure(figure, path)
 
 
-def _from_best_to_worst(lines: Sequence[_Line], label: str, name: str) -> tuple[Figure, Axes]:
+def _from_best_to_worst(lines: Sequence[Line], label: str, name: str) -> tuple[Figure, Axes]:
     """A single panel along the labelled share, limits and grid of the other axis left to the caller."""
     figure = Figure(figsize=(6, 4.1), layout="constrained")
     axes = figure.add_subplot()
-    _draw(axes, lines)
+    draw_lines(axes, lines)
     axes.set_xlabel(AXES["fraction"] + (f" ({label})" if label else ""))
     axes.set_ylabel(name)
     _log_x(axes, lines, ticks=True)
@@ -218,7 +236,7 @@ def _from_best_to_worst(lines: Sequence[_Line], label: str, name: str) -> tuple[
 
 def _lines(
     summaries: Sequence[Summary], by: str, wanted: Sequence[str], methods: Sequence[str] | None
-) -> dict[Any, _Line]:
+) -> dict[Any, Line]:
     """A line per method; along the trajectories used one per method and budget."""
     methods = list(methods or dict.fromkeys(item.method for item in summaries))
     fractions = sorted({item.fraction for item in summaries})
@@ -230,9 +248,9 @@ def _lines(
         places = {
             fraction: {"marker": _MARKERS[n % 13], "dash": _DASHES[n % 3]} for n, fraction in enumerate(fractions)
         }
-        lines = {key: _Line(name, **styles[key[0]] | places[key[1]]) for key, name in zip(keys, names, strict=True)}
+        lines = {key: Line(name, **styles[key[0]] | places[key[1]]) for key, name in zip(keys, names, strict=True)}
     else:
-        lines = {key: _Line(name, **styles[name]) for key, name in zip(keys, names, strict=True)}
+        lines = {key: Line(name, **styles[name]) for key, name in zip(keys, names, strict=True)}
     for item in sorted(summaries, key=lambda item: getattr(item, by) or 0):
         values = [getattr(item, name) for name in (by, *wanted)]
         if item.method not in methods or any(value is None for value in values):
@@ -245,12 +263,24 @@ def _lines(
     return lines
 
 
-def _draw(axes: Axes, lines: Sequence[_Line]) -> None:
+def draw_lines(
+    axes: Axes, lines: Sequence[Line], *, beside: Callable[[float, float], float] = lambda x, step: x * 1.014**step
+) -> None:
+    """Draws lines with bands, or with whiskers where there are many or each has one place alone.
+
+    Args:
+        axes (Axes): where to.
+        lines (sequence of Line): what to draw; the first lies on top. Each learns where it ends.
+
+    Keyword Args:
+        beside (callable): from a place and a number of steps to the place of a whisker that others would hide.
+            Defaults to a step on a logarithmic axis.
+    """
     whiskers = len(lines) > _BANDS or all(len(line.x) == 1 for line in lines)
     for index, line in enumerate(lines):
         x, order = line.x, 3 + (len(lines) - index) / 100  # the first method lies on top
         if whiskers:  # beside each other
-            x = [value * 1.014 ** (index - (len(lines) - 1) / 2) for value in x]
+            x = [beside(value, index - (len(lines) - 1) / 2) for value in x]
             axes.vlines(x, line.low, line.high, color=line.color, linewidth=0.9, alpha=0.55, zorder=order - 1)
         else:
             axes.fill_between(x, line.low, line.high, color=line.color, alpha=0.13, linewidth=0, zorder=order - 1)
@@ -265,7 +295,7 @@ def _draw(axes: Axes, lines: Sequence[_Line]) -> None:
             axes.plot(px, py, linestyle=(0, (2, 2)), linewidth=1, zorder=order + 0.5, **style)
 
 
-def _log_x(axes: Axes, lines: Sequence[_Line], *, ticks: bool) -> None:
+def _log_x(axes: Axes, lines: Sequence[Line], *, ticks: bool) -> None:
     """Logarithmic axis that ends at the data; ``ticks`` at the places themselves, where there is room."""
     places = sorted({value for line in lines for value in [*line.x, *(place for place, _ in line.paper)]})
     positive = [place for place in places if place > 0] or [1.0]
@@ -296,8 +326,13 @@ def _log_y_ticks(axes: Axes) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def _name_lines(axes: Axes, lines: Sequence[_Line]) -> None:
-    """Names to the right of the panel at the height of the lines' ends, moved apart, joined to them by thin lines."""
+def name_lines(axes: Axes, lines: Sequence[Line]) -> None:
+    """Names to the right of the panel at the height of the lines' ends, moved apart, joined to them by thin lines.
+
+    Args:
+        axes (Axes): a panel that is drawn and has its limits.
+        lines (sequence of Line): the lines.
+    """
     axes.figure.canvas.draw()  # the height of the panel is known only when it was laid out
     step = 11.5 * axes.figure.dpi / 72 / max(axes.get_window_extent().height, 1)
     heights = [axes.transAxes.inverted().transform(axes.transData.transform((line.end, line.y[-1]))) for line in lines]

@@ -64,6 +64,7 @@ def write_curve_report(
     title: str,
     paper: Sequence[Mapping[str, Any]] | None = None,
     reference: str = "koap",
+    layout: Mapping[str, Any] | None = None,
 ) -> Path:
     """Writes ``table.md``, ``comparisons.csv``, pictures and ``index.html`` into the folder of a curve.
 
@@ -76,8 +77,10 @@ def write_curve_report(
         title (str): heading of the page.
         paper (sequence of mapping, optional): the paper's figures as of
             :func:`~torchrl_koap.studies.paper_results.paper_points`: ``task``, ``method``, ``fraction``, ``success``
-            in 0..1.
+            in 0..1 and, optionally, ``spread``.
         reference (str): the method that all others are compared with.
+        layout (mapping, optional): the cells in the paper's layout, as
+            :func:`~torchrl_koap.studies.paper_layout.write_paper_layout` returns them: the page begins with them.
 
     Returns:
         Path: the page.
@@ -115,7 +118,8 @@ def write_curve_report(
         **_what_was_run(rows),
         options=options,
         table=table_rows(summaries),
-        paper=_paper_rows(summaries, points),
+        paper=[] if layout else _paper_rows(summaries, points),
+        layout=layout,
         offline=any(item.offline for item in summaries),
         figures=_draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows)), points),
         compared=_comparison_rows(compared, reference, offline=any(item.offline for item in summaries)),
@@ -211,7 +215,8 @@ def _paper_rows(summaries: Sequence[Summary], paper: Sequence[Mapping[str, Any]]
         item = ours.get((row["task"], row["method"], row["fraction"])) if "task" in row else None
         here = "not run" if item is None else f"{percent(item.success, 1)} ({100 * item.low:.1f}-{100 * item.high:.1f})"
         names = {"task": row.get("task", ""), "method": row["method"], "labels": percent(row["fraction"])}
-        rows.append(names | {"paper": percent(row["success"], 0), "here (95 %)": here})
+        spread = f" +- {100 * row['spread']:.1f}" if row.get("spread") is not None else ""
+        rows.append(names | {"paper (%)": f"{100 * row['success']:.1f}{spread}", "here (95 %)": here})
     return rows
 
 

@@ -126,7 +126,8 @@ register_task(
             " any target: the tray was lost; crosses near one: the angle was wrong or time ran out.",
             camera="cage",
         ),
+        label_levels=(0.02, 0.05, 0.1, 0.25, 0.5),
         in_paper=True,
-        defaults=Defaults(released_epochs=200),
+        defaults=Defaults(demonstrations=1000, released_epochs=200),
     )
 )

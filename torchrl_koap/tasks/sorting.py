@@ -33,6 +33,7 @@ BIN_WALLS = (
 )
 BOX_HALF = 0.03  # half width of a box (m)
 PLATFORM_X, PLATFORM_Y = (0.2, 0.8), (-0.4, 0.2)  # m
+PO_NOISE = 0.002  # m; of PO-Sorting, in demonstrations as well as in evaluation; the paper states no figure
 # six regions (x range, y range in m) that are dealt out to the boxes at random
 REGIONS = tuple((x, y) for x in ((0.4, 0.5), (0.55, 0.65)) for y in ((-0.15, -0.1), (-0.05, 0.0), (0.05, 0.1)))
 _CAPTION = (
@@ -146,7 +147,7 @@ def _sorting(num_boxes: int) -> Task:
         converter=f"torchrl_koap.data.d3il.conversion:SORTING_{num_boxes}",
         scene=Scene(shapes=(platform, *_walls()), x=(0.17, 0.83), y=(-0.43, 0.45), caption=_CAPTION, camera="cage"),
         in_paper=num_boxes == 4,
-        defaults=Defaults(released_epochs=400),
+        defaults=Defaults(demonstrations=1000, released_epochs=400),
     )
 
 
@@ -157,10 +158,10 @@ register_task(
         name="po_sorting",
         max_steps=400,
         hidden=tuple(f"{box}_tan_yaw" for box in _BY_BOXES[4].objects),
-        noise=0.002,
+        noise=PO_NOISE,
         data="sorting",
         gym_id="",
-        defaults=Defaults(released_epochs=200),
+        defaults=Defaults(demonstrations=1000, released_epochs=200),
     )
 )
 

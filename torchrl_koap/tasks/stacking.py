@@ -113,10 +113,10 @@ _STACKING = register_task(
             camera="front",
         ),
         # measured: a shifted arm, redundant as it is, learns to wander (benchmarks/RESULTS.md)
-        defaults=Defaults(recovery_sigma=0.0, released_epochs=400),
+        defaults=Defaults(demonstrations=1000, recovery_sigma=0.0, released_epochs=400),
     )
 )
-register_task(
+_STACKING_1 = register_task(
     replace(
         _STACKING,
         name="stacking_1",
@@ -127,6 +127,19 @@ register_task(
         env_options={"num_boxes": 1},
         data="stacking",
         gym_id="",
+    )
+)
+# as the paper has it: joints are commanded but not seen, and the gripper's number is decoded like any other action
+register_task(
+    replace(
+        _STACKING_1,
+        name="stacking_unobserved_joints",
+        state={"tcp_position": "plain"}
+        | {part: kind for part, kind in _STACKING.state.items() if part != "measured_joints"},
+        hidden=("measured_joints",),
+        robot=tuple(range(4)),  # position of the tool, width of the gripper
+        tool_kinematics=None,
+        gripper=None,
         in_paper=True,
     )
 )

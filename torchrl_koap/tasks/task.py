@@ -69,6 +69,7 @@ class Defaults:
         channels (tuple of int): widths of the planner's U-Net.
         relative (bool): plans are displacements from the present state.
         recovery_sigma (float): typical shift of the recovery augmentation, in the units of the robot's columns.
+        recovery_response (str): how that augmentation leads back, ``"first_order"`` or ``"second_order"``.
         released_epochs (int): epochs of a controller in KOAP's first public code.
 
     Examples:
@@ -82,6 +83,7 @@ class Defaults:
     channels: tuple[int, ...] = (64, 128)
     relative: bool = True
     recovery_sigma: float = 0.004
+    recovery_response: str = "first_order"
     released_epochs: int = 400
 
 
@@ -127,7 +129,8 @@ class Task(StateParts):
         bodies (tuple of Body): what a context places: bodies that start elsewhere in every episode.
         start_regions (StartRegions, optional): where they start.
         collides (bool): an episode can end by a collision.
-        noise (float): standard deviation of the noise on the measured end effector (m).
+        noise (float): standard deviation of the noise on the measured end effector (m), in rollouts and on the
+            demonstrations as they are loaded.
         env (str, optional): import string of the environment (:mod:`torchrl_koap.envs.registry` says what it has to
             offer). None: a robot with data and no simulator.
         env_options (dict): its further keyword arguments.

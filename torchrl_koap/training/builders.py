@@ -15,6 +15,8 @@ from torchrl_koap.modules import Normalizer
 from torchrl_koap.training.methods import Method, get_method, normalizers_of
 from torchrl_koap.training.released_settings import get_released
 
+_MOST_THREADS = 1024
+
 # what every preset was designed with: how states and actions are normalised
 NORMALIZATION = {
     "default": {"state": "standard", "action": "rms"},
@@ -69,7 +71,8 @@ def method_named(options: Mapping[str, Any]) -> Method:
     """
     if options.get("released"):
         return get_released(options["method"]).method
-    return get_method(options["method"], options.get("decoder"))
+    method = get_method(options["method"], options.get("decoder"))
+    return get_method(method.earlier) if method.earlier and not options.get("revised") else method
 
 
 def set_up_torch(threads: int, device: str) -> None:
@@ -84,9 +87,17 @@ def set_up_torch(threads: int, device: str) -> None:
     """
     if threads < 1:
         raise ValueError(f"threads must be >= 1, got {threads}")
-    kind = device.partition(":")[0]
-    if kind not in ("cpu", "cuda"):
+    kind, colon, index = device.partition(":")
+    if kind not in ("cpu", "cuda") or (colon and not index.isdecimal()):
         raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
+    if kind == "cpu" and int(index or 0) > 0:
+        raise ValueError(
+            f"device must be 'cpu' or 'cuda', got {device!r}: there is one processor, as far as torch knows"
+        )
     if kind == "cuda" and not torch.cuda.is_available():
         raise ValueError(f"device {device!r} was asked for, but torch finds no CUDA here (see `koap doctor`)")
+    if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"device {device!r} was asked for, but there are {torch.cuda.device_count()}, counted from 0")
+    if threads > _MOST_THREADS:
+        raise ValueError(f"threads must be at most {_MOST_THREADS}, got {threads}")
     torch.set_num_threads(threads)

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +17,13 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from torchrl_koap.files import replacing_file
+from torchrl_koap.modules import Normalizer
 from torchrl_koap.training.compact_weights import expand
+
+_SHA256 = "sha256"  # among the facts of a file: the checksum of its tensors
+
+
+_MOMENTS = {"step", "exp_avg", "exp_avg_sq"}  # what AdamW keeps of a parameter
 
 
 class CheckpointError(ValueError):
@@ -55,7 +64,31 @@ def load_weights(path: str | Path, module: nn.Module, *, task: str) -> dict[str,
     except RuntimeError as error:
         problems = " ".join(str(error).split("\n", 1)[-1].split())
         raise CheckpointError(f"{path} does not fit the model: {problems}") from error
+    check_weights(path, module)
     return about
+
+
+def check_weights(path: str | Path, module: nn.Module) -> None:
+    """Refuses weights with which nothing can be computed.
+
+    Args:
+        path (str or Path): the file they are from, for the message.
+        module (nn.Module): the module that has received them.
+
+    Raises:
+        CheckpointError: naming an entry that is NaN or infinite, or a normaliser whose scale is not positive.
+    """
+    for name, value in module.named_parameters():  # of a buffer that nobody has fitted NaN says just that
+        if not value.isfinite().all():
+            raise CheckpointError(f"{path} is damaged: {name} is NaN or infinite")
+    for name, part in module.named_modules():
+        if not isinstance(part, Normalizer) or not part.is_fitted:
+            continue
+        if not part.offset.isfinite().all() or not part.scale.isfinite().all() or not (part.scale > 0).all():
+            raise CheckpointError(
+                f"{path} is damaged: {name} needs a finite offset and a finite, positive scale,"
+                f" got {part.offset.tolist()} and {part.scale.tolist()}"
+            )
 
 
 def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
@@ -68,7 +101,12 @@ def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping
     """
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with replacing_file(path) as aside:
-        save_file(tensors, aside, metadata={"about": json.dumps(about or {})})
+        try:
+            # one entry alone: of several the order in the file would be another one every time
+            facts = {**(about or {}), _SHA256: _digest(tensors)}
+            save_file(tensors, aside, metadata={"about": json.dumps(facts)})
+        except SafetensorError as error:  # it has no errno
+            raise OSError(errno.EIO, str(error)) from error
 
 
 def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -89,12 +127,26 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise CheckpointError(f"{path} is missing")
     try:
         with safe_open(path, "pt") as file:
-            about = json.loads((file.metadata() or {}).get("about", "{}"))
+            metadata = file.metadata() or {}
+        about = json.loads(metadata.get("about", "{}"))
         if not isinstance(about, dict):
             raise ValueError(f"its facts are no object but {type(about).__name__}")
-        return load_file(path), about
-    except (SafetensorError, ValueError) as error:
+        tensors = load_file(path)
+    except (SafetensorError, ValueError, RecursionError, OSError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
+    digest = _digest(tensors)
+    if about.pop(_SHA256, digest) != digest:  # files of before have none
+        raise CheckpointError(f"{path} is damaged: its tensors are not those that were written (checksum)")
+    return tensors, about
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        value = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+        digest.update(value.reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
 
 
 def save_training_state(
@@ -115,7 +167,7 @@ def save_training_state(
     tensors["rng.cpu"] = torch.get_rng_state()
     if torch.cuda.is_available():
         tensors |= {f"rng.cuda.{i}": value for i, value in enumerate(torch.cuda.get_rng_state_all())}
-    save_tensors(path, tensors, {**about, "param_groups": state["param_groups"]})
+    save_tensors(path, tensors, {**about, "param_groups": state["param_groups"], "moments": len(state["state"])})
 
 
 def load_training_state(path: str | Path, loss: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
@@ -130,26 +182,76 @@ def load_training_state(path: str | Path, loss: nn.Module, optimizer: torch.opti
         dict: the facts given when it was saved.
 
     Raises:
-        CheckpointError: if the file is damaged, no training state, or does not fit the loss module.
+        CheckpointError: if the file is damaged, no training state, lacks that of the optimiser, or does not fit the
+            loss module or the optimiser. Nothing has been changed then.
     """
     tensors, about = load_tensors(path)
     if "rng.cpu" not in tensors or "param_groups" not in about:
         raise CheckpointError(f"{path} is no state of a training")
+    if type(about.get("step")) is not int or about["step"] < 0:
+        raise CheckpointError(
+            f"{path} is damaged: its step must be a whole number from 0 on, got {about.get('step')!r}"
+        )
     wanted = {name: value for name, value in loss.state_dict().items() if isinstance(value, Tensor)}
     saved = {name.removeprefix("loss."): value for name, value in tensors.items() if name.startswith("loss.")}
     if wanted.keys() != saved.keys() or any(wanted[name].shape != saved[name].shape for name in wanted):
         raise CheckpointError(f"{path} holds the state of another model")
+    for name, value in saved.items():
+        if value.dtype != wanted[name].dtype:
+            raise CheckpointError(f"{path} is damaged: {name} is {value.dtype}, wanted {wanted[name].dtype}")
+    groups = _param_groups(path, about.pop("param_groups"), optimizer)
+    moments = _moments(path, tensors, optimizer)
+    if about.pop("moments", len(moments)) != len(moments) or (about["step"] > 0 and not moments):
+        raise CheckpointError(f"{path} lacks the state of the optimiser: {len(moments)} parameters have moments")
+    _check_random_state(path, tensors["rng.cpu"])
     with torch.no_grad():
         for name, value in wanted.items():
             value.copy_(saved[name])
-    moments: dict[int, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        if name.startswith("optimizer."):
-            _, index, key = name.split(".")
-            moments.setdefault(int(index), {})[key] = value
-    optimizer.load_state_dict({"state": moments, "param_groups": about.pop("param_groups")})
+    optimizer.load_state_dict({"state": moments, "param_groups": groups})
     torch.set_rng_state(tensors["rng.cpu"])
     cuda = [tensors[name] for name in sorted(tensors) if name.startswith("rng.cuda.")]
     if cuda and torch.cuda.is_available():
         torch.cuda.set_rng_state_all(cuda)
     return about
+
+
+def _param_groups(path: str | Path, saved: Any, optimizer: torch.optim.Optimizer) -> list[dict[str, Any]]:
+    """The optimiser's settings, which are those of the run; only the learning rate has gone on since."""
+    now = optimizer.state_dict()["param_groups"]
+    if not isinstance(saved, list) or len(saved) != len(now) or not all(isinstance(group, dict) for group in saved):
+        raise CheckpointError(f"{path} is damaged: param_groups must be a list of {len(now)} objects")
+    for old, new in zip(saved, json.loads(json.dumps(now)), strict=True):
+        rate = old.get("lr")
+        if type(rate) not in (int, float) or not math.isfinite(rate) or rate < 0:
+            raise CheckpointError(f"{path} is damaged: param_groups: lr must be a number from 0 on, got {rate!r}")
+        other = [key for key in new if key != "lr" and key in old and old[key] != new[key]]
+        if other or "params" not in old:
+            raise CheckpointError(f"{path} is of another optimiser: {', '.join(other) or 'params'} differ")
+    return saved
+
+
+def _moments(
+    path: str | Path, tensors: Mapping[str, Tensor], optimizer: torch.optim.Optimizer
+) -> dict[int, dict[str, Tensor]]:
+    """The optimiser's state by number of the parameter."""
+    shapes = [parameter.shape for group in optimizer.param_groups for parameter in group["params"]]
+    moments: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        if not name.startswith("optimizer."):
+            continue
+        _, index, key = (*name.split("."), "", "")[:3]
+        fits = index.isdecimal() and int(index) < len(shapes) and name.count(".") == 2
+        if not fits or (key != "step" and value.shape != shapes[int(index)]) or not value.isfinite().all():
+            raise CheckpointError(f"{path} is damaged: {name} does not belong to any parameter, or is not finite")
+        moments.setdefault(int(index), {})[key] = value
+    lacking = [index for index, entries in moments.items() if entries.keys() != _MOMENTS]
+    if lacking:
+        raise CheckpointError(f"{path} is damaged: parameter {lacking[0]} lacks part of the state of its optimiser")
+    return moments
+
+
+def _check_random_state(path: str | Path, state: Tensor) -> None:
+    try:
+        torch.Generator().set_state(state)
+    except (RuntimeError, TypeError) as error:
+        raise CheckpointError(f"{path} is damaged: rng.cpu is no random state: {error}") from error

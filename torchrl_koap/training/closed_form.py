@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl_koap.data import cut_windows
 from torchrl_koap.modules import KoopmanInverseDynamics, LatentActionFourier, RidgeFit
 from torchrl_koap.modules.koopman.smoothed_action import RAW, LatentActionSmoothed
+from torchrl_koap.tasks import Task
 
 # one or two labelled trajectories cannot be left out to choose the penalty
 DEFAULT_PENALTY = 0.15
@@ -106,6 +107,29 @@ def _best_block(
     chooser.choose(kept[1])
     controller.action_decoder.load_state_dict(kept[3])
     return kept[2]
+
+
+def likely_axes(task: Task, columns: Sequence[int]) -> list[int]:
+    """The column that each action is likely to move, for a robot that came with data alone, which does not say it.
+
+    Args:
+        task (Task): the task.
+        columns (sequence of int): state columns that the controller reads.
+
+    Returns:
+        list of int: a column of those read for every action; empty where there is nothing to guess.
+
+    Examples:
+        >>> from torchrl_koap.tasks import Task, get_task
+        >>> from torchrl_koap.training.closed_form import likely_axes
+        >>> arm = Task("arm", {"goal": 2, "q": 2}, {"a": "rad", "b": "rad"}, "q", robot=(2, 3))
+        >>> likely_axes(arm, (2, 3)), likely_axes(get_task("avoiding"), (0, 1))
+        ([0, 1], [])
+    """
+    moved = task.action_targets or task.robot
+    if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
+        return []
+    return [list(columns).index(column) for column in moved]
 
 
 def _better_without(

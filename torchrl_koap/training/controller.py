@@ -3,26 +3,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import inspect
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictSequential
 from torch import nn
 
 from torchrl_koap.data import WindowTable, cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.tasks import HORIZON, WINDOW, Task
+from torchrl_koap.tasks import HORIZON, WINDOW
 from torchrl_koap.training import released_settings
 from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.checkpoints import save_tensors, save_weights
-from torchrl_koap.training.closed_form import fit_closed_form
-from torchrl_koap.training.config import ResolvedConfig
+from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
+from torchrl_koap.training.config import ResolvedConfig, TrainConfig
 from torchrl_koap.training.loop import moving_average, train_phase
-from torchrl_koap.training.methods import LABELLED_SHARES, Method, Phase
-from torchrl_koap.training.planner import planner_weight_decay, training_dtype
+from torchrl_koap.training.methods import COEFFICIENTS, LABELLED_SHARES, Method, Phase
+from torchrl_koap.training.planner import augmentation, planner_weight_decay, training_dtype
 from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.run_directory import RunDirectory
 
@@ -71,12 +73,12 @@ def learn_actions(
     method = resolved.method
     train_one = _Training(run, resolved, logger)
     fit: dict[str, Any] = {}
+    if resolved.teacher is not None:
+        data = _relabelled(train_one, resolved, data)
     if method.has_planner:
         view = resolved.controller_view(data)
         controller, fit, values = _train_network(train_one, method, resolved.controller, view)
     else:
-        if resolved.teacher is not None:
-            data = _relabelled(train_one, resolved, data)
         controller, values = _train_policy(train_one, resolved, data)
     values["updates"] = train_one.updates
     return controller, fit, values
@@ -153,7 +155,7 @@ def _train_network(
         )
         values |= train_one(
             phase.name,
-            phase.loss(controller),
+            phase.loss(controller, **_coefficients(options, phase)),
             buffer.sample,
             num_steps=train_one.budget(phase, budget, table),
             learning_rate=options.controller_learning_rate,
@@ -165,16 +167,15 @@ def _train_network(
         controller.fit_unlabelled(windows["state"])
     if method.closed_form:
         columns = task.controller_columns(options.controller_state)
-        fit = fit_closed_form(controller, data, shared_axes=task.actuated, guessed_axes=_likely_axes(task, columns))
+        fit = fit_closed_form(controller, data, shared_axes=task.actuated, guessed_axes=likely_axes(task, columns))
     return controller, fit, values
 
 
-def _likely_axes(task: Task, columns: Sequence[int]) -> list[int]:
-    """The column that each action is likely to move, for a robot that came with data alone, which does not say it."""
-    moved = task.action_targets or task.robot
-    if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
-        return []
-    return [list(columns).index(column) for column in moved]
+def _coefficients(options: TrainConfig, phase: Phase) -> dict[str, float]:
+    """The coefficients that were asked for, of those that the loss of a phase takes."""
+    takes = inspect.signature(phase.loss).parameters
+    asked = {name: getattr(options, name) for name in COEFFICIENTS if name in takes}
+    return {name: value for name, value in asked.items() if value is not None}
 
 
 def _train_policy(
@@ -201,12 +202,14 @@ def _train_policy(
         labelled_share=LABELLED_SHARES[phase.windows],
     )
     loss = phase.loss(policy)
+    # what the planner's windows undergo, but for the settings of the first public code, which has none of it
+    augment = augmentation(options, task, actions=True) if resolved.released is None else TensorDictSequential()
     table = WindowTable.build(data, WINDOW, pad_before=1, pad_after=HORIZON - 1)
     num_steps = train_one.budget(phase, options.steps, table, released_settings.POLICY_EPOCHS)
     values = train_one(
         phase.name,
         loss,
-        buffer.sample,
+        lambda: augment(buffer.sample()),
         num_steps=num_steps,
         learning_rate=options.planner_learning_rate,
         weight_decay=planner_weight_decay(options),

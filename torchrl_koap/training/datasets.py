@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import D3ILExperienceReplay, load_ted, read_about, read_task, select_state
@@ -58,7 +59,8 @@ def load_demonstrations(
         task (Task): the task.
         episodes (int, optional): number of scripted demonstrations to record. Default: that of the task.
         seed (int): seed of the scripted demonstrations.
-        progress (callable, optional): called with recorded and wanted scripted demonstrations.
+        progress (callable, optional): called with the number of demonstrations that were recorded, or read from raw
+            files, and that of all.
 
     Raises:
         FileNotFoundError: if there is no such folder, or it holds no demonstrations.
@@ -74,5 +76,43 @@ def load_demonstrations(
     elif (Path(dataset) / "ted").is_dir():
         data = load_ted(Path(dataset) / "ted", task=task.source, memmap=False)
     else:
-        data = D3ILExperienceReplay(task.name, dataset).data.clone()
+        data = D3ILExperienceReplay(task.name, dataset, progress=progress).data.clone()
+    if task.noise:
+        data = with_noise(data, task.observation[task.position], task.noise)
     return select_state(data, task.state_of)
+
+
+def with_noise(data: TensorDictBase, columns: slice, sigma: float, *, seed: int = 0) -> TensorDictBase:
+    """Demonstrations as a noisy sensor would have recorded them: actions are untouched.
+
+    A frame has the same noise as the next observation of a step and as the observation of the step that follows it.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]``; not changed.
+        columns (slice): observation columns that are disturbed.
+        sigma (float): standard deviation of the noise, in the units of the columns.
+
+    Keyword Args:
+        seed (int): seed of the noise: every reader of the same data meets the same. Defaults to ``0``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import flatten_trajectories
+        >>> from torchrl_koap.training.datasets import with_noise
+        >>> data = flatten_trajectories([torch.zeros(4, 3)] * 2, [torch.zeros(3, 1)] * 2)
+        >>> noisy = with_noise(data, slice(1, 3), 0.002)
+        >>> bool((noisy["next", "observation"][0] == noisy["observation"][1]).all())
+        True
+        >>> noisy["observation"].count_nonzero(dim=0).tolist()
+        [0, 6, 6]
+    """
+    generator = torch.Generator().manual_seed(seed)
+    now, following = data["observation"].clone(), data["next", "observation"].clone()
+    last = torch.ones(len(now), dtype=torch.bool)
+    last[:-1] = data["episode"][1:] != data["episode"][:-1]
+    shape = now[:, columns].shape
+    noise, ends = (sigma * torch.randn(shape, generator=generator, dtype=now.dtype) for _ in range(2))
+    after = torch.where(last[:, None], ends, noise.roll(-1, 0))
+    now[:, columns] += noise
+    following[:, columns] += after
+    return data.copy().set("observation", now).set("next", data["next"].copy().set("observation", following))

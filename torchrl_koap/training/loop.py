@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.objectives import SoftUpdate
 
-from torchrl_koap.training.checkpoints import load_training_state, save_training_state
+from torchrl_koap.training.checkpoints import CheckpointError, load_training_state, save_training_state
 from torchrl_koap.training.run_directory import RunDirectory
 
 
@@ -113,6 +113,8 @@ def train_phase(
     if resume and checkpoint is not None:
         if checkpoint.exists():
             start = load_training_state(checkpoint, loss_module, optimizer)["step"]
+            if start > num_steps:
+                raise CheckpointError(f"{checkpoint} is at step {start}, this training has {num_steps}")
         run.rewind_metrics(phase, start)
     values: dict[str, float] = run.last_metrics(phase) if start else {}
     began, mark, marked = time.perf_counter(), time.perf_counter(), start

@@ -6,8 +6,10 @@ an entry point of the group ``torchrl_koap.methods`` names.
 
 Fair by construction: all controllers get the same labelled windows, the same planner and the same number of updates
 (two-stage methods share theirs between the stages). Networks that may look ahead read the same frames, 4 before and up
-to 5 after the present one; Decision Diffuser's controller may not, it is defined by the next state. ``dp`` and
-``relabel`` have no planner and make its number of updates instead, ``relabel`` those of its teacher besides.
+to 5 after the present one, but for two that are defined otherwise: Decision Diffuser's controller (``dd``, and
+``relabel``, which is one trained on a teacher's actions) is told the next state, ``vae`` encodes the whole window.
+``dp`` and ``dp_relabel`` have no planner and make its number of updates instead; relabelling costs the updates of the
+teacher besides.
 
 Four controls say what the Koopman model itself is worth: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
 none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action reads, with its scales, penalty and prior;
@@ -17,9 +19,10 @@ none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action re
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -36,6 +39,7 @@ from torchrl_koap.modules import (
     QuantizedInverseDynamics,
     SupervisedInverseDynamics,
     VariationalInverseDynamics,
+    WindowVariationalInverseDynamics,
     make_koopman_inverse_dynamics,
 )
 from torchrl_koap.objectives import (
@@ -56,6 +60,7 @@ LOOK_AHEAD = (1, 2, 3, 4, 5)
 KINDS = ("controller", "policy")
 # share of every batch that has labels; None: as it comes
 LABELLED_SHARES = {"all": None, "mixed": 0.25, "labelled": 1.0}
+COEFFICIENTS = ("koopman_coeff", "action_coeff")  # of losses, that a training may be given
 GROUP = "torchrl_koap.methods"  # of entry points
 
 
@@ -113,6 +118,8 @@ class Method:
         teacher (str): the method whose controller labels the rest of the data first.
         other_decoder (str): the same method with the other way to get a decoder.
         presets (tuple of str): values of ``--preset`` that it can be built with; the first is its own.
+        earlier (str): the method that runs hold which name this one but were trained before it was what it is now:
+            those whose ``controller`` entry does not say ``"revised"``.
 
     Raises:
         ValueError: for an unknown kind, a name that cannot be a folder's, or two phases of one name.
@@ -136,6 +143,7 @@ class Method:
     teacher: str = ""
     other_decoder: str = ""
     presets: tuple[str, ...] = ("default",)
+    earlier: str = ""
 
     def __post_init__(self):
         lookup(KINDS, self.kind, "kind of method")
@@ -173,15 +181,44 @@ def _diffusion_policy(state_dim, action_dim, features, options):
     return build_diffusion_policy(options, state_dim, action_dim, features)
 
 
-def without_actions(network: nn.Module) -> LossModule:
-    """KOAP's loss on states alone."""
-    return KOAPLoss(network, action_coeff=0.0)
+def without_actions(network: nn.Module, *, koopman_coeff: float = 1.0) -> LossModule:
+    """KOAP's loss on states alone.
+
+    Args:
+        network (nn.Module): the model.
+
+    Keyword Args:
+        koopman_coeff (float): weight of its Koopman term. Defaults to ``1``.
+    """
+    return KOAPLoss(network, action_coeff=0.0, koopman_coeff=koopman_coeff)
+
+
+def loss_coefficients(method: Method) -> set[str]:
+    """Names of the coefficients that the losses of a method take, such as ``"koopman_coeff"``.
+
+    Args:
+        method (Method): the method.
+
+    Examples:
+        >>> from torchrl_koap.training.methods import get_method, loss_coefficients
+        >>> sorted(loss_coefficients(get_method("koap_paper"))), loss_coefficients(get_method("dd"))
+        (['action_coeff', 'koopman_coeff'], set())
+    """
+    return {
+        name for phase in method.phases for name in inspect.signature(phase.loss).parameters if name in COEFFICIENTS
+    }
 
 
 _LABELS = (Phase("controller", InverseDynamicsLoss, "labelled"),)
 _JOINT = (Phase("controller", KOAPLoss, "mixed"),)
 # the decoder that is fitted afterwards, on a frozen encoder
 _DECODER = Phase("decoder", LatentDecoderLoss, "labelled", share=0.5)
+
+
+def _decoder_of_samples(network: nn.Module) -> LossModule:
+    """Fits the action decoder to samples of the latent instead of its mean."""
+    return LatentDecoderLoss(network, samples=True)
+
 
 _POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
 
@@ -260,7 +297,14 @@ for _method in (
     Method("dd_lookahead", "supervised, look-ahead", partial(_supervised, look_ahead=LOOK_AHEAD), _LABELS),
     Method(
         "vae",
-        "variational autoencoder",
+        "variational autoencoder of whole windows",
+        partial(_network, kind=WindowVariationalInverseDynamics),
+        (Phase("controller", VariationalLoss, share=0.5), replace(_DECODER, loss=_decoder_of_samples)),
+        earlier="vae_steps",
+    ),
+    Method(
+        "vae_steps",
+        "variational autoencoder of the steps around a frame",
         partial(_network, kind=VariationalInverseDynamics),
         (Phase("controller", VariationalLoss, share=0.5), _DECODER),
     ),
@@ -279,6 +323,14 @@ for _method in (
     Method("dp", "Diffusion Policy", _diffusion_policy, _POLICY, kind="policy"),
     Method(
         "relabel",
+        "Decision Diffuser on relabelled data",
+        partial(_supervised, look_ahead=1),
+        _LABELS,
+        teacher="dd_lookahead",
+        earlier="dp_relabel",
+    ),
+    Method(
+        "dp_relabel",
         "Diffusion Policy on relabelled data",
         _diffusion_policy,
         _POLICY,

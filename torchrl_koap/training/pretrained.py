@@ -9,12 +9,13 @@ from pathlib import Path
 from torchrl_koap.lookup import lookup
 from torchrl_koap.training.checkpoints import load_tensors, save_tensors
 from torchrl_koap.training.compact_weights import compact
+from torchrl_koap.training.digests import DIGESTS, write_digests
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 PREFIX = "pretrained:"
 # what a run is made of; evaluations, reports and checkpoints are made from it
 WEIGHTS = ("planner.safetensors", "controller.safetensors")
-FILES = ("config.json", "summary.json", "metrics.csv", "eigenvalues.safetensors", *WEIGHTS)
+FILES = ("config.json", "summary.json", "metrics.csv", "eigenvalues.safetensors", *WEIGHTS, DIGESTS)
 
 
 def pretrained_folders() -> dict[str, Path]:
@@ -88,5 +89,6 @@ def publish(run: str | Path, folder: str | Path, card: str) -> Path:
             # a closed-form decoder was fitted to features of exactly these frequencies: of them nothing is rounded
             only = ("covariance_root",) if name == "controller.safetensors" and (folder / WEIGHTS[0]).exists() else ()
             save_tensors(folder / name, compact(tensors, only=only), about)
+    write_digests(RunDirectory(folder))
     (folder / "README.md").write_text(card)
     return folder

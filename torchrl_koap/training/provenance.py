@@ -3,14 +3,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import platform
 from dataclasses import asdict
 from typing import Any
 
+import torch
+from tensordict import TensorDictBase
+
 from torchrl_koap.tasks.registry import is_adopted
 from torchrl_koap.training.config import ResolvedConfig
 
+# what is derived from these may differ from version to version
+_RECORDED = ("observation", "action", "has_action", "episode", "step_count", ("next", "observation"), ("next", "done"))
 _PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
 
 
@@ -29,6 +35,29 @@ def to_json(resolved: ResolvedConfig, command: str | None = None) -> dict[str, A
     if command is not None:
         content["command"] = command
     return content | {"versions": versions()}
+
+
+def fingerprint(data: TensorDictBase) -> dict[str, Any]:
+    """What tells data from others: their size, and a checksum of what was recorded.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]``, on any device.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.training.provenance import fingerprint
+        >>> one, other = (TensorDict({"action": torch.tensor([[0.0], [last]])}, [2]) for last in (1.0, 2.0))
+        >>> fingerprint(one) == fingerprint(one.clone()), fingerprint(one) == fingerprint(other)
+        (True, False)
+    """
+    digest = hashlib.sha256()
+    present = set(data.keys(True, True))
+    for name in [name for name in _RECORDED if name in present]:
+        value = data.get(name).detach().cpu().contiguous()
+        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+        digest.update(value.reshape(-1).view(torch.uint8).numpy())
+    return {"steps": len(data), "sha256": digest.hexdigest()}
 
 
 def versions() -> dict[str, str]:

@@ -8,11 +8,16 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from torchrl._utils import logger
+
 from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 # with which a run may be resumed differently; with other threads sums are rounded differently
-FREE = frozenset({"out", "threads", "checkpoint_every", "resume", "plugins", "command", "versions"})
+FREE = frozenset(
+    {"out", "threads", "checkpoint_every", "resume", "force_data", "plugins", "command", "versions", "data"}
+)
+_EVERY_TIME = ("resume", "force_data")  # asked for anew or not at all
 
 
 def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
@@ -26,7 +31,10 @@ def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
         return config
     earlier = run.read_json("config.json")
     left = [field.name for field in fields(config) if getattr(config, field.name) == field.default]
+    left = [name for name in left if name not in _EVERY_TIME]
     kept = {name: earlier[name] for name in left if name in earlier}
+    if "forecast" in left and "forecast" not in earlier:
+        kept["forecast"] = False  # there was none to choose
     kept = {name: tuple(value) if isinstance(value, list) else value for name, value in kept.items()}
     if kept.get("planner_from") is not None:
         kept["planner_from"] = Path(kept["planner_from"])
@@ -47,6 +55,9 @@ def check_resume(run: RunDirectory, content: Mapping[str, Any], *, resume: bool)
         RunDirectoryError: naming what differs.
     """
     if not (run.path / "config.json").exists():
+        left = [name for name in ("planner.safetensors", "controller.safetensors", "checkpoints") if _is_in(run, name)]
+        if left:
+            raise RunDirectoryError(f"{run.path} holds {', '.join(left)} but no config.json; choose another --out")
         return
     if not resume:
         raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
@@ -54,6 +65,50 @@ def check_resume(run: RunDirectory, content: Mapping[str, Any], *, resume: bool)
     # a folder that is gone was moved, probably together with this run: there is nothing to compare with
     paths = {name: earlier.get(name) for name in ("dataset", "planner_from")}
     moved = {name for name, path in paths.items() if path not in (None, "scripted") and not Path(path).exists()}
-    changed = [key for key in content if key not in FREE | moved and content[key] != earlier.get(key)]
+    fixed = [key for key in content if key not in FREE | moved]
+    changed = [key for key in fixed if (content[key] or None) != (earlier.get(key) or None)]  # off, or not there yet
     if changed:
         raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so")
+
+
+def _is_in(run: RunDirectory, name: str) -> bool:
+    return (run.path / name).exists()
+
+
+def check_data(run: RunDirectory, content: Mapping[str, Any], *, force: bool = False) -> None:
+    """Refuses to go on with other demonstrations, or another version of this package, than a run was begun with.
+
+    The weights would be neither those of the one nor of the other. Runs of earlier versions kept nothing to compare.
+
+    Args:
+        run (RunDirectory): the folder.
+        content (mapping): what ``config.json`` is to hold, ``data`` included
+            (:func:`~torchrl_koap.training.provenance.fingerprint`).
+
+    Keyword Args:
+        force (bool): go on all the same.
+
+    Raises:
+        RunDirectoryError: naming what differs.
+    """
+    if force or not (run.path / "config.json").exists():
+        return
+    earlier = run.read_json("config.json")
+    before, now = earlier.get("data"), content["data"]
+    if before not in (None, now):
+        sizes = (
+            f"{before.get('steps')} steps then, {now['steps']} now" if before.get("steps") != now["steps"] else "others"
+        )
+        raise RunDirectoryError(
+            f"{run.path} was started with other demonstrations than {content['dataset']} holds now ({sizes}); bring the"
+            " earlier ones back, choose another --out, or insist with --force-data"
+        )
+    then, here = (versions.get("versions") or {} for versions in (earlier, content))
+    if then.get("torchrl_koap", here["torchrl_koap"]) != here["torchrl_koap"]:
+        raise RunDirectoryError(
+            f"{run.path} was started with torchrl_koap {then['torchrl_koap']}, this is {here['torchrl_koap']}; choose"
+            " another --out, or insist with --force-data"
+        )
+    others = [f"{name} {then[name]} (now {here[name]})" for name in here if then.get(name, here[name]) != here[name]]
+    if others:
+        logger.warning("%s was started with %s: the last bits of its weights may differ", run.path, ", ".join(others))

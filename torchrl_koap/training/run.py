@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -21,11 +20,13 @@ from torchrl_koap.training.config import ResolvedConfig, TrainConfig, resolve
 from torchrl_koap.training.controller import train_controller
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.diffusion_builders import build_planner
+from torchrl_koap.training.digests import forget_digests, write_digests
+from torchrl_koap.training.loggers import close_logger, make_logger
 from torchrl_koap.training.planner import train_planner
 from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
-from torchrl_koap.training.provenance import to_json
-from torchrl_koap.training.resume import check_resume, started_with
+from torchrl_koap.training.provenance import fingerprint, to_json
+from torchrl_koap.training.resume import check_data, check_resume, started_with
 from torchrl_koap.training.run_directory import RunDirectory
 from torchrl_koap.training.validation import choose_validation, validation_of, without_validation
 
@@ -60,9 +61,11 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         set_up_torch(options.threads, options.device)
         content = to_json(resolved, command)
         check_resume(run, content, resume=options.resume)
-        _build_once(resolved)
+        check_networks(resolved)
 
-        with progress_bar(None, "demonstrations", unit="episode", shown=options.dataset == "scripted") as bar:
+        # files are read in a moment, unless there are thousands of them
+        wait = 0 if options.dataset == "scripted" else 3
+        with progress_bar(None, "demonstrations", unit="episode", delay=wait) as bar:
             data = load_demonstrations(options.dataset, task, episodes=options.episodes, progress=count_up_to(bar))
         resolved = resolved.with_labels_of(data)
         options = resolved.options
@@ -70,6 +73,8 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         labelled, report = resolved.budget.apply(data, command=task.command_columns)
         # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
         labelled = subsample_trajectories(labelled, options.observation_fraction).to(options.device)
+        content["data"] = fingerprint(labelled)
+        check_data(run, content, force=options.force_data)
         held_out = _validation(resolved, labelled)
         if held_out:
             content["validation_episodes"] = held_out
@@ -79,10 +84,12 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         if not mine:
             held.enter_context(run.locked("koap train"))
             check_resume(run, content, resume=options.resume)  # another one may have begun here in the meantime
+        if options.force_data:
+            forget_digests(run)
         run.write_json("config.json", content)  # not before the data are known to be good: a wrong call leaves nothing
 
         began = time.perf_counter()
-        logger = _make_logger(options)
+        logger = make_logger(options.logger, options.out)
         try:
             torch.manual_seed(options.seed)
             planner, planner_values = None, {}
@@ -92,8 +99,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
             torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
             controller, fit, controller_values = train_controller(run, resolved, labelled, logger)
         finally:
-            if logger is not None:
-                logger.close()
+            close_logger(logger)
         summary = {
             "labels": report.as_dict(),
             "trajectories_used": len(labelled["episode"].unique()),
@@ -109,6 +115,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
             analysis = write_analysis(run, task, data, labelled, controller, resolved.columns)
             summary[error_entry(task.action_unit)] = analysis
         run.write_json("summary.json", summary)
+        write_digests(run)
     return summary
 
 
@@ -132,13 +139,19 @@ def train_shared_planner(config: TrainConfig) -> dict[str, float]:
     data["action"] = torch.full_like(data["action"], torch.nan)
     data["has_action"] = torch.zeros_like(data["has_action"])
     data = subsample_trajectories(data, options.observation_fraction).to(options.device)
-    content = to_json(resolved)
+    content = to_json(resolved) | {"data": fingerprint(data)}
     if held_out:
         content["validation_episodes"] = held_out
-    check_resume(run, content, resume=options.resume)
-    run.write_json("config.json", content)
-    torch.manual_seed(options.seed)
-    return train_planner(run, resolved, without_validation(data, held_out))[1]
+    with run.locked("koap train"):
+        check_resume(run, content, resume=options.resume)
+        check_data(run, content, force=options.force_data)
+        if options.force_data:
+            forget_digests(run)
+        run.write_json("config.json", content)
+        torch.manual_seed(options.seed)
+        values = train_planner(run, resolved, without_validation(data, held_out))[1]
+        write_digests(run)
+    return values
 
 
 def _validation(resolved: ResolvedConfig, labelled: TensorDictBase) -> list[int]:
@@ -151,8 +164,22 @@ def _validation(resolved: ResolvedConfig, labelled: TensorDictBase) -> list[int]
     return choose_validation(labelled, options.validation_fraction, seed=options.seed)
 
 
-def _build_once(resolved: ResolvedConfig) -> None:
-    """Finds unknown names and weights that do not fit before any work is done."""
+def check_networks(resolved: ResolvedConfig) -> None:
+    """Finds unknown names, networks that cannot read the task's state and weights that do not fit, before any work.
+
+    Args:
+        resolved (ResolvedConfig): all options.
+
+    Raises:
+        ValueError: naming what does not fit.
+        CheckpointError: if the planner to take over is of another task or size.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training.config import TrainConfig, resolve
+        >>> from torchrl_koap.training.run import check_networks
+        >>> check_networks(resolve(TrainConfig(out=Path("run"), task="sorting")))
+    """
     task, features = resolved.task, resolved.task.planner_features()
     if not resolved.method.has_planner:
         resolved.method.build(task.state_dim, task.action_dim, features, resolved.planner)
@@ -160,6 +187,7 @@ def _build_once(resolved: ResolvedConfig) -> None:
     planner = build_planner(resolved.planner, task.state_dim, features)
     if resolved.options.planner_from is not None:
         load_weights(Path(resolved.options.planner_from) / "planner.safetensors", planner, task=task.name)
+    build_controller(resolved.controller, len(resolved.columns), task.action_dim, method=resolved.method)
 
 
 def _check_lengths(resolved: ResolvedConfig, data: TensorDictBase) -> None:
@@ -173,12 +201,3 @@ def _check_lengths(resolved: ResolvedConfig, data: TensorDictBase) -> None:
     WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.num_past)
     if resolved.options.analysis:
         WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
-
-
-def _make_logger(options: TrainConfig):
-    if options.logger == "csv":
-        return None
-    from torchrl.record.loggers import get_logger
-
-    mode = os.environ.get("WANDB_MODE", "offline")
-    return get_logger("wandb", str(options.out), options.out.name, wandb_kwargs={"mode": mode, "project": "koap"})

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.files import LockedError, one_at_a_time, replacing_file
+from torchrl_koap.files import LockedError, check_file, one_at_a_time, read_bytes, replacing_file
 
 
 class RunDirectoryError(ValueError):
@@ -52,20 +52,27 @@ class RunDirectory:
             aside.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
     def read_json(self, name: str) -> dict[str, Any]:
-        """Reads a JSON file.
+        """Reads a JSON file; the entries of ``config.json`` are compared with the types of the options.
 
         Raises:
             RunDirectoryError: if it is not there or damaged; the message names it.
         """
         path = self.path / name
-        if not path.is_file():
+        if not path.exists():
             raise RunDirectoryError(f"{path} is missing: is {self.path} the folder of a finished `koap train`?")
         try:
-            content = json.loads(path.read_text())
-        except ValueError as error:
+            # numbers that are not finite were written once; JSON does not know them
+            content = json.loads(read_bytes(path).decode(), parse_constant=lambda _: None)
+        except (ValueError, RecursionError) as error:
             raise RunDirectoryError(f"{path} is damaged: {error}") from error
+        except OSError as error:
+            raise RunDirectoryError(f"{path} cannot be read: {error}") from error
         if not isinstance(content, dict):
             raise RunDirectoryError(f"{path} is damaged: expected an object, got {type(content).__name__}")
+        if name == "config.json":
+            from torchrl_koap.training.saved_options import check_config  # knows the options, and with them TorchRL
+
+            check_config(path, content)
         return content
 
     def read_entry(self, name: str, key: str) -> Any:
@@ -119,12 +126,22 @@ class RunDirectory:
         """All complete rows of ``metrics.csv``; none if there is no such file.
 
         A row that was cut off when a process was killed or the disk was full is left out.
+
+        Raises:
+            RunDirectoryError: if a complete row is damaged; the message names the file and the row.
         """
         path = self.path / "metrics.csv"
         if not path.exists():
             return []
-        with path.open(newline="") as file:
-            return list(csv.DictReader(line for line in file if line.endswith("\n")))
+        try:
+            check_file(path)
+            with path.open(newline="") as file:
+                rows = list(csv.DictReader(line for line in file if line.endswith("\n")))
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise RunDirectoryError(f"{path} is damaged: {error}") from error
+        for row in rows:
+            _check_row(path, row)
+        return rows
 
     def last_metrics(self, phase: str) -> dict[str, float]:
         """The values of the last row of a phase; none if there is none."""
@@ -166,6 +183,19 @@ class RunDirectory:
             except LockedError as error:
                 raise RunDirectoryError(str(error)) from None
             yield
+
+
+def _check_row(path: Path, row: Mapping[str, Any]) -> None:
+    """Refuses a row without phase and step, or with a value that is no number."""
+    try:
+        if not row["phase"] or int(row["step"]) < 0 or None in row:
+            raise ValueError("wanted a phase, a step, and a value or nothing for every other column")
+        for name, value in row.items():
+            if value and name not in ("phase", "step"):
+                float(value)
+    except (KeyError, TypeError, ValueError) as error:
+        found = ", ".join(f"{value}" for value in row.values())
+        raise RunDirectoryError(f"{path} is damaged in the row {found[:60]!r}: {error}") from error
 
 
 def _finite(value: Any) -> Any:

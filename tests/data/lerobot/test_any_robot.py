@@ -24,8 +24,11 @@ FEATURES = {
 }
 
 
-def write(root, *, actions="all", features=None, rows=6, change=None):
-    """Two episodes of a seven-joint arm; ``actions`` is "all", "none", "missing" or a list of rows without one."""
+def write(root, *, actions="all", features=None, rows=6, change=None, version="v3.0", lacking=()):
+    """Two episodes of a seven-joint arm; ``actions`` is "all", "none", "missing" or a list of rows without one.
+
+    In format 2.1 every episode has a file of its own; those ``lacking`` have no column of actions.
+    """
     state = np.linspace(0, 1, 2 * rows * 7).reshape(-1, 7)
     columns = {
         "observation.state": pa.array(state.tolist(), pa.list_(pa.float32())),
@@ -40,8 +43,14 @@ def write(root, *, actions="all", features=None, rows=6, change=None):
     columns |= change or {}
     (root / "data/chunk-000").mkdir(parents=True)
     (root / "meta").mkdir()
-    pq.write_table(pa.table(columns), root / "data/chunk-000/file-000.parquet")
-    info = {"codebase_version": "v3.0", "fps": 30, "total_episodes": 2, "features": features or FEATURES}
+    table = pa.table(columns)
+    if version == "v3.0":
+        pq.write_table(table, root / "data/chunk-000/file-000.parquet")
+    for episode in range(2) if version == "v2.1" else ():
+        part = table.slice(episode * rows, rows)
+        part = part.drop_columns(["action"]) if episode in lacking else part
+        pq.write_table(part, root / f"data/chunk-000/episode_{episode:06d}.parquet")
+    info = {"codebase_version": version, "fps": 30, "total_episodes": 2, "features": features or FEATURES}
     (root / "meta/info.json").write_text(json.dumps(info))
     return root
 
@@ -53,23 +62,44 @@ def test_names_rate_and_images(tmp_path):
     assert [frames.shape for frames in recordings.states] == [(6, 8), (6, 8)] and recordings.num_labels == 10
 
 
-def test_actions_for_a_part_of_the_rows(tmp_path):
-    recordings = read_lerobot_recordings(write(tmp_path, actions=[1, *range(6, 12)]))
+VERSIONS = pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+
+
+@VERSIONS
+def test_actions_for_a_part_of_the_rows(version, tmp_path):
+    recordings = read_lerobot_recordings(write(tmp_path, actions=[1, *range(6, 12)], version=version))
     assert recordings.num_labels == 4
     assert np.isnan(recordings.actions[0][1]).all() and np.isnan(recordings.actions[1]).all()
 
 
+@VERSIONS
 @pytest.mark.parametrize("actions", ["none", "missing"])
-def test_no_actions_at_all(actions, tmp_path):
-    recordings = read_lerobot_recordings(write(tmp_path, actions=actions))
+def test_no_actions_at_all(actions, version, tmp_path):
+    recordings = read_lerobot_recordings(write(tmp_path, actions=actions, version=version))
     assert recordings.num_labels == 0 and recordings.actions[0].shape == (5, 7)
 
 
-def test_nan_rows_have_no_label(tmp_path):
+@VERSIONS
+def test_nan_rows_have_no_label(version, tmp_path):
     steps = np.full((12, 7), 0.5)
     steps[3] = np.nan
-    recordings = read_lerobot_recordings(write(tmp_path, change={"action": pa.array(steps.tolist())}))
+    recordings = read_lerobot_recordings(write(tmp_path, change={"action": pa.array(steps.tolist())}, version=version))
     assert recordings.num_labels == 9
+
+
+def test_an_episode_whose_file_has_no_actions(tmp_path):
+    recordings = read_lerobot_recordings(write(tmp_path, version="v2.1", lacking=[1]))
+    assert recordings.num_labels == 5 and np.isnan(recordings.actions[1]).all()
+
+
+@VERSIONS
+def test_pictures_inside_the_tables_are_listed_and_skipped(version, tmp_path):
+    features = FEATURES | {"observation.images.wrist": {"dtype": "image", "shape": [4, 4, 3], "names": None}}
+    pictures = pa.array([{"bytes": b"png", "path": None}] * 12)
+    root = write(tmp_path, features=features, change={"observation.images.wrist": pictures}, version=version)
+    recordings = read_lerobot_recordings(root)
+    assert recordings.skipped == ("observation.images.front", "observation.images.wrist")
+    assert recordings.state_names == (*JOINTS, "force")
 
 
 def test_chosen_features(tmp_path):

@@ -162,7 +162,12 @@ def find_raw_files(task: str, root: str | Path, *, split_file: str | Path | None
 
 
 def convert_raw_files(
-    converter: Converter, files: Sequence[Path], folder: Path, *, dtype: torch.dtype = torch.float32
+    converter: Converter,
+    files: Sequence[Path],
+    folder: Path,
+    *,
+    dtype: torch.dtype = torch.float32,
+    progress: Callable[[int, int], None] | None = None,
 ) -> TensorDictBase:
     """Converts raw demonstrations to flat TED data.
 
@@ -171,12 +176,15 @@ def convert_raw_files(
         files (sequence of Path): the demonstrations, one trajectory each.
         folder (Path): what to call the whole in an error message.
         dtype (torch.dtype): floating type of the entries.
+        progress (callable, optional): called with the number of files read and that of all.
 
     Raises:
         RawFolderError: with the problems of all files.
     """
     problems, observations, actions = [], [], []
-    for file in files:
+    for index, file in enumerate(files):
+        if progress is not None and index:
+            progress(index, len(files))
         try:
             episode = read_raw_episode(file, robot=converter.robot, objects=converter.objects)
         except RawEpisodeError as error:
@@ -189,8 +197,9 @@ def convert_raw_files(
             problems.append(_origin(file, episode, converter))
             continue
         observation, action = converter.convert(episode)
-        observations.append(torch.from_numpy(observation))
-        actions.append(torch.from_numpy(action))
+        # of thousands of files only this is kept: not their bytes, and not twice the digits
+        observations.append(torch.from_numpy(observation).to(dtype))
+        actions.append(torch.from_numpy(action).to(dtype))
     if problems:
         raise RawFolderError(folder, problems)
     return flatten_trajectories(observations, actions, dtype=dtype)

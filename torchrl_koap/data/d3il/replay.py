@@ -59,6 +59,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         dtype (torch.dtype): floating type of the entries; the differences are taken in float64.
         label_budget (LabelBudget, optional): hides labels, and the commands that would give them away, from everything
             that uses this data set; what was spent is in :attr:`label_report`. Never part of the cache.
+        progress (callable, optional): called with the number of raw files converted and that of all.
         batch_size, sampler, sample_unit, transform, prefetch, collate_fn (optional): as in
             :class:`~torchrl.data.TensorDictReplayBuffer`.
 
@@ -93,6 +94,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         cache: str | Path | None = None,
         dtype: torch.dtype = torch.float32,
         label_budget: LabelBudget | None = None,
+        progress: Callable[[int, int], None] | None = None,
         **kwargs: Any,
     ):
         facts = get_task(task)
@@ -103,7 +105,7 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
             raise ValueError(f"actions={actions!r} is for LeRobot data sets; {root} is none")
         else:
             (self.root, files), kind = find_raw_files(task, root, split_file=split_file), []
-            convert = partial(convert_raw_files, get_converter(task), files, self.root, dtype=dtype)
+            convert = partial(convert_raw_files, get_converter(task), files, self.root, dtype=dtype, progress=progress)
         self._cache = _cache_folder(cache)
         self._data_path = self._cache / "d3il" / f"{task}-{_fingerprint(facts, files, dtype, kind)}"
         # several processes may open the same folder at the same time: one converts, the others wait for it

@@ -17,18 +17,25 @@ import math
 import pickle
 import pickletools
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from torchrl_koap.files import read_bytes
+
 _MAX_DEPTH = 64
+_MOST_VALUES = 1_000_000  # values that a tuple unfolds to: so much is gone through when it is hashed
+_MOST_ODD_KEYS = 10_000  # keys other than text can be chosen to collide, which takes the square of their number
 _ELEMENT_TYPES = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,5}")
 _PLAIN = (str, bytes, bool, int, float, type(None))
 
 _STRINGS = frozenset("STRING BINSTRING SHORT_BINSTRING UNICODE SHORT_BINUNICODE BINUNICODE BINUNICODE8".split())
 _REMEMBER = frozenset("PUT BINPUT LONG_BINPUT MEMOIZE".split())
 _RECALL = frozenset("GET BINGET LONG_BINGET".split())
+_TUPLES = frozenset("TUPLE TUPLE1 TUPLE2 TUPLE3".split())
+_KEYED = frozenset("DICT SETITEM SETITEMS".split())
 _PLAIN_OPCODES = (
     frozenset(
         "PROTO FRAME STOP MARK NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT"
@@ -62,6 +69,7 @@ def load_pickle(path: str | Path) -> Any:
         UnsafePickleError: if the file holds anything else. The message names the file and the class or function.
         DamagedPickleError: if the file is empty, truncated or no pickle.
         FileNotFoundError: if there is no such file.
+        OSError: if it is a pipe or device, or larger than 256 MB.
 
     Examples:
         >>> import os, pickle, tempfile
@@ -85,7 +93,7 @@ def load_pickle(path: str | Path) -> Any:
         True
     """
     path = Path(path)
-    return loads_pickle(path.read_bytes(), name=str(path))
+    return loads_pickle(read_bytes(path), name=str(path))
 
 
 def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
@@ -120,44 +128,78 @@ def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
         raise DamagedPickleError(f"{name}: not a complete pickle ({type(error).__name__}: {error})") from error
 
 
+class _Sketch(NamedTuple):
+    """What the scan knows of a value without building it: its text, if it is one, and how many values it unfolds to."""
+
+    text: str | None = None
+    size: int = 1
+
+
 def _scan(content: bytes, name: str) -> None:
-    """Refuses, without running anything, instructions and names that plain data do not need."""
+    """Refuses, without running anything, instructions, names and amounts of work that plain data do not need."""
     refused: dict[str, None] = {}  # in the order they are met
-    recent: list[str | None] = []  # values pushed last, None where they are no known text
-    remembered: dict[int, str | None] = {}
-    position, damage = 0, None
+    stack: list[_Sketch | None] = []  # None is a mark
+    remembered: dict[int, _Sketch] = {}
+    position, damage, odd_keys = 0, None, 0
     try:
         for opcode, argument, position in pickletools.genops(content):
             instruction, asked = opcode.name, None
-            if instruction in _STRINGS:
-                recent.append(argument)
-            elif instruction in _REMEMBER:
+            if instruction in _REMEMBER:
                 slot = len(remembered) if instruction == "MEMOIZE" else argument
                 if slot > position:  # the C unpickler allocates up to the largest slot at once
                     refused[f"memory slot {slot}"] = None
-                remembered[slot] = recent[-1] if recent else None
-            elif instruction in _RECALL:
-                recent.append(remembered.get(argument))
-            elif instruction in ("GLOBAL", "INST"):
+                remembered[slot] = stack[-1] or _Sketch()
+            taken = [] if instruction in _REMEMBER else _take(stack, opcode.stack_before)
+            if instruction in ("GLOBAL", "INST"):
                 asked = tuple(argument.split(" ", 1))
-                recent.clear()
             elif instruction == "STACK_GLOBAL":
-                asked = tuple(([None, None] + recent)[-2:])
-                recent.clear()
-            elif instruction not in ("PROTO", "FRAME"):
-                recent.clear()
+                asked = tuple(value.text for value in taken)
             if asked is not None and not _permitted(*asked):
                 refused["a disguised name" if None in asked else _spell(*asked)] = None
             elif instruction not in _PLAIN_OPCODES:
                 refused[f"pickle instruction {instruction}"] = None
+            if instruction in _KEYED:
+                keys = taken if instruction == "DICT" else taken[1:]
+                odd_keys += sum(key.text is None for key in keys[::2])
+            if instruction in _REMEMBER:
+                continue
+            if instruction == "MARK":
+                stack.append(None)
+            elif opcode.stack_after:
+                sketch = remembered.get(argument, _Sketch()) if instruction in _RECALL else _Sketch()
+                if instruction in _STRINGS:
+                    sketch = _Sketch(argument)
+                elif instruction in _TUPLES:
+                    sketch = _Sketch(size=1 + sum(value.size for value in taken))
+                if sketch.size > _MOST_VALUES:  # shared parts: a short file can unfold without end
+                    refused[f"a tuple of more than {_MOST_VALUES:,} values"] = None
+                    sketch = _Sketch()
+                stack.append(sketch)
     except Exception as error:  # genops reports damage by several kinds of errors
-        damage = f"{name}: not a complete pickle ({error}, after byte {position})"
+        damage = f"{name}: not a complete pickle ({error or type(error).__name__}, after byte {position})"
+    if odd_keys > _MOST_ODD_KEYS:
+        refused[f"{odd_keys:,} dictionary keys that are no text (more than {_MOST_ODD_KEYS:,})"] = None
     if refused:
         raise _refusal(name, ", ".join(list(refused)[:6]))
     if damage:
         raise DamagedPickleError(damage)
     if position + 1 != len(content):
         raise DamagedPickleError(f"{name}: {len(content) - position - 1} bytes follow the end of the pickle")
+
+
+def _take(stack: list[_Sketch | None], before: Sequence[Any]) -> list[_Sketch]:
+    """Takes from the sketched stack what an instruction uses up; first comes what was pushed first."""
+    taken = []
+    if pickletools.markobject in before:
+        while (value := stack.pop()) is not None:
+            taken.append(value)
+        before = before[: before.index(pickletools.markobject)]
+    for _ in before:
+        value = stack.pop()
+        if value is None:
+            raise ValueError("a mark where a value was wanted")
+        taken.append(value)
+    return taken[::-1]
 
 
 def _refusal(name: str, asked: str) -> UnsafePickleError:
@@ -282,6 +324,12 @@ def _encode(text, encoding):
     return text.encode("latin1")
 
 
+def _ordered_dict(*pairs):
+    if pairs and len(pairs[0]) > _MOST_ODD_KEYS:
+        raise UnsafePickleError(f"a dictionary is made of {len(pairs[0]):,} pairs, more than {_MOST_ODD_KEYS:,}")
+    return dict(*pairs)
+
+
 def _no_call(*_args):
     raise UnsafePickleError("calls numpy.ndarray directly")
 
@@ -293,7 +341,7 @@ def _empty_bytes():
 _STAND_INS = {
     ("numpy", "ndarray"): _no_call,
     ("numpy", "dtype"): _ElementType,
-    ("collections", "OrderedDict"): dict,
+    ("collections", "OrderedDict"): _ordered_dict,
     ("_codecs", "encode"): _encode,
     ("builtins", "bytes"): _empty_bytes,
     ("__builtin__", "bytes"): _empty_bytes,

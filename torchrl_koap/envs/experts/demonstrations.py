@@ -1,16 +1,17 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recording demonstrations: scripted experts play the library's own environments, all episodes in one batch.
+"""Recording demonstrations: scripted experts play the library's own environments, in batches of bounded size.
 
 An attempt that touches what it must not, takes another mode than asked for, does not finish, or is unlike any human one
 (all but touches, takes too long) is played again with other random draws, after four attempts from another context;
-nothing else is selected, and every discarded attempt is counted in the report.
+nothing else is selected, and every discarded attempt is counted in the report. A batch is finished before the next one
+begins, so demonstrations come in their order, and an operator that never succeeds is found out by the first batch.
 """
 
 from __future__ import annotations
 
+import functools
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,9 @@ from tensordict import TensorDict
 from torchrl_koap.data import RawEpisode, flatten_trajectories, write_raw_episode
 from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.experts.recording import FAULTS, Episode, PlainEpisode, RecordingRules, expert_of, play
+from torchrl_koap.envs.experts.disturbances import Disturbances, choose_disturbed, disturbed_columns
+from torchrl_koap.envs.experts.recording import FAULTS, Episode, PlainEpisode, expert_of, play
+from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.tasks import Task, get_task
 
@@ -28,56 +31,17 @@ MAX_ATTEMPTS = 20
 BATCH_SIZE = 50  # episodes that are played at once: few enough that the first are over within seconds
 _PER_CONTEXT = 4  # attempts before an episode gets another context
 _CONTEXT_STREAM = 1  # keeps the draws of contexts apart from those of the players
+_MEANING = {
+    "collision": "something forbidden was touched",
+    "unfinished": "no success within the step limit",
+    "mode": "success in another mode than asked for",
+    "close": "passed nearer than any human demonstration",
+    "slow": "took longer than any human demonstration",
+}
 
 
 class RecordingError(RuntimeError):
     """An episode whose expert failed in every attempt."""
-
-
-@dataclass(frozen=True)
-class RecordingReport:
-    """What was recorded, and what it took.
-
-    Args:
-        task (str): name of the task.
-        seed (int): seed of the recording.
-        modes (list of int): mode of each demonstration as the environment saw it.
-        rows (list of int): control steps of each demonstration.
-        attempts (list of int): attempts each demonstration took, 1 if the first one was good.
-        failures (dict): number of discarded attempts by reason: ``collision``, ``mode``, ``unfinished``,
-            ``close`` (nearly touched a cylinder), ``slow``.
-        num_modes (int): modes the task has.
-        seconds (float): wall-clock time.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.demonstrations import RecordingReport
-        >>> report = RecordingReport("avoiding", 0, modes=[3, 7], rows=[80, 95], attempts=[1, 2], failures={"mode": 1})
-        >>> report.failed_attempts
-        1
-    """
-
-    task: str
-    seed: int
-    modes: list[int]
-    rows: list[int]
-    attempts: list[int]
-    failures: dict[str, int] = field(default_factory=dict)
-    seconds: float = 0.0
-    num_modes: int = 0
-
-    @property
-    def failed_attempts(self) -> int:
-        """Number of attempts that were discarded."""
-        return sum(self.failures.values())
-
-    def __str__(self) -> str:
-        discarded = ", ".join(f"{count} {reason}" for reason, count in self.failures.items() if count) or "none"
-        counts = [self.modes.count(mode) for mode in range(self.num_modes or max(self.modes) + 1)]
-        return (
-            f"{len(self.modes)} demonstrations of {self.task} in {len(set(self.modes))} modes"
-            f" ({', '.join(map(str, counts))}), {min(self.rows)} to {max(self.rows)} rows, {self.seconds:.1f} s;"
-            f" {self.attempts.count(1)} good at the first attempt; discarded attempts: {discarded}"
-        )
 
 
 def record_demonstrations(
@@ -89,6 +53,7 @@ def record_demonstrations(
     *,
     dtype: torch.dtype = torch.float32,
     batch_size: int = BATCH_SIZE,
+    disturbance: float = 0.0,
 ) -> tuple[TensorDict, RecordingReport]:
     """Records demonstrations of a scripted expert as flat TED data, every action labelled.
 
@@ -103,6 +68,7 @@ def record_demonstrations(
         progress (callable, optional): called with the number of demonstrations recorded and wanted.
         dtype (torch.dtype): floating type of the entries; everything is computed in float64.
         batch_size (int): episodes played at once. The demonstrations do not depend on it.
+        disturbance (float): share of the demonstrations in which the operator is disturbed.
 
     Returns:
         tuple: flat data ``[N]`` in the storage layout of :mod:`torchrl_koap.keys`, and the :class:`RecordingReport`.
@@ -117,7 +83,8 @@ def record_demonstrations(
         >>> data["action"].shape[1], data["has_action"].all().item(), len(report.modes)
         (2, True, 3)
     """
-    raw, report = record_episodes(task, episodes, seed, num_threads, progress, batch_size=batch_size)
+    options = {"batch_size": batch_size, "disturbance": disturbance}
+    raw, report = record_episodes(task, episodes, seed, num_threads, progress, **options)
     return episodes_to_ted(raw, task, dtype=dtype), report
 
 
@@ -129,6 +96,7 @@ def record_episodes(
     progress: Callable[[int, int], None] | None = None,
     *,
     batch_size: int = BATCH_SIZE,
+    disturbance: float = 0.0,
 ) -> tuple[list[Episode], RecordingReport]:
     """Records demonstrations with everything D3IL's recorder logs.
 
@@ -140,7 +108,8 @@ def record_episodes(
         progress (callable, optional): called with the number of demonstrations recorded and wanted.
 
     Keyword Args:
-        batch_size (int): episodes played at once: what memory holds. The demonstrations do not depend on it.
+        batch_size (int): episodes played at once. The demonstrations do not depend on it.
+        disturbance (float): share of the demonstrations in which the operator is disturbed.
 
     Returns:
         tuple: the episodes, for :func:`episodes_to_ted` and, of a task of D3IL, :func:`write_raw_episodes`, and the
@@ -150,8 +119,53 @@ def record_episodes(
         ValueError: if the task is unknown or has no expert, or a number is out of range.
         RecordingError: if an episode fails again and again.
     """
-    facts = get_task(get_task(task).source)
-    expert_of(facts)
+    start, facts = time.perf_counter(), get_task(get_task(task).source)
+    options = {"batch_size": batch_size, "disturbance": disturbance}
+    takes = list(iterate_takes(facts, episodes, seed, num_threads, progress, **options))
+    report = RecordingReport.of(facts, seed, takes, time.perf_counter() - start, disturbance)
+    return [take.episode for take in takes], report
+
+
+def iterate_takes(
+    task: Task | str,
+    episodes: int,
+    seed: int = 0,
+    num_threads: int = 2,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    batch_size: int = BATCH_SIZE,
+    disturbance: float = 0.0,
+    done: Collection[int] = (),
+) -> Iterator[Take]:
+    """Demonstrations one after the other, in their order; no more than a batch of them is held in memory.
+
+    Args:
+        task (Task or str): the task.
+        episodes (int): number of demonstrations.
+        seed (int): seed of modes and players.
+        num_threads (int): threads that advance the physics.
+        progress (callable, optional): called with the number of demonstrations recorded and wanted.
+
+    Keyword Args:
+        batch_size (int): episodes played at once: what memory holds. The demonstrations do not depend on it.
+        disturbance (float): share of the demonstrations in which the operator is disturbed.
+        done (collection of int): numbers of demonstrations that are there already and left out.
+
+    Yields:
+        Take: the next demonstration.
+
+    Raises:
+        ValueError: if the task is unknown or has no expert, or a number is out of range.
+        RecordingError: if an episode fails again and again; it names the expert and the last failure.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.demonstrations import iterate_takes
+        >>> [take.index for take in iterate_takes("avoiding", 4, done=[0, 2])]
+        [1, 3]
+    """
+    task = get_task(task if isinstance(task, str) else task.source)
+    task = get_task(task.source)
+    expert_of(task)
     limits = (
         ("episodes", episodes, 1),
         ("seed", seed, 0),
@@ -161,8 +175,10 @@ def record_episodes(
     for option, value, least in limits:
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(f"{option} must be an integer of at least {least}, got {value!r}")
-    progress = progress or (lambda done, total: None)
-    return _record(facts, episodes, seed, num_threads, progress, None, batch_size)
+    disturbed = choose_disturbed(episodes, disturbance, seed)
+    if disturbance:
+        disturbed_columns(task)
+    return _play_batches(task, episodes, seed, num_threads, progress, batch_size, disturbed, frozenset(done))
 
 
 def episodes_to_ted(raw: Sequence[Episode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:
@@ -239,59 +255,85 @@ def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
     return [*range(num_modes)] * full + sorted(extra.tolist())
 
 
-def _record(
+def _play_batches(
     task: Task,
     episodes: int,
     seed: int,
     num_threads: int,
-    progress: Callable[[int, int], None],
-    rules: RecordingRules | None,
-    batch_size: int = BATCH_SIZE,
-) -> tuple[list[Episode], RecordingReport]:
-    start = time.perf_counter()
-    modes = balanced_modes(episodes, task.num_modes, seed)
-    size, shown = min(batch_size, episodes), 0
+    progress: Callable[[int, int], None] | None,
+    batch_size: int,
+    disturbed: np.ndarray,
+    done: frozenset[int],
+) -> Iterator[Take]:
+    modes, left = balanced_modes(episodes, task.num_modes, seed), [i for i in range(episodes) if i not in done]
+    if not left:
+        return
+    size, shown = min(batch_size, len(left)), 0
     env = make_env(task, size, num_threads=num_threads, max_steps=task.max_steps, dtype=torch.float64)
-    raw: list[Episode | None] = [None] * episodes
-    attempts = [0] * episodes
-    failures = dict.fromkeys(FAULTS, 0)
-    contexts = None
 
     def show(over: int) -> None:  # attempts that turn out bad are played again: the bar waits for them
         nonlocal shown
         shown = max(shown, over)
-        progress(shown, episodes)
+        if progress is not None:
+            progress(shown, episodes)
+
+    @functools.cache
+    def contexts_of(attempt: int) -> np.ndarray | None:
+        """Drawn for all episodes, so that none depends on how many are played at once."""
+        if not task.bodies:
+            return None
+        return draw_contexts(task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
 
     try:
-        for attempt in range(MAX_ATTEMPTS):
-            # drawn for all episodes, so that none depends on how many are played at once
-            if attempt % _PER_CONTEXT == 0 and task.bodies:
-                contexts = draw_contexts(task, episodes, np.random.default_rng((seed, attempt, _CONTEXT_STREAM)))
-            left = np.array([index for index in range(episodes) if raw[index] is None])
-            for begin in range(0, len(left), size):
-                rows = left[begin : begin + size]
-                already = sum(episode is not None for episode in raw)
+        for begin in range(0, len(left), size):
+            batch = np.array(left[begin : begin + size])
+            already = len(done) + begin
+            takes: dict[int, Take] = {}
+            failures = {row: dict.fromkeys(FAULTS, 0) for row in batch}
+            for attempt in range(MAX_ATTEMPTS):
+                rows, found = np.array([row for row in batch if row not in takes]), already + len(takes)
+                contexts = contexts_of(attempt - attempt % _PER_CONTEXT)
+                seeds = [(seed, int(row), attempt) for row in rows]
+                hand = Disturbances(task, seeds, disturbed[rows]) if disturbed[rows].any() else None
                 results = play(
                     env,
                     task,
                     np.arange(len(rows)),
                     [modes[row] for row in rows],
                     None if contexts is None else contexts[np.resize(rows, size)],  # the rest of the batch idles
-                    [(seed, int(row), attempt) for row in rows],
-                    lambda over, already=already: show(already + over),
-                    rules=rules,
+                    seeds,
+                    lambda over, found=found: show(found + over),
+                    disturbances=hand,
                 )
-                for row, (episode, fault) in zip(rows, results, strict=True):
-                    attempts[row] += 1
-                    raw[row] = episode
+                for place, (row, (episode, fault)) in enumerate(zip(rows, results, strict=True)):
                     if fault:
-                        failures[fault] += 1
-            if all(episode is not None for episode in raw):
-                break
+                        failures[row][fault] += 1
+                        last = int(row), fault
+                        continue
+                    spells = () if hand is None else _within(hand.spells[place], episode)
+                    reasons = {name: count for name, count in failures[row].items() if count}
+                    takes[row] = Take(
+                        int(row), episode, modes[row], len(episode), attempt + 1, reasons, bool(disturbed[row]), spells
+                    )
+                if len(takes) == len(batch):
+                    break
+            else:
+                missing = [int(row) for row in batch if row not in takes]
+                counts = {name: sum(failures[row][name] for row in batch) for name in FAULTS}
+                raise RecordingError(
+                    f"{task.expert} never succeeded: no good attempt out of {MAX_ATTEMPTS} for episodes {missing} of"
+                    f" task {task.name!r}, seed {seed}: {counts}; the last one, episode {last[0]} in mode"
+                    f" {modes[last[0]]}, ended as {last[1]!r}: {_MEANING[last[1]]}"
+                )
+            for row in batch:
+                yield takes.pop(row)
     finally:
         env.close()
-    missing = [index for index in range(episodes) if raw[index] is None]
-    if missing:
-        raise RecordingError(f"no good attempt out of {MAX_ATTEMPTS} for episodes {missing}: {failures}")
-    rows, seconds = [len(episode) for episode in raw], time.perf_counter() - start
-    return raw, RecordingReport(task.name, seed, modes, rows, attempts, failures, seconds, task.num_modes)
+
+
+def _within(spells: Sequence[tuple[int, int, str]], episode: Episode) -> tuple[tuple[int, int, str], ...]:
+    """Disturbances in steps of the data: in D3IL's log the first row is the state after the first control step."""
+    shift = 0 if isinstance(episode, PlainEpisode) else 1
+    last = len(episode) - shift
+    moved = [(max(begin - shift, 0), min(end - shift, last), kind) for begin, end, kind in spells]
+    return tuple(spell for spell in moved if spell[0] < spell[1])

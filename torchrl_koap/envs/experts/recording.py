@@ -28,6 +28,7 @@ from torchrl_koap import keys
 from torchrl_koap.data import RawEpisode
 from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.envs.contexts import yaw_quaternions
+from torchrl_koap.envs.experts.disturbances import Disturbances
 from torchrl_koap.envs.registry import mode_index_of
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.import_strings import resolve
@@ -106,6 +107,7 @@ def play(
     progress: Callable[[int], None],
     *,
     rules: RecordingRules | None = None,
+    disturbances: Disturbances | None = None,
 ) -> list[tuple[Episode | None, str]]:
     """Plays one attempt of the episodes ``rows``.
 
@@ -120,6 +122,7 @@ def play(
 
     Keyword Args:
         rules (RecordingRules, optional): what is discarded. Default: the expert's own.
+        disturbances (Disturbances, optional): what changes the actions of the episodes that are played.
 
     Returns:
         list: for each episode its recording and ``""``, or None and what went wrong, one of ``FAULTS``.
@@ -137,7 +140,8 @@ def play(
     for _ in range(env.max_steps):
         observation = data[keys.OBSERVATION].numpy()
         action = np.zeros((count, task.action_dim))
-        action[rows] = expert.act(observation[rows])
+        wanted = expert.act(observation[rows])
+        action[rows] = wanted if disturbances is None else disturbances.disturb(wanted)
         # an environment may leave alone those that are over; what it does with them is not looked at
         step = data.set(keys.ACTION, torch.from_numpy(action)).set("_step", torch.from_numpy(active[:, None].copy()))
         data = env.step(step)["next"].clone()

@@ -92,7 +92,7 @@ class PolicyEnv(TransformedEnv):
     """
 
     def __init__(self, env: EnvBase, policy: RecedingHorizonPolicy, *, observation_key: NestedKey = OBSERVATION):
-        noise = SeededNoise(policy.planner.noise_shape, noise_key=policy.planner.noise_key)
+        noise = SeededNoise(policy.noise_shape, noise_key=policy.planner.noise_key)
         transforms = policy_transforms(policy.history, observation_key=observation_key)
         super().__init__(env, Compose(*(transform.clone() for transform in transforms), noise))
 

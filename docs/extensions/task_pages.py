@@ -1,0 +1,211 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A page per task from the registry: columns, units, limits, modes, pictures, expert, what was measured."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from pages import GENERATED, code, escape, heading, read_rows, table, toctree, write_page
+
+from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.import_strings import resolve
+from torchrl_koap.tasks.registry import TASKS
+
+UNITS = {"quaternion": "1 (quaternion w, x, y, z)", "tan_yaw": "1 (tangent of the yaw)"}
+
+
+def setup(app: Any) -> dict[str, Any]:
+    """Called by Sphinx."""
+    app.connect("builder-inited", lambda app: write_task_pages())
+    return {"parallel_read_safe": True}
+
+
+def write_task_pages() -> None:
+    """Writes ``generated/tasks``: an index, and a page and a picture per task."""
+    names = [name for name, task in TASKS.items() if task.env is not None and task.env.startswith("torchrl_koap.")]
+    for name in names:
+        write_task(TASKS[name])
+    rows = [
+        (
+            f":doc:`{name}`",
+            f"{task.observation_dim} / {task.state_dim}",
+            ", ".join(f"{column} ({unit or '1'})" for column, unit in task.actions.items()),
+            task.num_modes,
+            f"{task.max_steps} steps, {task.max_steps / task.control_hz:.0f} s",
+        )
+        for name, task in ((name, TASKS[name]) for name in names)
+    ]
+    write_page(
+        "tasks/index",
+        heading("Every task in numbers"),
+        "Made from the registry of tasks, ``torchrl_koap/tasks``. What the simulator does, fact by fact, and how it "
+        "was compared with the original one: :doc:`/d3il`.",
+        table(("task", "columns observed / planned", "actions", "modes", "limit"), rows),
+        toctree(names, hidden=True),
+    )
+
+
+def write_task(task: Task) -> None:
+    """Writes the page of one task."""
+    draw(task)
+    expert = resolve(task.expert, "expert") if task.expert else None
+    facts = [
+        ("control rate", f"{task.control_hz:.4g} Hz"),
+        ("an episode is cut after", f"{task.max_steps} control steps ({task.max_steps / task.control_hz:.1f} s)"),
+        ("ends by a collision", "yes" if task.collides else "no"),
+        ("noise on the measured tool", f"{1e3 * task.noise:g} mm" if task.noise else "none"),
+        ("plans are", "displacements" if task.defaults.relative else "positions"),
+        ("demonstrations, planner updates", f"{task.defaults.demonstrations}, {task.defaults.planner_steps:,}"),
+        ("Gymnasium id", f"``{task.gym_id}``" if task.gym_id else "none"),
+        ("environment", f":class:`~{task.env.replace(':', '.')}`" if task.env else "none"),
+        ("scripted expert", f":class:`~{task.expert.replace(':', '.')}`" if task.expert else "none"),
+        ("demonstrations are those of", f":doc:`{task.source}`" if task.source != task.name else "this task"),
+    ]
+    write_page(
+        f"tasks/{task.name}",
+        heading(task.name),
+        f".. image:: {task.name}.png\n   :width: 420\n   :alt: {task.name} from above",
+        f"In the pictures of a report: {escape(task.scene.caption.strip())}" if task.scene.caption else "",
+        code(
+            f"koap demos --task {task.name} --out demos\nkoap train --task {task.name} --out runs/{task.name}", "bash"
+        ),
+        table(("fact", "value"), facts),
+        heading("What is observed", 1),
+        table(("column", "part", "unit", "in the state as"), observation_rows(task)),
+        heading("What is commanded", 1),
+        table(("column", "unit", "limits per step", "kind"), action_rows(task)),
+        *mode_blocks(task),
+        *body_blocks(task),
+        *expert_blocks(expert),
+        *measured_blocks(task),
+    )
+
+
+def observation_rows(task: Task) -> list[tuple[str, ...]]:
+    """Column, part, unit and what planner and controller see of it."""
+    rows = []
+    for part, columns in task.observation.items():
+        names = task.observation_names[columns]
+        kind = task.state_parts.get(part)
+        if part == task.command:
+            seen = "never: its differences are the actions"
+        elif kind is None:
+            seen = "hidden"
+        else:
+            seen = ", ".join(task.state_names[task.state_slices[part]])
+        unit = UNITS.get(kind or "", "m" if "xy" in part or "pos" in part else "")
+        for index, name in enumerate(names):
+            given = task.observation_units[columns][index] if task.observation_units else unit
+            rows.append((f"``{name}``", part, given or "rad or 1", seen if index == 0 else ""))
+    return rows
+
+
+def action_rows(task: Task) -> list[tuple[str, ...]]:
+    """Column, unit, least and greatest value that the environment takes, and whether it is a change."""
+    low, high = action_limits(task)
+    rows = []
+    for index, (name, unit) in enumerate(task.actions.items()):
+        kind = "command itself" if name in task.absolute_actions else "change of the command"
+        bounded = low is not None and math.isfinite(low[index]) and math.isfinite(high[index])
+        limits = f"{low[index]:.4g} to {high[index]:.4g}" if bounded else "not bounded"
+        rows.append((f"``{name}``", unit or "1", limits, kind))
+    return rows
+
+
+def action_limits(task: Task) -> tuple[list[float] | None, list[float] | None]:
+    """Bounds of the environment's actions, as its specification says."""
+    from torchrl_koap.envs.registry import make_env
+
+    env = make_env(task.name, num_envs=1, num_threads=1)
+    space = env.action_spec.space
+    env.close()
+    if not hasattr(space, "low"):
+        return None, None
+    return space.low[0].tolist(), space.high[0].tolist()
+
+
+def mode_blocks(task: Task) -> list[str]:
+    """The ways in which it can be done."""
+    if not task.modes.choices:
+        return []
+    names = {"all": "all successful episodes", "contexts": "contexts", "solved_contexts": "contexts with a success"}
+    among = names.get(task.modes.entropy, task.modes.entropy)
+    return [
+        heading(f"{task.num_modes} modes", 1),
+        table(("choice", "values"), [(choice, ", ".join(names)) for choice, names in task.modes.choices]),
+        f"Their entropy is taken over {among}, to the base {task.num_modes}.",
+    ]
+
+
+def body_blocks(task: Task) -> list[str]:
+    """What a context places, and where."""
+    if not task.bodies or task.start_regions is None:
+        return []
+    regions, (low, high) = task.start_regions, task.start_regions.yaw
+    rows = []
+    for index, body in enumerate(task.bodies):
+        for (x0, x1), (y0, y1) in regions.of(index):
+            rows.append((body.label, f"{x0:g} to {x1:g}", f"{y0:g} to {y1:g}", f"{low:g} to {high:g}"))
+    dealt = "The regions are dealt out to the bodies at random." if regions.dealt else ""
+    return [
+        heading("Where the bodies start", 1),
+        table(("body", "x (m)", "y (m)", "yaw (deg)"), rows),
+        dealt,
+        "``koap eval`` takes the 60 contexts of a fixed table, so that two methods meet the same situations.",
+    ]
+
+
+def expert_blocks(expert: Any) -> list[str]:
+    """What the scripted player does, in its own words."""
+    if expert is None or not expert.__doc__:
+        return []
+    return [heading("The expert", 1), expert.__doc__.strip().splitlines()[0]]
+
+
+def measured_blocks(task: Task) -> list[str]:
+    """Success of KOAP and of the ridge, from the committed curves."""
+    rows = []
+    for row in read_rows("label_curves"):
+        if row["task"] == task.name and row["method"] in ("koap", "linear") and row.get("n"):
+            rate = 100 * int(row["successes"]) / int(row["n"]) if row["successes"] else None
+            rows.append(
+                (
+                    f"``{row['method']}``",
+                    f"{row['data']}, {row['demonstrations']}",
+                    f"{100 * float(row['label_fraction']):g} %",
+                    "" if rate is None else f"{rate:.1f} % of {row['n']}",
+                    row["entropy"],
+                )
+            )
+    if not rows:
+        return [heading("Measured", 1), "See :doc:`/results/tasks`."]
+    head = ("method", "demonstrations", "labelled", "success", "entropy")
+    return [heading("Measured", 1), table(head, rows), "All methods, with intervals: :doc:`/results`."]
+
+
+def draw(task: Task) -> None:
+    """The scene from above, with the regions in which bodies start."""
+    path = GENERATED / "tasks" / f"{task.name}.png"
+    if path.exists():
+        return
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
+    from torchrl_koap.reports.scenes import color_of, draw_scene
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = Figure(figsize=(4.6, 4), layout="constrained")
+    axes = draw_scene(figure.add_subplot(), task.name)
+    for index, body in enumerate(task.bodies if task.start_regions else ()):
+        for (x0, x1), (y0, y1) in task.start_regions.of(index):
+            color = color_of(body.color)
+            axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linestyle=":", edgecolor=color))
+            x, y = (x0 + x1) / 2, (y0 + y1) / 2
+            axes.add_patch(
+                Rectangle(
+                    (x - body.half[0], y - body.half[1]), 2 * body.half[0], 2 * body.half[1], color=color, alpha=0.6
+                )
+            )
+    axes.autoscale_view()
+    figure.savefig(path, dpi=100)

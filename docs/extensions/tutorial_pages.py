@@ -1,0 +1,127 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A page per tutorial: its text and code, then the output and picture that ``make tutorials`` left.
+
+A tutorial is not run here: the site is built in a minute, the tutorials take longer. One whose output is older than its
+code is marked as such, by the hash of the code that stands in the output.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import shutil
+from pathlib import Path
+from typing import Any
+
+from pages import GENERATED, ROOT, code, heading, table, toctree, write_page
+
+FOLDER, OUTPUTS = ROOT / "tutorials", ROOT / "docs" / "outputs"
+# in the order in which they are read
+ORDER = (
+    "few_labels",
+    "own_robot",
+    "gymnasium_robot",
+    "modules_by_hand",
+    "compare_controllers",
+    "planners",
+    "own_task",
+    "label_next",
+    "label_curve",
+)
+DIGEST = "# code: "
+
+
+def setup(app: Any) -> dict[str, Any]:
+    """Called by Sphinx."""
+    app.connect("builder-inited", lambda app: write_tutorial_pages())
+    return {"parallel_read_safe": True}
+
+
+def write_tutorial_pages() -> None:
+    """Writes ``generated/tutorials``: an index and a page per tutorial."""
+    there = {path.stem for path in FOLDER.glob("*.py")}
+    if there != set(ORDER):
+        raise ValueError(f"tutorials and their order differ: {sorted(there ^ set(ORDER))}")
+    rows = []
+    for name in ORDER:
+        write_tutorial(FOLDER / f"{name}.py")
+        title, about = introduction(FOLDER / f"{name}.py")
+        points = [line.lstrip("* ") for line in about.splitlines() if line.startswith("* ")]
+        rows.append((f":doc:`{name}`", title, points[0].rstrip(",.") if points else ""))
+    write_page(
+        "tutorials/index",
+        heading("Tutorials"),
+        "Each is a script that tells one story, prints its numbers and ends with a picture. ``make tutorials`` runs "
+        "them all; what is shown here is what it left.",
+        table(("script", "story", "to begin with"), rows),
+        toctree(ORDER, hidden=True),
+    )
+
+
+def digest(path: Path) -> str:
+    """Short hash of a tutorial's code without docstring, comments and layout: text may change without a new run."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    if ast.get_docstring(tree) is not None:
+        del tree.body[0]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
+
+
+def introduction(path: Path) -> tuple[str, str]:
+    """Title and text of the docstring."""
+    lines = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").splitlines()
+    return lines[0].rstrip("."), "\n".join(lines[2:]).strip()
+
+
+def cells(path: Path) -> list[tuple[str, str]]:
+    """Pieces of a script after its docstring: ``("text" or "code", content)``."""
+    source = path.read_text(encoding="utf-8")
+    end = ast.parse(source).body[0].end_lineno or 0
+    pieces: list[tuple[str, str]] = []
+    for block in "\n".join(source.splitlines()[end:]).split("\n# %%"):
+        lines = block.lstrip("\n").splitlines()
+        words = []
+        while lines and lines[0].lstrip().startswith("#"):
+            words.append(lines.pop(0).lstrip()[1:].removeprefix(" "))
+        if words and any(words):
+            pieces.append(("text", "\n".join(words)))
+        if any(lines):
+            pieces.append(("code", "\n".join(lines).strip("\n")))
+    return pieces
+
+
+def write_tutorial(path: Path) -> None:
+    """Writes the page of one tutorial."""
+    title, about = introduction(path)
+    blocks = [heading(title), about]
+    for kind, content in cells(path):
+        content = content.replace("%% ", "").strip("\n") if kind == "text" else content
+        blocks.append(code(content, "python") if kind == "code" else underlined(content))
+    blocks += [heading("Output", 1), *output_of(path)]
+    write_page(f"tutorials/{path.stem}", *blocks)
+
+
+def underlined(text: str) -> str:
+    """Headings of a cell, marked as those of generated pages are."""
+    lines = text.splitlines()
+    for index, line in enumerate(lines):
+        if line and set(line) == {"-"} and index:
+            lines[index] = "-" * len(lines[index - 1])
+    return "\n".join(lines)
+
+
+def output_of(path: Path) -> list[str]:
+    """What it printed and drew when ``make tutorials`` was last called."""
+    printed, picture = OUTPUTS / f"{path.stem}.txt", OUTPUTS / f"{path.stem}.png"
+    blocks = []
+    if not printed.exists():
+        return ["Not run yet: ``make tutorials``."]
+    first, *lines = printed.read_text(encoding="utf-8").splitlines()
+    if first != DIGEST + digest(path):
+        blocks.append(".. note:: The code has changed since; ``make tutorials`` renews the output.")
+    blocks.append(code("\n".join(lines), "text"))
+    if picture.exists():
+        target = GENERATED / "tutorials" / picture.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(picture, target)
+        blocks.append(f".. image:: {picture.name}\n   :class: picture\n   :alt: picture of {path.stem}")
+    return blocks

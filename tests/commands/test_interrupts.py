@@ -1,0 +1,130 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Signals, full devices and odd settings: one line, and the exit status that shells expect."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from torchrl_koap.commands import cli
+from torchrl_koap.commands.interrupts import Interrupted, describe_interrupt, ending_like_ctrl_c
+from torchrl_koap.commands.sanity import check_options
+
+COMMAND = (sys.executable, "-m", "torchrl_koap.commands.cli")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)])
+def test_signals_are_like_ctrl_c(number, status, monkeypatch, capsys):
+    def interrupted(arguments):
+        os.kill(os.getpid(), number)
+        time.sleep(5)
+
+    monkeypatch.setattr(cli, "_run", interrupted)
+    before = signal.getsignal(number)
+    assert cli.main(["doctor"]) == status
+    assert signal.getsignal(number) is before
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("koap: interrupted") and "--resume" in line
+
+
+def test_what_is_ignored_stays_ignored():
+    earlier = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with ending_like_ctrl_c():
+            os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, earlier)
+
+
+def test_words_of_a_signal():
+    assert describe_interrupt(Interrupted(signal.SIGTERM))[0].startswith("interrupted by SIGTERM; ")
+    assert describe_interrupt(KeyboardInterrupt())[0].startswith("interrupted; ")
+
+
+@pytest.mark.parametrize("words", [["--out", ""], ["--out="], [""]])
+def test_empty_words_are_refused(words, capsys):
+    assert cli.main(["train", *words]) == 1
+    assert "is a variable of the shell not set?" in capsys.readouterr().err
+
+
+def test_a_narrow_terminal_gets_its_help(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "1")
+    with pytest.raises(SystemExit) as left:
+        cli.main(["doctor", "--help"])
+    assert left.value.code == 0 and "--quiet" in capsys.readouterr().out and os.environ["COLUMNS"] == "1"
+
+
+def test_out_of_memory_is_one_line(monkeypatch, capsys):
+    def full(arguments):
+        raise MemoryError
+
+    monkeypatch.setattr(cli, "_run", full)
+    assert cli.main(["doctor"]) == 1
+    assert capsys.readouterr().err.startswith("koap: out of memory; try fewer episodes")
+
+
+def test_a_fault_of_ours_keeps_its_traceback(monkeypatch):
+    def wrong(arguments):
+        raise TypeError("ours")
+
+    monkeypatch.setattr(cli, "_run", wrong)
+    with pytest.raises(TypeError, match="ours"):
+        cli.main(["doctor"])
+
+
+def test_options_that_can_mean_nothing():
+    from torchrl_koap.commands.demos import Demos
+
+    check_options(Demos(out="somewhere/new"))
+    with pytest.raises(ValueError, match="--episodes must be at most"):
+        check_options(Demos(out="x", episodes=10**30))
+    with pytest.raises(ValueError, match="--out /dev/null/x cannot be made: /dev/null is no folder"):
+        check_options(Demos(out="/dev/null/x"))
+
+
+def ended(*words, settings=None, output=subprocess.PIPE, number=None, after=0.0):
+    """Exit status and stderr of a process of its own."""
+    process = subprocess.Popen(
+        [*COMMAND, *words], stdout=output, stderr=subprocess.PIPE, text=True, env={**os.environ, **(settings or {})}
+    )
+    if number is not None:
+        time.sleep(after)
+        process.send_signal(number)
+    return process.wait(), process.communicate()[1]
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"MUJOCO_GL": "bogus"}, "MUJOCO_GL: bogus"),
+        ({"MUJOCO_GL": "osmesa"}, "MUJOCO_GL=osmesa"),
+        ({"MPLBACKEND": "bogus"}, "MPLBACKEND=bogus is no backend"),
+        ({"PYTHONOPTIMIZE": "2"}, "Python runs with -OO"),
+    ],
+)
+def test_settings_with_which_nothing_can_be_imported(settings, says):
+    status, said = ended("doctor", settings=settings)
+    assert status == 1 and says in said and len(said.splitlines()) == 1
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("words", [("--version",), ("doctor",), ("--help",)])
+def test_a_full_device(words):
+    with open("/dev/full", "w") as full:
+        status, said = ended(*words, output=full)
+    assert status == 1 and said.startswith("koap: the output could not be written: No space left on device")
+    assert len(said.splitlines()) == 1
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("after", [0.5, 1.5])
+def test_a_signal_while_everything_is_imported(number, after):
+    status, said = ended("doctor", number=number, after=after)
+    assert status in (128 + number, 0) and "Traceback" not in said and len(said.splitlines()) <= 1

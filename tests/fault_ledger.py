@@ -1,0 +1,219 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A ledger of faults: what is done wrong, and what is to be said of it. One fault is one line.
+
+Every fault is met in this process: ``koap`` is called with its words, and must leave with status 1 and one line, or
+with 2 and the option named. A call that comes to the work itself (training, rollouts) was accepted: it is stopped
+there, so that hundreds of faults take seconds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import shutil
+import signal
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_runs import TINY, koap, write_demonstrations
+
+LONGEST = 60  # s; a fault that takes longer counts as a hang
+EVERY = 25  # of so many faults one is met in `make test`, all of them in `make faults`
+# where a call begins with what it was called for
+WORK = (
+    "torchrl_koap.training.loop.warmup_cosine",
+    "torchrl_koap.evaluation.run.roll_out",
+    "torchrl_koap.evaluation.inspection.roll_out",
+    "torchrl_koap.studies.label_efficiency.launch",
+    "torchrl_koap.commands.export.export_part",
+    "torchrl_koap.data.demonstrations.save_ted",
+)
+
+
+class AcceptedError(BaseException):
+    """The work was begun."""
+
+
+class HangError(BaseException):
+    """Nothing came in time."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Folders of one fault, made anew for each.
+
+    Args:
+        root (Path): an empty folder.
+        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set and ``arrays``; not written to.
+    """
+
+    root: Path
+    template: Path
+
+    def get(self, name: str) -> Path:
+        """A copy of a part of the template, or a path where nothing is yet."""
+        path, source = self.root / name, self.template / name
+        if source.exists() and not path.exists():
+            shutil.copytree(source, path)
+        return path
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that goes wrong.
+
+    Args:
+        name (str): what is wrong.
+        words (tuple of str): the call; ``{run}``, ``{data}``, ``{ted}`` and ``{arrays}`` stand for folders that are
+            there, ``{out}`` for one that is not.
+        says (str): regular expression that the one line matches.
+        damage (callable, optional): does the damage; called with the :class:`Place`.
+        status (int or tuple): exit status that is right.
+        accepted (bool): nothing is wrong after all; the line says so that nobody refuses it by mistake.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    says: str = ""
+    damage: Callable[[Place], Any] | None = None
+    status: int | tuple[int, ...] = 1
+    accepted: bool = False
+
+    @property
+    def id(self) -> str:
+        """Name of the test."""
+        return re.sub(r"[^\w.=+-]+", "_", f"{self.words[0]} {self.name}")[:100]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a call came to: its exit status, ``"accepted"``, ``"hang"`` or the error that escaped; what it printed."""
+
+    status: Any
+    said: str
+
+
+def meet(fault: Fault, place: Place) -> Outcome:
+    """Does the damage and makes the call."""
+    words = [_filled(word, place) for word in fault.words]
+    if fault.damage is not None:
+        fault.damage(place)
+    said = io.StringIO()
+    with (
+        contextlib.redirect_stderr(said),
+        contextlib.redirect_stdout(io.StringIO()),
+        stopped_at_work(),
+        _in_time(),
+    ):
+        try:
+            status = koap(*words)
+        except AcceptedError:
+            status = "accepted"
+        except HangError:
+            status = "hang"
+        except SystemExit as left:
+            status = left.code
+        except Exception as error:  # what a user would see as a traceback
+            status = f"{type(error).__name__}: {error}"
+    return Outcome(status, said.getvalue())
+
+
+def check(fault: Fault, outcome: Outcome) -> None:
+    """Asserts that the fault was met as it should be."""
+    told = f"{fault.id}: status {outcome.status}, said {outcome.said[-500:]!r}"
+    if fault.accepted:
+        assert outcome.status in (0, "accepted"), told
+        return
+    wanted = fault.status if isinstance(fault.status, tuple) else (fault.status,)
+    assert outcome.status in wanted, told
+    assert "Traceback" not in outcome.said, told
+    if outcome.status == 2:  # the parser frames what it says
+        plain = re.sub(r"[│╭╮╰╯─\s]+", " ", outcome.said)
+    else:
+        lines = [line for line in outcome.said.replace("\r", "\n").splitlines() if line.startswith("koap: ")]
+        assert len(lines) == 1 and outcome.said.rstrip().endswith(lines[0]), told
+        plain = lines[0]
+    assert re.search(fault.says, plain), f"{told}\nwanted {fault.says!r}"
+
+
+def table(faults: Iterable[Fault], every: int = EVERY) -> list[Any]:
+    """Parameters of a test: one fault each; most of them are left to ``make faults``."""
+    faults = list(faults)
+    names = [fault.id for fault in faults]
+    assert len(set(names)) == len(names), f"twice: {sorted({name for name in names if names.count(name) > 1})}"
+    return [
+        pytest.param(fault, id=fault.id, marks=() if index % every == every // 2 else pytest.mark.faults)
+        for index, fault in enumerate(faults)
+    ]
+
+
+def make_template(root: Path) -> Path:
+    """A trained run with checkpoints, an evaluation and a log, and data of every kind."""
+    import numpy as np
+
+    from torchrl_koap.data import save_ted
+    from torchrl_koap.tasks import get_task
+    from torchrl_koap.training.datasets import load_demonstrations
+
+    data = write_demonstrations(root / "data")
+    run = ("--out", root / "run", "--dataset", data, *TINY, "--checkpoint-every", "10", "--quiet")
+    assert koap("train", *run) == 0
+    flat = load_demonstrations(str(data), get_task("avoiding"))
+    save_ted(flat, root / "ted" / "ted", task="avoiding")
+    (root / "arrays").mkdir()
+    for index in range(3):
+        generator = np.random.default_rng(index)
+        states = generator.normal(size=(40, 3)).cumsum(0)
+        np.savez(root / "arrays" / f"{index}.npz", states=states, actions=np.diff(states[:, :2], axis=0))
+    return root
+
+
+@contextlib.contextmanager
+def stopped_at_work() -> Iterator[None]:
+    """Inside the block no training and no rollout begins."""
+
+    def stop(*arguments, **options):
+        raise AcceptedError
+
+    with pytest.MonkeyPatch.context() as patch:
+        for place in WORK:
+            patch.setattr(place, stop)
+        yield
+
+
+@contextlib.contextmanager
+def _in_time() -> Iterator[None]:
+    def late(*arguments):
+        raise HangError
+
+    earlier = signal.signal(signal.SIGALRM, late)
+    signal.alarm(LONGEST)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, earlier)
+
+
+def _filled(word: str, place: Place) -> str:
+    for name in ("run", "data", "ted", "arrays", "out"):
+        if f"{{{name}}}" in word:
+            word = word.replace(f"{{{name}}}", str(place.get(name)))
+    return word
+
+
+def edit_json(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    """Changes a JSON file in place."""
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def words_of(command: str, *more: str, base: dict[str, Sequence[str]]) -> tuple[str, ...]:
+    """A call that would do, and more words behind it."""
+    return (command, *base[command], *more)

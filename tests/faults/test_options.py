@@ -1,0 +1,118 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Every option of every command with values that no option of its type can have."""
+
+from __future__ import annotations
+
+import re
+import types
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import pytest
+from fault_ledger import Fault, check, meet, table
+from tiny_runs import TINY
+
+from torchrl_koap.commands.subcommands import Subcommand
+
+HUGE = str(10**30)
+# calls that would do
+BASE = {
+    "convert": ("{arrays}", "--out", "{out}", "--control-hz", "30"),
+    "demos": ("--out", "{out}", "--episodes", "1", "--threads", "1"),
+    "train": ("--out", "{out}", "--dataset", "{data}", *TINY),
+    "eval": ("{run}", "--episodes", "1", "--threads", "1", "--no-report"),
+    "curve": (
+        *("--out", "{out}", "--dataset", "{data}", "--methods", "linear", "--fractions", "0.5", "--seeds", "1"),
+        *("--steps", "2", "--episodes", "1", "--workers", "1"),
+    ),
+    "bench": ("--out", "{out}", "--table", "1", "--tasks", "avoiding", "--seeds", "1", "--workers", "1"),
+    "inspect": ("{run}", "--episodes", "1", "--threads", "1"),
+    "suggest": ("{run}",),
+    "export": ("{run}", "--no-latency"),
+    "latency": ("{run}", "--steps", "2"),
+    "doctor": (),
+    "validate": ("{data}",),
+}
+WRONG: dict[Any, tuple[str, ...]] = {
+    int: ("many", "1.5", "-1", "0", HUGE),
+    float: ("many", "-1", "nan", "inf"),
+    bool: ("maybe",),
+    str: ("n0nsense", ""),
+    Path: ("", "/dev/null/below"),
+}
+# values that are right after all: names of one's own, and 0 where it means "none of it"
+RIGHT = {
+    "convert": ("--name n0nsense", "--out /dev/null/below", "--action-columns n0nsense"),
+    "demos": ("--seed 0",),
+    "eval": ("--seed 0",),
+    "inspect": ("--seed 0",),
+    "suggest": ("--seed 0",),
+    "curve": ("--condition-octaves 0",),
+    "bench": ("--condition-octaves 0",),
+    "train": (
+        *("--seed 0", "--controller-steps 0", "--condition-octaves 0", "--episodes -1", "--episodes 0"),
+        *("--denoiser-width", "--denoiser-depth"),
+    ),
+}
+EMPTY = ("--action-units", "--state-units")  # of a number without a unit
+# where the message has another word for the option
+SAYS = {
+    "--label-count": "labelled|label-count",
+    "--label-unit": "unit",
+    "--controller-steps": "steps",
+    "--solver-steps": "solver-steps|num_steps",
+    "--controller-state": "part of the state|controller-state",
+    "--action-kind": "kind of action",
+    "--tasks": "task",
+    "--methods": "method",
+    "--units": "unit",
+    "--planners": "planners|n0nsense",
+    "--data-share": "share of the data|data-share",
+    "--planner-from": "/dev/null/below|planner-from",
+}
+
+
+def plain(kind: Any) -> tuple[Any, bool]:
+    """The type that the words of an option are read as, and whether it takes several of them."""
+    if get_origin(kind) in (Union, types.UnionType):
+        kind = next(part for part in get_args(kind) if part is not type(None))
+    if get_origin(kind) is tuple:
+        return get_args(kind)[0], True
+    return kind, False
+
+
+def options(command: type) -> Iterator[tuple[str, Any]]:
+    """Names and types of all options of a command; positional ones are left out."""
+    hints, full = get_type_hints(command), get_type_hints(command, include_extras=True)
+    for field in fields(command):
+        kind = hints[field.name]
+        if is_dataclass(kind):
+            yield from options(kind)
+        elif "Positional" not in str(full[field.name]) and field.name != "plugins":
+            yield f"--{field.name.replace('_', '-')}", kind
+
+
+def faults() -> Iterator[Fault]:
+    for part in get_args(Subcommand):
+        command, configuration = get_args(part)[:2]
+        name = configuration.name
+        for option, kind in options(command):
+            kind, _ = plain(kind)
+            for value in WRONG[kind]:
+                call = f"{option} {value}"
+                if call in RIGHT.get(name, ()) or option in RIGHT.get(name, ()) or option in EMPTY:
+                    continue
+                words = (name, *BASE[name], option, value)
+                says = SAYS.get(option, re.escape(option.removeprefix("--")).replace("\\-", "[-_ ]"))
+                if kind is bool:
+                    says = value
+                yield Fault(f"{option} {value or 'empty'}", words, says, status=(1, 2))
+
+
+if __name__ != "__main__":
+
+    @pytest.mark.parametrize("fault", table(faults()))
+    def test_wrong_values_of_an_option_are_refused_by_name(fault, place):
+        check(fault, meet(fault, place))

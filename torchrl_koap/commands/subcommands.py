@@ -1,0 +1,35 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""All commands of ``koap``; importing them takes seconds."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import tyro
+
+from torchrl_koap.commands.bench import Bench
+from torchrl_koap.commands.convert import Convert
+from torchrl_koap.commands.curve import Curve
+from torchrl_koap.commands.demos import Demos
+from torchrl_koap.commands.doctor import Doctor, Validate
+from torchrl_koap.commands.eval import Eval
+from torchrl_koap.commands.export import Export
+from torchrl_koap.commands.inspect import Inspect
+from torchrl_koap.commands.latency import Latency
+from torchrl_koap.commands.suggest import Suggest
+from torchrl_koap.commands.train import Train
+
+Subcommand = (
+    Annotated[Convert, tyro.conf.subcommand("convert")]
+    | Annotated[Demos, tyro.conf.subcommand("demos")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Curve, tyro.conf.subcommand("curve")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Inspect, tyro.conf.subcommand("inspect")]
+    | Annotated[Suggest, tyro.conf.subcommand("suggest")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Latency, tyro.conf.subcommand("latency")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[Validate, tyro.conf.subcommand("validate")]
+)

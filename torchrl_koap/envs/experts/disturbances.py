@@ -1,0 +1,189 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Disturbances while a scripted operator plays, so that demonstrations show how mistakes are corrected.
+
+Noise injected into the actions of whoever demonstrates takes it to states that it would not visit by itself, and
+what it does there is what a learner needs to see (Laskey et al., "DART: Noise Injection for Robust Imitation Learning",
+2017). A disturbed step changes the command that is executed, and that command is what the recording holds: the label of
+a state is always the action that was done in it::
+
+    impulse      for a few control steps the command is pushed in a direction of its own
+    slip         for a while the command runs off to the side of the way that the operator wants
+    late_turn    for a while the operator goes on as it did before
+
+All draws come from the seed of the attempt, so an episode does not depend on the others in the batch.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchrl_koap.tasks import Task
+
+KINDS = ("impulse", "slip", "late_turn")
+_STREAM, _CHOICE_STREAM = 2, 3  # keep these draws apart from those of players and contexts
+_QUIET, _MEAN_GAP = 12, 45  # control steps from one disturbance to the next: at least, and on average beyond that
+_STEPS = {"impulse": (2, 6), "slip": (4, 11), "late_turn": (4, 11)}  # control steps that one lasts, low and high end
+_SLIP = (0.6, 1.4)  # rad
+_MEMORY = 0.98  # of the size of the operator's own steps
+
+
+def choose_disturbed(episodes: int, share: float, seed: int) -> np.ndarray:
+    """Which episodes of a recording are disturbed.
+
+    Args:
+        episodes (int): number of demonstrations.
+        share (float): share of them that is disturbed, 0 to 1.
+        seed (int): seed of the recording. Whether an episode is disturbed does not depend on how many there are.
+
+    Returns:
+        np.ndarray: bool ``[episodes]``.
+
+    Raises:
+        ValueError: if the share is not between 0 and 1.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.disturbances import choose_disturbed
+        >>> int(choose_disturbed(1000, 0.5, seed=0).sum())
+        491
+    """
+    if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 <= share <= 1:
+        raise ValueError(f"disturbance must be the share of the episodes that are disturbed, 0 to 1, got {share!r}")
+    return np.random.default_rng((seed, _CHOICE_STREAM)).random(episodes) < share
+
+
+class Disturbances:
+    """Disturbs the actions of a batch of operators.
+
+    How far an action is changed follows from the operator's own steps so far, so one class serves every task. Entries
+    that are no change of a command (the gripper) are left alone, and so is the height of a tool that is pushed about.
+
+    Args:
+        task (Task): tells which actions are changes of commands.
+        seeds (sequence): per episode a tuple of integers.
+        disturbed (array): bool per episode; the others are left as they are.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.envs.experts.disturbances import Disturbances
+        >>> from torchrl_koap.tasks import get_task
+        >>> hand = Disturbances(get_task("avoiding"), [(0, 0), (0, 1)], [True, False])
+        >>> wanted = np.tile([0.0, 0.01], (2, 1))
+        >>> done = np.stack([hand.disturb(wanted) for _ in range(60)], axis=1)
+        >>> (done != wanted[:, None]).any(-1).any(-1).tolist(), hand.spells[1]
+        ([True, False], [])
+    """
+
+    def __init__(self, task: Task, seeds: Sequence, disturbed: Sequence[bool]):
+        self._columns = disturbed_columns(task)
+        self._hands = [
+            _Hand(np.random.default_rng((*seed, _STREAM)), len(self._columns)) if chosen else None
+            for seed, chosen in zip(seeds, disturbed, strict=True)
+        ]
+
+    def disturb(self, action: np.ndarray) -> np.ndarray:
+        """The actions that are executed in the next control step.
+
+        Args:
+            action (np.ndarray): what the operators want, ``[n, act]``.
+
+        Returns:
+            np.ndarray: ``[n, act]``, a new array.
+        """
+        done = action.copy()
+        for row, hand in enumerate(self._hands):
+            if hand is not None:
+                done[row, self._columns] = hand.disturb(action[row, self._columns])
+        return done
+
+    @property
+    def spells(self) -> list[list[tuple[int, int, str]]]:
+        """Of every episode so far the disturbances: first control step, the one after the last, kind."""
+        return [[] if hand is None else list(hand.spells) for hand in self._hands]
+
+
+def disturbed_columns(task: Task) -> np.ndarray:
+    """Columns of the actions that are disturbed: changes of a command, of a tool on the table only sideways ones.
+
+    Args:
+        task (Task): the task.
+
+    Raises:
+        ValueError: if no action of the task is a change of a command.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.disturbances import disturbed_columns
+        >>> from torchrl_koap.tasks import get_task
+        >>> [len(disturbed_columns(get_task(name))) for name in ("avoiding", "aligning", "stacking")]
+        [2, 2, 7]
+    """
+    changes = {name: unit for name, unit in task.actions.items() if name not in task.absolute_actions}
+    if not changes or task.action_targets:
+        raise ValueError(f"task {task.name!r} has no action that is a change of a command: nothing can be disturbed")
+    joints = [name for name, unit in changes.items() if unit == "rad"]
+    names = list(task.actions)
+    return np.array([names.index(name) for name in joints or list(changes)[:2]])
+
+
+def count_spells(spells: Sequence[Sequence[tuple[int, int, str]]]) -> dict[str, int]:
+    """How often each kind of disturbance happened.
+
+    Args:
+        spells (sequence): disturbances of every episode, as :attr:`Disturbances.spells` gives them.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.disturbances import count_spells
+        >>> count_spells([[(20, 23, "slip")], []])
+        {'impulse': 0, 'slip': 1, 'late_turn': 0}
+    """
+    counts = Counter(kind for episode in spells for _, _, kind in episode)
+    return {kind: counts[kind] for kind in KINDS}
+
+
+class _Hand:
+    """One episode: when the next disturbance comes, and what it does."""
+
+    def __init__(self, generator: np.random.Generator, width: int):
+        self._generator, self._width = generator, width
+        self._time, self._pace = 0, 0.0
+        self._held, self._last = np.zeros(width), np.zeros(width)
+        self._plan(0)
+        self.spells: list[tuple[int, int, str]] = []
+
+    def _plan(self, now: int) -> None:
+        draw = self._generator
+        self._start = now + _QUIET + int(draw.exponential(_MEAN_GAP))
+        self._kind = KINDS[draw.integers(len(KINDS))]
+        self._end = self._start + int(draw.integers(*_STEPS[self._kind]))
+        direction = draw.normal(size=self._width)
+        self._push = draw.uniform(0.7, 1.4) * direction / np.linalg.norm(direction)
+        self._turn = draw.uniform(*_SLIP) * draw.choice((-1.0, 1.0))
+        self._share = draw.uniform(-1.0, 1.0, self._width)
+
+    def disturb(self, wanted: np.ndarray) -> np.ndarray:
+        self._pace = max(float(np.linalg.norm(wanted)), _MEMORY * self._pace)
+        done = wanted
+        if self._time >= self._start:
+            if self._time == self._start:
+                self._held = self._last.copy()
+                self.spells.append((self._start, self._end, self._kind))
+            done = getattr(self, f"_{self._kind}")(wanted)
+        self._last = wanted
+        self._time += 1
+        if self._time >= self._end:
+            self._plan(self._time)
+        return done
+
+    def _impulse(self, wanted: np.ndarray) -> np.ndarray:
+        return wanted + self._pace * self._push
+
+    def _slip(self, wanted: np.ndarray) -> np.ndarray:
+        if self._width != 2:  # no one side to run off to: a push that grows with the speed
+            return wanted + 0.5 * np.linalg.norm(wanted) * self._share
+        c, s = np.cos(self._turn), np.sin(self._turn)
+        return np.array([c * wanted[0] - s * wanted[1], s * wanted[0] + c * wanted[1]])
+
+    def _late_turn(self, wanted: np.ndarray) -> np.ndarray:
+        return self._held

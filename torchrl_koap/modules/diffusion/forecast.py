@@ -1,0 +1,107 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A linear forecast of the plan, from which a planner learns the deviations alone."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
+from torchrl_koap.modules.normalizer import Normalizer
+
+_MOST_ROWS = 20_000  # windows that the ridge is fitted to at most, spread evenly
+_NOTHING = 1e-3  # of the range of an entry: scale of what is forecast without error
+_PENALTIES = tuple(10.0**power for power in range(-6, 8))  # the last one leaves next to nothing
+
+
+class LinearForecast(nn.Module):
+    r"""Takes a ridge regression on the condition off a sequence, and adds it again.
+
+    .. math:: y = (x - W c - b - \text{offset}) / \text{scale}
+
+    A network that has seen the motions to fifty goals knows these fifty by heart; what lies between them it guesses. A
+    linear map of as many numbers as the condition has carries over to new goals wherever the motion is nearly linear in
+    what was observed, and elsewhere its penalty, chosen on trajectories left out, makes it vanish. What it takes off
+    depends on the condition alone, so no distribution of plans is ruled out by it.
+
+    Args:
+        condition_dim (int): number ``c`` of condition columns.
+        width (int): number ``w`` of columns of the flat sequence.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.diffusion.forecast import LinearForecast
+        >>> condition, forecast = torch.randn(90, 3), LinearForecast(3, 2)
+        >>> sequence = condition[:, :2] - 0.5 * condition[:, 2:]
+        >>> penalty = forecast.fit(condition, sequence, torch.arange(90) // 30)
+        >>> torch.allclose(forecast.weight, torch.tensor([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5]]), atol=1e-3)
+        True
+    """
+
+    def __init__(self, condition_dim: int, width: int):
+        super().__init__()
+        self.register_buffer("weight", torch.zeros(width, condition_dim))
+        self.register_buffer("bias", torch.zeros(width))
+        self.rest = Normalizer(torch.zeros(width), torch.ones(width))
+
+    def fit(self, condition: Tensor, sequence: Tensor, groups: Tensor | None = None, *, mode: str = "minmax") -> float:
+        """Fits the ridge and the statistics of what it leaves over.
+
+        Args:
+            condition (Tensor): normalised conditions ``[N, c]``.
+            sequence (Tensor): normalised sequences ``[N, w]``.
+            groups (Tensor, optional): trajectory of every row ``[N]``; they are left out one at a time to choose the
+                penalty. Default: one row at a time.
+
+        Keyword Args:
+            mode (str): of the statistics (:class:`~torchrl_koap.modules.normalizer.Normalizer`).
+
+        Returns:
+            float: the penalty chosen.
+        """
+        groups = torch.arange(len(condition), device=condition.device) if groups is None else groups
+        rows = slice(None, None, -(-len(condition) // _MOST_ROWS))
+        ridge = LinearActionDecoder(condition.shape[-1], sequence.shape[-1]).to(condition)
+        every = torch.ones(len(condition), dtype=torch.bool, device=condition.device)
+        fit = ridge.fit_ridge(
+            condition[rows],
+            sequence[rows],
+            every[rows],
+            groups=groups[rows],
+            penalties=_PENALTIES,
+            default_penalty=_PENALTIES[-1],  # where too few trajectories are there to choose by
+        )
+        self.weight.copy_(ridge.linear.weight.detach())
+        self.bias.copy_(ridge.linear.bias.detach())
+        rest = sequence - self._forecast(condition)
+        fitted = Normalizer.fit(rest, mode=mode)
+        nothing = (rest - fitted.offset).abs().amax(0) < _NOTHING  # such as a goal that never moves
+        self.rest = Normalizer(fitted.offset, torch.where(nothing, _NOTHING, fitted.scale)).to(self.bias)
+        return fit.penalty
+
+    def take_off(self, condition: Tensor, sequence: Tensor) -> Tensor:
+        """Normalised deviation of a sequence from its forecast.
+
+        Args:
+            condition (Tensor): normalised conditions ``[*B, c]``.
+            sequence (Tensor): normalised sequences ``[*B, w]``.
+
+        Returns:
+            Tensor: ``[*B, w]``.
+        """
+        return self.rest(sequence - self._forecast(condition))
+
+    def add(self, condition: Tensor, deviation: Tensor) -> Tensor:
+        """Inverse of :meth:`take_off`.
+
+        Args:
+            condition (Tensor): normalised conditions ``[*B, c]``.
+            deviation (Tensor): normalised deviations ``[*B, w]``.
+
+        Returns:
+            Tensor: ``[*B, w]``.
+        """
+        return self.rest.inverse(deviation) + self._forecast(condition)
+
+    def _forecast(self, condition: Tensor) -> Tensor:
+        return nn.functional.linear(condition, self.weight, self.bias)

@@ -1,0 +1,235 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Measured cells in the layout of the paper's tables, the paper's cell beside each, and success averaged over tasks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from torchrl_koap.files import replacing_file
+from torchrl_koap.reports.style import FAINT, save_figure, set_title, tidy
+from torchrl_koap.studies.paper_results import PaperCell, paper_cell, paper_levels
+from torchrl_koap.studies.plots import Line, draw_lines, method_styles, name_lines
+from torchrl_koap.studies.summary import Summary, percent, summarise
+from torchrl_koap.tasks.registry import find_task
+
+AVERAGE = "plots/average.png"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A measured cell and the paper's.
+
+    Args:
+        task (str): name of the task.
+        method (str): name of the method.
+        level (int): label level, 1 for the fewest labels.
+        label_share (float): share of the labels.
+        measured (Summary, optional): what was measured, pooled over seeds.
+        paper (PaperCell, optional): the paper's cell.
+
+    Examples:
+        >>> from torchrl_koap.studies.paper_layout import Entry
+        >>> from torchrl_koap.studies.paper_results import paper_cell
+        >>> Entry("avoiding", "koap", 1, 0.02, None, paper_cell("avoiding", "koap", 1)).text
+        'not run [78.0 +- 8.6]'
+    """
+
+    task: str
+    method: str
+    level: int
+    label_share: float
+    measured: Summary | None
+    paper: PaperCell | None
+
+    @property
+    def success(self) -> float | None:
+        """Measured success in 0..1, None if no seed is done."""
+        return None if self.measured is None else self.measured.success
+
+    @property
+    def text(self) -> str:
+        """Measured success and its interval in percent, number of rollouts and, in brackets, the paper's mean."""
+        if self.success is None:
+            here = "failed" if self.measured is not None and self.measured.failed else "not run"
+        else:
+            low, high = 100 * self.measured.low, 100 * self.measured.high
+            lost = f", {len(self.measured.failed)} failed" if self.measured.failed else ""
+            here = f"{100 * self.success:.1f} ({low:.0f}-{high:.0f}){lost}"
+        return here if self.paper is None else f"{here} [{self.paper.text}]"
+
+
+def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
+    """Cells of all tasks, methods and levels that occur among some rows, those that were not run included.
+
+    Args:
+        rows (sequence of mapping): cells; those at shares that are no label level of their task are left out.
+
+    Raises:
+        ValueError: as :func:`~torchrl_koap.studies.summary.summarise`.
+
+    Examples:
+        >>> from torchrl_koap.studies.paper_layout import paper_entries
+        >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.05, "seed": 0, "status": "missing"}
+        >>> [(entry.level, entry.paper.success) for entry in paper_entries([cell])]
+        [(2, 0.9805)]
+    """
+    found = {}
+    for item in summarise(rows):
+        levels = _levels_of(item.task)
+        if item.fraction in levels:
+            found[item.task, levels.index(item.fraction) + 1, item.method] = item
+    tasks, methods = (list(dict.fromkeys(key[place] for key in found)) for place in (0, 2))
+    return [
+        Entry(task, method, level, share, found.get((task, level, method)), paper_cell(task, method, level))
+        for task in tasks
+        for level, share in enumerate(_levels_of(task), start=1)
+        if any(key[:2] == (task, level) for key in found)
+        for method in methods
+    ]
+
+
+def _levels_of(task: str) -> tuple[float, ...]:
+    facts = find_task(task)
+    return paper_levels(task) if facts is None else facts.label_levels
+
+
+def layout_rows(entries: Sequence[Entry]) -> list[dict[str, str]]:
+    """The table as text: a row per task and level, a column per method.
+
+    Args:
+        entries (sequence of Entry): of :func:`paper_entries`.
+    """
+    lines: dict[tuple[str, int], dict[str, str]] = {}
+    for entry in entries:
+        line = lines.setdefault(
+            (entry.task, entry.level), {"task": entry.task, "level": f"{entry.level} ({percent(entry.label_share)})"}
+        )
+        line[entry.method] = entry.text
+    return list(lines.values())
+
+
+def above_the_paper(entries: Sequence[Entry], method: str = "koap") -> tuple[int, int]:
+    """In how many cells a method succeeds more often than the paper's, of how many that both have.
+
+    Args:
+        entries (sequence of Entry): of :func:`paper_entries`.
+        method (str): the method.
+    """
+    both = [entry for entry in entries if entry.method == method and entry.paper and entry.success is not None]
+    return sum(entry.success > entry.paper.success for entry in both), len(both)
+
+
+def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Writes ``paper_table.md`` and the picture of success averaged over tasks into a folder.
+
+    Args:
+        folder (str or Path): the folder of the comparison.
+        rows (sequence of mapping): cells of all its tasks.
+
+    Returns:
+        dict: ``rows`` of the table, a ``sentence`` on KOAP and the paper's, and ``picture``, the path of the picture
+        below the folder, None if nothing is done that could be averaged.
+    """
+    folder, entries = Path(folder), paper_entries(rows)
+    table = layout_rows(entries)
+    above, both = above_the_paper(entries)
+    sentence = f"KOAP succeeds more often than the paper's KOAP in {above} of {both} cells." if both else ""
+    with replacing_file(folder / "paper_table.md") as aside:
+        aside.write_text(f"{as_markdown(table)}\n{sentence}\n", encoding="utf-8")
+    points = average_over_tasks(entries)
+    picture = None
+    if points:
+        plot_average(entries, folder / AVERAGE)
+        picture = AVERAGE
+    return {"rows": table, "sentence": sentence, "picture": picture}
+
+
+def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
+    """Rows of text as a markdown table.
+
+    Args:
+        table (sequence of mapping): rows with the same keys.
+    """
+    if not table:
+        return "no cells\n"
+    lines = [list(table[0]), *(list(row.values()) for row in table)]
+    text = ["| " + " | ".join(line) + " |" for line in lines]
+    return "\n".join([text[0], "|---" * len(lines[0]) + "|", *text[1:], ""])
+
+
+def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, float, float, float]]]:
+    """Success averaged over the tasks at every level, by method: level, mean and the ends of its 95 % interval.
+
+    A method has a point where every task has a cell of it that is done, so that all points are of the same tasks. Its
+    interval combines the Wilson intervals of the cells by the squares of their halves (Newcombe's method).
+
+    Args:
+        entries (sequence of Entry): of :func:`paper_entries`.
+    """
+    lines: dict[str, list[tuple[int, float, float, float]]] = {}
+    number = len({entry.task for entry in entries})
+    for method in dict.fromkeys(entry.method for entry in entries):
+        for level in sorted({entry.level for entry in entries}):
+            cells = [entry for entry in entries if (entry.method, entry.level) == (method, level)]
+            if len(cells) < number or any(entry.success is None for entry in cells):
+                continue
+            mean = sum(entry.success for entry in cells) / len(cells)
+            below = math.sqrt(sum((entry.success - entry.measured.low) ** 2 for entry in cells)) / len(cells)
+            above = math.sqrt(sum((entry.measured.high - entry.success) ** 2 for entry in cells)) / len(cells)
+            lines.setdefault(method, []).append((level, mean, mean - below, mean + above))
+    return lines
+
+
+def plot_average(entries: Sequence[Entry], path: str | Path) -> Path:
+    """Success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
+
+    Args:
+        entries (sequence of Entry): of :func:`paper_entries`.
+        path (str or Path): png to write.
+
+    Raises:
+        ValueError: if there is no level at which a method is done in every task.
+    """
+    averages = average_over_tasks(entries)
+    if not averages:
+        raise ValueError("there is nothing to average: no method is done at a level in every task")
+    methods = list(dict.fromkeys(entry.method for entry in entries))
+    lines = []
+    for method, points in averages.items():
+        line = Line(method, **method_styles(methods)[method])
+        for level, *values in points:
+            line.x.append(level)
+            for part, value in zip((line.y, line.low, line.high), values, strict=True):
+                part.append(100 * value)
+            cells = [entry.paper for entry in entries if (entry.method, entry.level) == (method, level)]
+            if all(cells):
+                line.paper.append((level, 100 * sum(cell.success for cell in cells) / len(cells)))
+        lines.append(line)
+    figure = Figure(figsize=(7.4, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    draw_lines(axes, lines, beside=lambda x, step: x + 0.028 * step)
+    levels = sorted({level for line in lines for level in line.x})
+    axes.set_xlim(levels[0] - 0.25, levels[-1] + 0.25)
+    axes.set_xticks(levels)
+    axes.set_ylim(-3, 103)
+    axes.set_yticks(range(0, 101, 20))
+    axes.set_xlabel("label level (1: fewest labels)")
+    axes.set_ylabel("success (%)")
+    axes.grid(axis="y", color=FAINT, linewidth=0.5)
+    tasks = list(dict.fromkeys(entry.task for entry in entries))
+    title = (
+        f"success, 95 % interval: {', '.join(tasks)}"
+        if len(tasks) == 1
+        else f"mean over {len(tasks)} tasks, 95 % interval"
+    )
+    hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
+    set_title(axes, title + hollow)
+    tidy(axes)
+    name_lines(axes, lines)
+    return save_figure(figure, path)
