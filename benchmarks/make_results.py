@@ -21,7 +21,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from readme_pictures import draw_label_curves, draw_pipeline
 from scipy.stats import t as student
-from unlabelled_picture import REGIMES, draw_errors
+from unlabelled_picture import CONTROLS, REGIMES, draw_errors
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layout_rows, paper_entries
@@ -341,6 +341,14 @@ def unlabelled_labels(regime: str) -> list[str]:
     return [f"{number} labelled" for number in sorted({number for _, number in unlabelled_cells(regime)})]
 
 
+def unlabelled_missing() -> str:
+    """Regimes and controls of the study that the table has no row of."""
+    found = read_rows("unlabelled_data")
+    regimes = [REGIMES[name] for name in REGIMES if name not in {row["regime"] for row in found}]
+    methods = [f"`{name}`" for name in CONTROLS if name not in {row["method"] for row in found}]
+    return ", ".join(regimes + methods) or "nothing of the study's table"
+
+
 def unlabelled_gains(regimes: Sequence[str], against: Sequence[str]) -> list[list[str]]:
     """How much smaller the error of ``semi_supervised`` is, in percent, paired by seed, with a 95 % t-interval."""
     body = []
@@ -366,7 +374,7 @@ def paired_gain(gains: Sequence[float]) -> str:
 
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
 _PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size)
-_UNLABELLED = (unlabelled_rows, unlabelled_labels, unlabelled_gains)
+_UNLABELLED = (unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
 _HELPERS = (first, label_sizes, *_TABLES, tracking_rows, export_rows, preset_rows, *_PAPER, *_UNLABELLED)
 
 

@@ -13,9 +13,15 @@ REGIMES = {
     "plain": "positions as recorded",
     "noise": "positions, noise of three steps",
     "wide_64": "64 nonlinear columns, noise",
+    "wide_512": "512 nonlinear columns, noise",
     "pictures": "32 x 32 pictures, 64 components",
+    "distractors": "64 columns, 2 distractors",
     "joints_hidden": "Stacking, joints hidden",
 }
+CONTROLS = (
+    *("semi_supervised", "semi_supervised, untrained", "semi_supervised, labelled only", "koap", "koap_untrained"),
+    *("koap_labelled_only", "koap_paper", "pca", "linear_steps", "dd_lookahead"),
+)
 LOOKS = {
     "semi_supervised": ("#0b6e4f", "-", "o"),
     "koap_untrained": ("#7a7a7a", "--", "s"),
