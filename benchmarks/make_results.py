@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import statistics
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,11 +20,18 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from readme_pictures import draw_label_curves, draw_pipeline
+from scipy.stats import t as student
+from unlabelled_picture import REGIMES, draw_errors
 
 from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layout_rows, paper_entries
+from torchrl_koap.studies.paper_results import paper_cells, paper_levels, paper_points
+from torchrl_koap.studies.paper_tables import PAPER_TASKS
+from torchrl_koap.studies.table import read_cells
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "benchmarks" / "results"
+CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
 BEGIN, END = "<!-- results: made by benchmarks/make_results.py -->", "<!-- end of results -->"
 PICTURES = Path("docs") / "pictures"
 DRAWN = ("koap", "koap_untrained", "linear_steps", "linear", "dd_lookahead", "dd", "dp")
@@ -108,7 +116,7 @@ def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
     body = [
         [
             row["labels"],
-            f"`{row['method']}`",
+            "*oracle*" if row.get("controller") == "oracle" else f"`{row['method']}`",
             row["denoiser"],
             f"{row['updates']} x {row['batch']}",
             row["training_seed"],
@@ -208,14 +216,60 @@ def suggestion_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
 
 
 def level_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
-    """Table of tasks and label levels, with KOAP and the recurrent network side by side."""
-    other = {(row["task"], row["level"]): percent(row) for row in rows if row["method"] == "recurrent"}
+    """Table of tasks and labels: KOAP, the recurrent network, and the paper's KOAP at the same share."""
+    other = {(row["task"], row["label_fraction"]): percent(row) for row in rows if row["method"] == "recurrent"}
     return [
-        [row["task"] + (f", {row['goal']}" if row["goal"] else ""), row["level"], percent(row)]
-        + [other.get((row["task"], row["level"]), "not run"), row["entropy"], row["paper"]]
+        [row["task"] + (f", {row['goal']}" if row["goal"] else ""), share(row["label_fraction"]), percent(row)]
+        + [other.get((row["task"], row["label_fraction"]), "not run"), row["entropy"], paper_at_share(row)]
         for row in rows
         if row["method"] == "koap"
     ]
+
+
+def paper_at_share(row: Mapping[str, str]) -> str:
+    """The paper's KOAP at the share of labels of a row, empty where it has no such level or counts another goal."""
+    task = {"stacking": "stacking_1"}.get(row["task"], row["task"])
+    if row["goal"] not in ("", "first box"):
+        return ""
+    points = [point for point in paper_points(task, [float(row["label_fraction"])]) if point["method"] == "koap"]
+    return "".join(f"{100 * point['success']:.1f} +- {100 * point['spread']:.1f}" for point in points)
+
+
+def paper_levels_table() -> str:
+    """The shares of labels that are the paper's levels, by task."""
+    body = [[f"`{task}`", *map(share, paper_levels(task))] for task in PAPER_TASKS]
+    return table(["task", *(f"level {level}" for level in range(1, 6))], body)
+
+
+def bench_table(name: str) -> str:
+    """Cells of a comparison in the layout of the paper's tables, the paper's beside each.
+
+    Args:
+        name (str): file of cells without its ending.
+    """
+    return as_markdown(layout_rows(paper_entries(read_cells(CELLS / f"{name}.csv"))))
+
+
+def paper_size() -> str:
+    """Number of cells that the paper's tables have."""
+    return str(sum(cell.task != "stacking_1" for number in (1, 2) for cell in paper_cells(number)))
+
+
+def bench_sentence(name: str) -> str:
+    """In how many cells of a comparison KOAP is above the paper's."""
+    above, both = above_the_paper(paper_entries(read_cells(CELLS / f"{name}.csv")))
+    return f"{above} of {both}"
+
+
+def bench_size(name: str) -> str:
+    """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
+    cells = [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
+    seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
+    rollouts = " or ".join(map(str, sorted(episodes)))
+    plural = "s" if len(seeds) > 1 else ""
+    return (
+        f"{len(cells)} cells, {len(seeds)} training seed{plural}, {rollouts} rollouts each, {'/'.join(units)}s labelled"
+    )
 
 
 def env_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
@@ -249,13 +303,71 @@ def tracking_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     return [[row[name] for name in names] for row in rows]
 
 
+def export_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """Table of the ways to call a whole policy."""
+    return [list(row.values()) for row in rows]
+
+
 def preset_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     """Table of the presets."""
     return [[row["preset"], row["decoder"], f"{row['action_error']} {row['unit']}"] for row in rows]
 
 
+def unlabelled_cells(regime: str) -> dict[tuple[str, int], dict[int, float]]:
+    """Action errors of a regime by method and number of labelled trajectories, then by seed."""
+    found: dict[tuple[str, int], dict[int, float]] = {}
+    for row in read_rows("unlabelled_data", regime=regime):
+        found.setdefault((row["method"], int(row["labels"])), {})[int(row["seed"])] = float(row["error"])
+    return found
+
+
+def unlabelled_rows(regime: str) -> list[list[str]]:
+    """A row per method of a regime: mean error and range over seeds for every number of labelled trajectories."""
+    cells = unlabelled_cells(regime)
+    labels = sorted({number for _, number in cells})
+    body = []
+    for method in dict.fromkeys(method for method, _ in cells):
+        row = [f"`{method}`"]
+        for number in labels:
+            errors = list(cells.get((method, number), {}).values())
+            ends = f"{min(errors):.2f}-{max(errors):.2f}, {len(errors)} seeds" if errors else ""
+            row.append(f"{statistics.fmean(errors):.2f} ({ends})" if errors else "not run")
+        body.append(row)
+    return body
+
+
+def unlabelled_labels(regime: str) -> list[str]:
+    """Headings of :func:`unlabelled_rows`."""
+    return [f"{number} labelled" for number in sorted({number for _, number in unlabelled_cells(regime)})]
+
+
+def unlabelled_gains(regimes: Sequence[str], against: Sequence[str]) -> list[list[str]]:
+    """How much smaller the error of ``semi_supervised`` is, in percent, paired by seed, with a 95 % t-interval."""
+    body = []
+    for regime in regimes:
+        cells = unlabelled_cells(regime)
+        for number in sorted({number for _, number in cells}):
+            row = [REGIMES[regime], str(number)]
+            for method in against:
+                own, other = (cells.get((name, number), {}) for name in ("semi_supervised", method))
+                row.append(paired_gain([100 * (1 - own[seed] / other[seed]) for seed in own.keys() & other.keys()]))
+            body.append(row)
+    return body
+
+
+def paired_gain(gains: Sequence[float]) -> str:
+    """Mean of some gains in percent with its 95 % t-interval; no interval below three."""
+    if len(gains) < 3:
+        return f"{statistics.fmean(gains):+.0f} % ({len(gains)} seeds)" if gains else "not run"
+    half = student.ppf(0.975, len(gains) - 1) * statistics.stdev(gains) / len(gains) ** 0.5
+    mean = statistics.fmean(gains)
+    return f"{mean:+.0f} % ({mean - half:+.0f} to {mean + half:+.0f})"
+
+
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
-_HELPERS = (first, label_sizes, *_TABLES, tracking_rows, preset_rows)
+_PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size)
+_UNLABELLED = (unlabelled_rows, unlabelled_labels, unlabelled_gains)
+_HELPERS = (first, label_sizes, *_TABLES, tracking_rows, export_rows, preset_rows, *_PAPER, *_UNLABELLED)
 
 
 def commands(rows: Sequence[Mapping[str, str]]) -> str:
@@ -317,6 +429,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     (ROOT / PICTURES).mkdir(parents=True, exist_ok=True)
     drawn = [draw_label_curves(curves(), ROOT / PICTURES / "success_and_entropy.png")]
     drawn += [draw_pipeline(ROOT / PICTURES / f"pipeline.{kind}") for kind in ("svg", "png")]
+    drawn.append(draw_errors({regime: unlabelled_cells(regime) for regime in REGIMES}, ROOT / PICTURES))
     print("\n".join(f"wrote {path}" for path in [*stale, *(path.relative_to(ROOT) for path in drawn)]))
     return 0
 

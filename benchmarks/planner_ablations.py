@@ -2,6 +2,7 @@
 """Adds one row to the table of planners that were tried: success in closed loop over several noise seeds.
 
     python benchmarks/planner_ablations.py RUN --seeds 100 1100 2100 --candidates 4 --note "wider"
+    python benchmarks/planner_ablations.py RUN --controller oracle        # a ceiling: the simulator's own inverse map
 
 Every seed is one rollout in each of the fixed contexts (60 episodes on Avoiding, which has none). Sixty rollouts tell
 88 from 96 % by luck alone, so the table holds the sum.
@@ -16,13 +17,17 @@ from collections import defaultdict
 from pathlib import Path
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
+from torchrl_koap.evaluation.policy_files import BLEND_DECAY
+from torchrl_koap.evaluation.run import CONTROLLERS
 from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
+from torchrl_koap.files import replacing_file
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.run_directory import RunDirectory
 
 TABLE = Path(__file__).parent / "results" / "planner_ablations.csv"
 SIZES = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay")
 UNITS = {"trajectory": "trajectories", "window": "windows", "transition": "transitions"}
+OLDER = {"controller": "learned"}  # in rows that were written before the column
 OTHERS = ("first_steps_weight", "precision", "recovery_sigma", "planner_learning_rate")
 
 
@@ -44,7 +49,7 @@ def labels_of(config: dict) -> str:
     return f"{config['label_fraction']:g} of {UNITS[config['label_unit']]}"
 
 
-def row_of(path: Path, results: list[dict], choices: dict, note: str) -> dict:
+def row_of(path: Path, results: list[dict], choices: dict, note: str, controller: str = "learned") -> dict:
     """One row of the table from a run directory and its evaluations."""
     run = RunDirectory(path)
     config, summary = run.read_json("config.json"), run.read_json("summary.json")
@@ -58,7 +63,7 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str) -> dict:
         groups = defaultdict(list)
         for row in rows:
             groups[row["context"]] += [row["mode"]] * (row["outcome"] == "success" and row["mode"] >= 0)
-        unsolved = "zero" if task.entropy == "contexts" else "skip"
+        unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
         entropy = conditional_entropy(list(groups.values()), task.num_modes, unsolved=unsolved)
     seconds = summary["train_seconds"]
     return {
@@ -84,17 +89,26 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str) -> dict:
         "mean_steps_won": round(statistics.fmean(row["steps"] for row in won), 1) if won else None,
         "note": note,
         "command": config["command"],
+        "controller": controller,
     }
 
 
 def append(row: dict, table: Path) -> None:
-    """Adds a row, below a header if the table is new."""
+    """Adds a row; columns that the rows before did not have yet are filled with what those were."""
     table.parent.mkdir(parents=True, exist_ok=True)
-    new = not table.exists()
-    with table.open("a", newline="") as file:
-        writer = csv.DictWriter(file, list(row), lineterminator="\n")
-        if new:
-            writer.writeheader()
+    earlier = []
+    if table.exists():
+        with table.open(newline="") as file:
+            reader = csv.DictReader(file)
+            earlier, known = list(reader), reader.fieldnames or []
+        if list(known) != list(row):  # written before a column was there
+            strange = [name for name in known if name not in row]
+            if strange:
+                raise ValueError(f"{table} has columns that no row gets any more: {', '.join(strange)}")
+    with replacing_file(table) as aside, aside.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(row), restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([OLDER | line for line in earlier])
         writer.writerow(row)
 
 
@@ -104,10 +118,11 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--seeds", type=int, nargs="+", default=[100, 1100, 2100])
     parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--controller", choices=CONTROLLERS, default="learned")
     parser.add_argument("--candidates", type=int, default=1)
     parser.add_argument("--choice", default="quarter")
     parser.add_argument("--replan-interval", type=int, default=4)
-    parser.add_argument("--blend-decay", type=float, default=0.8)
+    parser.add_argument("--blend-decay", type=float, default=BLEND_DECAY)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--note", default="")
     parser.add_argument("--table", type=Path, default=TABLE)
@@ -120,10 +135,10 @@ def main() -> None:
     }
     results = []
     for seed in options.seeds:
-        settings = {**choices, "choice": options.choice}
+        settings = {**choices, "choice": options.choice, "controller": options.controller}
         config = EvalConfig(episodes=options.episodes, seed=seed, threads=options.threads, **settings)
         results.append(evaluate(options.run, config))
-    row = row_of(options.run, results, choices, options.note)
+    row = row_of(options.run, results, choices, options.note, options.controller)
     append(row, options.table)
     keys = ("candidates", "choice", "successes", "n", "success", "low", "high", "by_seed", "entropy", "mean_steps")
     print(options.run.name, {key: row[key] for key in keys})

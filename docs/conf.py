@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """The documentation site: ``make docs`` builds it offline, every warning is an error.
 
-Pages about tasks, methods, commands, rooms and modules are made from the code itself by the extensions beside this file,
-into ``docs/generated`` (not committed). Tutorials are shown with the output that ``make tutorials`` left.
+Pages about tasks, methods, commands, rooms and modules are made from the code itself by the extensions beside this
+file, into ``docs/generated`` (not committed). Tutorials are shown with the output that ``make tutorials`` left.
 """
 
 import os

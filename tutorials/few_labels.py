@@ -45,6 +45,7 @@ task = get_task("avoiding")
 demonstrations, _ = record_demonstrations("avoiding", episodes=48)
 demonstrations = select_state(demonstrations, task.state_columns)
 data, report = LabelBudget(2, unit="trajectory").apply(demonstrations, command=task.command_columns)
+print(f"labels: {report.labelled_transitions} of {report.total_transitions} transitions, 2 of 48 demonstrations")
 
 # %%
 # Latent actions from states alone
@@ -72,6 +73,7 @@ for _ in range(200):
 # The labels are spent last: the linear decoder is fitted to them in closed form.
 
 fit = fit_closed_form(inverse_dynamics, data, shared_axes=task.actuated)
+print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
 
 # %%
 # A planner over states
@@ -108,11 +110,15 @@ mode_index = mode_index_of(task)
 result = score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index)
 rollouts = rollouts_to_tensors(episodes, position=task.observation[task.position], mode_index=mode_index, interval=4)
 plot_rollouts(rollouts, "few_labels.png", task="avoiding", num_modes=task.num_modes)
+low, high = (100 * result[f"success_{end}"] for end in ("low", "high"))
+print(f"success {100 * result['success_rate']:.1f} % ({low:.0f}-{high:.0f}) of {len(seeds)} rollouts")
+print(f"{result['distinct_modes']} of {task.num_modes} ways taken, entropy {result['mode_entropy']:.2f}")
 
 # %%
 # Every module works alone as well: the latent actions of any window of states are one call away.
 
 latent = inverse_dynamics(TensorDict({"state": extended["state"][None, :16]}, batch_size=[1]))["latent_action"]
+print("latent actions of a window:", tuple(latent.shape))
 
 # %%
 # Conclusion

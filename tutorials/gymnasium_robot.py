@@ -112,7 +112,7 @@ results = {}
 planner = None
 for method in ("linear", "koap_untrained", "koap"):
     run = folder / method
-    options = {"steps": 1500, "channels": (32, 64), "controller_steps": 200, "method": method, "analysis": False}
+    options = {"steps": 800, "channels": (32, 64), "controller_steps": 200, "method": method, "analysis": False}
     train(TrainConfig(out=run, dataset=str(data), planner_from=planner, **options))
     planner = planner or run
     results[method] = evaluate(run, EvalConfig(episodes=20, env="FlatMaze-v0", success_key="success"))

@@ -39,8 +39,8 @@ if __name__ == "__main__":  # workers import this file
         fractions="0.025,0.1",
         seeds=2,
         demonstrations=40,
-        episodes=16,
-        steps=1200,
+        episodes=12,
+        steps=600,
         controller_steps=100,
         workers=2,
         launcher=launcher,
@@ -57,7 +57,7 @@ if __name__ == "__main__":  # workers import this file
     # %%
     # The table
     # ---------
-    # Seeds are pooled: 32 rollouts per entry. An interval of that many is some thirty points wide, so only the large
+    # Seeds are pooled: 24 rollouts per entry. An interval of that many is up to forty points wide, so only the large
     # differences mean anything here. ``comparisons.csv`` pairs the methods rollout by rollout.
 
     with (out / "cells.csv").open() as file:

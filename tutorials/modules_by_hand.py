@@ -14,7 +14,7 @@ Run it with ``python tutorials/modules_by_hand.py``; it leaves ``modules_by_hand
 # %%
 # Four parts and a model
 # ----------------------
-# The latent action ``u_t = f(x_{t-1}, x_t, x_{t+1}, x_{t+2})`` is inferred from states alone. Lifting ``z = g(x)`` and
+# The latent action ``u_t = f(x_{t-1}, x_t, x_{t+2}, x_{t+3})`` is inferred from states alone. Lifting ``z = g(x)`` and
 # operator ``z' = K z + u`` are there to give it a meaning; the decoder ``a = D u`` is all that ever needs labels.
 
 import torch
@@ -45,7 +45,7 @@ task = get_task("avoiding")
 demonstrations = select_state(record_demonstrations("avoiding", episodes=24)[0], task.state_columns)
 data, report = LabelBudget(2).apply(demonstrations, command=task.command_columns)
 model = KoopmanInverseDynamics(
-    LatentActionMLP(2, 16, hidden_dims=(32, 32), num_past=1, look_ahead=(1, 2), relative=True, linear_skip=True),
+    LatentActionMLP(2, 16, hidden_dims=(32, 32), num_past=1, look_ahead=(2, 3), relative=True, linear_skip=True),
     LinearActionDecoder(16, 2),
     lifting=KoopmanLifting(2, 16, hidden_dims=(32, 32), include_state=True, in_key="normalized_state"),
     operator=KoopmanOperator(16),

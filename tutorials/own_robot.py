@@ -23,7 +23,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
+from tensordict import TensorDict
 
 import torchrl_koap
 
@@ -74,7 +76,7 @@ data, task = torchrl_koap.make_demonstrations(
     states, actions, control_hz=30, state_names=NAMES, state_units="rad", action_units="rad/s", robot=NAMES[:2]
 )
 print(f"{len(states)} trajectories, {int(data['has_action'].sum())} of {len(data)} steps with their command")
-planner = torchrl_koap.fit_planner(data, task, steps=1500, channels=(32, 64), progress=False)  # looks at no command
+planner = torchrl_koap.fit_planner(data, task, steps=500, channels=(32, 64), progress=False)  # looks at no command
 controllers = {
     name: torchrl_koap.fit_controller(data, task, method=name, steps=200, progress=False)
     for name in ("linear", "dd", "koap")
@@ -86,13 +88,11 @@ controllers = {
 # Without a simulator the commands decoded from *recorded* joints are compared with the recorded ones. The training was
 # given no labels of these trajectories; here their commands happen to be known.
 
-from tensordict import TensorDict  # noqa: E402
-
 columns = list(task.controller_columns("robot"))
 for name, controller in controllers.items():
     errors = []
     for frames, commands in recordings[3:13]:
-        window = data["state"].new_tensor(frames)[None, :, columns]
+        window = torch.tensor(frames, dtype=torch.float32)[None, :, columns]
         decoded = controller(TensorDict({"state": window}, [1]))["action"][0].detach().numpy()
         errors.append(decoded[5:65] - commands[5:65])
     spread = np.concatenate([commands[5:65] for _, commands in recordings[3:13]]).std()

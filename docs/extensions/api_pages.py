@@ -28,7 +28,9 @@ def write_api_pages(quick: bool = False) -> None:
         for path in modules:
             write_module(path)
         link = "``{}``" if quick else ":doc:`{}`"
-        rows = [(link.format(name_of(path)), ", ".join(f"``{name}``" for name in public_names(path))) for path in modules]
+        rows = [
+            (link.format(name_of(path)), ", ".join(f"``{name}``" for name in public_names(path))) for path in modules
+        ]
         write_page(
             f"api/{room}",
             heading(f"torchrl_koap.{room}"),

@@ -12,7 +12,7 @@ from typing import Any, get_args
 import tyro
 from pages import code, heading, table, toctree, write_page
 
-from torchrl_koap.commands.cli import Subcommand
+from torchrl_koap.commands.subcommands import Subcommand
 
 
 def setup(app: Any) -> dict[str, Any]:
@@ -37,8 +37,8 @@ def write_command_pages() -> None:
     write_page(
         "commands/index",
         heading("Every command and option"),
-        "What ``koap COMMAND --help`` prints. Fields of a configuration in Python have the same names with underscores, "
-        "such as :class:`~torchrl_koap.training.config.TrainConfig`.",
+        "What ``koap COMMAND --help`` prints. Fields of a configuration in Python have the same names, with "
+        "underscores, as in :class:`~torchrl_koap.training.config.TrainConfig`.",
         table(("command", "what it does"), [(f":doc:`{name}`", summary(kind)) for name, kind in commands.items()]),
         toctree(commands, hidden=True),
     )

@@ -28,7 +28,11 @@ def write_design_page() -> None:
     for room in (name for name in allowed if (PACKAGE / name).is_dir()):
         files = [path for path in sorted((PACKAGE / room).rglob("*.py")) if path.name != "__init__.py"]
         rows = [(f"``{path.relative_to(PACKAGE)}``", first_sentence(path)) for path in files]
-        blocks += [heading(room, 1), first_sentence(PACKAGE / room / "__init__.py"), table(("file", "what it holds"), rows)]
+        blocks += [
+            heading(room, 1),
+            first_sentence(PACKAGE / room / "__init__.py"),
+            table(("file", "what it holds"), rows),
+        ]
     rules = [
         (f"``{room}``", ", ".join(sorted(others - {room, "__version__"})) or "nothing of the package")
         for room, others in allowed.items()
@@ -36,8 +40,8 @@ def write_design_page() -> None:
     write_page(
         "design",
         heading("The house"),
-        "Rooms are folders of the package. An arrow points to what a room may import; what is imported by way of another "
-        "room is left out of the drawing. A test reads every import and fails where one points upward, so that "
+        "Rooms are folders of the package. An arrow points to what a room may import; what is imported by way of "
+        "another room is left out of the drawing. A test reads every import and fails where one points upward, so that "
         "``import torchrl_koap.modules`` never loads a simulator.",
         ".. raw:: html\n   :file: rooms.svg",
         table(("room", "may import"), rules),
@@ -49,7 +53,7 @@ def may_import() -> dict[str, set[str]]:
     """The table of the test: only its assignments are run."""
     found: dict[str, Any] = {}
     for node in ast.parse(SOURCE.read_text(encoding="utf-8")).body:
-        if isinstance(node, ast.Assign) and node.targets[0].id in ("BASE", "TRAINING", "MAY_IMPORT"):  # type: ignore[attr-defined]
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) in ("BASE", "TRAINING", "MAY_IMPORT"):
             exec(compile(ast.Module([node], []), SOURCE.name, "exec"), found)
     return found["MAY_IMPORT"]
 
@@ -85,7 +89,9 @@ def drawing(allowed: dict[str, set[str]]) -> str:
         direct = {other for other in below if not any(other in allowed[third] - {third} for third in below - {other})}
         for other in sorted(direct):
             (x0, y0), (x1, y1) = place[room], place[other]
-            lines.append(f'<line x1="{x0:.0f}" y1="{y0 + 15:.0f}" x2="{x1:.0f}" y2="{y1 - 17:.0f}" marker-end="url(#tip)"/>')
+            lines.append(
+                f'<line x1="{x0:.0f}" y1="{y0 + 15:.0f}" x2="{x1:.0f}" y2="{y1 - 17:.0f}" marker-end="url(#tip)"/>'
+            )
     boxes = [
         f'<rect x="{x - BOX / 2:.0f}" y="{y - 15:.0f}" width="{BOX}" height="30" rx="6"/>'
         f'<text x="{x:.0f}" y="{y + 5:.0f}">{room}</text>'

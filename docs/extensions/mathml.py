@@ -6,7 +6,10 @@ from __future__ import annotations
 from typing import Any
 
 from docutils import nodes
-from docutils.utils.math import latex2mathml
+from docutils.utils.math import MathError, latex2mathml
+from sphinx.util import logging
+
+LOGGER = logging.getLogger(__name__)
 
 
 def setup(app: Any) -> dict[str, Any]:
@@ -17,11 +20,20 @@ def setup(app: Any) -> dict[str, Any]:
 
 def inline(writer: Any, node: nodes.math) -> None:
     """An equation in a line."""
-    writer.body.append(latex2mathml.tex2mathml(node.astext(), as_block=False))
+    writer.body.append(drawn(node, as_block=False))
     raise nodes.SkipNode
 
 
 def block(writer: Any, node: nodes.math_block) -> None:
     """An equation of its own."""
-    writer.body.append(f'<div class="math">{latex2mathml.tex2mathml(node.astext(), as_block=True)}</div>')
+    writer.body.append(f'<div class="math">{drawn(node, as_block=True)}</div>')
     raise nodes.SkipNode
+
+
+def drawn(node: nodes.Element, as_block: bool) -> str:
+    """The equation; a command that is not known is a warning."""
+    try:
+        return latex2mathml.tex2mathml(node.astext().replace(r"\dots", r"\ldots"), as_block=as_block)
+    except MathError as error:
+        LOGGER.warning("equation %r: %s", node.astext(), error, location=node)
+        return ""

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import inspect
+import re
+import textwrap
 from functools import partial
 from typing import Any
 
@@ -12,20 +15,15 @@ from torchrl_koap.tasks import get_task
 from torchrl_koap.training.config import TrainConfig, resolve
 from torchrl_koap.training.methods import METHODS, Method
 
-# what is decoded from what; a method without an entry is described by its network alone
+# of networks whose docstring has no equation; "paper" is that of the preset
 EQUATIONS = {
-    "koap": r"z_t = g(x_t), \quad u_t = f(x_{t-4:t}, x_{t+2:t+5}), \quad z_{t+1} = K z_t + B u_t, \quad a_t = D u_t",
-    "koap_paper": r"z_t = g(x_t), \quad u_t = f(x_{t-1}, x_t, x_{t+8}), \quad z_{t+1} = K z_t + u_t, \quad a_t = D u_t + b",
-    "linear": r"a_t = W \, [x_{t-1}, x_t, x_{t+8}] + b",
-    "dd": r"a_t = h(x_{t-4:t}, x_{t+1})",
-    "dd_lookahead": r"a_t = h(x_{t-4:t}, x_{t+1:t+5})",
-    "vae": r"q(u_t \mid x_t, x_{t+1}), \quad p(x_{t+1} \mid x_t, u_t), \quad a_t = D u_t",
-    "lapo": r"u_t = \mathrm{quantise}(f(x_t, x_{t+1})), \quad x_{t+1} = h(x_t, u_t), \quad a_t = D u_t",
-    "nonlinear": r"z_{t+1} = h(z_t, u_t), \quad a_t = d(u_t)",
-    "dp": r"p(a_{t:t+H} \mid x_{t-1}, x_t)",
-    "relabel": r"p(\hat a_{t:t+H} \mid x_{t-1}, x_t), \quad \hat a \text{ of the teacher where no label is}",
+    "KoopmanInverseDynamics": (
+        r"z_t = g(x_t), \quad u_t = f(x_{t-4:t}, x_{t+2:t+5}), \quad z_{t+1} = K z_t + B u_t, \quad a_t = D u_t"
+    ),
+    "paper": r"z_t = g(x_t), \quad u_t = f(x_{t-1}, x_t, x_{t+8}), \quad z_{t+1} = K z_t + u_t, \quad a_t = D u_t + b",
+    "LinearInverseDynamics": r"a_t = W \, [x_{t-1}, x_t, x_{t+8}] + b",
+    "DiffusionPolicy": r"p(a_{t:t+H} \mid x_{t-1}, x_t)",
 }
-LIKE_KOAP = ("koap_sgd", "koap_labelled_only", "koap_untrained", "pretrain")
 WINDOWS = {
     "all": "all windows, labelled or not, as they come",
     "mixed": "all windows, a quarter of every batch labelled",
@@ -59,7 +57,6 @@ def write_method(method: Method) -> None:
     network = build(method, "avoiding")
     kind = type(network)
     sizes = {task: sum(p.numel() for p in build(method, task).parameters()) for task in ("avoiding", "stacking")}
-    equation = EQUATIONS.get(method.name) or (EQUATIONS["koap"] if method.name in LIKE_KOAP else None)
     facts = [
         ("network", f":class:`~{kind.__module__}.{kind.__name__}`"),
         ("planner", "the one that all controllers share" if method.has_planner else "none: it is a policy of its own"),
@@ -76,7 +73,7 @@ def write_method(method: Method) -> None:
         f"methods/{method.name}",
         heading(method.name),
         f"{escape(method.title)}. {(kind.__doc__ or '').strip().splitlines()[0]}",
-        f".. math::\n\n   {equation}" if equation else "",
+        equation(method, kind),
         table(("fact", "value"), facts),
         heading("How it is trained", 1),
         phases(method),
@@ -94,6 +91,15 @@ def build(method: Method, task_name: str) -> Any:
     from torchrl_koap.training.builders import build_controller
 
     return build_controller(resolved.controller, len(resolved.columns), task.action_dim, method=method)
+
+
+def equation(method: Method, kind: type) -> str:
+    """What is decoded from what: the equation of the network's docstring, or the one listed above."""
+    found = re.search(r"^\.\. math::\n((?:[ \t]+\S.*\n|\s*\n)+)", (inspect.getdoc(kind) or "") + "\n", re.MULTILINE)
+    if found:
+        return f".. math::\n\n{textwrap.indent(textwrap.dedent(found[1]).strip(), '   ')}"
+    text = EQUATIONS.get(method.presets[0]) or EQUATIONS.get(kind.__name__)
+    return f".. math::\n\n   {text}" if text else ""
 
 
 def frames_read(network: Any) -> list[tuple[str, str]]:
@@ -127,7 +133,7 @@ def phases(method: Method) -> str:
 
 
 def measured(method: Method) -> str:
-    """Rows of the committed curves."""
+    """Rows of the committed curves, those of a method of the same name before it was changed left out."""
     rows = []
     for row in read_rows("label_curves"):
         if row["method"] != method.name:
@@ -137,4 +143,7 @@ def measured(method: Method) -> str:
         data = f"{row['data']}, {row['demonstrations']}"
         rows.append((row["task"], data, f"{100 * float(row['label_fraction']):g} %", success, row["entropy"], error))
     head = ("task", "demonstrations", "labelled", "success", "entropy", "action error")
+    earlier = getattr(method, "earlier", "")
+    if rows and earlier:
+        return f"The committed curves were measured when ``{method.name}`` was what is :doc:`{earlier}` now."
     return table(head, rows) or "No curve of it is committed."

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Runs tutorials and keeps what they print and draw for the site.
 
-    python docs/extensions/run_tutorials.py              # all of them
-    python docs/extensions/run_tutorials.py planners     # one
+python docs/extensions/run_tutorials.py              # all of them
+python docs/extensions/run_tutorials.py planners     # one
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def run(name: str) -> float:
     """
     script, began = FOLDER / f"{name}.py", time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
-        env = {**os.environ, "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1"}
+        env = {**os.environ, "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1", "RL_LOGGING_LEVEL": "WARNING"}
         done = subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True, env=env)
         if done.returncode:
             raise SystemExit(f"{script.name} failed:\n{done.stderr[-3000:]}")

@@ -39,8 +39,8 @@ def write_task_pages() -> None:
     write_page(
         "tasks/index",
         heading("Every task in numbers"),
-        "Made from the registry of tasks, ``torchrl_koap/tasks``. What the simulator does, fact by fact, and how it was "
-        "compared with the original one: :doc:`/d3il`.",
+        "Made from the registry of tasks, ``torchrl_koap/tasks``. What the simulator does, fact by fact, and how it "
+        "was compared with the original one: :doc:`/d3il`.",
         table(("task", "columns observed / planned", "actions", "modes", "limit"), rows),
         toctree(names, hidden=True),
     )
@@ -66,8 +66,10 @@ def write_task(task: Task) -> None:
         f"tasks/{task.name}",
         heading(task.name),
         f".. image:: {task.name}.png\n   :width: 420\n   :alt: {task.name} from above",
-        escape(task.scene.caption.strip()),
-        code(f"koap demos --task {task.name} --out demos\nkoap train --task {task.name} --out runs/{task.name}", "bash"),
+        f"In the pictures of a report: {escape(task.scene.caption.strip())}" if task.scene.caption else "",
+        code(
+            f"koap demos --task {task.name} --out demos\nkoap train --task {task.name} --out runs/{task.name}", "bash"
+        ),
         table(("fact", "value"), facts),
         heading("What is observed", 1),
         table(("column", "part", "unit", "in the state as"), observation_rows(task)),
@@ -127,11 +129,12 @@ def mode_blocks(task: Task) -> list[str]:
     """The ways in which it can be done."""
     if not task.modes.choices:
         return []
-    among = {"all": "all successful episodes", "contexts": "contexts", "solved_contexts": "contexts with a success"}
+    names = {"all": "all successful episodes", "contexts": "contexts", "solved_contexts": "contexts with a success"}
+    among = names.get(task.modes.entropy, task.modes.entropy)
     return [
         heading(f"{task.num_modes} modes", 1),
         table(("choice", "values"), [(choice, ", ".join(names)) for choice, names in task.modes.choices]),
-        f"Their entropy is taken over {among.get(task.modes.entropy, task.modes.entropy)}, to the base {task.num_modes}.",
+        f"Their entropy is taken over {among}, to the base {task.num_modes}.",
     ]
 
 
@@ -200,7 +203,9 @@ def draw(task: Task) -> None:
             axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linestyle=":", edgecolor=color))
             x, y = (x0 + x1) / 2, (y0 + y1) / 2
             axes.add_patch(
-                Rectangle((x - body.half[0], y - body.half[1]), 2 * body.half[0], 2 * body.half[1], color=color, alpha=0.6)
+                Rectangle(
+                    (x - body.half[0], y - body.half[1]), 2 * body.half[0], 2 * body.half[1], color=color, alpha=0.6
+                )
             )
     axes.autoscale_view()
     figure.savefig(path, dpi=100)

@@ -33,7 +33,11 @@ def drawing() -> str:
         ("executed of each plan", dict.fromkeys(range(now + 1, now + 1 + REPLAN_INTERVAL), "done")),
         (
             "controller reads, now",
-            {**dict.fromkeys(range(now - past, now), "past"), now: "now", **dict.fromkeys((now + k for k in ahead), "")},
+            {
+                **dict.fromkeys(range(now - past, now), "past"),
+                now: "now",
+                **dict.fromkeys((now + k for k in ahead), ""),
+            },
         ),
         (
             "next plan observes",
@@ -50,7 +54,8 @@ def drawing() -> str:
             x = LEFT + CELL * index
             parts.append(f'<rect class="{kind}" x="{x + 2}" y="{y}" width="{CELL - 4}" height="{HIGH}" rx="4"/>')
     width, height = LEFT + CELL * columns + 4, 28 + len(rows) * (HIGH + 12)
-    return f'<svg class="drawing" viewBox="0 0 {width} {height}" role="img" aria-label="frames in time">{"".join(parts)}</svg>\n'
+    head = f'<svg class="drawing" viewBox="0 0 {width} {height}" role="img" aria-label="frames in time">'
+    return head + "".join(parts) + "</svg>\n"
 
 
 def time_name(offset: int) -> str:

@@ -51,16 +51,19 @@ def write_tutorial_pages() -> None:
     write_page(
         "tutorials/index",
         heading("Tutorials"),
-        "Each is a script that tells one story, prints its numbers and ends with a picture. ``make tutorials`` runs them "
-        "all; what is shown here is what it left.",
+        "Each is a script that tells one story, prints its numbers and ends with a picture. ``make tutorials`` runs "
+        "them all; what is shown here is what it left.",
         table(("script", "story", "to begin with"), rows),
         toctree(ORDER, hidden=True),
     )
 
 
 def digest(path: Path) -> str:
-    """Short hash of a tutorial's code without comments and blank lines: text may change without a new run."""
-    return hashlib.sha256(ast.dump(ast.parse(path.read_text(encoding="utf-8"))).encode()).hexdigest()[:12]
+    """Short hash of a tutorial's code without docstring, comments and layout: text may change without a new run."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    if ast.get_docstring(tree) is not None:
+        del tree.body[0]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()[:12]
 
 
 def introduction(path: Path) -> tuple[str, str]:

@@ -29,7 +29,7 @@ def arm(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(arm, tmp_path_factory):
-    return train_arm(tmp_path_factory.mktemp("runs") / "run", arm)
+    return train_arm(tmp_path_factory.mktemp("runs") / "run", arm, forecast=False)
 
 
 def test_a_run_of_seven_joints(run):
@@ -47,6 +47,16 @@ def test_a_run_of_seven_joints(run):
     assert result["control_hz"] > 0 and not (run / "rollouts.safetensors").exists()
     # 20 updates make no planner, and it is said
     assert any(fault.startswith("plans are worse than standing still (columns in rad)") for fault in result["faults"])
+
+
+def test_a_forecast_is_the_default_and_carries_over(tmp_path):
+    """To the validation trajectories, whose goals the planner has not seen; after 20 updates already."""
+    arm = save_arm(tmp_path / "arm", count=30, joints=2)
+    run = train_arm(tmp_path / "run", arm, method="linear")
+    assert json.loads((run / "config.json").read_text())["planner"]["forecast"] is True
+    result = evaluate(run, FEW)
+    assert result["relative_plan_error"] < 0.1
+    assert not any(fault.startswith("plans") for fault in result["faults"])
 
 
 def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):
@@ -119,7 +129,7 @@ def test_a_policy_of_its_own_is_judged_by_its_chunks(tmp_path, capsys):
 def test_all_trajectories_labelled(tmp_path):
     """One is held out from the planner; its labels still count."""
     arm = save_arm(tmp_path / "arm", labelled=10, joints=2)
-    result = evaluate(train_arm(tmp_path / "run", arm, label_fraction=1.0), FEW)
+    result = evaluate(train_arm(tmp_path / "run", arm), FEW)  # every label there is
     assert result["plan_errors"]["trajectories"] == 1 and result["action_errors"]["left_out"]["trajectories"] == 10
 
 

@@ -55,6 +55,8 @@ def test_a_run_as_one_file(trained_run, tmp_path):
 
 def test_a_policy_of_its_own(demonstrations, tmp_path):
     assert koap("train", "--out", tmp_path / "dp", "--dataset", demonstrations, "--method", "dp", *TINY) == 0
+    with pytest.raises(ValueError, match="'open_loop' was asked of .*dp, but method 'dp' is a policy of its own"):
+        load_policy(tmp_path / "dp", EvalConfig(execution="open_loop"))
     policy = load_policy(tmp_path / "dp", EvalConfig(replan_interval=3))
     loaded = load_policy(save_policy(policy, tmp_path / "dp.safetensors"))
     assert isinstance(loaded, ChunkedPolicy) and loaded.replan_interval == 3

@@ -62,7 +62,7 @@ def test_cells_have_folders_of_their_own():
     assert len({cell.folder for cell in cells}) == len(cells)
     assert Cell("koap", 0.01, 1.0, 2).folder == "cells/koap-0.01-1-seed2"
     assert Cell("koap", 0.01, 0.5, 2).planner == planner_folder(0.5) == "planner-0.5"
-    assert Cell("dp", 0.01, 1.0, 2).planner is None and Cell("relabel", 0.01, 1.0, 2).planner is None
+    assert Cell("dp", 0.01, 1.0, 2).planner is None and Cell("dp_relabel", 0.01, 1.0, 2).planner is None
 
 
 def test_no_action_reaches_a_planner(planner, demonstrations, tmp_path, monkeypatch):

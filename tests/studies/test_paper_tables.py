@@ -19,6 +19,7 @@ from torchrl_koap.training.run_directory import RunDirectoryError
 def asked(monkeypatch):
     """Every curve that is asked for; instead of training, each writes one finished and one failed cell."""
     curves = []
+    monkeypatch.setattr(paper_tables, "check_curve", lambda options: None)
 
     def fake(options):
         curves.append(options)
@@ -26,7 +27,8 @@ def asked(monkeypatch):
         won = {"status": "done", "episodes": 10, "successes": 7, "success_rate": 0.7, "run": "cells/a"}
         lost = {"status": "failed", "reason": "no memory", "run": "cells/b"}
         options.out.mkdir(parents=True)
-        rows = [common | {"method": "koap", "fraction": 0.01} | won, common | {"method": "dd", "fraction": 0.01} | lost]
+        level = {"fraction": get_task(options.task).label_levels[0]}
+        rows = [common | level | {"method": "koap"} | won, common | level | {"method": "dd"} | lost]
         write_cells(options.out / "cells.csv", rows)
 
     monkeypatch.setattr(paper_tables, "run_curve", fake)
@@ -35,7 +37,7 @@ def asked(monkeypatch):
 
 @pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
 def test_presets_name_methods_tasks_and_levels_that_exist(preset):
-    assert set(preset.methods.split(",")) <= set(METHODS)
+    assert set(preset.methods.split(",")) - {"pca"} <= set(METHODS)
     assert set(preset.tasks) <= set(TASKS)
     assert all(1 <= level <= len(get_task(task).label_levels) for level in preset.levels for task in preset.tasks)
 
@@ -46,7 +48,9 @@ def test_a_table_is_a_curve_per_task_at_the_papers_levels(asked, tmp_path):
         ("aligning", tmp_path / "t/aligning"),
         ("sorting", tmp_path / "t/sorting"),
     ]
-    assert all(curve.units == "window" and curve.fractions == "0.01,0.02,0.05,0.1,0.25" for curve in asked)
+    assert [curve.fractions for curve in asked] == ["0.02,0.05,0.1,0.25,0.5", "0.01,0.02,0.05,0.1,0.25"]
+    assert [curve.first_seed_only for curve in asked] == ["0.1,0.25", "0.05,0.1"]
+    assert all((curve.units, curve.denoiser, curve.denoiser_width) == ("window", "mlp", 512) for curve in asked)
     assert all((curve.seeds, curve.steps, curve.episodes) == (2, 7, 10) for curve in asked)
     assert (result["done"], result["failed"], result["missing"]) == (2, 2, 0)
     rows = read_cells(tmp_path / "t/cells.csv")
@@ -57,14 +61,45 @@ def test_a_table_is_a_curve_per_task_at_the_papers_levels(asked, tmp_path):
         "sorting/cells/b",
     ]
     page = Path(result["report"]).read_text()
-    assert "no memory" in page and "80" in page  # KOAP on Aligning, level 1, in the paper: 80 %
+    assert "no memory" in page and "70.0 (40-89) [80.3 +- 4.9]" in page  # KOAP on Aligning, level 1
+    text = (tmp_path / "t/paper_table.md").read_text()
+    assert "| aligning | 1 (2 %) | 70.0 (40-89) [80.3 +- 4.9] | failed [23.9 +- 10.9] |" in text
+    assert "KOAP succeeds more often than the paper's KOAP in 1 of 2 cells." in text  # 70 against 80.3 and 61.7
 
 
-def test_the_observation_study_varies_what_is_known_at_fixed_labels(asked, tmp_path):
+def test_the_observation_study_varies_what_the_controller_knows_at_fixed_labels_and_planner(asked, tmp_path):
     run_bench(BenchConfig(tmp_path / "s", study="observations"))
+    run_bench(BenchConfig(tmp_path / "p", study="observations_and_planner"))
+    fixed, grown = asked
+    for curve in asked:
+        assert (curve.task, curve.fractions, curve.observations) == ("avoiding", "0.01", "0.1,0.25,0.5,1")
+        assert curve.units == "trajectory"  # 1 % of the windows would touch most trajectories, and those must stay
+    assert (fixed.planner_observations, grown.planner_observations) == (1.0, None)
+
+
+def test_quick_is_small_but_what_is_asked_for_stays(asked, tmp_path):
+    run_bench(BenchConfig(tmp_path / "q", table=1, quick=True, tasks="avoiding", episodes=7, denoiser_width=99))
     (curve,) = asked
-    assert (curve.task, curve.fractions, curve.observations) == ("avoiding", "0.02", "0.1,0.25,0.5,1")
-    assert curve.units == "trajectory"  # 2 % of the windows would touch most trajectories, and those must stay
+    assert (curve.fractions, curve.first_seed_only, curve.seeds) == ("0.02,0.5", "", 1)
+    assert (curve.episodes, curve.demonstrations, curve.steps, curve.denoiser_width) == (7, 48, 3000, 99)
+
+
+def test_a_quick_study_has_enough_trajectories_for_one_label(asked, tmp_path):
+    run_bench(BenchConfig(tmp_path / "q", study="observations", quick=True))
+    (curve,) = asked
+    assert curve.demonstrations is None and curve.episodes == 10
+
+
+def test_planners_and_data_sets_are_named_by_task(asked, tmp_path):
+    planner = tmp_path / "run"
+    planner.mkdir()
+    (planner / "config.json").write_text('{"dataset": "here/demos"}')
+    named = {"tasks": "avoiding,sorting", "planners": f"avoiding={planner}", "dataset": "sorting=there"}
+    run_bench(BenchConfig(tmp_path / "t", table=1, levels="5,1", data_share="paper", **named))
+    first, second = asked
+    assert (first.planner_from, first.dataset, first.data_share) == (planner, "here/demos", 0.5)
+    assert (second.planner_from, second.dataset, second.data_share) == (None, "there", 0.25)
+    assert (first.fractions, second.fractions) == ("0.5,0.02", "0.25,0.01")
 
 
 def test_a_folder_holds_one_comparison(asked, tmp_path):
@@ -82,4 +117,19 @@ def test_wrong_calls_are_explained_before_any_work(asked, tmp_path):
         run_bench(BenchConfig(tmp_path, table=3))
     with pytest.raises(ValueError, match="unknown task 'sortin'; did you mean 'sorting'"):
         run_bench(BenchConfig(tmp_path, table=1, tasks="aligning,sortin"))
+    with pytest.raises(ValueError, match="'avoiding' has no label level 6: its levels 1 to 5 are 2, 5, 10, 25, 50 %"):
+        run_bench(BenchConfig(tmp_path, table=1, levels="1,6"))
+    with pytest.raises(ValueError, match="levels must be whole numbers with commas between, got '2 %'"):
+        run_bench(BenchConfig(tmp_path, table=1, levels="2 %"))
+    with pytest.raises(ValueError, match="unknown task of planners: 'sortin'; did you mean 'sorting'"):
+        run_bench(BenchConfig(tmp_path, table=1, planners="sortin=run"))
+    with pytest.raises(ValueError, match="dataset must be task=FOLDER with commas between, got 'demos'"):
+        run_bench(BenchConfig(tmp_path, table=1, dataset="demos"))
     assert not asked
+
+
+def test_a_later_task_is_checked_before_the_first_is_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(paper_tables, "run_curve", lambda options: pytest.fail("work has begun"))
+    with pytest.raises(ValueError, match="execution 'open_loop' was asked of dp"):
+        run_bench(BenchConfig(tmp_path / "t", table=1, methods="koap,dp", execution="open_loop"))
+    assert not (tmp_path / "t").exists()

@@ -61,6 +61,7 @@ def test_plane_drops_the_height():
         ("po_sorting", 16, 10),
         ("stacking", 31, 26),
         ("stacking_1", 31, 26),
+        ("stacking_unobserved_joints", 31, 19),
     ],
 )
 def test_sizes(name, observed, state):
@@ -96,3 +97,18 @@ def test_facts_fit_each_other(name):
 def test_wrong_observations_are_named():
     with pytest.raises(ValueError, match="task 'sorting' has 16 columns, got 4"):
         get_task("sorting").state_of(torch.zeros(2, 4))
+
+
+def test_stacking_without_joints_shows_and_commands_what_the_paper_does():
+    task, whole = get_task("stacking_unobserved_joints"), get_task("stacking_1")
+    observation = torch.randn(3, task.observation_dim)
+    hidden = observation.clone()
+    hidden[:, task.observation["measured_joints"]] = torch.nan
+    state = task.state_of(observation)
+    assert torch.equal(state, task.state_of(hidden))
+    assert torch.equal(state[:, :3], observation[:, task.observation["tcp_position"]])
+    assert torch.equal(state[:, 3:4], observation[:, task.observation["gripper_width"]])
+    assert torch.equal(state[:, 4:], whole.state_of(observation)[:, whole.state_slices["red_position"].start :])
+    # joints and gripper are commanded, and the controller decodes both
+    assert task.actions == whole.actions and task.action_rule is None and whole.action_rule is not None
+    assert task.controller_columns("robot") == (0, 1, 2, 3) and task.source == "stacking"

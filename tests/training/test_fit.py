@@ -12,8 +12,10 @@ from tensordict import TensorDict
 
 from torchrl_koap.data import LabelBudget, load_ted, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.keys import LayoutError
+from torchrl_koap.tasks import get_task
 from torchrl_koap.training import Recipe, TrainConfig, fit_controller, fit_planner, train
 from torchrl_koap.training.checkpoints import load_tensors
+from torchrl_koap.training.config import resolve
 
 NAMES = ["q1", "q2", "goal_1", "goal_2"]
 SMALL = {"batch_size": 8, "channels": (8, 16)}
@@ -140,3 +142,16 @@ def test_refusals():
     wrong["has_action"][-1] = True
     with pytest.raises(LayoutError, match="'action' is not finite in 1 labelled steps"):
         fit_controller(wrong, task)
+
+
+def test_a_forecast_is_the_default_without_an_environment(tmp_path):
+    _, task = make_demonstrations([np.zeros((20, 2))], control_hz=30, action_dim=2)
+
+    def entry(task=task, **options):
+        return resolve(TrainConfig(out=tmp_path, **options), task).planner
+
+    assert entry()["forecast"] is True and "forecast" not in entry(get_task("avoiding"))
+    assert "forecast" not in entry(forecast=False) and entry(get_task("avoiding"), forecast=True)["forecast"] is True
+    assert "forecast" not in entry(method="dp")
+    with pytest.raises(ValueError, match="'dp' is a policy of its own and has no plans to forecast"):
+        entry(method="dp", forecast=True)

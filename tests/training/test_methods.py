@@ -24,7 +24,7 @@ def data():
 
 def make(name, data):
     torch.manual_seed(0)
-    return build_controller({"method": name, "preset": "default"}, 3, 2, data)
+    return build_controller({"method": name, "preset": "default", "revised": True}, 3, 2, data)
 
 
 def same(first, second):

@@ -116,7 +116,8 @@ KILLED = {
     "lapo": ["controller", "decoder"],
     "nonlinear": ["controller"],
     "dp": ["policy"],
-    "relabel": ["teacher_controller", "policy"],
+    "relabel": ["teacher_controller", "controller"],
+    "dp_relabel": ["teacher_controller", "policy"],
 }
 
 
@@ -173,7 +174,7 @@ def steps_of(run, phase):
 # policies of their own
 
 
-@pytest.fixture(scope="module", params=["dp", "relabel"])
+@pytest.fixture(scope="module", params=["dp", "dp_relabel"])
 def policy_run(request, tmp_path_factory, demonstrations, planner):
     folder = tmp_path_factory.mktemp(request.param) / "run"
     train_tiny(folder, demonstrations, planner, request.param)
@@ -201,7 +202,7 @@ def test_a_policy_spends_the_labels_it_was_given(policy_run):
     assert summary["controller_updates"] == (8 if teacher else 4)
 
 
-@pytest.mark.parametrize("method", ["dp", "relabel"])
+@pytest.mark.parametrize("method", ["dp", "dp_relabel"])
 def test_a_policy_takes_no_planner_over(method, planner, demonstrations, tmp_path, capsys):
     command = ("train", "--out", tmp_path / "run", "--dataset", demonstrations, "--method", method)
     assert koap(*command, "--planner-from", planner) == 1

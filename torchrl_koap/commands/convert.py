@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap convert``: recordings of one's own robot become a data set that ``koap train --dataset`` takes."""
+"""``koap convert``: recordings of one's own robot become a data set that ``koap train`` takes, or another format."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ import tyro
 
 from torchrl_koap.commands.command import Command
 from torchrl_koap.data import read_about, read_recordings, save_demonstrations
+from torchrl_koap.data.recordings.recordings import Recordings
+from torchrl_koap.data.recordings.writers import WRITERS, recordings_of, write_recordings
+from torchrl_koap.lookup import lookup
 
 
 @dataclass(kw_only=True)
@@ -18,9 +21,10 @@ class Convert(Command):
     """Turn recordings of any robot, of which few or none have actions, into a data set that holds its whole task.
 
     Attributes:
-        source: a folder of *.npz, *.csv or *.parquet files, a LeRobot data set, an HDF5 file in robomimic's layout, or
-            minari:NAME.
-        out: folder to write.
+        source: a folder of *.npz, *.csv or *.parquet files, a LeRobot data set, an HDF5 file in robomimic's layout,
+            minari:NAME, or a data set of this library.
+        out: folder to write; a file for robomimic.
+        to: another format than this library's: "npz", "robomimic", "lerobot" (3.0) or "lerobot-2.1".
         name: name of the task (default: that of the folder).
         control_hz: frames per second (default: as the source says).
         observations: features of a LeRobot data set or entries of an HDF5 file that make up the state (default: all
@@ -38,6 +42,7 @@ class Convert(Command):
 
     source: tyro.conf.Positional[str]
     out: Path
+    to: str | None = None
     name: str | None = None
     control_hz: float | None = None
     observations: tuple[str, ...] = ()
@@ -55,15 +60,12 @@ class Convert(Command):
         """Reads, checks and writes."""
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps must be >= 1, got {self.max_steps}")
+        if self.to is not None:
+            lookup(WRITERS, self.to, "format")
+            return self._in_another_format(self._read(), self.to)
         if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
-        recordings = read_recordings(
-            self.source,
-            control_hz=self.control_hz,
-            observations=self.observations,
-            action_columns=self.action_columns,
-            action_dim=self.action_dim,
-        )
+        recordings = self._read()
         folder = save_demonstrations(
             self.out,
             recordings,
@@ -88,6 +90,30 @@ class Convert(Command):
             "frames per second": recordings.control_hz,
             "skipped": ", ".join(recordings.skipped) or "nothing",
             "next": f"koap train --dataset {folder} --out runs/{about['task']}",
+        }
+
+    def _read(self) -> Recordings:
+        """The recordings of the source, those of a data set of this library included."""
+        if (Path(self.source) / "ted").is_dir():
+            return recordings_of(self.source)
+        return read_recordings(
+            self.source,
+            control_hz=self.control_hz,
+            observations=self.observations,
+            action_columns=self.action_columns,
+            action_dim=self.action_dim,
+        )
+
+    def _in_another_format(self, recordings: Recordings, kind: str) -> dict[str, Any]:
+        written = write_recordings(recordings, self.out, kind)
+        return {
+            "written": str(written),
+            "format": kind,
+            "trajectories": len(recordings.states),
+            "labelled steps": recordings.num_labels,
+            "states": ", ".join(recordings.state_names),
+            "actions": ", ".join(recordings.action_names),
+            "frames per second": recordings.control_hz,
         }
 
 

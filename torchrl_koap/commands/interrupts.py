@@ -12,7 +12,7 @@ from types import FrameType
 
 # SIGHUP: the terminal was closed; other systems than Unix do not know it
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-KEPT = "`koap train --resume` goes on from its last checkpoint, `koap curve` when called again"
+KEPT = "`koap train --resume` goes on from its last checkpoint, `koap demos` and `koap curve` when called again"
 
 
 class Interrupted(KeyboardInterrupt):

@@ -91,9 +91,10 @@ class LabelBudget:
     for ``1.0``, which draws every unit that has a label.
 
     * ``"trajectory"``: whole demonstrations. The honest default: a robot records whole demonstrations.
-    * ``"window"``: the paper's levels. Windows are drawn without replacement from all windows of all trajectories, and
-      of each the inner frames ``history - 1 .. window - 2`` keep their label (14 of 16). A window costs 14 labels where
-      windows overlap less, and the windows of a small share touch most trajectories: read the report.
+    * ``"window"``: the unit of the first public code. Windows are drawn without replacement from all windows of all
+      trajectories, and of each the inner frames ``history - 1 .. window - 2`` keep their label (14 of 16). A window
+      costs 14 labels where windows overlap less, and the windows of a small share touch most trajectories: read the
+      report.
     * ``"transition"``: single steps.
 
     Args:

@@ -36,10 +36,10 @@ def mode_index(mode: torch.Tensor) -> torch.Tensor:
     """Number of the mode: 0 if the tray was pushed from inside at the last instant, 1 from outside.
 
     Args:
-        mode (torch.Tensor): leaf ``mode`` of :class:`AligningEnv`, int64 [*B, 1].
+        mode (torch.Tensor): leaf ``mode`` of :class:`AligningEnv`, int64 ``[*B, 1]``.
 
     Returns:
-        torch.Tensor: int64 [*B]; -1 before the first step.
+        torch.Tensor: int64 ``[*B]``; -1 before the first step.
     """
     return mode.squeeze(-1).to(torch.int64)
 
@@ -47,9 +47,9 @@ def mode_index(mode: torch.Tensor) -> torch.Tensor:
 class AligningEnv(ManipulationEnv):
     """Aligning of D3IL as a native-batch TorchRL environment on MuJoCo.
 
-    ============== ========== ================= ===============================================================
-    key            shape      dtype             meaning
-    ============== ========== ================= ===============================================================
+    =============== ========= ================= ===============================================================
+    key             shape     dtype             meaning
+    =============== ========= ================= ===============================================================
     ``observation`` [n, 20]   ``dtype``         0-2 last commanded TCP xyz, 3-5 measured TCP xyz, 6-8 tray position
                                                 (m), 9-12 tray quaternion, 13-15 target position, 16-19 target
                                                 quaternion; after a reset the commanded xyz is the measured one
@@ -58,7 +58,7 @@ class AligningEnv(ManipulationEnv):
     ``mode``        [n, 1]    int64             0 pushed from inside, 1 from outside, -1 before the first step
     ``context``     [n, 2, 3] ``dtype``         start of the tray, and target: x, y (m), yaw (rad)
     ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
-    ============== ========== ================= ===============================================================
+    =============== ========= ================= ===============================================================
 
     The order of events is that of :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one
     control step back. There is no failure. Unlike the original, exact alignment counts (its rotation distance has no

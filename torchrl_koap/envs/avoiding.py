@@ -30,10 +30,10 @@ def mode_index(flags: torch.Tensor) -> torch.Tensor:
     ``12 * row1 + 4 * row2 + row3``, each counted from small x to large x.
 
     Args:
-        flags (torch.Tensor): leaf ``mode`` of :class:`AvoidingEnv`, bool or int [*B, 9].
+        flags (torch.Tensor): leaf ``mode`` of :class:`AvoidingEnv`, bool or int ``[*B, 9]``.
 
     Returns:
-        torch.Tensor: int64 [*B].
+        torch.Tensor: int64 ``[*B]``.
 
     Raises:
         ValueError: if the last axis does not hold nine flags.
@@ -56,9 +56,9 @@ def mode_index(flags: torch.Tensor) -> torch.Tensor:
 class AvoidingEnv(ManipulationEnv):
     """Avoiding of D3IL as a native-batch TorchRL environment on MuJoCo.
 
-    ============== ========== ================= ===============================================================
-    key            shape      dtype             meaning
-    ============== ========== ================= ===============================================================
+    =============== ========= ================= ===============================================================
+    key             shape     dtype             meaning
+    =============== ========= ================= ===============================================================
     ``observation`` [n, 4]    ``dtype``         0-1 last commanded xy, 2-3 measured TCP xy (m); after a reset the
                                                 commanded xy is the measured one
     ``action``      [n, 2]    ``dtype``         change of the commanded xy (m)
@@ -68,7 +68,7 @@ class AvoidingEnv(ManipulationEnv):
     ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
     ``terminated``  [n, 1]    bool              ``success`` or ``collision``
     ``truncated``   [n, 1]    bool              ``max_steps`` control steps are over
-    ============== ========== ================= ===============================================================
+    =============== ========= ================= ===============================================================
 
     Kept from the original because policies experience it: the measured xy is one control step old (the first step
     repeats the reset's), ``success``, ``collision`` and ``done`` come one step after the state that caused them,

@@ -24,6 +24,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_koap import keys
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
+from torchrl_koap.envs.foresight import Foresight
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.mujoco.simulation import SimulationBatch
@@ -31,7 +32,7 @@ from torchrl_koap.envs.raw_log import RawLog
 from torchrl_koap.tasks import Task
 
 
-class ManipulationEnv(RawLog, EnvBase):
+class ManipulationEnv(RawLog, Foresight, EnvBase):
     """Base of the D3IL tasks: a batch of simulations, outcome bookkeeping, partial resets and partial steps.
 
     A task implements four hooks; each receives ``rows``, the indices of the environments concerned:
@@ -332,6 +333,11 @@ class ManipulationEnv(RawLog, EnvBase):
     def commands(self) -> np.ndarray:
         """Present commands in float64: TCP position (m) and quaternion [n, 7]; Stacking: joints and gripper [n, 8]."""
         return self._commands.copy()
+
+    @property
+    def over(self) -> np.ndarray:
+        """Which episodes are decided or have used up their steps, bool [n]."""
+        return self._success | self._collision | (self._steps >= self.max_steps)
 
     def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str = "cage") -> np.ndarray:
         """Draws one environment.

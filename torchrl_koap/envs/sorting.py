@@ -81,10 +81,10 @@ def mode_index(mode: torch.Tensor) -> torch.Tensor:
     """Number of the order in which the colours arrived, in lexicographic order (red before blue).
 
     Args:
-        mode (torch.Tensor): leaf ``mode`` of :class:`SortingEnv`, int64 [*B, num_boxes].
+        mode (torch.Tensor): leaf ``mode`` of :class:`SortingEnv`, int64 ``[*B, num_boxes]``.
 
     Returns:
-        torch.Tensor: int64 [*B]: 0 to 5 with four boxes, 0 to 1 with two, 0 to 19 with six; -1 while boxes are missing.
+        torch.Tensor: int64 ``[*B]``: 0 to 5 with four boxes, 0 to 1 with two, 0 to 19 with six; -1 if one is missing.
 
     Raises:
         ValueError: if the last axis fits no number of boxes.
@@ -103,9 +103,9 @@ def mode_index(mode: torch.Tensor) -> torch.Tensor:
 class SortingEnv(ManipulationEnv):
     """Sorting of D3IL as a native-batch TorchRL environment on MuJoCo.
 
-    ============== ========== ================= ===============================================================
-    key            shape      dtype             meaning
-    ============== ========== ================= ===============================================================
+    =============== ========= ================= ===============================================================
+    key             shape     dtype             meaning
+    =============== ========= ================= ===============================================================
     ``observation`` [n, 16]   ``dtype``         0-1 last commanded TCP xy, 2-3 measured TCP xy (m), then x, y (m)
                                                 and tan(yaw) of red_1, red_2, blue_1, blue_2 (10 columns with two
                                                 boxes, 22 with six); after a reset the commanded xy is the measured
@@ -116,7 +116,7 @@ class SortingEnv(ManipulationEnv):
                                                 6 columns with as many boxes)
     ``context``     [n, 4, 3] ``dtype``         start of the boxes: x, y (m), yaw (rad)
     ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
-    ============== ========== ================= ===============================================================
+    =============== ========= ================= ===============================================================
 
     The order of events is that of :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one
     control step back, except for the mode. There is no failure; a box that lies in the wrong bin stays there.

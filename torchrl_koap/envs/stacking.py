@@ -33,11 +33,11 @@ def mode_index(mode: torch.Tensor, num_boxes: int = 3) -> torch.Tensor:
     """Number of the order in which the boxes arrived: rgb 0, rbg 1, grb 2, gbr 3, brg 4, bgr 5.
 
     Args:
-        mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 [*B, 3]: 0 red, 1 green, 2 blue, -1 none.
+        mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 ``[*B, 3]``: 0 red, 1 green, 2 blue, -1 none.
         num_boxes (int): how many letters count: 1 tells the first box (0 to 2), 2 and 3 the order (0 to 5).
 
     Returns:
-        torch.Tensor: int64 [*B]; -1 while incomplete.
+        torch.Tensor: int64 ``[*B]``; -1 while incomplete.
 
     Raises:
         ValueError: if the last axis has not 3 entries or the number is not 1, 2 or 3.
@@ -63,10 +63,10 @@ def first_box(mode: torch.Tensor) -> torch.Tensor:
     """Mode of Stacking-1, which is over with the first box: that box.
 
     Args:
-        mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 [*B, 3].
+        mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 ``[*B, 3]``.
 
     Returns:
-        torch.Tensor: int64 [*B]: 0 red, 1 green, 2 blue, -1 none yet.
+        torch.Tensor: int64 ``[*B]``: 0 red, 1 green, 2 blue, -1 none yet.
     """
     return mode[..., 0].long()
 
@@ -79,9 +79,9 @@ def _check_num_boxes(num_boxes: int) -> None:
 class StackingEnv(ManipulationEnv):
     """Stacking of D3IL as a native-batch TorchRL environment on MuJoCo.
 
-    ============== ========== ================= ===============================================================
-    key            shape      dtype             meaning
-    ============== ========== ================= ===============================================================
+    =============== ========= ================= ===============================================================
+    key             shape     dtype             meaning
+    =============== ========= ================= ===============================================================
     ``observation`` [n, 31]   ``dtype``         0-6 last commanded joints (rad), 7 last gripper number (m), 8-10 red
                                                 box position (m), 11 its tan(yaw), 12-15 green, 16-19 blue, 20-26
                                                 measured joints, 27 distance of the fingers (m), 28-30 TCP position;
@@ -92,7 +92,7 @@ class StackingEnv(ManipulationEnv):
     ``mode``        [n, 3]    int64             boxes in the order of their arrival: 0 red, 1 green, 2 blue, -1 none
     ``context``     [n, 3, 3] ``dtype``         start of red, green and blue: x, y (m), yaw (rad)
     ``reward``      [n, 1]    ``dtype``         1 where ``success`` else 0
-    ============== ========== ================= ===============================================================
+    =============== ========= ================= ===============================================================
 
     The first 20 columns of the observation are those of D3IL's recordings. A box has *arrived* once its centre has
     been within 6 cm (horizontally) of (0.5, 0.2), at most one box per control step. Success with ``num_boxes=3``: all

@@ -50,7 +50,12 @@ def errors_outside_budget(
 
 
 def errors_left_out(
-    controller: nn.Module, labelled: TensorDictBase, task: Task, *, closed_form: bool
+    controller: nn.Module,
+    labelled: TensorDictBase,
+    task: Task,
+    *,
+    closed_form: bool,
+    guessed_axes: Sequence[int] = (),
 ) -> dict[str, Any]:
     """Errors on labels inside the budget: each labelled trajectory in turn is hidden and the decoder is fitted again.
 
@@ -65,6 +70,7 @@ def errors_left_out(
     Keyword Args:
         closed_form (bool): the controller's decoder is fitted in closed form. Otherwise it would have to be trained
             again for each trajectory, and there is only a note.
+        guessed_axes (sequence of int): as in training (:func:`~torchrl_koap.training.closed_form.likely_axes`).
 
     Returns:
         dict: of :func:`summarise_errors`, or a ``note`` why there is none.
@@ -84,7 +90,7 @@ def errors_left_out(
         fold["has_action"] = labelled["has_action"] & ~hidden.unsqueeze(-1)
         fold["action"] = torch.where(fold["has_action"], labelled["action"], math.nan)
         again = copy.deepcopy(controller)
-        fit_closed_form(again, fold, shared_axes=task.actuated)
+        fit_closed_form(again, fold, shared_axes=task.actuated, guessed_axes=guessed_axes)
         ridge = LinearInverseDynamics(labelled["state"].shape[-1], task.action_dim).to(labelled["state"].dtype)
         fit_closed_form(ridge, fold)
         predicted, true, episode = first_actions(again, labelled, [int(number)])

@@ -15,6 +15,7 @@ from torchrl_koap.evaluation.chunk_errors import errors_of_chunks
 from torchrl_koap.evaluation.label_errors import errors_left_out, errors_outside_budget
 from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.tasks.units import thousandths
+from torchrl_koap.training.closed_form import likely_axes
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.run_directory import RunDirectoryError
 
@@ -122,7 +123,13 @@ def _actions(trained: TrainedRun, data: TensorDictBase, labelled: TensorDictBase
     controller = trained.controller.cpu()
     return {
         "outside_budget": errors_outside_budget(controller, view, seen, task),
-        "left_out": errors_left_out(controller, seen, task, closed_form=trained.method.closed_form),
+        "left_out": errors_left_out(
+            controller,
+            seen,
+            task,
+            closed_form=trained.method.closed_form,
+            guessed_axes=likely_axes(task, trained.columns),
+        ),
     }
 
 

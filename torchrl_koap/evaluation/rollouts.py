@@ -120,6 +120,8 @@ def roll_out(
             noise = RecordedFutures(futures[begin : begin + size])
         else:
             noise = EpisodeNoise(part, policy.noise_shape, num_steps=max_steps)
+        if hasattr(policy, "attach"):  # it reads the simulation
+            policy.attach(env)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,13 @@ from torch import nn
 
 from torchrl_koap.data import LabelBudget
 from torchrl_koap.evaluation.offline import evaluate_offline
-from torchrl_koap.evaluation.policy_files import PolicyDescription, assemble_policy, build_networks, read_policy
+from torchrl_koap.evaluation.policy_files import (
+    BLEND_DECAY,
+    PolicyDescription,
+    assemble_policy,
+    build_networks,
+    read_policy,
+)
 from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.lookup import lookup
@@ -31,6 +37,7 @@ from torchrl_koap.training.pretrained import PREFIX, copy_run, find_run
 from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
+CONTROLLERS = ("learned", "oracle")
 MOST_EPISODES = 100_000
 
 
@@ -42,6 +49,8 @@ class EvalConfig:
         episodes: number of rollouts; tasks with contexts take the fixed ones of the evaluation table in turn.
         rollouts_per_context: rollouts in each context; from 2 on the entropy of the modes per context is known.
         seed: seed of the first rollout; the others count on from it.
+        controller: "learned", or "oracle": the simulator's own inverse map, which takes the tool where the plan says:
+            what fails then is the planner's.
         execution: "feedback" (decode at every step) or "open_loop" (decode once per plan).
         solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
         solver_steps: another number of solver steps.
@@ -71,11 +80,12 @@ class EvalConfig:
     episodes: int = 60
     rollouts_per_context: int = 1
     seed: int = 100
+    controller: str = "learned"
     execution: str = "feedback"
     solver: str | None = None
     solver_steps: int | None = None
     replan_interval: int = REPLAN_INTERVAL
-    blend_decay: float = 0.8
+    blend_decay: float = BLEND_DECAY
     candidates: int | None = None
     choice: str = "quarter"
     out: Path | None = None
@@ -183,10 +193,14 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     """
     given, config = config, EvalConfig() if config is None else config
     lookup(EXECUTIONS, config.execution, "execution")
+    lookup(CONTROLLERS, config.controller, "controller")
+    oracle = config.controller == "oracle"
     names = ("execution", "replan_interval", "blend_decay", "choice")
     options = {name: getattr(config, name) for name in names}
     options |= {} if config.candidates is None else {"candidates": config.candidates}
-    if isinstance(run, (str, Path)) and Path(run).is_file():
+    if oracle:
+        policy = _oracle(run if isinstance(run, TrainedRun) else load_run(run, task=config.task), options)
+    elif isinstance(run, (str, Path)) and Path(run).is_file():
         policy = read_policy(run, plugins=config.plugins, **({} if given is None else options))
         trained_on = policy.description.task.name
         if config.task not in (None, trained_on):
@@ -212,6 +226,23 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     if config.solver_steps is not None:
         policy.planner.num_steps = config.solver_steps
     return policy.to(config.device)
+
+
+def _oracle(trained: TrainedRun, options: dict[str, Any]) -> RecedingHorizonPolicy:
+    """The run's planner with the simulator's inverse map."""
+    if trained.planner is None:
+        raise ValueError(
+            f"{trained.directory.path} was trained with method {trained.method.name!r}, which has no planner: there is"
+            " nothing that the oracle controller could follow"
+        )
+    if trained.task.env is None:
+        raise ValueError(f"task {trained.task.name!r} has no environment, whose simulation the oracle controller reads")
+    from torchrl_koap.evaluation.oracle import OracleControl
+
+    kept = {"candidates": trained.config.get("candidates") or 1}
+    history = max(trained.planner.history, getattr(trained.controller, "num_past", 0) + 1)
+    rule = trained.task.action_rule if trained.task.gripper is not None else None
+    return OracleControl(trained.planner, trained.task, history=history, action_rule=rule, **kept | options)
 
 
 def choose_contexts(
@@ -320,15 +351,18 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     lookup(EXECUTIONS, config.execution, "execution")
     if config.success_key is not None and config.env is None:
         raise ValueError(
-            f"success_key {config.success_key!r} was given, but no env that could report it: name an environment of"
+            f"success_key was given, but no env that could report {config.success_key!r}: name an environment of"
             " Gymnasium with --env"
         )
     set_up_torch(config.threads, config.device)
+    lookup(CONTROLLERS, config.controller, "controller")
     load_plugins(config.plugins)
     trained = load_run(_folder(run, config), task=config.task)
     directory, task = trained.directory, trained.task
     if task.env is None and config.env is None:
         return _judge_offline(trained, config)
+    if config.controller == "oracle" and config.env is not None:
+        raise ValueError("the oracle controller reads the task's own simulation; it cannot be combined with env")
     if config.dataset is not None:
         raise ValueError(f"dataset is for judging without an environment; task {task.name!r} is rolled out in one")
     policy = load_policy(trained, config)
@@ -357,8 +391,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if config.env is None:
         result |= task_scores(task, result, episodes, place.numbers)
     rows = result.pop("episode")
-    result |= measure_latency(policy, task.observation_dim)
+    timed = policy if config.controller == "learned" else load_policy(trained, replace(config, controller="learned"))
+    result |= measure_latency(timed, task.observation_dim)
     result |= {
+        "controller": config.controller,
         "execution": "chunks" if trained.planner is None else config.execution,
         "solver": sampler.solver,
         "solver_steps": sampler.num_steps,

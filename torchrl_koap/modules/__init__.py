@@ -4,6 +4,7 @@
 from torchrl_koap.modules.baselines.finite_scalar_quantization import FiniteScalarQuantizer
 from torchrl_koap.modules.baselines.linear import LinearInverseDynamics
 from torchrl_koap.modules.baselines.nonlinear import NonlinearInverseDynamics
+from torchrl_koap.modules.baselines.principal import PrincipalInverseDynamics
 from torchrl_koap.modules.baselines.quantized import QuantizedInverseDynamics
 from torchrl_koap.modules.baselines.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
@@ -60,6 +61,7 @@ __all__ = [
     "Normalizer",
     "PlanThenControl",
     "PolicyEnv",
+    "PrincipalInverseDynamics",
     "QuantizedInverseDynamics",
     "RecedingHorizonPolicy",
     "RecordedFutures",

@@ -134,7 +134,7 @@ class DenoisingLoss(LossModule):
 class PlannerLoss(DenoisingLoss):
     r"""Mean squared error of the denoiser at random noise levels.
 
-    With the normalised future ``x_0``, noise ``eps ~ N(0, I)`` and a random time ``t`` per plan,
+    With the normalised future ``x_0``, noise ``eps ~ N(0, I)`` and a random time ``t`` per plan::
 
         L = mean | denoiser(signal(t) x_0 + noise(t) eps, t, condition) - target |^2
 
@@ -207,7 +207,7 @@ class PlannerLoss(DenoisingLoss):
             raise ValueError(f"first_steps_weight must be > 0, got {first_steps_weight}")
         self.window = window
         if first_steps_weight != 1:
-            share = torch.linspace(1, 0, planner.horizon)[:, None]
+            share = torch.linspace(1, 0, len(planner.steps))[:, None]
             weights = first_steps_weight**share  # [H, 1]
             self.step_weights = weights / weights.mean()
         super().set_keys(history=planner.in_keys[0], plan=planner.out_keys[0])
@@ -249,6 +249,8 @@ class PlannerLoss(DenoisingLoss):
         mask = tensordict.get(self.tensor_keys.mask, None)
         if mask is None:
             return None
+        if len(self.planner.steps) != self.planner.horizon:
+            raise ValueError(f"{self.tensor_keys.mask!r} was given, but the planner models some steps of plans alone")
         if mask.ndim == plan.ndim and mask.shape[-1] == 1:
             mask = mask.squeeze(-1)
         horizon, length = self.planner.horizon, self.planner.history + self.planner.horizon
@@ -264,7 +266,7 @@ class DiffusionPolicyLoss(DenoisingLoss):
     r"""Mean squared error of the denoiser of actions at random noise levels, on labelled steps.
 
     With the normalised actions ``a`` of frames ``history - 1 .. T - 2`` of a window, noise ``eps ~ N(0, I)`` and a
-    random time ``t`` per window,
+    random time ``t`` per window::
 
         L = mean over labelled steps | denoiser(signal(t) a + noise(t) eps, t, condition) - target |^2
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.reports.advice import Numbers, advice
 from torchrl_koap.reports.html import bar, duration, number, write_page
 from torchrl_koap.reports.mode_plots import even_entropy
 from torchrl_koap.reports.pictures import FOLDER, all_pictures, draw_pictures, run_facts
@@ -61,7 +62,7 @@ def write_report(
         raise FileNotFoundError(f"there is no run directory {str(run_dir)!r}")
     problems = draw_pictures(run_dir, animation=animation, progress=progress) if draw else {}
     files, notes = {}, list(problems.values())
-    for name in ("config", "summary", "eval"):
+    for name in ("config", "summary", "eval", "inspect"):
         files[name], note = _read(run_dir, f"{name}.json")
         notes += note
     config, summary, evaluation = files["config"], files["summary"], files["eval"]
@@ -80,6 +81,7 @@ def write_report(
         commands={
             name: _filled(command, run_dir) for name, command in (_OFFLINE_COMMANDS if offline else _COMMANDS).items()
         },
+        advice=_advice(run_dir, files, facts),
         labels=summary.get("labels"),
         labels_read=number(_action_errors(summary)[0].get("analysis_labels_read")),
         label_figure=next((item for item in figures if item.get("name") == _BESIDE_LABELS), None),
@@ -93,6 +95,26 @@ def write_report(
         versions=config.get("versions"),
         options={key: value for key, value in config.items() if key not in _CONFIG_ELSEWHERE},
     )
+
+
+def _advice(run_dir: Path, files: Mapping[str, Mapping[str, Any]], facts: Mapping[str, Any]) -> list[dict[str, str]]:
+    """What the numbers say to try next, command lines filled in."""
+    evaluation = files["eval"]
+    rate, episodes = number(evaluation.get("success_rate")), number(evaluation.get("episodes"))
+    successes = round(rate * episodes) if rate and episodes else 0
+    found = advice(
+        Numbers(
+            config={**files["config"], "control_hz": facts["control_hz"]},
+            summary=files["summary"],
+            evaluation=evaluation,
+            inspection=files["inspect"],
+            even_entropy=even_entropy(successes, facts["num_modes"]) if successes else None,
+        )
+    )
+    return [
+        {"finding": item.finding, "proposal": item.proposal, "command": _filled(item.command, run_dir)}
+        for item in found
+    ]
 
 
 def _read(run_dir: Path, name: str) -> tuple[dict[str, Any], list[str]]:
@@ -279,6 +301,7 @@ def _eval_command(run_dir: Path, evaluation: Mapping[str, Any]) -> str:
     first = episode[0] if isinstance(episode, list) and episode and isinstance(episode[0], Mapping) else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
     options |= {key: evaluation.get(key) for key in ("execution", "solver", "solver_steps", "env", "success_key")}
+    options["controller"] = "oracle" if evaluation.get("controller") == "oracle" else None
     for key, value in options.items():
         if value is not None:
             words += [f"--{key.replace('_', '-')}", str(value)]

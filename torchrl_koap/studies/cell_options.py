@@ -36,7 +36,7 @@ class CellOptions:
             methods with a planner (default: feedback; open_loop for koap_paper, as published).
         joining: share of the distance between state and plan that is left after each step, `--blend-decay` of
             `koap eval`; 0: plans as they are (default: 0.8; 0 for koap_paper).
-        candidates: plans sampled whenever one is due (default: 1).
+        candidates: plans sampled whenever one is due (default: 1; always 1 for koap_paper in open loop).
         controller_state: what controllers read, "robot" (the robot's own columns) or "all" (default: robot; all for
             koap_paper).
         koopman_coeff: weight of the Koopman term in the loss of every method that has one (default: 1).
@@ -111,6 +111,8 @@ def evaluation_options(options: CellOptions, method: str) -> dict[str, Any]:
     if not get_method(method).has_planner:
         names = {"candidates": "candidates"}
     chosen = {written: _chosen(options, method, name) for name, written in names.items()}
+    if chosen.get("execution") == "open_loop" and options.execution is None:
+        chosen["candidates"] = 1  # no plan is kept that several could be compared with
     return {name: value for name, value in chosen.items() if value is not None}
 
 
@@ -140,13 +142,11 @@ def check_cell_options(options: CellOptions, methods: list[Method]) -> None:
             f"execution 'open_loop' was asked of {', '.join(chunked)}: a policy of its own executes chunks of actions"
             " and has no other execution; leave it out of --methods"
         )
-    for method in methods:
-        way = evaluation_options(options, method.name)
-        if way.get("execution") == "open_loop" and way.get("candidates", 1) > 1:
-            raise ValueError(
-                f"method {method.name!r} is executed in open loop, where no plan is kept that several candidates"
-                f" could be compared with; got candidates {way['candidates']}"
-            )
+    if options.execution == "open_loop" and (options.candidates or 1) > 1:
+        raise ValueError(
+            "in open loop no plan is kept that several candidates could be compared with: execution 'open_loop' goes"
+            f" with 1 candidate, got {options.candidates}"
+        )
     if options.joining is not None and not 0 <= options.joining < 1:
         raise ValueError(f"joining must be in [0, 1), got {options.joining}")
     for name in ("candidates", "planner_seeds", "batch_size"):

@@ -55,7 +55,12 @@ class Cell:
 
 
 def planner_folder(observations: float, seed: int = 0) -> str:
-    """Folder of the planner that all cells with this share of the trajectories, and this seed of it, have in common."""
+    """Folder of the planner that all cells with this share of the trajectories, and this seed of it, have in common.
+
+    Args:
+        observations (float): share of the trajectories that it is trained on.
+        seed (int): its seed. Defaults to ``0``.
+    """
     return f"planner-{observations:.15g}" + (f"-seed{seed}" if seed else "")
 
 

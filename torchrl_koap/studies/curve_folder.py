@@ -83,7 +83,12 @@ def as_json(options: CurveConfig) -> dict[str, Any]:
 
 
 def write_options(root: RunDirectory, options: CurveConfig) -> None:
-    """Keeps what was asked for, earlier methods, fractions and seeds included."""
+    """Keeps what was asked for, earlier methods, fractions and seeds included.
+
+    Args:
+        root (RunDirectory): the folder.
+        options (CurveConfig): what is asked for.
+    """
     content = as_json(options)
     if (root.path / "curve.json").exists():
         earlier = read_options(root, type(options))

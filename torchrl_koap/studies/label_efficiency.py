@@ -50,7 +50,7 @@ class CurveConfig(CellOptions):
         demonstrations: number of scripted demonstrations (default: that of the task).
         methods: names in torchrl_koap.training.methods.METHODS, with commas between.
         fractions: shares of the units that keep their labels, with commas between.
-        units: "trajectory", "window" (the paper's levels) or "transition".
+        units: "trajectory", "window" (the unit of the first public code) or "transition".
         observations: shares of the trajectories that are used at all, with commas between.
         seeds: number of seeds of label choice and training.
         episodes: rollouts per cell; all cells meet the same ones.

@@ -166,17 +166,18 @@ def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
 def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, float, float, float]]]:
     """Success averaged over the tasks at every level, by method: level, mean and the ends of its 95 % interval.
 
-    A method has a point where every task that has the level has a cell of it. Its interval combines the Wilson
-    intervals of the cells by the squares of their halves (Newcombe's method).
+    A method has a point where every task has a cell of it that is done, so that all points are of the same tasks. Its
+    interval combines the Wilson intervals of the cells by the squares of their halves (Newcombe's method).
 
     Args:
         entries (sequence of Entry): of :func:`paper_entries`.
     """
     lines: dict[str, list[tuple[int, float, float, float]]] = {}
+    number = len({entry.task for entry in entries})
     for method in dict.fromkeys(entry.method for entry in entries):
         for level in sorted({entry.level for entry in entries}):
             cells = [entry for entry in entries if (entry.method, entry.level) == (method, level)]
-            if not cells or any(entry.success is None for entry in cells):
+            if len(cells) < number or any(entry.success is None for entry in cells):
                 continue
             mean = sum(entry.success for entry in cells) / len(cells)
             below = math.sqrt(sum((entry.success - entry.measured.low) ** 2 for entry in cells)) / len(cells)
@@ -222,7 +223,11 @@ def plot_average(entries: Sequence[Entry], path: str | Path) -> Path:
     axes.set_ylabel("success (%)")
     axes.grid(axis="y", color=FAINT, linewidth=0.5)
     tasks = list(dict.fromkeys(entry.task for entry in entries))
-    title = f"success, 95 % interval: {', '.join(tasks)}" if len(tasks) == 1 else f"mean over {len(tasks)} tasks"
+    title = (
+        f"success, 95 % interval: {', '.join(tasks)}"
+        if len(tasks) == 1
+        else f"mean over {len(tasks)} tasks, 95 % interval"
+    )
     hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
     set_title(axes, title + hollow)
     tidy(axes)

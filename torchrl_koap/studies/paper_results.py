@@ -108,7 +108,7 @@ def paper_cells(table: int) -> list[PaperCell]:
     tables = _content()["tables"]
     lookup(tuple(tables), str(table), "table of the paper")
     return [
-        PaperCell(table, task, method, level, shares[level - 1] / 100, success / 100, spread / 100)
+        PaperCell(table, task, method, level, shares[level - 1] / 100, round(success / 100, 4), round(spread / 100, 4))
         for name, methods in tables[str(table)].items()
         for task in _content()["tasks"][name]["tasks"]
         for method, cells in methods.items()

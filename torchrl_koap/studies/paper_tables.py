@@ -33,8 +33,8 @@ WIDE_PLANNER = {
 }
 SMALL_PLANNER = WIDE_PLANNER | {"denoiser_width": 256, "denoiser_depth": 3, "batch_size": 128}
 # what --quick asks for where nothing else is: a table that can be read, not one to be cited
-QUICK = {"demonstrations": 48, "seeds": 1, "episodes": 10, "steps": 1500, "controller_steps": 200}
-QUICK_LEVELS = (1, 3, 5)
+QUICK = {"demonstrations": 48, "seeds": 1, "episodes": 10, "steps": 3000, "controller_steps": 200}
+QUICK_LEVELS = (1, 5)
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,8 @@ class BenchConfig(CellOptions):
         table: 1 (methods) or 2 (variants).
         study: "observations" (unlabelled data of the controller at 1 % of the labels, the planner fixed) or
             "observations_and_planner" (the planner grows too) instead of a table.
-        quick: a readable table in a quarter of an hour: few demonstrations, a small planner, one seed, three levels.
+        quick: a small comparison, to be read and not to be cited: few demonstrations, a small planner, one seed, lowest
+            and highest level, ten rollouts.
         tasks: names with commas between, instead of the preset's.
         methods: names with commas between, instead of the preset's.
         levels: label levels (1: fewest labels) with commas between, instead of the preset's.
@@ -216,7 +217,9 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
     lookup(("all", "paper"), config.data_share, "share of the data")
     # studies need labels of whole trajectories: windows of a share touch nearly all of them
     units = config.units or ("window" if config.study is None else "trajectory")
-    quick = QUICK if config.quick else {}
+    quick = dict(QUICK) if config.quick else {}
+    if config.study is not None:
+        quick.pop("demonstrations", None)  # 1 % of fewer trajectories is none
     values = {"seeds": 3, "episodes": 60, "controller_steps": 1000, "demonstrations": None, "steps": None} | quick
     values |= {name: getattr(config, name) for name in values if getattr(config, name) is not None}
     own = {name: getattr(config, name) for name in OPTION_NAMES}

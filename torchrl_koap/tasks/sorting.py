@@ -147,7 +147,7 @@ def _sorting(num_boxes: int) -> Task:
         converter=f"torchrl_koap.data.d3il.conversion:SORTING_{num_boxes}",
         scene=Scene(shapes=(platform, *_walls()), x=(0.17, 0.83), y=(-0.43, 0.45), caption=_CAPTION, camera="cage"),
         in_paper=num_boxes == 4,
-        defaults=Defaults(released_epochs=400),
+        defaults=Defaults(demonstrations=1000, released_epochs=400),
     )
 
 
@@ -161,7 +161,7 @@ register_task(
         noise=PO_NOISE,
         data="sorting",
         gym_id="",
-        defaults=Defaults(released_epochs=200),
+        defaults=Defaults(demonstrations=1000, released_epochs=200),
     )
 )
 

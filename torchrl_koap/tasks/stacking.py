@@ -113,7 +113,7 @@ _STACKING = register_task(
             camera="front",
         ),
         # measured: a shifted arm, redundant as it is, learns to wander (benchmarks/RESULTS.md)
-        defaults=Defaults(recovery_sigma=0.0, released_epochs=400),
+        defaults=Defaults(demonstrations=1000, recovery_sigma=0.0, released_epochs=400),
     )
 )
 _STACKING_1 = register_task(

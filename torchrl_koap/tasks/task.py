@@ -69,6 +69,7 @@ class Defaults:
         channels (tuple of int): widths of the planner's U-Net.
         relative (bool): plans are displacements from the present state.
         recovery_sigma (float): typical shift of the recovery augmentation, in the units of the robot's columns.
+        recovery_response (str): how that augmentation leads back, ``"first_order"`` or ``"second_order"``.
         released_epochs (int): epochs of a controller in KOAP's first public code.
 
     Examples:
@@ -82,6 +83,7 @@ class Defaults:
     channels: tuple[int, ...] = (64, 128)
     relative: bool = True
     recovery_sigma: float = 0.004
+    recovery_response: str = "first_order"
     released_epochs: int = 400
 
 

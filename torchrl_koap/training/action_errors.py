@@ -19,7 +19,7 @@ from torchrl_koap.training.closed_form import fit_closed_form
 from torchrl_koap.training.run_directory import RunDirectory
 
 # frames of the evaluation windows: enough history and look-ahead for every controller compared
-BEFORE, AFTER = 4, 11
+BEFORE, AFTER = 8, 11
 UNITS = {"m": "mm", "rad": "mrad"}  # unit of the actions to the unit of their errors
 
 

@@ -20,6 +20,7 @@ _MOST_THREADS = 1024
 # what every preset was designed with: how states and actions are normalised
 NORMALIZATION = {
     "default": {"state": "standard", "action": "rms"},
+    "semi_supervised": {"state": "standard", "action": "rms"},
     "paper": {"state": "minmax", "action": "minmax"},
     "released": {"state": "minmax", "action": "minmax"},
 }

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
 from torchrl_koap.modules import KoopmanInverseDynamics, LatentActionFourier, RidgeFit
+from torchrl_koap.modules.koopman.smoothed_action import RAW, LatentActionSmoothed
+from torchrl_koap.tasks import Task
 
 # one or two labelled trajectories cannot be left out to choose the penalty
 DEFAULT_PENALTY = 0.15
@@ -44,22 +46,90 @@ def fit_closed_form(
     mask = windows["has_action"].squeeze(-1) & ~windows["padded"].squeeze(-1)
     # every step is frame `num_past` of one window; at other frames a clamped look-ahead would count it again
     mask[:, : controller.num_past], mask[:, controller.num_past + 1 :] = False, False
-    extra = {}
-    axes = shared_axes or guessed_axes
-    if isinstance(controller, KoopmanInverseDynamics):
-        through_zero = not controller.action_normalizer.offset.any()
-        extra = {"default_penalty": DEFAULT_PENALTY, "bias": not through_zero}
-        if axes and isinstance(controller.latent_action, LatentActionFourier):
-            extra["tied_axes"] = axes
     groups = windows["episode"][:, -1]
-    fit = controller.fit_decoder(windows, mask, groups=groups, **extra)
-    if "tied_axes" in extra and not shared_axes:
-        fit = _better_without(controller, fit, windows, mask, groups=groups, **extra)
+    if not isinstance(controller, KoopmanInverseDynamics):
+        fit = controller.fit_decoder(windows, mask, groups=groups)
+    elif isinstance(controller.latent_action, LatentActionSmoothed):
+        fit = _best_block(controller, windows, mask, groups, shared_axes, guessed_axes)
+    else:
+        has_axes = isinstance(controller.latent_action, LatentActionFourier)
+        axes = (shared_axes, guessed_axes) if has_axes else ((), ())
+        fit = _fit_koopman(controller, windows, mask, groups, *axes)
     if not isinstance(fit, RidgeFit):
         return dict(fit or {})
     # LAPACK's last digits depend on where memory lies: keep those that two equal runs share
     held_out = float(f"{fit.errors[fit.penalty]:.6g}")
-    return {"penalty": fit.penalty, "labels_used": fit.num_labels, "held_out_error": held_out}
+    found = {"penalty": fit.penalty, "labels_used": fit.num_labels, "held_out_error": held_out}
+    if isinstance(getattr(controller, "latent_action", None), LatentActionSmoothed):
+        found["block"] = controller.latent_action.chosen
+    return found
+
+
+def _fit_koopman(
+    controller: KoopmanInverseDynamics,
+    windows: TensorDictBase,
+    mask: Tensor,
+    groups: Tensor,
+    shared_axes: Sequence[int],
+    guessed_axes: Sequence[int],
+) -> RidgeFit:
+    """One fit, with tied axes where there are any: known ones, or likely ones if they help."""
+    through_zero = not controller.action_normalizer.offset.any()
+    options: dict[str, Any] = {"groups": groups, "default_penalty": DEFAULT_PENALTY, "bias": not through_zero}
+    if not (shared_axes or guessed_axes):
+        return controller.fit_decoder(windows, mask, **options)
+    options["tied_axes"] = shared_axes or guessed_axes
+    fit = controller.fit_decoder(windows, mask, **options)
+    return fit if shared_axes else _better_without(controller, fit, windows, mask, **options)
+
+
+def _best_block(
+    controller: KoopmanInverseDynamics,
+    windows: TensorDictBase,
+    mask: Tensor,
+    groups: Tensor,
+    shared_axes: Sequence[int],
+    guessed_axes: Sequence[int],
+) -> RidgeFit:
+    """Fits each block of a smoothed latent action and keeps the one with the smallest held-out labelled error."""
+    chooser = controller.latent_action
+    kept: tuple[float, str, RidgeFit, dict[str, Tensor]] | None = None
+    for block in chooser.choices:
+        chooser.choose(block)
+        own_columns = chooser.identity or block == RAW
+        axes = (shared_axes, guessed_axes) if own_columns else ((), ())
+        fit = _fit_koopman(controller, windows, mask, groups, *axes)
+        error = fit.errors[fit.penalty]
+        if kept is None or error < kept[0]:
+            weights = {name: value.clone() for name, value in controller.action_decoder.state_dict().items()}
+            kept = error, block, fit, weights
+    assert kept is not None
+    chooser.choose(kept[1])
+    controller.action_decoder.load_state_dict(kept[3])
+    return kept[2]
+
+
+def likely_axes(task: Task, columns: Sequence[int]) -> list[int]:
+    """The column that each action is likely to move, for a robot that came with data alone, which does not say it.
+
+    Args:
+        task (Task): the task.
+        columns (sequence of int): state columns that the controller reads.
+
+    Returns:
+        list of int: a column of those read for every action; empty where there is nothing to guess.
+
+    Examples:
+        >>> from torchrl_koap.tasks import Task, get_task
+        >>> from torchrl_koap.training.closed_form import likely_axes
+        >>> arm = Task("arm", {"goal": 2, "q": 2}, {"a": "rad", "b": "rad"}, "q", robot=(2, 3))
+        >>> likely_axes(arm, (2, 3)), likely_axes(get_task("avoiding"), (0, 1))
+        ([0, 1], [])
+    """
+    moved = task.action_targets or task.robot
+    if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
+        return []
+    return [list(columns).index(column) for column in moved]
 
 
 def _better_without(

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,13 +15,15 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.training.datasets import find_task_of
+from torchrl_koap.training.loggers import check_logger
 from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.run_directory import RunDirectory
 from torchrl_koap.training.validation import default_fraction
 
-LABEL_FRACTION, ALL_LABELS = 0.02, 1.0  # defaults for data with all labels, and for data that lack some
+# defaults for data that lack labels or came without an environment, and for all others
+ALL_LABELS, LABEL_FRACTION = 1.0, 0.02
 
 
 @dataclass
@@ -35,10 +36,10 @@ class TrainConfig:
         dataset: "scripted", or a folder: written by `koap demos`, `koap convert` or save_demonstrations, of D3IL raw
             pickles, or a LeRobot data set.
         label_fraction: share of the trajectories, windows or transitions that keep their actions (default: 0.02; all
-            labels that there are, where data lack some).
+            labels that there are, where data lack some or the task has no environment).
         label_count: number of them instead of a share.
         label_episodes: these trajectories instead of a random choice, as `koap suggest` names them.
-        label_unit: "trajectory", "window" (the paper's levels) or "transition".
+        label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
         seed: seed of label choice, initialisation and batches.
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
         validation_fraction: share of the trajectories that the planner never sees, those without labels first, for
@@ -47,7 +48,7 @@ class TrainConfig:
             another name in torchrl_koap.training.methods.METHODS, those that plugins register included.
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
-        preset: variant of KOAP: "default", "paper" or "released" (default: the method's own).
+        preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the method's own).
         koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
         action_coeff: weight of the action term, for methods whose action decoder is trained with the rest (default: 1).
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
@@ -74,9 +75,16 @@ class TrainConfig:
         relative: plan displacements from the current state instead of states (default: the task's).
         forecast: plan deviations from a linear forecast, which carries over to goals not demonstrated (default: for a
             task without an environment).
+        frame: object from which the planner sees everything, such as "target": tasks whose place on the table does not
+            matter (default: the world).
+        plan_steps: frames of the plan that are modelled, counted from 1, such as 1 2 3 4 6 8 11 14; those in between
+            lie on straight lines, and the last one is the horizon (default: all of 14).
+        observed_frames: frames that the planner sees, 1 or 2 (default: 2).
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
+        recovery_response: how the augmentation leads back, "first_order" at once or "second_order" from rest, which
+            robots that follow their commands late can do (default: the task's).
         scene_shift: typical displacement (m) of whole scenes, for tasks whose place on the table does not matter.
         scene_turn: typical angle (rad) by which such scenes are turned.
         exchange: exchange objects that are alike.
@@ -89,7 +97,8 @@ class TrainConfig:
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
         force_data: resume although the demonstrations, or the version of this package, are others than at the start.
-        logger: "csv" (metrics.csv alone) or "wandb" as well (offline unless WANDB_MODE says otherwise).
+        logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise), "tensorboard"
+            or "mlflow" (in the run directory unless MLFLOW_TRACKING_URI says otherwise).
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
             reads the run.
@@ -138,9 +147,13 @@ class TrainConfig:
     prediction: str = "sample"
     relative: bool | None = None
     forecast: bool | None = None
+    frame: str | None = None
+    plan_steps: tuple[int, ...] | None = None
+    observed_frames: int | None = None
     relations: bool = True
     controller_state: str = "robot"
     recovery_sigma: float | None = None
+    recovery_response: str | None = None
     scene_shift: float = 0.05
     scene_turn: float = 0.3
     exchange: bool = True
@@ -205,7 +218,8 @@ class ResolvedConfig:
         """The same with the share of labels that is the default for these data, if none was asked for."""
         if self.options.label_fraction is not None:
             return self
-        share = ALL_LABELS if not data["has_action"].all() else LABEL_FRACTION
+        every = self.task.env is None or not data["has_action"].all()
+        share = ALL_LABELS if every else LABEL_FRACTION
         options = replace(self.options, label_fraction=share)
         return replace(self, options=options, budget=_budget(options))
 
@@ -233,10 +247,14 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     released = _released(options)
     method = _method(options) if released is None else released.method
     _check(options, method)
+    if not method.has_planner:
+        if config.forecast:
+            raise ValueError(f"method {config.method!r} is a policy of its own and has no plans to forecast")
+        options = replace(options, forecast=None)
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:
-        planner = _planner_entry(options)
+        planner = _planner_entry(options, task)
     if released is not None and not method.has_planner:
         planner |= POLICY
     controller = {
@@ -264,6 +282,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
     defaults = {
         "steps": task.defaults.planner_steps,
         "recovery_sigma": task.defaults.recovery_sigma,
+        "recovery_response": task.defaults.recovery_response,
         "episodes": task.defaults.demonstrations,
         "relative": task.defaults.relative,
         "channels": task.defaults.channels,
@@ -304,9 +323,7 @@ _LEAST = (
 
 
 def _check(options: TrainConfig, method: Method) -> None:
-    lookup(("csv", "wandb"), options.logger, "logger")
-    if options.logger == "wandb" and importlib.util.find_spec("wandb") is None:
-        raise ValueError("--logger wandb needs an extra: pip install 'torchrl_koap[wandb]'")
+    check_logger(options.logger)
     for name in COEFFICIENTS:
         value = getattr(options, name)
         if value is not None and name not in loss_coefficients(method):
@@ -315,6 +332,13 @@ def _check(options: TrainConfig, method: Method) -> None:
             raise ValueError(f"{name} must be >= 0, got {value}")
     if not method.has_planner and options.planner_from is not None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
+    for name in ("frame", "plan_steps", "observed_frames"):
+        if getattr(options, name) is not None and not method.has_planner:
+            raise ValueError(f"{name} is the planner's, which method {options.method!r} does not have")
+    if options.observed_frames not in (None, *range(1, HISTORY + 1)):
+        raise ValueError(f"observed_frames must be 1 to {HISTORY}, got {options.observed_frames}")
+    if options.plan_steps is not None and (not options.plan_steps or options.plan_steps[-1] < 4):
+        raise ValueError(f"plan_steps must end at 4 or more control steps, got {list(options.plan_steps)}")
     if options.steps < 1 or options.controller_steps < 0:
         raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
     for name in ("planner_learning_rate", "controller_learning_rate"):
@@ -347,13 +371,33 @@ def _budget(options: TrainConfig) -> LabelBudget:
     return LabelBudget(amount, unit=options.label_unit, seed=options.seed, window=WINDOW, history=HISTORY)
 
 
-def _planner_entry(options: TrainConfig) -> dict[str, Any]:
+def _frame_of(task: Task, name: str) -> dict[str, list]:
+    """Columns of the frame of an object (:class:`~torchrl_koap.modules.diffusion.planar_frame.PlanarFrame`)."""
+    ends = ("_position", "_quaternion")
+    parts = [part.removesuffix(ends[0]) for part in task.planar_parts if part.endswith(ends[0])]
+    bodies = [body for body in parts if body + ends[1] in task.planar_parts]
+    if not bodies:
+        raise ValueError(f"frame was given, but in task {task.name!r} the place on the table matters")
+    lookup(bodies, name, "frame")
+    points, directions = task.planar_columns()
+    place, yaw = (task.state_slices[name + end].start for end in ends)
+    return {
+        "points": [list(pair) for pair in points],
+        "directions": [list(pair) for pair in directions],
+        "origin": [place, place + 1],
+        "heading": [yaw, yaw + 1],
+    }
+
+
+def _planner_entry(options: TrainConfig, task: Task) -> dict[str, Any]:
     sizes = {
         "width": options.denoiser_width,
         "depth": options.denoiser_depth,
         "frequencies": options.condition_octaves,
         "dropout": options.dropout,
         "forecast": options.forecast or None,
+        "frame": None if options.frame is None else _frame_of(task, options.frame),
+        "plan_steps": None if options.plan_steps is None else list(options.plan_steps),
     }
     # what was left out is left out here too, so that a run of before can be resumed
     return {name: value for name, value in sizes.items() if value is not None} | {
@@ -361,8 +405,8 @@ def _planner_entry(options: TrainConfig) -> dict[str, Any]:
         "channels": list(options.channels),
         "schedule": options.schedule,
         "prediction": options.prediction,
-        "history": HISTORY,
-        "horizon": HORIZON,
+        "history": options.observed_frames or HISTORY,
+        "horizon": options.plan_steps[-1] if options.plan_steps else HORIZON,
         "relative": options.relative,
         "relations": options.relations,
         "solver": options.solver,

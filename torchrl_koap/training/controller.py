@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,11 +16,11 @@ from torch import nn
 from torchrl_koap.data import WindowTable, cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.tasks import HORIZON, WINDOW, Task
+from torchrl_koap.tasks import HORIZON, WINDOW
 from torchrl_koap.training import released_settings
 from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.checkpoints import save_tensors, save_weights
-from torchrl_koap.training.closed_form import fit_closed_form
+from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
 from torchrl_koap.training.config import ResolvedConfig, TrainConfig
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.methods import COEFFICIENTS, LABELLED_SHARES, Method, Phase
@@ -163,9 +163,11 @@ def _train_network(
         )
     controller.eval()
     fit: dict[str, Any] = {}
+    if hasattr(controller, "fit_unlabelled"):
+        controller.fit_unlabelled(windows["state"])
     if method.closed_form:
         columns = task.controller_columns(options.controller_state)
-        fit = fit_closed_form(controller, data, shared_axes=task.actuated, guessed_axes=_likely_axes(task, columns))
+        fit = fit_closed_form(controller, data, shared_axes=task.actuated, guessed_axes=likely_axes(task, columns))
     return controller, fit, values
 
 
@@ -174,14 +176,6 @@ def _coefficients(options: TrainConfig, phase: Phase) -> dict[str, float]:
     takes = inspect.signature(phase.loss).parameters
     asked = {name: getattr(options, name) for name in COEFFICIENTS if name in takes}
     return {name: value for name, value in asked.items() if value is not None}
-
-
-def _likely_axes(task: Task, columns: Sequence[int]) -> list[int]:
-    """The column that each action is likely to move, for a robot that came with data alone, which does not say it."""
-    moved = task.action_targets or task.robot
-    if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
-        return []
-    return [list(columns).index(column) for column in moved]
 
 
 def _train_policy(

@@ -18,6 +18,7 @@ from torchrl_koap.modules import (
     TemporalUnet,
     TransformerDenoiser,
 )
+from torchrl_koap.modules.diffusion.planar_frame import PlanarFrame
 
 
 def _sizes(options: Mapping[str, Any], denoiser: str, *names: str) -> dict[str, Any]:
@@ -63,15 +64,18 @@ def build_planner(options: Mapping[str, Any], state_dim: int, features: nn.Modul
 
     Args:
         options (mapping): the ``planner`` entry of ``config.json``: denoiser, channels, schedule, prediction, history,
-            horizon, relative, forecast, solver, solver_steps, clip.
+            horizon, relative, forecast, solver, solver_steps, clip, frame (columns of a
+            :class:`~torchrl_koap.modules.diffusion.planar_frame.PlanarFrame`) and plan_steps.
         state_dim (int): number of state columns.
         features (nn.Module, optional): what the condition holds besides the history, see :class:`StatePlanner`.
 
     Raises:
         ValueError: for an unknown denoiser, schedule, prediction or solver.
     """
-    forecast = options.get("forecast", False)  # runs of before have none
-    return StatePlanner(forecast=forecast, **_diffusion(options, state_dim, state_dim, features))
+    forecast, steps = options.get("forecast", False), options.get("plan_steps")  # runs of before have none
+    parts = _diffusion(options, state_dim, state_dim, features, frames=None if steps is None else len(steps))
+    frame = PlanarFrame(**options["frame"]) if options.get("frame") else None
+    return StatePlanner(forecast=forecast, frame=frame, steps=steps, **parts)
 
 
 def build_diffusion_policy(
@@ -91,13 +95,15 @@ def build_diffusion_policy(
     return DiffusionPolicy(action_dim=action_dim, **_diffusion(options, state_dim, action_dim, features))
 
 
-def _diffusion(options: Mapping[str, Any], state_dim: int, width: int, features: nn.Module | None) -> dict[str, Any]:
-    """What planner and diffusion policy take alike, with a denoiser for sequences of that width."""
+def _diffusion(
+    options: Mapping[str, Any], state_dim: int, width: int, features: nn.Module | None, frames: int | None = None
+) -> dict[str, Any]:
+    """What planner and diffusion policy take alike, with a denoiser for sequences of that width and so many frames."""
     make = lookup(DENOISERS, options["denoiser"], "denoiser")
     features = features if options.get("relations") else None
     condition_dim = options["history"] * state_dim + (0 if features is None else features.num_features)
     return {
-        "denoiser": make(width, condition_dim, options),
+        "denoiser": make(width, condition_dim, dict(options) | ({} if frames is None else {"horizon": frames})),
         "schedule": NoiseSchedule(options["schedule"], options["prediction"]),
         "state_dim": state_dim,
         "history": options["history"],

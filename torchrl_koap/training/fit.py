@@ -32,16 +32,23 @@ PLANNER_OPTIONS = (
     *(
         "relations",
         "recovery_sigma",
+        "recovery_response",
         "scene_shift",
         "scene_turn",
         "exchange",
         "solver",
         "solver_steps",
         "denoiser_width",
+        "frame",
+        "plan_steps",
+        "observed_frames",
     ),
     *("denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay", "first_steps_weight", "precision"),
 )
-CONTROLLER_OPTIONS = ("controller_batch_size", "controller_learning_rate", "preset", "decoder", "controller_state")
+CONTROLLER_OPTIONS = (
+    *("controller_batch_size", "controller_learning_rate", "preset", "decoder", "controller_state"),
+    *("koopman_coeff", "action_coeff"),
+)
 
 
 @dataclass(frozen=True)
@@ -154,7 +161,8 @@ def fit_controller(
         steps (int): updates; with 0 only the closed form is fitted, if the method has one.
         seed, device, progress: as for :func:`fit_planner`.
         **options: further options of :class:`~torchrl_koap.training.TrainConfig` that concern the controller:
-            ``controller_batch_size``, ``controller_learning_rate``, ``preset``, ``decoder``, ``controller_state``.
+            ``controller_batch_size``, ``controller_learning_rate``, ``preset``, ``decoder``, ``controller_state``,
+            ``koopman_coeff``, ``action_coeff``.
 
     Returns:
         InverseDynamics: in evaluation mode, with a :class:`Recipe` as ``recipe``. It reads

@@ -11,9 +11,10 @@ to 5 after the present one, but for two that are defined otherwise: Decision Dif
 ``dp`` and ``dp_relabel`` have no planner and make its number of updates instead; relabelling costs the updates of the
 teacher besides.
 
-Three controls say what the Koopman model itself is worth: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
+Four controls say what the Koopman model itself is worth: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
 none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action reads, with its scales, penalty and prior;
-``koap_untrained``, KOAP with random features, of which nothing but the decoder is fitted.
+``koap_untrained``, KOAP with random features, of which nothing but the decoder is fitted;
+``pca``, a ridge on principal components of all windows, labelled or not.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from torchrl_koap.modules import (
     PRESETS,
     LinearInverseDynamics,
     NonlinearInverseDynamics,
+    PrincipalInverseDynamics,
     QuantizedInverseDynamics,
     SupervisedInverseDynamics,
     VariationalInverseDynamics,
@@ -180,7 +182,14 @@ def _diffusion_policy(state_dim, action_dim, features, options):
 
 
 def without_actions(network: nn.Module, *, koopman_coeff: float = 1.0) -> LossModule:
-    """KOAP's loss on states alone."""
+    """KOAP's loss on states alone.
+
+    Args:
+        network (nn.Module): the model.
+
+    Keyword Args:
+        koopman_coeff (float): weight of its Koopman term. Defaults to ``1``.
+    """
     return KOAPLoss(network, action_coeff=0.0, koopman_coeff=koopman_coeff)
 
 
@@ -277,6 +286,12 @@ for _method in (
         presets=_ANY_PRESET,
     ),
     Method("linear_steps", "ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
+    Method(
+        "pca",
+        "ridge on principal components of unlabelled windows",
+        partial(_network, kind=PrincipalInverseDynamics),
+        closed_form=True,
+    ),
     Method("linear", "ridge on raw frames", _linear, closed_form=True),
     Method("dd", "supervised, next state (Decision Diffuser)", partial(_supervised, look_ahead=1), _LABELS),
     Method("dd_lookahead", "supervised, look-ahead", partial(_supervised, look_ahead=LOOK_AHEAD), _LABELS),

@@ -21,7 +21,7 @@ from torchrl_koap.data import (
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.objectives import PlannerLoss
-from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
+from torchrl_koap.tasks import HISTORY, Task
 from torchrl_koap.training.checkpoints import load_weights, save_weights
 from torchrl_koap.training.config import ResolvedConfig, TrainConfig
 from torchrl_koap.training.diffusion_builders import build_planner
@@ -82,12 +82,20 @@ def learn_states(
         dict: its last losses.
     """
     # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
-    extended = extrapolate_ends(data, HORIZON - 1)
-    windows = cut_windows(extended, WINDOW, select=["state", "episode"], pad_before=1)
-    planner.fit_normalizers(windows["state"], groups=windows["episode"][:, -1])
-    planner.to(options.device)
-    buffer = make_window_buffer(extended, WINDOW, options.batch_size, select=["state"], pad_before=1)
+    # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
+    length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
+    extended = extrapolate_ends(data, planner.horizon - 1)
+    windows = cut_windows(extended, length, select=["state", "episode"], pad_before=1)
     augment = augmentation(options, task)
+    states, groups = windows["state"][:, unseen:], windows["episode"][:, -1]
+    seen = None if planner.forecast is None else augment(windows.clone())["state"][:, unseen:]
+    planner.fit_normalizers(states, seen=seen, groups=groups)
+    planner.to(options.device)
+    buffer = make_window_buffer(extended, length, options.batch_size, select=["state"], pad_before=1)
+
+    def draw() -> TensorDictBase:
+        return augment(buffer.sample())[:, unseen:]
+
     planner.training_dtype = training_dtype(options.precision)
     weight = 1.0 if options.first_steps_weight is None else options.first_steps_weight
     loss = PlannerLoss(planner, first_steps_weight=weight)
@@ -95,7 +103,7 @@ def learn_states(
         values = train_phase(
             "planner",
             loss,
-            lambda: augment(buffer.sample()),
+            draw,
             num_steps=options.steps,
             learning_rate=options.planner_learning_rate,
             weight_decay=planner_weight_decay(options),
@@ -149,6 +157,6 @@ def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> 
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
         tool = {"tool": task.tool_columns, "kinematics": task.tool_position}
-        sigma = options.recovery_sigma
-        steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, moved_by=moved_by, **tool))
+        way = {"response": options.recovery_response, "columns": arm, "moved_by": moved_by}
+        steps.append(RecoveryAugmentation(options.recovery_sigma, history=HISTORY, **way, **tool))
     return TensorDictSequential(*steps)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,6 +21,7 @@ from torchrl_koap.training.controller import train_controller
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.digests import forget_digests, write_digests
+from torchrl_koap.training.loggers import close_logger, make_logger
 from torchrl_koap.training.planner import train_planner
 from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
@@ -89,7 +89,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         run.write_json("config.json", content)  # not before the data are known to be good: a wrong call leaves nothing
 
         began = time.perf_counter()
-        logger = _make_logger(options)
+        logger = make_logger(options.logger, options.out)
         try:
             torch.manual_seed(options.seed)
             planner, planner_values = None, {}
@@ -99,8 +99,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
             torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
             controller, fit, controller_values = train_controller(run, resolved, labelled, logger)
         finally:
-            if logger is not None:
-                logger.close()
+            close_logger(logger)
         summary = {
             "labels": report.as_dict(),
             "trajectories_used": len(labelled["episode"].unique()),
@@ -202,12 +201,3 @@ def _check_lengths(resolved: ResolvedConfig, data: TensorDictBase) -> None:
     WindowTable.build(data, max(WINDOW, controller.num_window_frames), pad_before=controller.num_past)
     if resolved.options.analysis:
         WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
-
-
-def _make_logger(options: TrainConfig):
-    if options.logger == "csv":
-        return None
-    from torchrl.record.loggers import get_logger
-
-    mode = os.environ.get("WANDB_MODE", "offline")
-    return get_logger("wandb", str(options.out), options.out.name, wandb_kwargs={"mode": mode, "project": "koap"})

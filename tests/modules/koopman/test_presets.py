@@ -62,7 +62,7 @@ def test_paper_is_the_paper():
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_trains(preset):
     torch.manual_seed(0)
-    batch = make_batch()
+    batch = make_batch(num_frames=17)
     model = make_koopman_inverse_dynamics(
         2,
         2,
@@ -87,7 +87,7 @@ def test_every_preset_trains(preset):
     before = loss(batch)["loss_action"]
     fit = model.fit_decoder(batch, batch["has_action"].squeeze(-1))
     assert fit.num_labels > 0 and loss(batch)["loss_action"] < before
-    assert model(batch.select("state"))["action"].shape == (8, 16, 2)
+    assert model(batch.select("state"))["action"].shape == (8, 17, 2)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -133,9 +133,9 @@ def test_options_override_the_preset_and_reach_the_parts():
     ("options", "message"),
     [
         ({"preset": "paperr"}, "unknown preset 'paperr'; did you mean 'paper'"),
-        ({"preset": "xyz"}, "unknown preset 'xyz'; known: default, paper, released"),
+        ({"preset": "xyz"}, "unknown preset 'xyz'; known: default, semi_supervised, paper, released"),
         ({"preset": None}, "unknown preset None"),
-        ({"network": "tcn"}, "unknown network 'tcn'; known: fourier, lstm, mlp"),
+        ({"network": "tcn"}, "unknown network 'tcn'; known: fourier, lstm, smoothed, mlp"),
         ({"network": "lstmm"}, "unknown network 'lstmm'; did you mean 'lstm'"),
         ({"latentdim": 3}, "option .* 'latentdim'; did you mean 'latent_dim'"),
         ({"preset": "paper", "dropout": 0.1}, "option .* network 'lstm': 'dropout'"),

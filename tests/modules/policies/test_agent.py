@@ -123,6 +123,9 @@ def test_refusals():
     with pytest.raises(RuntimeError, match="has not acted yet"):
         agent.latency()
     agent.reset()
+    with pytest.raises(ValueError, match="must have at least 2 columns .state_columns., got 1"):
+        agent.act(np.zeros(1))
+    agent.reset()
     agent.act(np.zeros(2))
     with pytest.raises(ValueError, match=r"the observation is \[3\], those before were \[2\]; reset"):
         agent.act(np.zeros(3))

@@ -71,6 +71,7 @@ def test_onnx(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)  # minutes of g++
 def test_aotinductor(tmp_path):
     what = exportable(policy(), observation_dim=4)
     export_part(what, tmp_path / "policy.aoti.pt2", kind="aoti")

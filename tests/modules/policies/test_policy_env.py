@@ -10,8 +10,8 @@ import pytest
 import torch
 import toy_gym  # noqa: F401 - registers
 from tensordict import TensorDict
-from torchrl.collectors import MultiSyncCollector
-from torchrl.envs import DoubleToFloat, GymEnv, SerialEnv, TransformedEnv
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.envs import DoubleToFloat, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
 
 from torchrl_koap.modules import (
     Agent,
@@ -25,10 +25,19 @@ from torchrl_koap.modules import (
 )
 
 
-def plan_then_control():
+def plan_then_control(**options):
     torch.manual_seed(0)
     planner = StatePlanner(TemporalUnet(4, 8, channels=(8, 16)), state_dim=4, num_steps=2)
-    return PlanThenControl(planner, make_koopman_inverse_dynamics(4, 2), state_columns=range(4), history=5).eval()
+    controller = make_koopman_inverse_dynamics(4, 2)
+    return PlanThenControl(planner, controller, state_columns=range(4), history=5, **options).eval()
+
+
+def open_loop():
+    return plan_then_control(execution="open_loop")
+
+
+def candidates():
+    return plan_then_control(candidates=3)
 
 
 def chunks():
@@ -47,10 +56,18 @@ def make_env(make_policy):
 
 
 POLICIES = pytest.mark.parametrize("make_policy", [plan_then_control, chunks])
+
+
+def two_of(make_policy):
+    return SerialEnv(2, partial(make_env, make_policy))
+
+
 LAYOUTS = {
     "single": lambda make_policy: make_env(make_policy),
     "inside": lambda make_policy: SerialEnv(2, partial(make_env, make_policy)),
     "outside": lambda make_policy: PolicyEnv(SerialEnv(2, bare), make_policy()),
+    "inside, [2, 2]": lambda make_policy: SerialEnv(2, partial(two_of, make_policy)),
+    "outside, [2, 2]": lambda make_policy: PolicyEnv(SerialEnv(2, partial(SerialEnv, 2, bare)), make_policy()),
 }
 
 
@@ -67,6 +84,72 @@ def test_the_seed_fixes_everything(make_policy, layout):
         assert torch.equal(rollouts["first"][key], rollouts["again"][key]), key
         assert not torch.equal(rollouts["first"][key], rollouts["other"][key]), key
     env.close()
+
+
+@pytest.mark.parametrize("make_policy", [plan_then_control, open_loop, candidates, chunks])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_environment_is_served_as_if_it_were_alone(make_policy, layout):
+    env = LAYOUTS[layout](make_policy)
+    env.set_seed(2)
+    with torch.no_grad():
+        rollout = env.rollout(8, make_policy(), break_when_any_done=False)  # episodes last six steps
+    assert rollout.shape == (*env.batch_size, 8)
+    env.close()
+    alone(make_policy, rollout)
+
+
+def alone(make_policy, rollout):
+    """A fresh policy per environment gives the same actions for what was observed there."""
+    for episode in rollout.reshape(-1, rollout.shape[-1]):
+        fresh, carried = make_policy(), TensorDict(batch_size=[])
+        for step in episode:
+            with torch.no_grad():
+                carried = fresh(carried.update(step.select("observation_history", "is_init", "noise")))
+            torch.testing.assert_close(carried["action"], step["action"], rtol=1e-4, atol=1e-5)
+
+
+PARALLEL = {
+    "inside": lambda make_policy: ParallelEnv(2, partial(make_env, make_policy)),
+    "outside": lambda make_policy: PolicyEnv(ParallelEnv(2, bare), make_policy()),
+    "inside, [2, 2]": lambda make_policy: ParallelEnv(2, partial(two_of, make_policy)),
+    "outside, [2, 2]": lambda make_policy: PolicyEnv(ParallelEnv(2, partial(SerialEnv, 2, bare)), make_policy()),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make_policy", [plan_then_control, open_loop, candidates, chunks])
+@pytest.mark.parametrize("layout", PARALLEL)
+def test_environments_in_processes_give_the_numbers_of_a_serial_one(make_policy, layout):
+    _in_processes(make_policy, layout)
+
+
+def test_environments_in_processes(layout="inside"):
+    _in_processes(plan_then_control, layout)
+
+
+def _in_processes(make_policy, layout):
+    rollouts = []
+    for layouts in (LAYOUTS, PARALLEL):
+        env = layouts[layout](make_policy)
+        env.set_seed(7)
+        with torch.no_grad():
+            rollouts.append(env.rollout(8, make_policy(), break_when_any_done=False))
+        env.close()
+    assert torch.equal(rollouts[0]["observation"], rollouts[1]["observation"])
+    assert torch.equal(rollouts[0]["action"], rollouts[1]["action"])
+
+
+@pytest.mark.parametrize("make_policy", [plan_then_control, open_loop, candidates, chunks])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_in_a_collector(make_policy, layout):
+    env = LAYOUTS[layout](make_policy)
+    frames = 8 * max(env.batch_size.numel(), 1)
+    collector = Collector(env, make_policy(), frames_per_batch=frames, total_frames=frames)
+    collector.set_seed(3)
+    (batch,) = list(collector)
+    collector.shutdown()
+    assert batch.shape[-1] == 8
+    alone(make_policy, batch)
 
 
 @POLICIES
@@ -94,9 +177,5 @@ def test_in_processes_of_a_collector(make_policy):
     for worker in range(2):
         episode = batch[worker, :6]  # every episode of the toy lasts six steps
         assert episode["is_init"].flatten().tolist() == [True] + [False] * 5
-        fresh, carried = make_policy(), TensorDict(batch_size=[])
-        for step in range(6):
-            with torch.no_grad():
-                carried = fresh(carried.update(episode[step].select("observation_history", "is_init", "noise")))
-            torch.testing.assert_close(carried["action"], episode["action"][step], rtol=1e-4, atol=1e-6)
+    alone(make_policy, batch)
     assert not torch.equal(batch["observation"][0], batch["observation"][1])

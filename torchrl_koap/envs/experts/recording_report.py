@@ -25,6 +25,12 @@ class Take:
         failures (dict): discarded attempts by reason.
         disturbed (bool): whether the operator was disturbed.
         spells (tuple): disturbances of the attempt that was kept: first control step, the one after the last, kind.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.demonstrations import iterate_takes
+        >>> take = next(iterate_takes("avoiding", 1))
+        >>> take.index, take.attempts, take.failures, take.disturbed
+        (0, 1, {}, False)
     """
 
     index: int

@@ -40,6 +40,7 @@ _EAGERNESS = np.array([0.15, 0.15, 0.12])  # share of the remaining way that is 
 _HOLD = 0.004  # the TCP grasps that much above the centre of a box (m)
 _FINGER_AT, _FINGER_HALF = 0.051, (0.015, 0.011)  # an open finger: distance from the TCP, half sizes (m)
 _CLEAR = 0.003  # room that a finger needs beside it (m)
+_PUSHED = 0.012  # m between the command and what this person commanded, more than inverse kinematics leave
 _HORIZON = 1500  # control steps for which the wobble of the hand is drawn
 _REACH, _GRASP, _CARRY, _RELEASE, _RETREAT = range(5)
 
@@ -120,6 +121,8 @@ class StackingExpert:
             tcp, width = seen["tcp_position"][i], seen["gripper_width"][i, 0]
             if person.position is None:
                 person.position, person.yaw = start[i].copy(), yaw
+            elif np.linalg.norm(start[i] - person.position) > _PUSHED:  # somebody moved the command: go on from there
+                person.position, person.yaw = start[i].copy(), math.remainder(yaw, 2 * math.pi)
             gripper[i] = person.decide(tcp, math.remainder(yaw, 2 * math.pi), width, boxes[i])
             half = person.yaw / 2
             poses[i] = (*person.position, 0.0, math.cos(half), math.sin(half), 0.0)

@@ -88,7 +88,7 @@ class WindowVariationalInverseDynamics(VariationalInverseDynamics):
         """
         shown = self.reader(self.normalize_state(state))  # [*B, T, F]
         context, _ = self.context(shown.reshape(-1, *shown.shape[-2:]))
-        read = torch.cat([shown, context.reshape(*shown.shape[:-1], -1)], -1)
+        read = torch.cat([shown, context.reshape(*shown.shape[:-1], 2 * self.context.hidden_size)], -1)
         return read if frames is None else read[..., frames.start : frames.stop, :]
 
     def split(self, read: Tensor) -> tuple[Tensor, Tensor]:

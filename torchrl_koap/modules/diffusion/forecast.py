@@ -10,7 +10,8 @@ from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.normalizer import Normalizer
 
 _MOST_ROWS = 20_000  # windows that the ridge is fitted to at most, spread evenly
-_FEW_TRAJECTORIES = 10.0  # penalty where too few trajectories are there to choose it by: next to no forecast
+_NOTHING = 1e-3  # of the range of an entry: scale of what is forecast without error
+_PENALTIES = tuple(10.0**power for power in range(-6, 8))  # the last one leaves next to nothing
 
 
 class LinearForecast(nn.Module):
@@ -32,7 +33,7 @@ class LinearForecast(nn.Module):
         >>> from torchrl_koap.modules.diffusion.forecast import LinearForecast
         >>> condition, forecast = torch.randn(90, 3), LinearForecast(3, 2)
         >>> sequence = condition[:, :2] - 0.5 * condition[:, 2:]
-        >>> forecast.fit(condition, sequence, torch.arange(90) // 30)
+        >>> penalty = forecast.fit(condition, sequence, torch.arange(90) // 30)
         >>> torch.allclose(forecast.weight, torch.tensor([[1.0, 0.0, -0.5], [0.0, 1.0, -0.5]]), atol=1e-3)
         True
     """
@@ -63,11 +64,19 @@ class LinearForecast(nn.Module):
         ridge = LinearActionDecoder(condition.shape[-1], sequence.shape[-1]).to(condition)
         every = torch.ones(len(condition), dtype=torch.bool, device=condition.device)
         fit = ridge.fit_ridge(
-            condition[rows], sequence[rows], every[rows], groups=groups[rows], default_penalty=_FEW_TRAJECTORIES
+            condition[rows],
+            sequence[rows],
+            every[rows],
+            groups=groups[rows],
+            penalties=_PENALTIES,
+            default_penalty=_PENALTIES[-1],  # where too few trajectories are there to choose by
         )
         self.weight.copy_(ridge.linear.weight.detach())
         self.bias.copy_(ridge.linear.bias.detach())
-        self.rest = Normalizer.fit(sequence - self._forecast(condition), mode=mode).to(self.bias)
+        rest = sequence - self._forecast(condition)
+        fitted = Normalizer.fit(rest, mode=mode)
+        nothing = (rest - fitted.offset).abs().amax(0) < _NOTHING  # such as a goal that never moves
+        self.rest = Normalizer(fitted.offset, torch.where(nothing, _NOTHING, fitted.scale)).to(self.bias)
         return fit.penalty
 
     def take_off(self, condition: Tensor, sequence: Tensor) -> Tensor:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict.utils import NestedKey
 from torch import nn
@@ -10,6 +12,7 @@ from torch import nn
 from torchrl_koap import keys
 from torchrl_koap.modules.diffusion.base import ConditionedDiffusion, identity_normalizer
 from torchrl_koap.modules.diffusion.forecast import LinearForecast
+from torchrl_koap.modules.diffusion.planar_frame import PlanarFrame
 from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.normalizer import Normalizer
 
@@ -30,6 +33,14 @@ class StatePlanner(ConditionedDiffusion):
     With ``forecast=True`` it is not the plan that is modelled but its deviation from a linear forecast
     (:class:`~torchrl_koap.modules.diffusion.forecast.LinearForecast`), which carries over to goals never seen.
 
+    With a ``frame`` history and plan are modelled as seen from an object
+    (:class:`~torchrl_koap.modules.diffusion.planar_frame.PlanarFrame`); with ``steps`` some frames of the plan are
+    modelled alone, those in between lie on straight lines::
+
+        steps        (1, 2, 4, 8)
+        modelled     x_{t+1}  x_{t+2}           x_{t+4}                             x_{t+8}
+        plan         x_{t+1}  x_{t+2}  x_{t+3}  x_{t+4}  x_{t+5}  x_{t+6}  x_{t+7}  x_{t+8}
+
     Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state
     dict.
 
@@ -49,6 +60,9 @@ class StatePlanner(ConditionedDiffusion):
         horizon (int): number ``H`` of planned frames. Defaults to 14.
         relative (bool): model displacements from the current state. Defaults to True.
         forecast (bool): model deviations from a linear forecast. Defaults to False.
+        frame (PlanarFrame, optional): what states are seen from. Default: the world.
+        steps (sequence of int, optional): frames of the plan that are modelled, counted from 1, the horizon last; the
+            denoiser is one of as many frames. Default: all.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
             further numbers that the condition holds, such as the relative positions of objects.
         solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
@@ -62,7 +76,8 @@ class StatePlanner(ConditionedDiffusion):
             H, d]`` where the rest are the draws of a stochastic solver. Defaults to ``"noise"``.
 
     Raises:
-        ValueError: for a history of another length or width, noise of another shape, an unknown or unfit solver.
+        ValueError: for a history of another length or width, noise of another shape, an unknown or unfit solver, steps
+            that do not rise from 1 or more to the horizon.
 
     Examples:
         >>> import torch
@@ -85,6 +100,8 @@ class StatePlanner(ConditionedDiffusion):
         state_dim: int,
         relative: bool = True,
         forecast: bool = False,
+        frame: PlanarFrame | None = None,
+        steps: Sequence[int] | None = None,
         **options,
     ):
         super().__init__(
@@ -97,10 +114,25 @@ class StatePlanner(ConditionedDiffusion):
             out_key=keys.PLAN,
             **options,
         )
-        self.plan_normalizer = identity_normalizer(self.horizon * state_dim)
+        self.frame = frame
+        self.steps = tuple(range(1, self.horizon + 1)) if steps is None else tuple(steps)
+        if self.steps[-1:] != (self.horizon,) or any(
+            b <= a for a, b in zip((0, *self.steps), self.steps, strict=False)
+        ):
+            raise ValueError(f"steps must rise from 1 or more to the horizon, {self.horizon}, got {list(self.steps)}")
+        self.plan_normalizer = identity_normalizer(len(self.steps) * state_dim)
         self.forecast = None
         if forecast:
-            self.forecast = LinearForecast(len(self.condition_normalizer.scale), self.horizon * state_dim)
+            self.forecast = LinearForecast(len(self.condition_normalizer.scale), len(self.steps) * state_dim)
+
+    @property
+    def sample_shape(self) -> tuple[int, int]:
+        """Shape ``(number of steps, d)`` of one diffused sequence, and so of its start noise."""
+        return len(self.steps), self.state_dim
+
+    def condition(self, history: Tensor) -> Tensor:
+        """The condition ``[*B, h * d + f]`` in raw units, as seen in the frame."""
+        return super().condition(history if self.frame is None else self.frame(history, history[..., -1:, :]))
 
     def set_keys(self, *, history: NestedKey | None = None, plan: NestedKey | None = None) -> None:
         """Renames the entries read and written.
@@ -112,7 +144,13 @@ class StatePlanner(ConditionedDiffusion):
         self._rename(history, plan)
 
     def fit_normalizers(
-        self, windows: Tensor, *, mode: str = "minmax", per_step: bool = True, groups: Tensor | None = None
+        self,
+        windows: Tensor,
+        *,
+        mode: str = "minmax",
+        per_step: bool = True,
+        seen: Tensor | None = None,
+        groups: Tensor | None = None,
     ) -> None:
         """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
 
@@ -120,25 +158,53 @@ class StatePlanner(ConditionedDiffusion):
             windows (Tensor): states in raw units, ``[*N, history + horizon, d]``.
 
         Keyword Args:
-            groups (Tensor, optional): trajectory of every window ``[*N]``, for the forecast
-                (:meth:`~torchrl_koap.modules.diffusion.forecast.LinearForecast.fit`).
             mode (str): ``"minmax"``, ``"standard"`` or ``"identity"`` (see
                 :class:`~torchrl_koap.modules.normalizer.Normalizer`).
             per_step (bool): own statistics for every planned step instead of shared ones. Defaults to True.
+            seen (Tensor, optional): the windows as training augments them, which the forecast is fitted to. Default:
+                as they are.
+            groups (Tensor, optional): trajectory of every window ``[*N]``, for the forecast
+                (:meth:`~torchrl_koap.modules.diffusion.forecast.LinearForecast.fit`).
         """
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
-        plan = plan - history[..., -1:, :] if self.relative else plan
+        plan = self._modelled(history, plan)
         if per_step:
             plan = plan.flatten(-2)
         else:
-            plan = plan.reshape(-1, self.state_dim).repeat(1, self.horizon)
+            plan = plan.reshape(-1, self.state_dim).repeat(1, len(self.steps))
         condition = self.condition(history)
         example = self.plan_normalizer.scale
         self.condition_normalizer = Normalizer.fit(condition, mode=mode).to(example)
         self.plan_normalizer = Normalizer.fit(plan, mode=mode).to(example)
         if self.forecast is not None:
+            history, plan = self.split_window((windows if seen is None else seen).reshape(-1, *windows.shape[-2:]))
+            plan = plan - history[..., -1:, :] if self.relative else plan
             groups = None if groups is None else groups.flatten()
-            self.forecast.fit(self.condition_normalizer(condition), self.plan_normalizer(plan), groups, mode=mode)
+            self.forecast.fit(self.encode_history(history), self.plan_normalizer(plan.flatten(-2)), groups, mode=mode)
+
+    def _modelled(self, history: Tensor, plan: Tensor) -> Tensor:
+        """What is modelled of raw plans ``[*B, H, d]``: the steps, seen in the frame, from the present state."""
+        now = history[..., -1:, :]
+        plan = plan if len(self.steps) == self.horizon else plan[..., [step - 1 for step in self.steps], :]
+        if self.frame is not None:
+            plan, now = self.frame(plan, now), self.frame(now, now)
+        return plan - now if self.relative else plan
+
+    def _whole(self, history: Tensor, modelled: Tensor) -> Tensor:
+        """Inverse of :meth:`_modelled`; frames in between lie on straight lines."""
+        now = history[..., -1:, :]
+        seen = now if self.frame is None else self.frame(now, now)
+        plan = modelled + seen if self.relative else modelled
+        if self.frame is not None:
+            plan = self.frame.inverse(plan, now)
+        if len(self.steps) == self.horizon:
+            return plan
+        knots = torch.tensor((0, *self.steps), device=plan.device)
+        wanted = torch.arange(1, self.horizon + 1, device=plan.device)
+        after = torch.searchsorted(knots, wanted)  # of every frame the first knot that is not before it
+        share = ((wanted - knots[after - 1]) / (knots[after] - knots[after - 1])).to(plan.dtype)[:, None]
+        plan = torch.cat([now, plan], -2)
+        return torch.lerp(plan[..., after - 1, :], plan[..., after, :], share)
 
     def encode_plan(self, history: Tensor, plan: Tensor) -> Tensor:
         """Raw plans to the normalised sequences that noise is added to.
@@ -148,17 +214,20 @@ class StatePlanner(ConditionedDiffusion):
             plan (Tensor): raw plans ``[*B, H, d]``.
 
         Returns:
-            Tensor: normalised sequences ``[*B, H, d]``.
+            Tensor: normalised sequences ``[*B, H, d]``, or of as many frames as there are steps.
 
         Raises:
             ValueError: for plans of another shape.
         """
-        self._check_sequence(plan)
-        plan = plan - history[..., -1:, :] if self.relative else plan
-        sequence = self.plan_normalizer(plan.flatten(-2))
+        if plan.shape[-2:] != (self.horizon, self.state_dim):
+            raise ValueError(
+                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self.state_dim}] (horizon, state_dim),"
+                f" got {list(plan.shape)}"
+            )
+        sequence = self.plan_normalizer(self._modelled(history, plan).flatten(-2))
         if self.forecast is not None:
             sequence = self.forecast.take_off(self.encode_history(history), sequence)
-        return sequence.unflatten(-1, (self.horizon, self.state_dim))
+        return sequence.unflatten(-1, self.sample_shape)
 
     def decode_plan(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Inverse of :meth:`encode_plan`.
@@ -173,8 +242,7 @@ class StatePlanner(ConditionedDiffusion):
         sequence = sequence.flatten(-2)
         if self.forecast is not None:
             sequence = self.forecast.add(self.encode_history(history), sequence)
-        plan = self.plan_normalizer.inverse(sequence).unflatten(-1, (self.horizon, self.state_dim))
-        return plan + history[..., -1:, :] if self.relative else plan
+        return self._whole(history, self.plan_normalizer.inverse(sequence).unflatten(-1, self.sample_shape))
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Raw plans of normalised sequences: :meth:`decode_plan`.
@@ -190,7 +258,7 @@ class StatePlanner(ConditionedDiffusion):
 
     def scale_columns(self, plan: Tensor) -> Tensor:
         """Raw plan ``[*B, H, d]`` in units of the columns' spread, the same for all its steps."""
-        return plan / self.plan_normalizer.scale.unflatten(-1, (self.horizon, self.state_dim)).mean(0)
+        return plan / self.plan_normalizer.scale.unflatten(-1, self.sample_shape).mean(0)
 
     def plan(
         self,
@@ -223,5 +291,6 @@ class StatePlanner(ConditionedDiffusion):
                 f" got {list(known.shape)}"
             )
         rest = known[..., -1:, :].expand(*known.shape[:-2], self.horizon - frames, -1)
-        fixed = self.encode_plan(history, torch.cat([known, rest], -2))[..., :frames, :]
+        fixed = self.encode_plan(history, torch.cat([known, rest], -2))
+        fixed = fixed[..., : sum(step <= frames for step in self.steps), :]
         return self.decode_plan(history, self.solve(history, noise, generator, fixed))

@@ -13,6 +13,9 @@ from torch import Tensor, nn
 
 from torchrl_koap.keys import ACTION, LATENT_ACTION
 
+# latent actions larger than this keep so many directions of their covariance: a square root of it would be gigabytes
+WIDE, DIRECTIONS = 2048, 256
+
 
 @dataclass(frozen=True)
 class RidgeFit:
@@ -74,10 +77,14 @@ class LinearActionDecoder(TensorDictModuleBase):
         super().__init__()
         self.in_keys, self.out_keys = [in_key], [out_key]
         self.linear = nn.Linear(latent_dim, action_dim)
-        self.register_buffer("covariance_root", torch.full((latent_dim, latent_dim), torch.nan))
+        self.is_wide = latent_dim > WIDE
+        width = DIRECTIONS if self.is_wide else latent_dim
+        self.register_buffer("covariance_root", torch.full((latent_dim, width), torch.nan))
         self.register_buffer("noise_variance", torch.full((action_dim,), torch.nan))
         self.register_buffer("latent_mean", torch.zeros(latent_dim))
         self.register_buffer("mean_leverage", torch.zeros(()))
+        if self.is_wide:  # variance of the directions that no label determines
+            self.register_buffer("prior_variance", torch.zeros(()))
 
     def forward(self, tensordict):
         """Writes the decoded actions."""
@@ -155,7 +162,7 @@ class LinearActionDecoder(TensorDictModuleBase):
 
         mean_x, mean_y = (x.mean(0), y.mean(0)) if bias else (torch.zeros_like(x[0]), torch.zeros_like(y[0]))
         centred, target = x - mean_x, y - mean_y
-        left, singular, right = torch.linalg.svd(centred, full_matrices=False)
+        left, singular, right = _thin_svd(centred)
         unit = centred.square().sum(-1).mean()
         unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # constant latent actions: any scale will do
         projected = left.mT @ target
@@ -173,10 +180,16 @@ class LinearActionDecoder(TensorDictModuleBase):
         self.noise_variance.copy_(held_out(best).square().mean(0))
         # a root, column by column along the singular directions: in float32 the covariance itself would drown the
         # well-determined directions (1e-4) in the rounding of the undetermined ones (1e6)
-        missing = torch.linalg.svd(right, full_matrices=True)[2][len(right) :]  # [m - r, m]
-        basis = torch.cat([right, missing])
-        spectrum = torch.cat([scaled, (best * unit).expand(len(missing))])
-        self.covariance_root.copy_(basis.mT / spectrum.sqrt())
+        if self.is_wide:
+            kept = min(DIRECTIONS, len(right))
+            known = (1 / (best * unit) - 1 / scaled[:kept]).clamp_min(0).sqrt()
+            self.covariance_root.zero_()[:, :kept] = (right[:kept].mT * known).to(self.covariance_root)
+            self.prior_variance.copy_(1 / (best * unit))
+        else:
+            missing = torch.linalg.svd(right, full_matrices=True)[2][len(right) :]  # [m - r, m]
+            basis = torch.cat([right, missing])
+            spectrum = torch.cat([scaled, (best * unit).expand(len(missing))])
+            self.covariance_root.copy_(basis.mT / spectrum.sqrt())
         self.latent_mean.copy_(mean_x)
         self.mean_leverage.fill_(1 / len(x) if bias else 0.0)
         return RidgeFit(best, errors, len(x), self.noise_variance.clone())
@@ -201,8 +214,25 @@ class LinearActionDecoder(TensorDictModuleBase):
         """
         if self.covariance_root.isnan().any():
             raise RuntimeError("predictive_variance needs a decoder fitted by fit_ridge()")
-        leverage = ((latent - self.latent_mean) @ self.covariance_root).square().sum(-1, keepdim=True)
+        centred = latent - self.latent_mean
+        leverage = (centred @ self.covariance_root).square().sum(-1, keepdim=True)
+        if self.is_wide:  # what labels say about the kept directions is taken off the prior's variance
+            prior = self.prior_variance * centred.square().sum(-1, keepdim=True)
+            leverage = (prior - leverage).clamp_min(0)
         return (1 + self.mean_leverage + leverage) * self.noise_variance
+
+
+def _thin_svd(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Singular value decomposition ``[N, r], [r], [r, m]``, of many columns by way of the rows' products.
+
+    Directions below the rounding of the products (a millionth of the largest singular value) are left out there.
+    """
+    if matrix.shape[1] <= max(WIDE, 2 * matrix.shape[0]):
+        return torch.linalg.svd(matrix, full_matrices=False)
+    values, left = torch.linalg.eigh(matrix @ matrix.mT)
+    kept = values > 1e-12 * values[-1].clamp_min(1e-300)
+    singular, left = values[kept].flip(0).sqrt(), left[:, kept].flip(-1)
+    return left, singular, (left.mT @ matrix) / singular[:, None]
 
 
 def _held_out(

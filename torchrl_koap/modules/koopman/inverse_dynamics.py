@@ -15,6 +15,7 @@ from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
+from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
 NORMALIZED_STATE = "normalized_state"
 NORMALIZED_ACTION = "normalized_action"
@@ -165,6 +166,27 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
         return torch.stack(states, -2)
 
     @torch.no_grad()
+    def fit_scales(self, windows: Tensor) -> None:
+        """Sets what is known of the inputs before training: spreads, and the linear part of a lifting that has one.
+
+        Args:
+            windows (Tensor): raw states ``[*B, T, d]``; no label is read.
+        """
+        if self.lifting.encoder_skip is not None:
+            self.lifting.fit_linear(self.normalize_state(windows))
+        super().fit_scales(windows)
+
+    @torch.no_grad()
+    def fit_unlabelled(self, windows: Tensor) -> None:
+        """Fits what is fitted in closed form to unlabelled windows after the training, where the network has any.
+
+        Args:
+            windows (Tensor): raw states ``[*B, T, d]``; no label is read.
+        """
+        if isinstance(self.latent_action, LatentActionSmoothed):
+            self.latent_action.fit_unlabelled(self.normalize_state(windows))
+
+    @torch.no_grad()
     def fit_decoder(
         self,
         windows: TensorDictBase,
@@ -222,10 +244,13 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
 
     def _tied_axis_prior(self, latent: Tensor, action: Tensor, axes: Sequence[int]) -> Tensor:
         """The decoder ``[act, m]`` that applies one and the same filter to the steps of every axis."""
-        if not isinstance(self.latent_action, LatentActionFourier) or len(axes) != action.shape[-1]:
+        if (
+            not isinstance(self.latent_action, (LatentActionFourier, LatentActionSmoothed))
+            or len(axes) != action.shape[-1]
+        ):
             raise ValueError(
-                f"tied_axes need a LatentActionFourier and one state column per action entry ({action.shape[-1]}),"
-                f" got {type(self.latent_action).__name__} and {list(axes)}"
+                f"tied_axes need a LatentActionFourier or LatentActionSmoothed and one state column per action entry"
+                f" ({action.shape[-1]}), got {type(self.latent_action).__name__} and {list(axes)}"
             )
         entries, factors = self.latent_action.steps(axes)  # [S, act]
         size = _unit(self.state_normalizer, self.latent_action.state_dim, factors)[list(axes)]

@@ -37,11 +37,14 @@ class KoopmanLifting(TensorDictModuleBase):
             decomposition; the other ``m - d`` are learned. Defaults to ``False``.
         recurrent (bool): use one LSTM layer and a linear map in both directions, so that ``z_t`` depends on
             ``x_0..x_t`` (the released code; the paper's ``g`` is a function of ``x_t`` alone). Defaults to ``False``.
+        linear_skip (bool): add a linear map in both directions, which :meth:`fit_linear` sets to the principal
+            components, so that a nearly linear lifting costs the networks nothing. Defaults to ``False``.
         in_key (NestedKey): states ``[*B, T, d]``. Defaults to ``"state"``.
         out_key (NestedKey): lifted states ``[*B, T, m]``. Defaults to ``"lifted_state"``.
 
     Raises:
-        ValueError: if ``include_state`` is asked for with ``latent_dim < state_dim`` or together with ``recurrent``.
+        ValueError: if ``include_state`` is asked for with ``latent_dim < state_dim`` or together with ``recurrent``, or
+            ``linear_skip`` with either.
 
     Examples:
         >>> import torch
@@ -63,6 +66,7 @@ class KoopmanLifting(TensorDictModuleBase):
         hidden_dims: Sequence[int] = (128, 128),
         include_state: bool = False,
         recurrent: bool = False,
+        linear_skip: bool = False,
         in_key: NestedKey = STATE,
         out_key: NestedKey = LIFTED_STATE,
     ):
@@ -71,6 +75,8 @@ class KoopmanLifting(TensorDictModuleBase):
             raise ValueError("include_state needs a lifting of single states; a recurrent one has no such columns")
         if include_state and latent_dim < state_dim:
             raise ValueError(f"include_state needs latent_dim >= state_dim, got {latent_dim} < {state_dim}")
+        if linear_skip and (include_state or recurrent):
+            raise ValueError("linear_skip is for a learned lifting of single states, not include_state or recurrent")
         self.in_keys, self.out_keys = [in_key], [out_key]
         self.state_dim, self.latent_dim, self.include_state = state_dim, latent_dim, include_state
         learned = latent_dim - state_dim if include_state else latent_dim
@@ -80,20 +86,42 @@ class KoopmanLifting(TensorDictModuleBase):
         else:
             self.encoder = MLP(state_dim, learned, num_cells=hidden_dims, activation_class=nn.ReLU) if learned else None
             self.decoder = MLP(latent_dim, state_dim, num_cells=hidden_dims, activation_class=nn.ReLU)
+        self.encoder_skip = nn.Linear(state_dim, latent_dim, bias=False) if linear_skip else None
+        self.decoder_skip = nn.Linear(latent_dim, state_dim, bias=False) if linear_skip else None
+
+    @torch.no_grad()
+    def fit_linear(self, states: Tensor) -> None:
+        """Sets the linear maps to the principal components of states ``[*B, d]``, at unit spread; no label is read.
+
+        Raises:
+            ValueError: if the lifting has no linear maps.
+        """
+        if self.encoder_skip is None:
+            raise ValueError("fit_linear needs a lifting with linear_skip=True")
+        states = states.flatten(0, -2).double()
+        centred = states - states.mean(0)
+        values, vectors = torch.linalg.eigh(centred.mT @ centred / len(centred))
+        count = min(self.latent_dim, self.state_dim)
+        components, spread = vectors[:, -count:].flip(-1), values[-count:].flip(-1).clamp_min(1e-12).sqrt()
+        components = components * torch.where(components.sum(0) < 0, -1.0, 1.0)  # their sign is the solver's whim
+        self.encoder_skip.weight.zero_()[:count] = (components / spread).mT.to(self.encoder_skip.weight)
+        self.decoder_skip.weight.zero_()[:, :count] = (components * spread).to(self.decoder_skip.weight)
 
     def encode(self, state: Tensor) -> Tensor:
         """Lifts states ``[*B, T, d]`` to ``[*B, T, m]``."""
         if state.shape[-1] != self.state_dim:
             raise ValueError(f"expected states with {self.state_dim} columns, got shape {list(state.shape)}")
         if not self.include_state:
-            return self.encoder(state)
+            lifted = self.encoder(state)
+            return lifted if self.encoder_skip is None else lifted + self.encoder_skip(state)
         if self.encoder is None:
             return state
         return torch.cat([state, self.encoder(state)], -1)
 
     def decode(self, lifted: Tensor) -> Tensor:
         """Maps lifted states ``[*B, T, m]`` back to ``[*B, T, d]``."""
-        return self.decoder(lifted)
+        state = self.decoder(lifted)
+        return state if self.decoder_skip is None else state + self.decoder_skip(lifted)
 
     def forward(self, tensordict):
         """Writes the lifted states."""

@@ -11,6 +11,7 @@ from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.koopman.inverse_dynamics import NORMALIZED_STATE, KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionLSTM, LatentActionMLP
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
+from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
 PRESETS = {
     # best measured (benchmarks/RESULTS.md): observables of the frames relative to the current one, an input matrix
@@ -26,6 +27,21 @@ PRESETS = {
         "num_features": 512,
         "num_past": 4,
         "look_ahead": (2, 3, 4, 5),
+        "clamped": False,
+    },
+    # where observations are noisy or wide: few coordinates that unlabelled windows determine, smoothed
+    # (docs/results/unlabelled_data.md)
+    "semi_supervised": {
+        "latent_dim": None,
+        "hidden_dim": 64,
+        "recurrent_lifting": False,
+        "include_state": False,
+        "structure": "dense",
+        "operator_init": "identity",
+        "network": "smoothed",
+        "num_features": 512,
+        "num_past": 8,
+        "look_ahead": (2, 3, 4, 5, 6, 7, 8),
         "clamped": False,
     },
     # the paper: g MLP, f LSTM, dense K, look-ahead k = 8
@@ -62,10 +78,14 @@ PRESETS = {
     },
 }
 
+# a smoothed lifting keeps states of at most so many columns as they are
+NARROW = 8
+
 # what only one kind of latent-action network takes, and its value where a preset does not name it
 NETWORK_OPTIONS = {
     "fourier": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0},
     "lstm": {"relative": False},
+    "smoothed": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0},
     "mlp": {"relative": False, "linear_skip": False, "dropout": 0.0},
 }
 
@@ -86,7 +106,7 @@ def make_koopman_inverse_dynamics(
         action_dim (int): size of an action.
 
     Keyword Args:
-        preset (str): ``"default"``, ``"paper"`` or ``"released"``.
+        preset (str): ``"default"``, ``"semi_supervised"``, ``"paper"`` or ``"released"``.
         state_normalizer (nn.Module, optional): see :class:`KoopmanInverseDynamics`.
         action_normalizer (nn.Module, optional): see :class:`KoopmanInverseDynamics`.
         **overrides: any entry of ``PRESETS[preset]``, and of ``NETWORK_OPTIONS`` for the network chosen.
@@ -109,25 +129,35 @@ def make_koopman_inverse_dynamics(
         lookup(choice, name, f"option of the inverse dynamics with network {network!r}:")
     choice.update(overrides)
 
-    latent_dim, hidden = choice["latent_dim"], choice["hidden_dim"]
+    hidden, skip = choice["hidden_dim"], network == "smoothed"
+    latent_dim, include_state = choice["latent_dim"], choice["include_state"]
+    if latent_dim is None:  # the state as it is where it is narrow, else a coordinate per action
+        include_state = include_state or state_dim <= NARROW
+        latent_dim = state_dim if include_state else action_dim
+    if "latent_dim" not in overrides and "include_state" not in overrides and latent_dim < state_dim:
+        include_state = False  # a preset's size is too small for a wide state to be part of the lifting
     frames = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *options)}
+    # networks are built in this order: their first weights are drawn one after the other
+    latent_action = None
     if network == "fourier":
         latent_action = LatentActionFourier(state_dim, **frames)
     elif network == "lstm":
         latent_action = LatentActionLSTM(state_dim, latent_dim, hidden_dim=hidden, **frames)
-    else:
+    elif network == "mlp":
         latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=(hidden, hidden), **frames)
     lifting = KoopmanLifting(
         state_dim,
         latent_dim,
         hidden_dims=(hidden, hidden),
-        include_state=choice["include_state"],
+        include_state=include_state,
         recurrent=choice["recurrent_lifting"],
+        linear_skip=skip and not include_state and not choice["recurrent_lifting"],
         in_key=NORMALIZED_STATE if state_normalizer is not None else STATE,
     )
+    latent_action = LatentActionSmoothed(lifting, **frames) if latent_action is None else latent_action
     operator = KoopmanOperator(
         latent_dim,
-        input_dim=latent_action.latent_dim if network == "fourier" else None,
+        input_dim=latent_action.latent_dim if network in ("fourier", "smoothed") else None,
         structure=choice["structure"],
         init=choice["operator_init"],
     )

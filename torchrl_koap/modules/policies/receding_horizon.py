@@ -115,7 +115,7 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
             self.state_of = state_columns
         else:
             self.register_buffer("state_columns", torch.as_tensor(state_columns), persistent=False)
-            self.state_of = self._select
+            self.state_of, self._widest = self._select, int(max(state_columns))
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self.history, self.replan_interval = history, replan_interval
         self.planner, self.candidates, self.choice = planner, candidates, choice
@@ -213,6 +213,11 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], action)
 
     def _select(self, observed: Tensor) -> Tensor:
+        if observed.shape[-1] <= self._widest:
+            raise ValueError(
+                f"an observation must have at least {self._widest + 1} columns (state_columns),"
+                f" got {observed.shape[-1]}"
+            )
         return observed[..., self.state_columns]
 
 

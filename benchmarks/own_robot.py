@@ -1,0 +1,149 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A robot of seven joints as its owner would teach it: arrays with few labels, about a minute of training, new goals.
+
+    python benchmarks/own_robot.py --write
+
+Joints follow delta commands with a lag; 50 demonstrations from random places to random goals, 5 of them with actions.
+The trained policy then drives ten robots to goals that no demonstration had. The forecast is what carries plans over to
+these (``--no-forecast`` shows it). ``--write`` writes ``benchmarks/results/own_robot.csv``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchrl_koap import Agent, EvalConfig, TrainConfig, evaluate, load_policy, train
+from torchrl_koap.data import controller_view, make_demonstrations, save_demonstrations, select_state
+from torchrl_koap.evaluation import load_run
+from torchrl_koap.modules import LinearInverseDynamics
+from torchrl_koap.training.action_errors import first_actions
+from torchrl_koap.training.closed_form import fit_closed_form
+
+RESULTS = Path(__file__).resolve().parent / "results" / "own_robot.csv"
+JOINTS, DEMONSTRATIONS, LABELLED, FRAMES = 7, 50, 5, 60
+REACHED = 0.05  # rad, every joint
+NAMES = [f"q{joint + 1}" for joint in range(JOINTS)] + [f"goal{joint + 1}" for joint in range(JOINTS)]
+
+
+class Arm:
+    """Several arms at once, somewhere, with a goal each."""
+
+    def __init__(self, count: int, generator: np.random.Generator):
+        self.joints, self.goals = generator.uniform(-1, 1, (2, count, JOINTS))
+        self.speed = np.zeros((count, JOINTS))
+
+    def observe(self) -> np.ndarray:
+        """Joints and goals ``[count, 14]`` (rad)."""
+        return np.concatenate([self.joints, self.goals], 1)
+
+    def step(self, action: np.ndarray) -> None:
+        """Delta commands ``[count, 7]`` (rad), followed with a lag."""
+        self.speed = 0.6 * self.speed + 0.4 * action
+        self.joints = self.joints + self.speed
+
+
+def record(seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Demonstrations: frames ``[60, 14]`` and actions ``[60, 7]`` of each."""
+    generator = np.random.default_rng(seed)
+    arm, states, actions = Arm(DEMONSTRATIONS, generator), [], []
+    for _ in range(FRAMES):
+        states.append(arm.observe())
+        actions.append(0.15 * (arm.goals - arm.joints) + generator.normal(0, 0.002, arm.joints.shape))
+        arm.step(actions[-1])
+    return list(np.stack(states, 1)), list(np.stack(actions, 1))
+
+
+def drive(run: Path, seed: int, steps: int = 200) -> np.ndarray:
+    """Distance to the goal of the worst joint of ten arms after some steps (rad)."""
+    arm, agent = Arm(10, np.random.default_rng(1000 + seed)), Agent(load_policy(run), seed=seed)
+    agent.reset()
+    for _ in range(steps):
+        arm.step(agent.act(arm.observe()))
+    return np.abs(arm.goals - arm.joints).max(1)
+
+
+def action_errors(run: Path, states: list[np.ndarray], actions: list[np.ndarray]) -> tuple[float, float]:
+    """Errors on the demonstrations whose actions were kept back, of the controller and of a ridge (rad)."""
+    trained = load_run(run)
+    every, few = (
+        controller_view(select_state(data, task.state_of), trained.columns)
+        for data, task in (
+            make_demonstrations(states, part, control_hz=30, robot=range(JOINTS)) for part in (actions, _few(actions))
+        )
+    )
+    ridge = LinearInverseDynamics(JOINTS, JOINTS).to(every["state"].dtype)
+    fit_closed_form(ridge, few)
+    errors = []
+    for model in (trained.controller, ridge):
+        predicted, true, _ = first_actions(model, every, range(LABELLED, DEMONSTRATIONS))
+        errors.append((predicted - true).square().mean().sqrt().item())
+    return errors[0], errors[1]
+
+
+def _few(actions: list[np.ndarray]) -> list[np.ndarray | None]:
+    return [taken if index < LABELLED else None for index, taken in enumerate(actions)]
+
+
+def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, Any]:
+    """Records, trains, judges and drives once."""
+    states, actions = record(seed)
+    data = save_demonstrations(
+        folder / "arm",
+        states,
+        _few(actions),
+        control_hz=30,
+        state_names=NAMES,
+        state_units="rad",
+        action_units="rad",
+        robot=NAMES[:JOINTS],
+    )
+    run = folder / "run"
+    forecast = None if options.forecast else False
+    summary = train(TrainConfig(dataset=str(data), out=run, steps=options.steps, seed=seed, forecast=forecast))
+    result = evaluate(run, EvalConfig(threads=1))
+    error, ridge = action_errors(run, states, actions)
+    away = drive(run, seed)
+    return {
+        "seed": seed,
+        "forecast": "yes" if options.forecast else "no",
+        "updates": options.steps,
+        "train_seconds": f"{sum(summary['train_seconds'].values()):.0f}",
+        "goals_reached": int((away < REACHED).sum()),
+        "goals": len(away),
+        "worst_distance_rad": f"{away.max():.3f}",
+        "action_error_rad": f"{error:.5f}",
+        "ridge_error_rad": f"{ridge:.5f}",
+        "relative_plan_error": f"{result['relative_plan_error']:.4f}",
+    }
+
+
+def main() -> None:
+    """Prints a row per training seed and, if asked, writes them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=800, help="updates of the planner")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--no-forecast", dest="forecast", action="store_false")
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = []
+    for seed in range(options.seeds):
+        with tempfile.TemporaryDirectory() as folder:
+            rows.append(measure(options, seed, Path(folder)))
+        print(", ".join(f"{name} {value}" for name, value in rows[-1].items()), flush=True)
+    if options.write:
+        with RESULTS.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The table of planners that were tried: rows of before a column was there are filled, nothing is lost."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def script():
+    spec = importlib.util.spec_from_file_location("planner_ablations", BENCHMARKS / "planner_ablations.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_rows_of_before_the_column_had_a_learned_controller(script, tmp_path):
+    table = tmp_path / "new" / "rows.csv"
+    script.append({"task": "avoiding", "n": 60}, table)
+    script.append({"task": "aligning", "n": 180, "controller": "oracle"}, table)
+    assert rows_of(table) == [
+        {"task": "avoiding", "n": "60", "controller": "learned"},
+        {"task": "aligning", "n": "180", "controller": "oracle"},
+    ]
+
+
+def test_no_column_is_lost(script, tmp_path):
+    table = tmp_path / "rows.csv"
+    script.append({"task": "avoiding", "by_hand": "a note"}, table)
+    before = table.read_bytes()
+    with pytest.raises(ValueError, match="has columns that no row gets any more: by_hand"):
+        script.append({"task": "aligning"}, table)
+    assert table.read_bytes() == before

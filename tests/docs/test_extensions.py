@@ -1,0 +1,104 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Pages that are made from the code: every tutorial, command, room and frame is on one."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "docs" / "extensions"))
+
+import api_pages  # noqa: E402
+import command_pages  # noqa: E402
+import design_page  # noqa: E402
+import pages  # noqa: E402
+import time_picture  # noqa: E402
+import tutorial_pages  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def generated(tmp_path, monkeypatch):
+    """Nothing is written into the repository."""
+    for module in (pages, tutorial_pages):
+        monkeypatch.setattr(module, "GENERATED", tmp_path)
+    return tmp_path
+
+
+def test_every_tutorial_is_a_page_with_its_code_and_text(generated):
+    tutorial_pages.write_tutorial_pages()
+    for name in tutorial_pages.ORDER:
+        page = (generated / "tutorials" / f"{name}.rst").read_text()
+        source = (ROOT / "tutorials" / f"{name}.py").read_text()
+        title = ast.get_docstring(ast.parse(source)).splitlines()[0].rstrip(".")
+        assert page.startswith(f"{title}\n{'=' * len(title)}\n")
+        assert ".. code-block:: python" in page and "Conclusion\n----------" in page
+        for line in re.findall(r"^from torchrl_koap\S* import .*$", source, re.MULTILINE):
+            assert f"   {line.strip()}" in page
+
+
+def test_a_tutorial_that_is_not_listed_is_an_error(monkeypatch):
+    monkeypatch.setattr(tutorial_pages, "ORDER", tutorial_pages.ORDER[1:])
+    with pytest.raises(ValueError, match="differ.*few_labels"):
+        tutorial_pages.write_tutorial_pages()
+
+
+def test_cells(tmp_path):
+    script = tmp_path / "story.py"
+    script.write_text('# licence\n"""\nA story.\n"""\n\n# %%\n# Head\n# ----\n# Words.\n\nx = 1\n\n# %%\n# More.\n')
+    assert tutorial_pages.cells(script) == [("text", "Head\n----\nWords."), ("code", "x = 1"), ("text", "More.")]
+
+
+def test_the_digest_is_that_of_the_code_not_of_the_text(tmp_path):
+    digests = []
+    for number, text in enumerate(("x = 1", "# a word\nx   = 1\n", "x = 2")):
+        script = tmp_path / f"{number}.py"
+        script.write_text(text)
+        digests.append(tutorial_pages.digest(script))
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_committed_output_says_of_which_code_it_is():
+    for file in tutorial_pages.OUTPUTS.glob("*.txt"):
+        assert file.stem in tutorial_pages.ORDER and file.with_suffix(".png").exists()
+        assert re.match(rf"{tutorial_pages.DIGEST}[0-9a-f]{{12}}\n", file.read_text())
+
+
+def test_rooms_stand_on_what_they_import():
+    allowed = design_page.may_import()
+    level = design_page.floors(allowed)
+    assert level["keys"] == 0 and level["commands"] == max(level.values())
+    for room, others in allowed.items():
+        assert all(level[other] < level[room] for other in others - {room, "__version__"})
+    drawing = design_page.drawing(allowed)
+    assert drawing.count("<rect") == len(allowed) and drawing.count("<line") < sum(map(len, allowed.values())) / 2
+
+
+def test_the_time_picture_has_the_numbers_of_the_code():
+    drawing = time_picture.drawing()
+    assert re.findall(r">([+-]\d+|now)<", drawing) == ["-4", "-3", "-2", "-1", "now", *(f"+{k}" for k in range(1, 15))]
+    assert drawing.count('class="done"') == 4 and drawing.count('class="now"') == 3
+
+
+def test_every_public_name_is_in_the_reference(generated):
+    api_pages.write_api_pages()
+    listed = "".join(path.read_text() for path in (generated / "api").glob("*.rst"))
+    for name in ("KoopmanInverseDynamics", "LabelBudget", "Agent", "TrainConfig", "AvoidingEnv", "KOAPLoss"):
+        assert f"``{name}``" in listed
+    assert (generated / "api" / "torchrl_koap.modules.koopman.lifting.rst").exists()
+
+
+def test_every_command_is_a_page_of_its_options(generated):
+    command_pages.write_command_pages()
+    train = (generated / "commands" / "train.rst").read_text()
+    assert "--label-fraction" in train and "Train planner and controller" in train and "\x1b" not in train
+    assert {path.stem for path in (generated / "commands").iterdir()} >= {"index", "convert", "curve", "doctor", "eval"}
+
+
+def test_tables_keep_several_lines_in_a_cell():
+    assert pages.table(("a", "b"), [("1", "x\ny")]).splitlines()[-2:] == ["     - x", "       y"]
+    assert pages.table(("a",), []) == ""

@@ -1,0 +1,123 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Disturbances of scripted operators: what they do to actions, who is disturbed, what the recording says of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.envs.experts import demonstrations
+from torchrl_koap.envs.experts.demonstrations import episodes_to_ted, record_episodes
+from torchrl_koap.envs.experts.disturbances import KINDS, Disturbances, choose_disturbed, disturbed_columns
+from torchrl_koap.tasks import get_task
+
+WANTED = np.array([[0.003, 0.01]])
+
+
+def spells_and_actions(seed, steps=600):
+    hand = Disturbances(get_task("avoiding"), [(seed, 0, 0)], [True])
+    return hand, np.stack([hand.disturb(WANTED)[0] for _ in range(steps)])
+
+
+def test_actions_change_within_the_spells_and_nowhere_else():
+    hand, done = spells_and_actions(1)
+    changed = (np.abs(done - WANTED) > 1e-12).any(1)
+    inside = np.zeros(len(done), dtype=bool)
+    for begin, end, kind in hand.spells[0]:
+        inside[begin:end] = kind != "late_turn"  # to go on as before changes nothing of a constant action
+    assert np.array_equal(changed, inside)
+    assert {kind for _, _, kind in hand.spells[0]} == set(KINDS)
+    assert all(second[0] - first[1] >= 12 for first, second in zip(hand.spells[0], hand.spells[0][1:], strict=False))
+
+
+def test_every_kind_does_what_its_name_says():
+    hand, done = spells_and_actions(1)
+    pace = np.linalg.norm(WANTED)
+    for begin, end, kind in hand.spells[0]:
+        if end > len(done):
+            continue
+        for action in done[begin:end]:
+            if kind == "slip":  # as quick as wanted, to the side
+                assert np.isclose(np.linalg.norm(action), pace)
+                assert 0.6 <= np.arccos(action @ WANTED[0] / pace**2) <= 1.4
+            if kind == "impulse":
+                assert 0.69 * pace <= np.linalg.norm(action - WANTED[0]) <= 1.41 * pace
+
+
+def test_a_late_turn_holds_the_action_of_before():
+    hand = Disturbances(get_task("avoiding"), [(1, 0, 0)], [True])
+    wanted = np.stack([np.array([[0.001 * step, 0.01]]) for step in range(400)])
+    done = np.stack([hand.disturb(action)[0] for action in wanted])
+    late = [spell for spell in hand.spells[0] if spell[2] == "late_turn" and spell[1] <= 400]
+    assert late
+    for begin, end, _ in late:
+        assert np.allclose(done[begin:end], wanted[begin - 1])
+
+
+def test_episodes_are_disturbed_by_their_own_seed_alone():
+    task = get_task("aligning")
+    both = Disturbances(task, [(0, 3, 0), (0, 4, 0)], [True, True])
+    one = Disturbances(task, [(0, 4, 0)], [True])
+    wanted = np.random.default_rng(0).normal(0, 0.01, (200, 2, 3))
+    for action in wanted:
+        assert np.array_equal(both.disturb(action)[1], one.disturb(action[1:])[0])
+    assert both.spells[1] == one.spells[0] != both.spells[0]
+    few, many = choose_disturbed(50, 0.3, seed=7), choose_disturbed(500, 0.3, seed=7)
+    assert np.array_equal(few, many[:50]) and 0.2 < many.mean() < 0.4
+    assert not choose_disturbed(9, 0, seed=0).any() and choose_disturbed(9, 1, seed=0).all()
+
+
+def test_grippers_and_heights_are_left_alone():
+    assert disturbed_columns(get_task("stacking")).tolist() == [*range(7)]
+    assert disturbed_columns(get_task("aligning")).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5, True, "all"])
+def test_a_share_that_is_none(share):
+    with pytest.raises(ValueError, match="disturbance must be the share of the episodes that are disturbed, 0 to 1"):
+        record_episodes("avoiding", 2, disturbance=share)
+
+
+@pytest.fixture(scope="module")
+def disturbed():
+    return record_episodes("avoiding", 6, seed=2, num_threads=1, disturbance=0.5)
+
+
+def test_the_recording_says_how_often(disturbed):
+    raw, report = disturbed
+    told = report.notes["disturbance"]
+    assert told["share"] == 0.5 and told["disturbed_demonstrations"] == sum(report.disturbed) > 0
+    assert told["attempts_under_disturbance"] == sum(
+        attempts for attempts, chosen in zip(report.attempts, report.disturbed, strict=True) if chosen
+    )
+    assert sum(told["kept"].values()) == sum(map(len, report.spells)) > 0
+    for spells, chosen, episode in zip(report.spells, report.disturbed, raw, strict=True):
+        assert chosen or not spells
+        assert all(0 <= begin < end <= len(episode) - 1 for begin, end, _ in spells)
+    assert "disturbed" in str(report)
+
+
+def test_undisturbed_episodes_are_those_of_a_recording_without(disturbed):
+    raw, report = disturbed
+    plain, without = record_episodes("avoiding", 6, seed=2, num_threads=1)
+    assert "disturbance" not in without.notes and "disturbed" not in str(without)
+    for index, chosen in enumerate(report.disturbed):
+        same = np.array_equal(raw[index].robot["des_c_pos"], plain[index].robot["des_c_pos"])
+        assert same == (not report.spells[index]) or chosen
+
+
+def test_recorded_actions_are_those_that_were_executed(disturbed, monkeypatch):
+    """In a slip the recorded change of the command is not what the operator wanted."""
+    done = []
+
+    class Watched(Disturbances):
+        def disturb(self, action):
+            done.append(super().disturb(action)[0])
+            return done[-1][None]
+
+    monkeypatch.setattr(demonstrations, "Disturbances", Watched)
+    raw, report = record_episodes("avoiding", 1, seed=1, num_threads=1, disturbance=1.0)
+    recorded = episodes_to_ted(raw, "avoiding", dtype=torch.float64)["action"].numpy()
+    last = np.array(done[-len(recorded) - 1 :])[1:]  # the first action is the state that the log begins with
+    assert report.attempts[0] >= 1 and np.allclose(recorded, last, atol=1e-12)

@@ -1,0 +1,111 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The oracle controller: the tool goes where the plan says, whatever the batch, and only in a simulation."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from tiny_runs import TINY, koap, write_demonstrations
+
+from torchrl_koap.envs import AvoidingEnv
+from torchrl_koap.evaluation.oracle import OracleControl
+from torchrl_koap.evaluation.rollouts import roll_out
+from torchrl_koap.modules import MLPDenoiser, RecordedPlanner, StatePlanner
+from torchrl_koap.tasks import get_task
+
+TASK = get_task("avoiding")
+STEPS = 30
+
+
+class Straight(RecordedPlanner):
+    """Plans that are handed over, one for every control step."""
+
+
+def futures_of(start, speed, horizon=14):
+    """States on a line that leaves ``start`` with ``speed`` m per control step, as plans of every step."""
+    ramp = torch.cat([torch.linspace(0, 1, 6), torch.ones(STEPS + horizon)]).cumsum(0)
+    path = start + ramp[:, None] * torch.tensor(speed)
+    return torch.stack([path[step + 1 : step + 1 + horizon] for step in range(STEPS)])
+
+
+def follow(speeds, **options):
+    planner = Straight(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2))
+    policy = OracleControl(planner, TASK, history=2, replan_interval=1, blend_decay=0.0, **options)
+    start = AvoidingEnv(1).reset()["observation"][0, 2:]
+    futures = torch.stack([futures_of(start, speed) for speed in speeds])
+    episodes = roll_out(policy, AvoidingEnv, list(range(len(speeds))), max_steps=STEPS, futures=futures)
+    return futures, episodes
+
+
+def test_the_tool_goes_where_the_plan_says():
+    futures, (episode,) = follow([(0.002, 0.006)])
+    seen = episode["next", "observation"][:, 2:]
+    planned = futures[0, :, 0]  # the next state, of every step
+    error = (seen - planned).norm(dim=-1)
+    assert error[8:].max() < 1e-3  # it covers 19 cm
+    assert (planned[-1] - planned[0]).norm() > 0.15
+
+
+def test_episodes_do_not_depend_on_the_batch():
+    _, both = follow([(0.0, 0.005), (0.003, 0.004)])
+    _, (one,) = follow([(0.003, 0.004)])
+    assert torch.allclose(both[1]["action"], one["action"], atol=1e-7)
+
+
+def test_smoothness_is_paid_for_by_tracking():
+    errors = []
+    for smoothness in (0.02, 50.0):
+        futures, (episode,) = follow([(0.0, 0.004)], smoothness=smoothness)
+        errors.append(float((episode["next", "observation"][:, 2:] - futures[0, :, 0]).norm(dim=-1)[10:].mean()))
+    assert errors[0] < 0.3 * errors[1]
+
+
+def test_wrong_uses():
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2)
+    with pytest.raises(ValueError, match="look_ahead must be 1 to 13, below the plan's, got 14"):
+        OracleControl(planner, TASK, history=2, look_ahead=14)
+    with pytest.raises(ValueError, match="execution must be 'feedback'"):
+        OracleControl(planner, TASK, history=2, execution="open_loop")
+    policy = OracleControl(planner, TASK, history=2)
+    with pytest.raises(RuntimeError, match="call attach"):
+        policy.act(torch.zeros(1, 2, 2), torch.zeros(1, 14, 2))
+    with pytest.raises(ValueError, match="needs an environment that foresees, object does not"):
+        policy.attach(object())
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    root = tmp_path_factory.mktemp("oracle")
+    write_demonstrations(root / "raw")
+    for method in ("koap", "dp"):
+        options = ("--method", method, "--controller-steps", 20, *TINY)
+        assert koap("train", "--out", root / method, "--dataset", root / "raw", *options) == 0
+    return root
+
+
+def test_the_command(runs):
+    options = ("--episodes", 1, "--threads", 1, "--no-report", "--controller", "oracle", "--out", runs / "out")
+    assert koap("eval", runs / "koap", *options) == 0
+    result = json.loads((runs / "out" / "eval.json").read_text())
+    assert result["controller"] == "oracle" and result["blend_decay"] == 0.8 and result["plan_ms"] > 0
+
+
+@pytest.mark.parametrize(
+    ("run", "option", "message"),
+    [
+        ("dp", (), "trained with method 'dp', which has no planner"),
+        ("koap", ("--execution", "open_loop"), "execution must be 'feedback'"),
+        ("koap", ("--env", "CartPole-v1"), "reads the task's own simulation; it cannot be combined with env"),
+    ],
+)
+def test_where_there_is_nothing_to_follow(runs, capsys, run, option, message):
+    assert koap("eval", runs / run, "--controller", "oracle", *option) == 1
+    assert message in capsys.readouterr().err
+    assert not (runs / run / "eval.json").exists()
+
+
+def test_an_unknown_controller(runs, capsys):
+    assert koap("eval", runs / "koap", "--controller", "oracel") == 1
+    assert "unknown controller 'oracel'; did you mean 'oracle'" in capsys.readouterr().err

@@ -1,0 +1,45 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The ridge on principal components: components of all windows, their number from held-out labels."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.modules import PrincipalInverseDynamics
+
+
+def make_windows(columns=3, num=80):
+    torch.manual_seed(0)
+    return torch.randn(num, 17, columns).cumsum(1)
+
+
+@pytest.mark.parametrize("num", [30, 400])  # fewer windows than columns, and more
+def test_components_are_those_of_the_windows(num):
+    states = make_windows(num=num)
+    model = PrincipalInverseDynamics(3, 2, counts=(8,))
+    model.fit_scales(states)
+    model.fit_unlabelled(states)
+    rows = model.reader(states, range(8, 9)).flatten(0, -2).double()
+    expected = torch.linalg.svd(rows, full_matrices=False)[2][:8]
+    torch.testing.assert_close((model.basis.double() @ expected.mT).abs(), torch.eye(8).double(), atol=1e-3, rtol=0)
+
+
+def test_the_number_of_components_is_chosen_by_labels_left_out():
+    states = make_windows()
+    windows = TensorDict({"state": states, "action": (states.roll(-2, 1) - states)[..., :2]}, [80])
+    model = PrincipalInverseDynamics(3, 2, counts=(2, 48))
+    model.fit_scales(states)
+    model.fit_unlabelled(states)
+    mask = torch.zeros(80, 17, dtype=torch.bool)
+    mask[:, 8] = True
+    fit = model.fit_decoder(windows, mask, groups=torch.arange(80) // 10)
+    assert int(model.gate.sum()) == 48 and fit.num_labels == 80
+    error = (model(windows.select("state"))["action"] - windows["action"])[:, 8].square().mean().sqrt()
+    assert error < 0.1 * windows["action"].square().mean().sqrt()
+
+
+def test_more_components_than_columns_are_not_asked_for():
+    model = PrincipalInverseDynamics(1, 1)
+    assert model.basis.shape == (16, 16)

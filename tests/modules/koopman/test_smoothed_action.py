@@ -1,0 +1,131 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Latent actions of a lifted, smoothed window, and the choice of the raw one."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.modules import KoopmanLifting, Normalizer, make_koopman_inverse_dynamics
+from torchrl_koap.modules.koopman.smoothed_action import LIFTED, RAW, LatentActionSmoothed
+from torchrl_koap.training.closed_form import fit_closed_form
+
+
+def make_infer(columns=2, dim=2, **options):
+    torch.manual_seed(0)
+    lifting = KoopmanLifting(columns, dim, include_state=columns == dim, linear_skip=columns != dim)
+    return LatentActionSmoothed(lifting, 16, num_past=8, look_ahead=range(2, 9), **options)
+
+
+def make_data(columns, episodes=12, length=30, noise=0.0):
+    generator = torch.Generator().manual_seed(1)
+    action = torch.randn(episodes, length, 2, generator=generator).cumsum(1) * 0.02
+    place = torch.cat([torch.zeros(episodes, 1, 2), action.cumsum(1)[:, :-1]], 1)
+    mix = torch.randn(2, columns, generator=generator) if columns > 2 else torch.eye(2)
+    state = place @ mix
+    state = state + noise * torch.randn(state.shape, generator=generator)
+    data = TensorDict({"state": state, "action": action}, [episodes, length])
+    data["episode"] = torch.arange(episodes)[:, None].expand(episodes, length).clone()
+    data["has_action"] = torch.ones(episodes, length, 1, dtype=torch.bool)
+    done = torch.zeros(episodes, length, 1, dtype=torch.bool)
+    done[:, -1] = True
+    data["next"] = TensorDict({"done": done, "terminated": done.clone(), "truncated": ~done & done}, [episodes, length])
+    return data.flatten(0, 1)
+
+
+def test_the_block_chosen_is_written_and_the_other_is_zero():
+    infer = make_infer()
+    windows = torch.randn(6, 17, 2).cumsum(1)
+    infer.fit_unlabelled(windows)
+    size = infer.lifted.latent_dim
+    latent = infer.infer(infer.gather(windows))
+    assert latent.shape == (6, 17, infer.latent_dim) and (latent[..., size:] == 0).all() and latent[..., :size].any()
+    infer.choose(RAW)
+    latent = infer.infer(infer.gather(windows))
+    assert (latent[..., :size] == 0).all()
+    torch.testing.assert_close(latent[..., size:], infer.raw.infer(infer.raw.gather(windows)))
+
+
+def test_the_successor_is_never_read():
+    infer = make_infer()
+    windows = torch.randn(6, 17, 2).cumsum(1)
+    infer.fit_unlabelled(windows)
+    changed = windows.clone()
+    changed[:, 9] += 1.0
+    for block in infer.choices:
+        infer.choose(block)
+        before, after = (infer.infer(infer.gather(value, range(8, 9))) for value in (windows, changed))
+        assert torch.equal(before, after)
+
+
+def test_the_choice_is_kept_by_the_weights():
+    infer, other = make_infer(), make_infer()
+    infer.choose(RAW)
+    other.load_state_dict(infer.state_dict())
+    assert other.chosen == RAW and make_infer().chosen == LIFTED
+    with pytest.raises(ValueError, match="unknown block 'wide'"):
+        infer.choose("wide")
+
+
+def test_the_raw_block_may_not_reach_further():
+    with pytest.raises(ValueError, match="reads 4 frames back and 9 ahead"):
+        make_infer(raw_look_ahead=(2, 9))
+
+
+def test_steps_of_the_state_are_where_they_are_said_to_be():
+    infer = make_infer()
+    windows = torch.randn(50, 17, 2).cumsum(1)
+    infer.fit_unlabelled(windows)
+    for block, past in ((LIFTED, 8), (RAW, 4)):
+        infer.choose(block)
+        if block == LIFTED:
+            infer.smoother.gain.copy_(torch.eye(len(infer.smoother.gain)))
+        latent = infer.infer(infer.gather(windows, range(8, 9)))[:, 0]
+        entries, factors = infer.steps([0, 1])
+        steps = latent[:, entries] * factors
+        torch.testing.assert_close(steps[:, past - 1], windows[:, 8] - windows[:, 7])
+    with pytest.raises(ValueError, match="no columns of the state"):
+        make_infer(columns=20).steps([0])
+
+
+@pytest.mark.parametrize(("columns", "noise", "block"), [(2, 0.05, LIFTED), (12, 0.05, LIFTED)])
+def test_noise_is_smoothed_away_and_the_labels_choose(columns, noise, block):
+    data = make_data(columns, noise=noise)
+    torch.manual_seed(0)
+    model = make_koopman_inverse_dynamics(
+        columns,
+        2,
+        preset="semi_supervised",
+        num_features=0,
+        state_normalizer=Normalizer.fit(data["state"], mode="standard"),
+        action_normalizer=Normalizer.fit(data["action"], mode="rms"),
+    )
+    windows = data["state"].view(12, 30, columns)
+    model.fit_scales(windows)
+    model.fit_unlabelled(windows)
+    data["has_action"] = data["has_action"] & (data["episode"] < 3)[:, None]
+    fit = fit_closed_form(model, data)
+    assert fit["block"] == block == model.latent_action.chosen
+    model.latent_action.choose(RAW)
+    raw = fit_closed_form_of_block(model, data)
+    assert fit["held_out_error"] < 0.9 * raw
+
+
+def fit_closed_form_of_block(model, data):
+    """Held-out error of the block that is chosen."""
+    from torchrl_koap.data import cut_windows
+
+    windows = cut_windows(data, 17, select=["state", "action", "has_action", "episode"], pad_before=8)
+    mask = torch.zeros(windows["has_action"].shape[:2], dtype=torch.bool)
+    mask[:, 8] = windows["has_action"][:, 8, 0]
+    fit = model.fit_decoder(windows, mask, groups=windows["episode"][:, -1], bias=False)
+    return fit.errors[fit.penalty]
+
+
+@pytest.mark.parametrize("preset", ["default", "semi_supervised", "paper", "released"])
+@pytest.mark.parametrize("columns", [2, 33, 2000])
+def test_every_preset_is_built_for_narrow_and_wide_states(preset, columns):
+    model = make_koopman_inverse_dynamics(columns, 2, preset=preset)
+    written = model(TensorDict({"state": torch.randn(1, 17, columns)}, [1]))
+    assert written["action"].shape == (1, 17, 2) and written["action"].isfinite().all()

@@ -1,0 +1,84 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Options of the planner: what they make of a task, and what is refused before any work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchrl_koap.data import flatten_trajectories, select_state
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training import TrainConfig, resolve
+from torchrl_koap.training.diffusion_builders import build_planner
+from torchrl_koap.training.planner import learn_states
+
+
+def planner_of(task="aligning", **options):
+    resolved = resolve(TrainConfig(out=Path("run"), task=task, denoiser="mlp", denoiser_width=16, **options))
+    facts = get_task(task)
+    return resolved, build_planner(resolved.planner, facts.state_dim, facts.planner_features())
+
+
+def demonstrations(task, count=3, length=25):
+    torch.manual_seed(0)
+    frames = [torch.randn(length, task.observation_dim, dtype=torch.float64).cumsum(0) / 20 for _ in range(count)]
+    steps = [frame[1:, : task.action_dim] - frame[:-1, : task.action_dim] for frame in frames]
+    return select_state(flatten_trajectories(frames, steps), task.state_of)
+
+
+@pytest.mark.parametrize("name", ["target", "box"])
+def test_the_frame_of_an_object(name):
+    task = get_task("aligning")
+    _, planner = planner_of(frame=name)
+    state = task.state_of(torch.randn(4, 20))[:, None]
+    seen = planner.frame(state, state)[:, 0]
+    place, yaw = (task.state_slices[f"{name}_{part}"] for part in ("position", "quaternion"))
+    assert torch.allclose(seen[:, place], torch.zeros(4, 2), atol=1e-6)
+    assert torch.allclose(seen[:, yaw], torch.tensor([1.0, 0.0]).expand(4, 2), atol=1e-5)
+    assert torch.allclose(planner.frame.inverse(seen[:, None], state), state, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "shape"),
+    [
+        ({"frame": "target"}, (2, 14, 14)),
+        ({"plan_steps": (1, 2, 4, 8, 20)}, (2, 20, 5)),
+        ({"observed_frames": 1}, (1, 14, 14)),
+        ({"frame": "box", "plan_steps": (2, 9), "observed_frames": 1}, (1, 9, 2)),
+    ],
+)
+def test_a_planner_learns_with_them(options, shape):
+    resolved, planner = planner_of(steps=2, batch_size=4, **options)
+    assert (planner.history, planner.horizon, len(planner.steps)) == shape
+    before = planner.denoiser.last.weight.clone()
+    losses = learn_states(planner, demonstrations(resolved.task), resolved.task, resolved.options)
+    assert 0 < losses["loss_planner"] < 100 and not torch.equal(before, planner.denoiser.last.weight)
+
+
+def test_without_them_the_entry_is_as_before():
+    resolved, _ = planner_of()
+    assert not {"frame", "plan_steps"} & set(resolved.planner)
+    assert (resolved.planner["history"], resolved.planner["horizon"]) == (2, 14)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frame": "tray"}, "unknown frame 'tray'"),
+        ({"frame": "box", "task": "sorting"}, "in task 'sorting' the place on the table matters"),
+        ({"observed_frames": 3}, "observed_frames must be 1 to 2, got 3"),
+        ({"observed_frames": 0}, "observed_frames must be 1 to 2, got 0"),
+        ({"plan_steps": (1, 2)}, "plan_steps must end at 4 or more control steps"),
+        ({"frame": "box", "method": "dp"}, "frame is the planner's, which method 'dp' does not have"),
+    ],
+)
+def test_what_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        planner_of(**options)
+
+
+def test_steps_out_of_order_are_refused_when_the_networks_are_made():
+    with pytest.raises(ValueError, match="steps must rise"):
+        planner_of(plan_steps=(4, 2, 14))

@@ -1,0 +1,154 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The planner with the simulator's own inverse map instead of a learned controller: what fails then is the planner's.
+
+Which command takes the tool where the plan says is found by trying, in the simulation of the episode itself: what
+happens if the command is held, and what if it is changed by a little in one direction. An arm under its tracking law
+answers nearly in proportion, so the commands of the next steps follow by least squares (dynamic matrix control: Cutler
+and Ramaker, 1980), of which the first one is executed::
+
+    y_k = held_k + sum_{j < k} S_{k-j} a_j         state after k steps, S the response to a step of the command
+    min_a  sum_k |y_k - plan_k|^2  +  smoothness sum_j |a_j - a_{j-1}|^2
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_koap.modules.diffusion.planner import StatePlanner
+from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
+from torchrl_koap.tasks import Task
+
+LOOK_AHEAD = 4  # control steps over which the plan is followed; the arm needs about three to follow a command
+SMOOTHNESS = 0.02  # weight of a change of the action against a distance from the plan
+_REFRESH = 8  # control steps after which the response, which changes with the arm's posture, is tried again
+_PUSH = {"m": 0.004, "rad": 0.01}  # change of a command by which its effect is measured
+
+
+class OracleControl(PlanThenControl):
+    """Plans states, and executes the commands that take the simulated robot there.
+
+    It reads the simulation, not the observation: nothing that a robot could have, but a ceiling for every controller
+    under the same planner.
+
+    Args:
+        planner (StatePlanner): plans states from the last observed ones.
+        task (Task): the task; its environment must be one of :class:`~torchrl_koap.envs.ManipulationEnv`.
+
+    Keyword Args:
+        history (int): observed frames handed over.
+        look_ahead (int): control steps over which the plan is followed.
+        smoothness (float): weight of changes of the action.
+        **options: as for :class:`~torchrl_koap.modules.PlanThenControl`.
+
+    Raises:
+        ValueError: if the plan is too short, or the execution is not ``"feedback"``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.evaluation.oracle import OracleControl
+        >>> from torchrl_koap.evaluation.rollouts import roll_out
+        >>> from torchrl_koap.envs import AvoidingEnv
+        >>> from torchrl_koap.modules import MLPDenoiser, StatePlanner
+        >>> from torchrl_koap.tasks import get_task
+        >>> _ = torch.manual_seed(0)
+        >>> planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2, num_steps=2)
+        >>> policy = OracleControl(planner, get_task("avoiding"), history=2)
+        >>> roll_out(policy, AvoidingEnv, [0], max_steps=3)[0]["action"].shape
+        torch.Size([3, 2])
+    """
+
+    def __init__(
+        self,
+        planner: StatePlanner,
+        task: Task,
+        *,
+        history: int,
+        look_ahead: int = LOOK_AHEAD,
+        smoothness: float = SMOOTHNESS,
+        **options: Any,
+    ):
+        if options.get("execution", "feedback") != "feedback":
+            raise ValueError(f"the oracle controller looks at every step: execution must be 'feedback', got {options}")
+        if not 1 <= look_ahead < planner.horizon:
+            raise ValueError(f"look_ahead must be 1 to {planner.horizon - 1}, below the plan's, got {look_ahead}")
+        super().__init__(planner, nn.Identity(), state_columns=task.state_of, history=history, **options)
+        self.task, self.look_ahead, self.smoothness = task, look_ahead, smoothness
+        self._changes = [i for i, name in enumerate(task.actions) if name not in task.absolute_actions]
+        self._moved = list(task.actuated or task.robot[: len(self._changes)])
+        if len(self._moved) != len(self._changes):
+            raise ValueError(f"task {task.name!r} does not say which state columns its actions move (Task.actuated)")
+        units = list(task.actions.values())
+        self._pushes = np.array([_PUSH.get(units[i], 0.01) for i in self._changes])
+        self._env = None
+
+    def attach(self, env: EnvBase) -> None:
+        """Tells the environment whose episodes are about to begin.
+
+        Args:
+            env (EnvBase): a batch of environments, whose rows are those of the tensordicts to come.
+
+        Raises:
+            ValueError: if it cannot be looked ahead in.
+        """
+        base = env.base_env if isinstance(env, TransformedEnv) else env
+        if not hasattr(base, "foresee"):
+            raise ValueError(
+                f"the oracle controller needs an environment that foresees, {type(base).__name__} does not"
+            )
+        count, size = base.batch_size[0], len(self._changes)
+        self._env, self._time, self._last = base, 0, np.zeros((count, size))
+        self._matrix = np.zeros((count, self.look_ahead * size, self.look_ahead * size))
+
+    def act(self, history: Tensor, cached: Tensor) -> Tensor:
+        """The action whose effect is nearest to the plan.
+
+        Args:
+            history (Tensor): observed states ``[n, history, d]``, raw units.
+            cached (Tensor): what remains of the plan ``[n, H, d]``; its first state is the present one, which is
+                observed a step late.
+
+        Raises:
+            RuntimeError: before :meth:`attach`.
+        """
+        if self._env is None:
+            raise RuntimeError("the oracle controller does not know its environment: call attach(env) first")
+        plan = blend_plan(history, cached, self.blend_decay)
+        action = np.zeros((len(plan), self.task.action_dim))
+        states = torch.cat([history, cached], -2)
+        if self.action_rule is not None:
+            zeros = states.new_zeros(*states.shape[:-1], self.task.action_dim)
+            action = self.action_rule(states, zeros)[:, self.history - 1].double().cpu().numpy()
+            action[:, self._changes] = 0.0
+        rows = np.flatnonzero(~self._env.over)
+        if not len(rows):
+            return torch.as_tensor(action, dtype=cached.dtype, device=cached.device)
+        wanted = plan[rows, 1 : self.look_ahead + 1][..., self._moved].double().cpu().numpy()
+        action[np.ix_(rows, self._changes)] = self._last[rows] = self._solve(rows, action[rows], wanted)
+        return torch.as_tensor(action, dtype=cached.dtype, device=cached.device)
+
+    def _solve(self, rows: np.ndarray, held: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """First actions ``[n, a]`` of those that lead along ``wanted [n, k, a]``; ``held [n, act]`` leave commands."""
+        steps, size = self.look_ahead, len(self._changes)
+        refresh = self._time % _REFRESH == 0
+        tries = np.tile(held[None, :, None], (1 + size * refresh, 1, steps, 1))
+        for entry in range(size * refresh):
+            tries[1 + entry, :, 0, self._changes[entry]] += self._pushes[entry]
+        seen = self._env.foresee(tries, rows)
+        moved = self.task.state_of(torch.from_numpy(seen))[..., self._moved].numpy()  # [1 + a, n, k, a]
+        if refresh:
+            response = (moved[1:] - moved[0]) / self._pushes[:, None, None, None]  # to a step of one entry
+            matrix = np.zeros((len(rows), steps, size, steps, size))
+            for begin in range(steps):
+                matrix[:, begin:, :, begin] = response[:, :, : steps - begin].transpose(1, 2, 3, 0)
+            self._matrix[rows] = matrix.reshape(len(rows), steps * size, steps * size)
+        self._time += 1
+        matrix, rough = self._matrix[rows], np.kron(np.eye(steps) - np.eye(steps, k=-1), np.eye(size))
+        normal = matrix.transpose(0, 2, 1) @ matrix + self.smoothness * rough.T @ rough
+        goal = (matrix.transpose(0, 2, 1) @ (wanted - moved[0]).reshape(len(rows), -1, 1))[..., 0]
+        goal[:, :size] += self.smoothness * self._last[rows]
+        return np.linalg.solve(normal, goal[..., None])[:, :size, 0]

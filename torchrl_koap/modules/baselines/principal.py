@@ -1,0 +1,131 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Ridge regression on principal components of unlabelled windows: what linear unsupervised learning gives by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
+from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.time_alignment import FrameGatherer
+
+COUNTS = (2, 4, 8, 16, 32, 64)
+
+
+class PrincipalInverseDynamics(LatentInverseDynamics):
+    """Ridge regression from the leading principal components of what a window holds: a control for latent actions.
+
+    A window is the present frame and the scaled steps around it, those that ``semi_supervised`` reads. The components
+    come from all windows, labelled or not (:meth:`fit_unlabelled`); their number from the held-out labelled error.
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        action_dim (int): size of an action.
+
+    Keyword Args:
+        counts (sequence of int): numbers of components to choose among. Defaults to ``(2, 4, 8, 16, 32, 64)``.
+        num_past (int): frames before the present one. Defaults to ``8``.
+        look_ahead (sequence of int): offsets ``k >= 2``. Defaults to ``(2, ..., 8)``.
+        default_penalty (float): ridge where fewer than three trajectories have labels. Defaults to ``0.15``.
+        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules.baselines.principal import PrincipalInverseDynamics
+        >>> states = torch.randn(60, 17, 3).cumsum(1)
+        >>> model = PrincipalInverseDynamics(3, 2, counts=(4, 48))
+        >>> model.fit_scales(states), model.fit_unlabelled(states)
+        (None, None)
+        >>> windows = TensorDict({"state": states, "action": (states.roll(-2, 1) - states)[..., :2]}, [60])
+        >>> fit = model.fit_decoder(windows, torch.ones(60, 17, dtype=torch.bool))
+        >>> int(model.gate.sum()), model(windows.select("state"))["action"].shape
+        (48, torch.Size([60, 17, 2]))
+    """
+
+    basis: Tensor
+    gate: Tensor
+
+    def __init__(
+        self,
+        state_dim: int,
+        action_dim: int,
+        *,
+        counts: Sequence[int] = COUNTS,
+        num_past: int = 8,
+        look_ahead: Sequence[int] = (2, 3, 4, 5, 6, 7, 8),
+        default_penalty: float = 0.15,
+        **kwargs,
+    ):
+        reader = FrameGatherer(state_dim, num_past=num_past, look_ahead=look_ahead)
+        self._counts = tuple(sorted({min(count, reader.num_features) for count in counts}))
+        super().__init__(reader, LinearActionDecoder(self._counts[-1], action_dim), **kwargs)
+        self.default_penalty = default_penalty
+        self.register_buffer("basis", torch.eye(self._counts[-1], reader.num_features))
+        self.register_buffer("gate", torch.ones(self._counts[-1]))
+
+    def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """The components ``[*B, len(frames), count]`` of windows of raw states; those not chosen are 0."""
+        return self.reader(self.normalize_state(state), frames) @ self.basis.mT * self.gate
+
+    def decode(self, latent: Tensor) -> Tensor:
+        """Actions in normalised units."""
+        return self.action_decoder.linear(latent)
+
+    @torch.no_grad()
+    def fit_unlabelled(self, windows: Tensor, *, most: int = 4096) -> None:
+        """Sets the components to those of windows of raw states ``[N, T, d]``; no label is read.
+
+        Args:
+            windows (Tensor): all windows.
+
+        Keyword Args:
+            most (int): windows used, evenly spaced among all.
+        """
+        windows = windows[:: max(1, len(windows) // most)]
+        now = self.reader.num_past
+        rows = self.reader(self.normalize_state(windows), range(now, now + 1)).flatten(0, -2).double()
+        if rows.shape[0] < rows.shape[1]:
+            values, vectors = torch.linalg.eigh(rows @ rows.mT)
+            count = min(len(self.basis), len(values))
+            found = (vectors[:, -count:].flip(-1).mT @ rows) / values[-count:].flip(0).clamp_min(1e-18).sqrt()[:, None]
+        else:
+            found = torch.linalg.eigh(rows.mT @ rows)[1][:, -len(self.basis) :].flip(-1).mT
+        self.basis.zero_()[: len(found)] = found.to(self.basis)
+
+    @torch.no_grad()
+    def fit_decoder(self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None) -> RidgeFit:
+        """Fits the ridge for every number of components and keeps the one with the smallest held-out error.
+
+        Args:
+            windows (TensorDictBase): raw states ``[N, T, d]`` and actions ``[N, T, act]``.
+            mask (Tensor): labelled frames, bool ``[N, T]``.
+            groups (Tensor, optional): trajectory of every window, int64 ``[N]``, left out together.
+
+        Returns:
+            RidgeFit: of the number chosen.
+
+        Raises:
+            ValueError: if no labelled frame lies in the span.
+        """
+        span = self.span(mask.shape[-1])
+        frames = slice(span.start, span.stop)
+        rows = mask[:, frames].any(-1)
+        mask = mask[rows][:, frames]
+        self.gate.fill_(1.0)
+        latent = self.infer(windows.get(self.in_key)[rows], span)
+        action = windows.get(self.out_key)[rows][:, frames]
+        action = self.normalize_action(torch.where(mask.unsqueeze(-1), action, 0.0))
+        groups = None if groups is None else groups[rows].unsqueeze(-1).expand_as(mask)
+
+        def fit(count: int) -> RidgeFit:
+            self.gate.copy_(torch.arange(len(self.gate), device=self.gate.device) < count)
+            options = {"groups": groups, "default_penalty": self.default_penalty, "bias": False}
+            return self.action_decoder.fit_ridge(latent * self.gate, action, mask, **options)
+
+        fits = {count: fit(count) for count in self._counts}
+        return fit(min(fits, key=lambda count: fits[count].errors[fits[count].penalty]))

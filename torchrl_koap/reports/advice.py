@@ -1,0 +1,260 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What to try next, from the numbers of a run: one small function per rule, each with its reason in figures.
+
+A rule speaks where its numbers are there and point somewhere, and is silent otherwise. What it proposes is a command
+that tells more or a change that was measured to matter (``docs/results``); that it helps in this case is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torchrl_koap.reports.html import number
+
+GOOD = 0.9  # a success rate above which nothing is looked for
+APART = 0.2  # success rates that differ by more than chance of a few dozen rollouts
+WIDE = 0.25  # width of a 95 % interval that hardly tells two methods apart
+FEW_MODES = 0.7  # of the entropy that an even choice would have
+FEW_LABELS = 300  # labelled transitions
+CONTROLS = ("koap_untrained", "linear_steps", "linear")
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Something to try.
+
+    Args:
+        finding (str): what the numbers say.
+        proposal (str): what may help, or tell more.
+        command (str): the command line, with ``{run}`` for the run directory; empty if there is none.
+
+    Examples:
+        >>> from torchrl_koap.reports.advice import Advice
+        >>> Advice("12 rollouts", "roll out more often", "koap eval {run} --episodes 60").command
+        'koap eval {run} --episodes 60'
+    """
+
+    finding: str
+    proposal: str
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """What is known of a run; absent files are empty.
+
+    Args:
+        config (mapping): ``config.json``.
+        summary (mapping): ``summary.json``.
+        evaluation (mapping): ``eval.json``.
+        inspection (mapping): ``inspect.json``.
+        even_entropy (float, optional): entropy that an even choice of modes would average with as many successes.
+
+    Examples:
+        >>> from torchrl_koap.reports.advice import Numbers
+        >>> Numbers(evaluation={"success_rate": 0.5}).of("success_rate")
+        0.5
+    """
+
+    config: Mapping[str, Any] = ()  # type: ignore[assignment]
+    summary: Mapping[str, Any] = ()  # type: ignore[assignment]
+    evaluation: Mapping[str, Any] = ()  # type: ignore[assignment]
+    inspection: Mapping[str, Any] = ()  # type: ignore[assignment]
+    even_entropy: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("config", "summary", "evaluation", "inspection"):
+            object.__setattr__(self, name, dict(getattr(self, name)))
+
+    def of(self, name: str) -> float | None:
+        """A number of the evaluation, None if it is not there."""
+        return number(self.evaluation.get(name))
+
+    def rate(self, experiment: str) -> float | None:
+        """Success of an experiment of ``koap inspect``, None if it was not made."""
+        found = self.inspection.get(experiment)
+        return number(found.get("rate")) if isinstance(found, Mapping) else None
+
+    @property
+    def labels(self) -> float | None:
+        """Labelled transitions, None if nobody counted."""
+        account = self.summary.get("labels")
+        return number(account.get("labelled_transitions")) if isinstance(account, Mapping) else None
+
+
+def advice(numbers: Numbers) -> list[Advice]:
+    """Everything that the rules have to say, most telling first.
+
+    Args:
+        numbers (Numbers): what is known of the run.
+
+    Examples:
+        >>> from torchrl_koap.reports.advice import Numbers, advice
+        >>> numbers = Numbers(evaluation={"success_rate": 0.5, "success_low": 0.2, "success_high": 0.8, "episodes": 8})
+        >>> [item.command for item in advice(numbers)][-1]
+        'koap eval {run} --episodes 60 --seed 100'
+    """
+    return [item for rule in RULES for item in [rule(numbers)] if item is not None]
+
+
+def which_part(numbers: Numbers) -> Advice | None:
+    """The closed loop fails and nobody has looked where."""
+    success = numbers.of("success_rate")
+    if success is None or success >= GOOD or numbers.rate("imagined") is not None or _is_policy(numbers):
+        return None
+    finding = f"success is {_percent(success)}; whether planner or controller fails is not known"
+    return Advice(finding, "let each of them work alone", "koap inspect {run}")
+
+
+def planner_imagines_failure(numbers: Numbers) -> Advice | None:
+    """The planner does not reach the goal even when its plans come true."""
+    imagined = numbers.rate("imagined")
+    if imagined is None or imagined >= GOOD:
+        return None
+    return Advice(
+        f"plans that come true reach the goal in {_percent(imagined)} only: the planner is what fails, not the labels",
+        "more updates (--steps), more demonstrations, or a wide MLP (--denoiser mlp --denoiser-width 512); more labels"
+        " will not help",
+    )
+
+
+def plans_are_not_followed(numbers: Numbers) -> Advice | None:
+    """Imagined high, closed loop low: what lies between a plan and its execution."""
+    imagined, followed, closed = (numbers.rate(name) for name in ("imagined", "followed", "closed_loop"))
+    if imagined is None or closed is None or imagined < GOOD or imagined - closed < APART:
+        return None
+    seen = f"plans alone reach the goal in {_percent(imagined)}, the closed loop in {_percent(closed)}"
+    if followed is not None and followed < GOOD:
+        return Advice(
+            f"{seen}, recorded futures are followed in {_percent(followed)}: the controller is what fails",
+            "more labels, those that teach the decoder most first",
+            "koap suggest {run} --count 5",
+        )
+    return Advice(
+        f"{seen}; recorded futures are followed well: executed states leave what the planner was trained on",
+        "train the planner with larger disturbances (--recovery-sigma, twice the present one)",
+    )
+
+
+def one_way_only(numbers: Numbers) -> Advice | None:
+    """Low entropy of the modes."""
+    entropy = numbers.of("mode_entropy")
+    entropy = numbers.of("pooled_mode_entropy") if entropy is None else entropy
+    success, even = numbers.of("success_rate"), numbers.even_entropy
+    if entropy is None or not even or not success or entropy >= FEW_MODES * even:
+        return None
+    seen = f"the entropy of the modes is {entropy:.2f}, an even choice would average {even:.2f}"
+    if _is_policy(numbers):
+        return Advice(
+            f"{seen}: a policy of its own knows the labelled ways only",
+            "a method that plans learns the ways from all demonstrations (--method koap)",
+        )
+    candidates = numbers.of("candidates") or 1
+    if candidates > 1:
+        return Advice(
+            f"{seen}, with {candidates:.0f} candidates per plan",
+            "candidates prefer to go on as before: fewer of them leave more variety",
+            "koap eval {run} --candidates 1",
+        )
+    return Advice(
+        seen,
+        "look at the modes of the demonstrations first; if the planner has lost some, train it longer (--steps)",
+        "koap inspect {run}",
+    )
+
+
+def control_is_as_good(numbers: Numbers) -> Advice | None:
+    """A plain ridge errs no more than the method."""
+    method = numbers.config.get("method")
+    for name, errors in numbers.summary.items():
+        if not (name.startswith("action_error") and isinstance(errors, Mapping)):
+            continue
+        own, ridge = number(errors.get(method)), number(errors.get("ridge"))
+        if own is not None and ridge is not None and own >= ridge and method not in CONTROLS:
+            unit = name.removeprefix("action_error").removeprefix("_")
+            return Advice(
+                f"the action error of {method} is {own:.3g} {unit}, that of a plain ridge {ridge:.3g} {unit}".strip(),
+                "the ridge is simpler; compare both in closed loop before keeping either",
+                "koap curve --methods koap,koap_untrained,linear_steps,linear --out curves/compare",
+            )
+    return None
+
+
+def few_labels(numbers: Numbers) -> Advice | None:
+    """Little is labelled, and it does not succeed yet."""
+    labels, success = numbers.labels, numbers.of("success_rate")
+    planner_fails = (numbers.rate("imagined") or 1.0) < GOOD
+    if labels is None or labels >= FEW_LABELS or success is None or success >= GOOD or planner_fails:
+        return None
+    if not str(numbers.config.get("method", "")).startswith("koap"):
+        return None
+    return Advice(
+        f"{labels:,.0f} transitions are labelled",
+        "a few more labels may do, where they teach the decoder most",
+        "koap suggest {run} --count 5",
+    )
+
+
+def worse_than_standing_still(numbers: Numbers) -> Advice | None:
+    """Judged on recorded data: plans or actions are no better than a trivial guess."""
+    plan, action = numbers.of("relative_plan_error"), numbers.of("relative_action_error")
+    if plan is not None and plan >= 1:
+        return Advice(
+            f"plans lie {plan:.2f} times as far from the recordings as standing still would",
+            "more updates (--steps), or displacements instead of positions (--relative)",
+        )
+    if action is not None and action >= 1:
+        return Advice(
+            f"actions err {action:.2f} times as much as their mean would",
+            "are labels and states of the same moment? If so: more labels",
+            "koap suggest {run} --count 5",
+        )
+    return None
+
+
+def too_slow(numbers: Numbers) -> Advice | None:
+    """A plan takes longer than the robot waits."""
+    plan, control = numbers.of("plan_ms"), number(numbers.config.get("control_hz"))
+    if plan is None or control is None or plan < 1000 / control:
+        return None
+    return Advice(
+        f"a plan takes {plan:.0f} ms, a control step {1000 / control:.0f} ms",
+        "plan in a thread (AsynchronousAgent), or with fewer solver steps",
+        "koap latency {run}",
+    )
+
+
+def few_rollouts(numbers: Numbers) -> Advice | None:
+    """The interval is too wide to tell anything from anything."""
+    low, high, episodes = (numbers.of(name) for name in ("success_low", "success_high", "episodes"))
+    if low is None or high is None or episodes is None or high - low <= WIDE or episodes >= 60:
+        return None
+    return Advice(
+        f"the interval of the success is {100 * (high - low):.0f} points wide with {episodes:.0f} rollouts",
+        "more rollouts before anything is concluded",
+        "koap eval {run} --episodes 60 --seed 100",
+    )
+
+
+RULES: tuple[Callable[[Numbers], Advice | None], ...] = (
+    worse_than_standing_still,
+    planner_imagines_failure,
+    plans_are_not_followed,
+    which_part,
+    few_labels,
+    one_way_only,
+    control_is_as_good,
+    too_slow,
+    few_rollouts,
+)
+
+
+def _is_policy(numbers: Numbers) -> bool:
+    """Whether the method acts without a planner, as far as the summary tells."""
+    return number(numbers.summary.get("planner_parameters")) == 0
+
+
+def _percent(rate: float) -> str:
+    return f"{100 * rate:.0f} %"
