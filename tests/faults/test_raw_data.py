@@ -198,6 +198,7 @@ ABOUT = {
 
 def ted() -> Iterator[Fault]:
     call = ("validate", "{ted}")
+    train = ("train", "--out", "{out}", "--dataset", "{ted}", "--steps", "2", "--threads", "1")
     files = ("about.json", "steps/meta.json", "steps/action.memmap", "steps/next/meta.json", "steps/next/done.memmap")
     for name in files:
         for kind, damage in DAMAGE.items():
@@ -212,7 +213,12 @@ def ted() -> Iterator[Fault]:
     for name, values in ABOUT.items():
         for number, value in enumerate(values):
             damage = lambda path, n=name, v=value: edit_json(path, lambda about: about.update({n: v}))  # noqa: E731
-            yield Fault(f"ted about.json {name} {number}", call, "about.json|steps|task|ted", at("about.json", damage))
+            yield Fault(
+                f"ted about.json {name} {number}",
+                train if name == "definition" else call,
+                "about.json|steps|task|ted",
+                at("about.json", damage),
+            )
     outside = {
         "a link": lambda steps: link(steps / "action.memmap"),
         "a folder that is a link": link_folder,
