@@ -31,8 +31,7 @@ from torchrl_koap.modules import InverseDynamics, Normalizer
 from torchrl_koap.tasks import Task
 from torchrl_koap.training import fit_controller
 from torchrl_koap.training.action_errors import first_actions, rmse
-from torchrl_koap.training.closed_form import fit_closed_form
-from torchrl_koap.training.controller import _likely_axes
+from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.progress import progress_bar
 
@@ -86,7 +85,7 @@ def refit(controller: InverseDynamics, data: TensorDictBase, task: Task) -> tupl
     controller = copy.deepcopy(controller)
     mode = Normalizer.fit(data["action"], mode="rms", mask=data["has_action"])
     controller.action_normalizer.load_state_dict(mode.state_dict())
-    axes = _likely_axes(task, task.controller_columns("robot"))
+    axes = likely_axes(task, task.controller_columns("robot"))
     return controller, fit_closed_form(controller, data, guessed_axes=axes)
 
 
