@@ -1,0 +1,70 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Rows of the tables on unlabelled data: errors by method and labels, gains paired by seed."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+
+from result_rows import read_rows
+from scipy.stats import t as student
+from unlabelled_picture import CONTROLS, REGIMES
+
+
+def unlabelled_cells(regime: str) -> dict[tuple[str, int], dict[int, float]]:
+    """Action errors of a regime by method and number of labelled trajectories, then by seed."""
+    found: dict[tuple[str, int], dict[int, float]] = {}
+    for row in read_rows("unlabelled_data", regime=regime):
+        found.setdefault((row["method"], int(row["labels"])), {})[int(row["seed"])] = float(row["error"])
+    return found
+
+
+def unlabelled_rows(regime: str) -> list[list[str]]:
+    """A row per method of a regime: mean error and range over seeds for every number of labelled trajectories."""
+    cells = unlabelled_cells(regime)
+    labels = sorted({number for _, number in cells})
+    body = []
+    for method in dict.fromkeys(method for method, _ in cells):
+        row = [f"`{method}`"]
+        for number in labels:
+            errors = list(cells.get((method, number), {}).values())
+            ends = f"{min(errors):.2f}-{max(errors):.2f}, {len(errors)} seeds" if errors else ""
+            row.append(f"{statistics.fmean(errors):.2f} ({ends})" if errors else "not run")
+        body.append(row)
+    return body
+
+
+def unlabelled_labels(regime: str) -> list[str]:
+    """Headings of :func:`unlabelled_rows`."""
+    return [f"{number} labelled" for number in sorted({number for _, number in unlabelled_cells(regime)})]
+
+
+def unlabelled_missing() -> str:
+    """Regimes and controls of the study that the table has no row of."""
+    found = read_rows("unlabelled_data")
+    regimes = [REGIMES[name] for name in REGIMES if name not in {row["regime"] for row in found}]
+    methods = [f"`{name}`" for name in CONTROLS if name not in {row["method"] for row in found}]
+    return ", ".join(regimes + methods) or "nothing of the study's table"
+
+
+def unlabelled_gains(regimes: Sequence[str], against: Sequence[str]) -> list[list[str]]:
+    """How much smaller the error of ``semi_supervised`` is, in percent, paired by seed, with a 95 % t-interval."""
+    body = []
+    for regime in regimes:
+        cells = unlabelled_cells(regime)
+        for number in sorted({number for _, number in cells}):
+            row = [REGIMES[regime], str(number)]
+            for method in against:
+                own, other = (cells.get((name, number), {}) for name in ("semi_supervised", method))
+                row.append(paired_gain([100 * (1 - own[seed] / other[seed]) for seed in own.keys() & other.keys()]))
+            body.append(row)
+    return body
+
+
+def paired_gain(gains: Sequence[float]) -> str:
+    """Mean of some gains in percent with its 95 % t-interval; no interval below three."""
+    if len(gains) < 3:
+        return f"{statistics.fmean(gains):+.0f} % ({len(gains)} seeds)" if gains else "not run"
+    half = student.ppf(0.975, len(gains) - 1) * statistics.stdev(gains) / len(gains) ** 0.5
+    mean = statistics.fmean(gains)
+    return f"{mean:+.0f} % ({mean - half:+.0f} to {mean + half:+.0f})"
