@@ -146,8 +146,8 @@ figure.savefig("own_robot.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# Sixty trajectories showed where to go and three how to get there. Of the trials that miss, most stop short of the
-# goal: a longer training of the planner (the default is more than ten times as long) is the first thing to try. The
-# time per tick is that of the machine that made this page, beside other work; an ``AsynchronousAgent`` plans in a
-# thread. From the shell it is ``koap convert``, ``koap train`` and ``koap eval``, which judge plans and commands on
-# trajectories that were held out, and say so in a report.
+# Sixty trajectories showed where to go and three how to get there. For the trials that miss, a longer training of the
+# planner (the default is more than ten times as long) is the first thing to try. The time per tick is that of the
+# machine that made this page, beside other work; an ``AsynchronousAgent`` plans in a thread. From the shell it is
+# ``koap convert``, ``koap train`` and ``koap eval``, which judge plans and commands on trajectories that were held
+# out, and say so in a report.
