@@ -83,7 +83,7 @@ def demonstrate(env, seed):
     return np.array(rows), np.array(forces)
 
 
-env = gymnasium.make("FlatMaze-v0").unwrapped
+env = FlatMaze()
 recordings = [demonstrate(env, seed) for seed in range(40)]
 states = [rows for rows, _ in recordings]
 actions = [forces if index % 13 == 0 and index < 39 else None for index, (_, forces) in enumerate(recordings)]

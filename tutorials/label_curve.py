@@ -46,7 +46,7 @@ if __name__ == "__main__":  # workers import this file
         launcher=launcher,
     )
     result = run_curve(config)
-    print(f"launcher {launcher}: {result['done']} cells done, {len(result['failed'])} failed")
+    print(f"launcher {launcher}: {result['done']} cells done, {result['failed']} failed")
 
     # %%
     # A call with the same folder does what is missing, which now is nothing. A larger budget would add its cells only.

@@ -159,7 +159,9 @@ def fit_controller(
         method (str): a name in :data:`~torchrl_koap.training.METHODS` of a controller, such as ``"koap"``,
             ``"linear"`` (ridge on raw frames) or ``"dd"`` (supervised).
         steps (int): updates; with 0 only the closed form is fitted, if the method has one.
-        seed, device, progress: as for :func:`fit_planner`.
+        seed (int): as for :func:`fit_planner`.
+        device (str): likewise.
+        progress (bool): likewise.
         **options: further options of :class:`~torchrl_koap.training.TrainConfig` that concern the controller:
             ``controller_batch_size``, ``controller_learning_rate``, ``preset``, ``decoder``, ``controller_state``,
             ``koopman_coeff``, ``action_coeff``.
