@@ -54,6 +54,8 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
     run = RunDirectory(path)
     config, summary = run.read_json("config.json"), run.read_json("summary.json")
     task = get_task(config["task"])
+    source = config.get("planner_from")  # a planner that was taken over is described by the run that trained it
+    trained = RunDirectory(source).read_json("config.json") if source else config
     rows = [row for result in results for row in result["episode"]]
     won = [row for row in rows if row["outcome"] == "success"]
     low, high = wilson_interval(len(won), len(rows))
@@ -71,9 +73,9 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
         "demonstrations": summary["labels"].get("trajectories", summary["trajectories_used"]),
         "labels": labels_of(config),
         "method": config["method"],
-        "denoiser": planner_of(config),
-        "updates": config["steps"],
-        "batch": config["batch_size"],
+        "denoiser": planner_of(trained),
+        "updates": trained["steps"],
+        "batch": trained["batch_size"],
         "train_seconds": round(seconds["controller" if config["method"] == "dp" else "planner"]),
         "training_seed": config["seed"],
         **choices,

@@ -159,7 +159,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, caps
     (tmp_path / "thesis.tex").write_text("precious")
     assert "is not empty and no folder of `koap curve`" in fails(capsys, *command_of(tmp_path, demonstrations))
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-    assert "thesis.tex is a file" in fails(capsys, *command_of(tmp_path / "thesis.tex", demonstrations))
+    assert "thesis.tex is no folder" in fails(capsys, *command_of(tmp_path / "thesis.tex", demonstrations))
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ class Demos(Command):
             lacks = "environment" if task.env is None else "scripted expert"
             raise ValueError(f"task {task.name!r} has no {lacks}: there is nothing to record demonstrations with")
         episodes = task.defaults.demonstrations if self.episodes is None else self.episodes
-        with progress_bar(episodes, "recording", unit="episode") as bar:
+        with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:  # refusals come without a bar
             return record_to_folder(
                 self.out,
                 task,

@@ -105,7 +105,8 @@ def alone(make_policy, rollout):
         for step in episode:
             with torch.no_grad():
                 carried = fresh(carried.update(step.select("observation_history", "is_init", "noise")))
-            torch.testing.assert_close(carried["action"], step["action"], rtol=1e-4, atol=1e-5)
+            # networks with random weights answer rounding, which depends on the batch, more than trained ones do
+            torch.testing.assert_close(carried["action"], step["action"], rtol=1e-3, atol=2e-3)
 
 
 PARALLEL = {
