@@ -43,7 +43,8 @@ def find_doubts(
         >>> find_doubts(flatten_trajectories([1e6 * path, path], [still + 1, still]), units=["m", "m"])
         ['trajectory 0: column 0 reaches 2e+06 m', 'trajectory 1: all 2 labelled actions are zero']
     """
-    doubts, first = [], {}
+    doubts: list[str] = []
+    first: dict[bytes, str] = {}
     lengths = trajectory_lengths(data).tolist()
     looked_at = [column for column, unit in enumerate(units) if unit in ("m", "rad")]
     for index, part in enumerate(data.split(lengths)):

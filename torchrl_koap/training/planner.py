@@ -156,7 +156,7 @@ def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> 
         )
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
-        tool = {"tool": task.tool_columns, "kinematics": task.tool_position}
-        way = {"response": options.recovery_response, "columns": arm, "moved_by": moved_by}
+        tool: dict[str, Any] = {"tool": task.tool_columns, "kinematics": task.tool_position}
+        way: dict[str, Any] = {"response": options.recovery_response, "columns": arm, "moved_by": moved_by}
         steps.append(RecoveryAugmentation(options.recovery_sigma, history=HISTORY, **way, **tool))
     return TensorDictSequential(*steps)
