@@ -15,7 +15,7 @@ class FiniteScalarQuantizer(nn.Module):
 
     .. math::
         c_i = \frac{1}{\lfloor L_i / 2 \rfloor}
-            \operatorname{round}\big(\tfrac{L_i - 1}{2} \tanh(z_i + s_i) - o_i\big),
+            \operatorname{round}(\tfrac{L_i - 1}{2} \tanh(z_i + s_i) - o_i),
         \qquad o_i = \tfrac12 [L_i \text{ even}], \quad \tfrac{L_i - 1}{2} \tanh(s_i) = o_i
 
     after Mentzer et al. 2023 (arXiv 2309.15505). An even number of levels has no middle one: they lie half a level

@@ -198,7 +198,7 @@ class LinearActionDecoder(TensorDictModuleBase):
         r"""Variance of a predicted action.
 
         .. math::
-            \sigma^2 \big(1 + 1/n + (u - \bar u)^T (\bar U^T \bar U + \lambda)^{-1} (u - \bar u)\big)
+            \sigma^2 (1 + 1/n + (u - \bar u)^T (\bar U^T \bar U + \lambda)^{-1} (u - \bar u))
 
         with the ``n`` centred latent actions :math:`\bar U` of the fit: the noise, the uncertainty of ``b`` (left out
         with ``bias=False``) and that of ``D``.

@@ -149,7 +149,7 @@ class LatentActionFourier(LatentActionModule):
     r"""Latent actions that are themselves observables of the window: a linear and a trainable Fourier part.
 
     .. math::
-        u_t = \big(v_t / \sqrt{D},\; \sqrt{2 c / p}\, \cos(\Omega [v_t / (\ell_v \sqrt{D}), x_t / \ell_x] + \beta)\big)
+        u_t = (v_t / \sqrt{D},\; \sqrt{2 c / p}\, \cos(\Omega [v_t / (\ell_v \sqrt{D}), x_t / \ell_x] + \beta))
 
     with ``v_t`` the ``D`` entries of the steps between neighbouring frames. A linear decoder under a ridge penalty is
     then Gaussian process regression with a linear plus ``c`` times a squared-exponential kernel (random Fourier

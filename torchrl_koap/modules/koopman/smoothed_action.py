@@ -21,8 +21,8 @@ class LatentActionSmoothed(LatentActionModule):
     r"""Observables of a lifted and smoothed window, or of the raw one where few labels say that it is better.
 
     .. math::
-        w_t = \big(g(x_{t-n}), \dots, g(x_t), g(x_{t+2}), \dots, g(x_{t+k})\big), \quad
-        u_t = \big(\gamma_1\, \phi(A w_t),\; \gamma_2\, \phi(x_{t-4}, \dots, x_{t+5})\big)
+        w_t = (g(x_{t-n}), \dots, g(x_t), g(x_{t+2}), \dots, g(x_{t+k})), \quad
+        u_t = (\gamma_1\, \phi(A w_t),\; \gamma_2\, \phi(x_{t-4}, \dots, x_{t+5}))
 
     ``g`` is the lifting to a few coordinates, ``A`` the gain of a :class:`WindowSmoother` and ``phi`` the observables
     of :class:`LatentActionFourier` (steps and random Fourier features). All of it comes from unlabelled windows
