@@ -29,6 +29,7 @@ from result_rows import (
     first,
     label_sizes,
     level_rows,
+    own_robot_rows,
     percent,
     pivot,
     planner_table,
@@ -99,7 +100,17 @@ def bench_size(name: str) -> str:
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
 _PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size)
 _UNLABELLED = (unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
-_HELPERS = (first, label_sizes, *_TABLES, tracking_rows, export_rows, preset_rows, *_PAPER, *_UNLABELLED)
+_HELPERS = (
+    first,
+    label_sizes,
+    *_TABLES,
+    tracking_rows,
+    export_rows,
+    preset_rows,
+    own_robot_rows,
+    *_PAPER,
+    *_UNLABELLED,
+)
 
 
 def commands(rows: Sequence[Mapping[str, str]]) -> str:

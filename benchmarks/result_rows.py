@@ -253,6 +253,16 @@ def export_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     return [list(row.values()) for row in rows]
 
 
+def own_robot_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """Seed, updates, seconds, goals, largest distance, errors of actions."""
+    names = ("seed", "updates", "train_seconds", "worst_distance_rad", "action_error_rad", "ridge_error_rad")
+    body = [[row[name] for name in names] for row in rows]
+    return [
+        [*line[:3], f"{row['goals_reached']} of {row['goals']}", *line[3:]]
+        for line, row in zip(body, rows, strict=True)
+    ]
+
+
 def preset_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     """Table of the presets."""
     return [[row["preset"], row["decoder"], f"{row['action_error']} {row['unit']}"] for row in rows]
