@@ -64,12 +64,12 @@ if __name__ == "__main__":  # workers import this file
         cells = list(csv.DictReader(file))
     pooled = defaultdict(list)
     for cell in cells:
-        pooled[cell["method"], float(cell["label_fraction"])].append(cell)
+        pooled[cell["method"], float(cell["fraction"])].append(cell)
     print(f"\n{'method':16}{'labelled':>10}{'success in % (95 %)':>24}{'action error':>16}")
     points = defaultdict(list)
     for (method, fraction), rows in sorted(pooled.items()):
-        trials = sum(int(float(row["episodes"])) for row in rows)
-        wins = round(sum(float(row["success_rate"]) * float(row["episodes"]) for row in rows))
+        trials = sum(int(row["episodes"]) for row in rows)
+        wins = sum(int(row["successes"]) for row in rows)
         low, high = (100 * end for end in wilson_interval(wins, trials))
         error = sum(float(row["action_error"]) for row in rows) / len(rows)
         points[method].append((fraction, 100 * wins / trials, low, high))
