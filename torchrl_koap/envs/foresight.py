@@ -16,9 +16,9 @@ class Foresight:
         >>> from torchrl_koap.envs import AvoidingEnv
         >>> env = AvoidingEnv(num_envs=2)
         >>> _ = env.reset()
-        >>> held, pushed = env.foresee(np.array([np.zeros((2, 3, 2)), np.full((2, 3, 2), 0.01)]))
+        >>> held, pushed = env.foresee(np.array([np.zeros((2, 6, 2)), np.full((2, 6, 2), 0.01)]))
         >>> held.shape, bool((pushed[:, -1, 2:] > held[:, -1, 2:] + 0.005).all())
-        ((2, 3, 4), True)
+        ((2, 6, 4), True)
     """
 
     def foresee(self, actions: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:

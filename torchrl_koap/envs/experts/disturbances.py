@@ -47,7 +47,7 @@ def choose_disturbed(episodes: int, share: float, seed: int) -> np.ndarray:
     Examples:
         >>> from torchrl_koap.envs.experts.disturbances import choose_disturbed
         >>> int(choose_disturbed(1000, 0.5, seed=0).sum())
-        491
+        514
     """
     if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 <= share <= 1:
         raise ValueError(f"disturbance must be the share of the episodes that are disturbed, 0 to 1, got {share!r}")
@@ -71,7 +71,7 @@ class Disturbances:
         >>> from torchrl_koap.tasks import get_task
         >>> hand = Disturbances(get_task("avoiding"), [(0, 0), (0, 1)], [True, False])
         >>> wanted = np.tile([0.0, 0.01], (2, 1))
-        >>> done = np.stack([hand.disturb(wanted) for _ in range(60)], axis=1)
+        >>> done = np.stack([hand.disturb(wanted) for _ in range(150)], axis=1)
         >>> (done != wanted[:, None]).any(-1).any(-1).tolist(), hand.spells[1]
         ([True, False], [])
     """

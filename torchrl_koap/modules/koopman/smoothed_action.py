@@ -53,7 +53,7 @@ class LatentActionSmoothed(LatentActionModule):
         >>> windows = torch.randn(20, 17, 64)
         >>> infer.fit_unlabelled(windows)
         >>> infer.infer(infer.gather(windows)).shape, infer.choices
-        (torch.Size([20, 17, 640]), ('lifted', 'raw'))
+        (torch.Size([20, 17, 606]), ('lifted', 'raw'))
     """
 
     gates: Tensor
