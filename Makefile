@@ -32,10 +32,9 @@ faults: setup
 	$(BIN)/python -m pytest -n 2 -q -m "faults or not faults" tests/faults
 	$(BIN)/python -m pytest -n 2 -q -m faults tests/commands tests/studies
 
-lint: setup
+lint: types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 
 types: setup
 	$(BIN)/mypy

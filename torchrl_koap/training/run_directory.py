@@ -61,8 +61,7 @@ class RunDirectory:
         if not path.exists():
             raise RunDirectoryError(f"{path} is missing: is {self.path} the folder of a finished `koap train`?")
         try:
-            # numbers that are not finite were written once; JSON does not know them
-            content = json.loads(read_bytes(path).decode(), parse_constant=lambda _: None)
+            content = json.loads(read_bytes(path).decode())
         except (ValueError, RecursionError) as error:
             raise RunDirectoryError(f"{path} is damaged: {error}") from error
         except OSError as error:
