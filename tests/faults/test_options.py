@@ -44,7 +44,7 @@ WRONG: dict[Any, tuple[str, ...]] = {
 }
 # values that are right after all: names of one's own, and 0 where it means "none of it"
 RIGHT = {
-    "convert": ("--name n0nsense", "--out /dev/null/below", "--action-columns n0nsense"),
+    "convert": ("--name n0nsense", "--out /dev/null/below"),
     "demos": ("--seed 0",),
     "eval": ("--seed 0",),
     "inspect": ("--seed 0",),

@@ -29,7 +29,7 @@ class Convert(Command):
         control_hz: frames per second (default: as the source says).
         observations: features of a LeRobot data set or entries of an HDF5 file that make up the state (default: all
             that are no images).
-        action_columns: columns of tables that are actions, if they are not named action...
+        action_columns: columns of CSV or parquet tables that are actions, if they are not named action...
         action_dim: number of action columns, where nothing has actions.
         robot: state columns of the robot itself, which the controller reads (default: all that are no command).
         command: neighbouring columns that repeat the last command; nothing that learns sees them.
