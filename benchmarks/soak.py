@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import argparse
 import csv
+import ctypes
+import gc
 import resource
 import sys
 import tempfile
@@ -29,7 +31,25 @@ from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.pretrained import find_run
 
-COLUMNS = ("episodes", "seconds", "resident_mb", "largest_mb")
+COLUMNS = ("episodes", "seconds", "in_use_mb", "resident_mb", "largest_mb")
+
+
+class _Allocated(ctypes.Structure):
+    """What glibc's mallinfo2 returns."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks")
+    ] + [("keepcost", ctypes.c_size_t)]
+
+
+def in_use() -> float:
+    """Memory that was asked for and not given back, in MB; the process may hold more, in pieces."""
+    gc.collect()
+    library = ctypes.CDLL("libc.so.6")
+    library.mallinfo2.restype = _Allocated
+    found = library.mallinfo2()
+    return (found.uordblks + found.hblkhd) / 1e6
 
 
 def resident() -> float:
@@ -60,7 +80,8 @@ def play(episodes: int, batch_size: int, run: str, minutes: float) -> Iterator[d
         seeds = range(first, min(first + batch_size, episodes))
         roll_out(policy, make_env, seeds, max_steps=task.max_steps, batch_size=batch_size)
         seconds = time.perf_counter() - began
-        row = {"episodes": seeds.stop, "seconds": seconds, "resident_mb": resident(), "largest_mb": largest()}
+        memory = {"in_use_mb": in_use(), "resident_mb": resident(), "largest_mb": largest()}
+        row = {"episodes": seeds.stop, "seconds": seconds} | memory
         print(" ".join(f"{row[name]:.0f}" for name in COLUMNS), flush=True)
         yield row
         if seconds > 60 * minutes:
@@ -94,7 +115,7 @@ def main() -> None:
         run = quick_run(folder) if options.run == "quick" else options.run
         rows = []
         for row in play(options.episodes, options.batch_size, run, options.minutes):
-            rows.append({name: round(value, 1) for name, value in row.items()})
+            rows.append({name: round(value, 2) for name, value in row.items()})
             if options.table:
                 with options.table.open("w", newline="") as file:
                     writer = csv.DictWriter(file, COLUMNS)
