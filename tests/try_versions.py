@@ -27,7 +27,8 @@ TESTS = (
     *("tests/test_keys.py", "tests/test_files.py", "tests/test_lookup.py", "tests/tasks", "tests/modules"),
     *("tests/objectives", "tests/data", "tests/envs/test_avoiding.py", "tests/training/test_loop.py"),
 )
-TOOLS = ("pytest", "pytest-timeout", "hypothesis", "pyarrow", "h5py")
+TOOLS = ("pytest", "pytest-timeout", "hypothesis")
+EXTRAS = ("--extra", "lerobot", "--extra", "hdf5")
 SHOWN = ("torch", "torchrl", "numpy", "scipy", "mujoco", "dm-control", "gymnasium", "numba", "matplotlib")
 # dm-control asks for labmaze, which has no wheels for newer Pythons; the part that is used here does without
 OVERRIDE = "labmaze ; python_version < '3.13'\n"
@@ -48,6 +49,7 @@ def resolve(python: str, versions: str, torch: str | None, folder: Path) -> tupl
     done = uv(
         *("pip", "compile", "--no-build", "--no-annotate", "--no-header", "--resolution", STRATEGIES[versions]),
         *("--python-version", python, "--override", override, "--constraint", constraint, "--output-file", made),
+        *EXTRAS,
         "pyproject.toml",
     )
     if done.returncode:
