@@ -23,8 +23,9 @@ class Convert(Command):
     Attributes:
         source: a folder of *.npz, *.csv or *.parquet files, a LeRobot data set, an HDF5 file in robomimic's layout,
             minari:NAME, or a data set of this library.
-        out: folder to write; a file for robomimic.
-        to: another format than this library's: "npz", "robomimic", "lerobot" (3.0) or "lerobot-2.1".
+        out: folder to write; a file for robomimic, minari:NAME for Minari.
+        to: another format than this library's: "npz", "robomimic", "lerobot" (3.0), "lerobot-2.1", "minari" or "d3il"
+            (raw pickles of a D3IL task).
         name: name of the task (default: that of the folder).
         control_hz: frames per second (default: as the source says).
         observations: features of a LeRobot data set or entries of an HDF5 file that make up the state (default: all
