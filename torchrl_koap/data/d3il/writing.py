@@ -77,7 +77,6 @@ def _task_of(recordings: Recordings, out: Path) -> Task:
 
 def _episode(task: Task, converter: Converter, frames: np.ndarray) -> RawEpisode:
     """A raw episode that converts to these observations ``[T, obs]``."""
-
     frames = np.array(frames)  # recordings are read-only
 
     def block(name: str) -> np.ndarray:
