@@ -64,12 +64,14 @@ SAYS = {
     "--controller-steps": "steps",
     "--solver-steps": "solver-steps|num_steps",
     "--controller-state": "part of the state|controller-state",
-    "--action-kind": "kind of action",
+    "--recovery-response": "recovery response|recovery-response",
+    "--action-kind": "kind of action|action-kind",
+    "--to": "unknown format|--to",
     "--tasks": "task",
     "--methods": "method",
     "--units": "unit",
     "--planners": "planners|n0nsense",
-    "--data-share": "share of the data|data-share",
+    "--data-share": "share of the data|data[-_]share",
     "--planner-from": "/dev/null/below|planner-from",
 }
 
