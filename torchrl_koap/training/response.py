@@ -104,7 +104,7 @@ def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, A
             if not out.any() or out.all():
                 continue
             _fit(response, steps.take(~out), penalty=penalty, coupled=coupled)
-            errors.append(_prediction_errors(response, data, steps.take(out), changes))
+            errors.append(_prediction_errors(response, data, steps.take(out), changes).flatten())
         errors = torch.cat(errors)
         error = errors.pow(2).mean().sqrt().item() if len(errors) else float("inf")
         if best is None or error < best[0]:
