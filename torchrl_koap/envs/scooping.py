@@ -31,7 +31,7 @@ class ScoopingEnv(ManipulationEnv):
     =============== ============ ================= ============================================================
     key             shape        dtype             meaning
     =============== ============ ================= ============================================================
-    ``observation`` [n, 67]      ``dtype``         0-63 embedding of the camera's frame, 64-66 the spoon's
+    ``observation`` [n, 99]      ``dtype``         0-95 embedding of the camera's frame, 96-98 the spoon's
                                                    position (m), which planner and controller never see
     ``action``      [n, 7]       ``dtype``         joint targets (rad) for the end of the step, absolute
     ``pixels``      [n, H, W, 3] uint8             the frame, where ``pixels`` was asked for
@@ -71,7 +71,7 @@ class ScoopingEnv(ManipulationEnv):
         >>> from torchrl_koap.envs import ScoopingEnv
         >>> env = ScoopingEnv(num_envs=2, seed=0, embed=False)
         >>> env.rollout(3)["next", "observation"].shape
-        torch.Size([2, 3, 67])
+        torch.Size([2, 3, 99])
     """
 
     def __init__(
@@ -89,10 +89,10 @@ class ScoopingEnv(ManipulationEnv):
         pixels: bool = False,
     ):
         self._arm = SpoonKinematics()
-        self._encoder = None
+        chosen = None
         if embed:
-            self._encoder = encoder if isinstance(encoder, FrozenImageEncoder) else load_encoder(encoder)
-            dim = 0 if self._encoder.projection is None else self._encoder.projection.dim
+            chosen = encoder if isinstance(encoder, FrozenImageEncoder) else load_encoder(encoder)
+            dim = 0 if chosen.projection is None else chosen.projection.dim
             if dim != EMBEDDING_DIM:
                 raise ValueError(f"the encoder's projection must have {EMBEDDING_DIM} components, got {dim}")
         self._pixels = np.zeros((num_envs, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8) if embed or pixels else None
@@ -113,6 +113,7 @@ class ScoopingEnv(ManipulationEnv):
             contexts=contexts,
             simulations=ScoopingSimulations("robot", num_envs, num_threads),
         )
+        self._encoder = chosen
         if pixels:
             self.observation_spec[PIXELS] = Unbounded(self._pixels.shape, dtype=torch.uint8, device=self.device)
         if self._pixels is not None:

@@ -25,7 +25,7 @@ STARTS = {"left": (0.5, 0.22), "near": (0.33, 0.0), "right": (0.5, -0.22)}  # of
 EMBODIMENTS = ("robot", "hand")
 FRAME_HZ = 10.0  # frames, and actions, per second
 CONTROL_HZ = 30.0  # commands per second
-EMBEDDING_DIM = 64  # columns
+EMBEDDING_DIM = 96  # columns
 IMAGE_SIZE = 96  # pixels, both ways
 
 

@@ -266,6 +266,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     }
     if method.earlier:
         controller["revised"] = True
+    if len(task.absolute_actions) == task.action_dim and not task.action_targets:
+        controller["absolute"] = True
     return ResolvedConfig(
         options=options,
         task=task,

@@ -18,7 +18,7 @@ from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
 from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.scooping import FRAME_HZ, IMAGE_SIZE, start_of
+from torchrl_koap.tasks.scooping import FRAME_HZ, IMAGE_SIZE, STARTS, start_of
 
 AFTERWARDS = 3  # frames that are recorded after a success
 MAX_ATTEMPTS = 10
@@ -47,7 +47,9 @@ class VideoReport:
 def play_episodes(
     embodiment: str, episodes: int, seed: int = 0, *, size: int = IMAGE_SIZE
 ) -> Iterator[tuple[ImageEpisode, int, int]]:
-    """Demonstrations in their order; one that does not succeed is played again from another start.
+    """Demonstrations in their order; one that does not succeed is played again, from another place.
+
+    They begin at the start positions in turn, so that the first few of them have seen them all.
 
     Args:
         embodiment (str): ``"robot"`` or ``"hand"``.
@@ -76,7 +78,7 @@ def play_episodes(
         for number in range(episodes):
             for attempt in range(MAX_ATTEMPTS):
                 own = (seed, stream, number, attempt)
-                context = draw_contexts("scooping", 1, np.random.default_rng((*own, 1)))[0]
+                context = _context_at(number % len(STARTS), np.random.default_rng((*own, 1)))
                 sims.reset(rows, start_joints(context, embodiment, arm)[None], [context[0, 2]])
                 expert = ScoopingExpert(sims, 0, start_of(context), own)
                 episode = _play(sims, expert, lambda: renderer.render(sims.data[0], CAMERA))
@@ -88,6 +90,14 @@ def play_episodes(
     finally:
         renderer.close()
         sims.close()
+
+
+def _context_at(start: int, generator: np.random.Generator) -> np.ndarray:
+    """A random context around one of the start positions."""
+    while True:
+        context = draw_contexts("scooping", 1, generator)[0]
+        if start_of(context) == start:
+            return context
 
 
 def _play(sims: ScoopingSimulations, expert: ScoopingExpert, draw: Callable[[], np.ndarray]) -> ImageEpisode | None:
