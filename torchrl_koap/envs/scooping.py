@@ -183,4 +183,3 @@ class ScoopingEnv(ManipulationEnv):
             self._camera.close()
             self._camera = None
         super().close(**kwargs)
-

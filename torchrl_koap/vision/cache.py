@@ -7,7 +7,6 @@ import hashlib
 import json
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 _ABOUT = "cache.json"

@@ -94,7 +94,8 @@ def embed_demonstrations(
     names = sorted({episode.embodiment for episodes in read for episode in episodes})
     if len(names) > 1 and not mixed:
         raise ImageDataError(
-            f"the sources mix the embodiments {' and '.join(names)}: pass mixed=True (koap embed --mixed) if that is meant"
+            f"the sources mix the embodiments {' and '.join(names)}: pass mixed=True (koap embed --mixed) if that is"
+            " meant"
         )
     for episode in (episode for episodes in read for episode in episodes):
         embedding = encoder.embed(torch.from_numpy(episode.frames)).float().numpy()

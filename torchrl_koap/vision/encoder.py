@@ -103,10 +103,8 @@ class FrozenImageEncoder(ObservationTransform):
         batch, flat = frames.shape[:-3], frames.reshape(-1, *frames.shape[-3:])
         found = None if self.cache is None else self.cache.get(flat)
         if found is None:
-            parts = [
-                POOLINGS[self.pooling](self.backbone(part.permute(0, 3, 1, 2).float() / 255)) for part in flat.split(BATCH)
-            ]
-            found = torch.cat(parts)
+            pool, pictures = POOLINGS[self.pooling], flat.permute(0, 3, 1, 2)
+            found = torch.cat([pool(self.backbone(part.float() / 255)) for part in pictures.split(BATCH)])
             if self.cache is not None:
                 self.cache.put(flat, found)
                 found = found.half().float()  # as the next reader of the cache has them

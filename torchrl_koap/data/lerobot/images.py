@@ -125,7 +125,11 @@ class ImageEpisodeWriter:
         features: dict[str, Any] = {
             CAMERA: {"dtype": "image", "shape": self._shape, "names": ["height", "width", "channel"]},
             "observation.state": {"dtype": "float32", "shape": [len(self._names)], "names": self._names},
-            **({"action": {"dtype": "float32", "shape": [len(self._actions)], "names": self._actions}} if self._actions else {}),
+            **(
+                {"action": {"dtype": "float32", "shape": [len(self._actions)], "names": self._actions}}
+                if self._actions
+                else {}
+            ),
             "timestamp": {"dtype": "float32", **single},
             **{name: {"dtype": "int64", **single} for name in numbers},
         }

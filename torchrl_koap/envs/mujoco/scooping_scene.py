@@ -45,9 +45,7 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
     holder, actuators = lookup({"robot": (_arm, 7), "hand": (_hand, 6)}, embodiment, "embodiment")
     assert embodiment in EMBODIMENTS
     kinds = _ARM_SERVO if actuators == 7 else _HAND_SERVO
-    motors = "".join(
-        f'<position name="a{i}" joint="j{i}" kp="{kp}" kv="{kv}"/>' for i, (kp, kv) in enumerate(kinds, 1)
-    )
+    motors = "".join(f'<position name="a{i}" joint="j{i}" kp="{kp}" kv="{kv}"/>' for i, (kp, kv) in enumerate(kinds, 1))
     xml = f"""
 <mujoco model="scooping">
   <compiler angle="radian"/>
@@ -69,7 +67,8 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
   </default>
   <worldbody>
     <light pos="0.4 0.6 2" dir="0 -0.3 -1" directional="true" diffuse="0.4 0.4 0.4"/>
-    <camera name="third_person" pos="1.12 -0.42 0.62" xyaxes="{_view((1.12, -0.42, 0.62), (0.46, 0.0, 0.15))}" fovy="40"/>
+    <camera name="third_person" pos="1.12 -0.42 0.62" fovy="40"
+      xyaxes="{_view((1.12, -0.42, 0.62), (0.46, 0.0, 0.15))}"/>
     <camera name="front" pos="1.6 -0.9 1.1" xyaxes="{_view((1.6, -0.9, 1.1), (0.35, 0.0, 0.25))}" fovy="42"/>
     <geom name="table" class="solid" type="plane" size="2 2 0.1" rgba="0.72 0.66 0.56 1"/>
     {_bowl()}
@@ -133,9 +132,24 @@ def _spoon() -> str:
 _LINKS = (
     ((0, 0, 0.333), 0, 2.8973, [((0, 0, -0.19), (0, 0, -0.03), 0.06, False)]),
     ((0, 0, 0), -1, 1.7628, [((0, -0.06, 0), (0, 0.06, 0), 0.06, False), ((0, 0, 0), (0, -0.13, 0), 0.06, False)]),
-    ((0, -0.316, 0), 1, 2.8973, [((0, 0, -0.13), (0, 0, -0.03), 0.055, False), ((0.0, 0, 0), (0.08, 0, 0), 0.05, True)]),
-    ((0.0825, 0, 0), 1, 3.0718, [((0, 0, -0.04), (0, 0, 0.04), 0.055, False), ((0, 0, 0), (-0.08, 0.09, 0), 0.055, False)]),
-    ((-0.0825, 0.384, 0), -1, 2.8973, [((0, 0, -0.26), (0, 0.03, -0.14), 0.05, False), ((0, 0.05, -0.12), (0, 0.03, 0), 0.04, False)]),
+    (
+        (0, -0.316, 0),
+        1,
+        2.8973,
+        [((0, 0, -0.13), (0, 0, -0.03), 0.055, False), ((0.0, 0, 0), (0.08, 0, 0), 0.05, True)],
+    ),
+    (
+        (0.0825, 0, 0),
+        1,
+        3.0718,
+        [((0, 0, -0.04), (0, 0, 0.04), 0.055, False), ((0, 0, 0), (-0.08, 0.09, 0), 0.055, False)],
+    ),
+    (
+        (-0.0825, 0.384, 0),
+        -1,
+        2.8973,
+        [((0, 0, -0.26), (0, 0.03, -0.14), 0.05, False), ((0, 0.05, -0.12), (0, 0.03, 0), 0.04, False)],
+    ),
     ((0, 0, 0), 1, 3.7525, [((0, 0, -0.03), (0, 0, 0.03), 0.05, True), ((0, 0, 0), (0.088, 0, 0), 0.04, False)]),
     ((0.088, 0, 0), 1, 2.8973, [((0, 0, 0.0), (0, 0, 0.08), 0.045, False)]),
 )
@@ -190,7 +204,10 @@ def _hand() -> str:
     return f"""
 <body name="tool" gravcomp="1">{joints}{_spoon()}{fingers}
 <geom type="ellipsoid" size="0.022 0.03 0.045" pos="{x - 0.012} -0.012 {top - 0.03}" rgba="{_SKIN}" mass="0.2"/>
-<geom type="capsule" size="0.01" fromto="{x} 0.02 {top - 0.02} {x + 0.012} 0.012 {top + 0.03}" rgba="{_SKIN}" mass="0.02"/>
-<geom type="capsule" size="0.026" fromto="{x - 0.02} -0.02 {top} {x - 0.11} -0.05 {top + 0.1}" rgba="{_SKIN}" mass="0.3"/>
-<geom type="capsule" size="0.042" fromto="{x - 0.11} -0.05 {top + 0.1} {x - 0.3} -0.12 {top + 0.3}" rgba="{_SLEEVE}" mass="0.3"/>
+<geom type="capsule" size="0.01" fromto="{x} 0.02 {top - 0.02} {x + 0.012} 0.012 {top + 0.03}" rgba="{_SKIN}"
+  mass="0.02"/>
+<geom type="capsule" size="0.026" fromto="{x - 0.02} -0.02 {top} {x - 0.11} -0.05 {top + 0.1}" rgba="{_SKIN}"
+  mass="0.3"/>
+<geom type="capsule" size="0.042" fromto="{x - 0.11} -0.05 {top + 0.1} {x - 0.3} -0.12 {top + 0.3}" rgba="{_SLEEVE}"
+  mass="0.3"/>
 </body>"""

@@ -164,9 +164,7 @@ class ScoopingSimulations:
         """Everything that decides the future of one simulation."""
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
         mujoco.mj_getState(self.model, self.data[row], physics, _PHYSICS)
-        return {"physics": physics} | {
-            name: np.copy(getattr(self, name)[row]) for name in ("commands", "rim", "held")
-        }
+        return {"physics": physics} | {name: np.copy(getattr(self, name)[row]) for name in ("commands", "rim", "held")}
 
     def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
         """Restores what :meth:`get_state` returned."""
