@@ -20,14 +20,15 @@ MAY_IMPORT = {
     "files": set(),
     "tasks": {*BASE, "tasks"},
     "data": {*BASE, "tasks", "data"},
-    "envs": {*BASE, "tasks", "data", "envs"},
+    "vision": {*BASE, "tasks", "data", "vision"},
+    "envs": {*BASE, "tasks", "data", "vision", "envs"},
     "modules": {"keys", "lookup", "modules"},
     "objectives": {"keys", "lookup", "modules", "objectives"},
     "training": TRAINING,
     "evaluation": {*TRAINING, "envs", "evaluation"},
     "reports": {*TRAINING, "envs", "evaluation", "reports"},
     "studies": {*TRAINING, "envs", "evaluation", "reports", "studies"},
-    "commands": {*TRAINING, "envs", "evaluation", "reports", "studies", "commands", "__version__"},
+    "commands": {*TRAINING, "envs", "evaluation", "reports", "studies", "vision", "commands", "__version__"},
 }
 IN_FUNCTIONS = {"training": {"envs"}}  # a simulator is loaded when it is asked for
 

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from torchrl_koap.commands.command import Command
 from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE
+from torchrl_koap.envs.experts.recording import expert_of
 from torchrl_koap.envs.experts.recording_report import RecordingReport
+from torchrl_koap.envs.experts.scooping_recording import VideoReport, record_videos
+from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
@@ -30,6 +34,8 @@ class Demos(Command):
         batch_size: episodes played at once; the demonstrations do not depend on it.
         disturbance: share of the demonstrations in which the operator is disturbed now and then (pushes, slips, late
             turns); those from which it recovers are kept, and OUT/ted/about.json says how often it did.
+        embodiment: of a task that is recorded by a camera, "robot" (with actions) or "hand" (frames alone); OUT is then
+            a LeRobot data set with pictures, for `koap embed`.
         plugins: modules that register tasks; imported before anything else.
     """
 
@@ -40,9 +46,10 @@ class Demos(Command):
     threads: int = 2
     batch_size: int = BATCH_SIZE
     disturbance: float = 0.0
+    embodiment: str | None = None
     plugins: Plugins = ()
 
-    def __call__(self) -> RecordingReport:
+    def __call__(self) -> RecordingReport | VideoReport:
         """Records and writes; returns the account of attempts.
 
         Raises:
@@ -56,6 +63,11 @@ class Demos(Command):
             lacks = "environment" if task.env is None else "scripted expert"
             raise ValueError(f"task {task.name!r} has no {lacks}: there is nothing to record demonstrations with")
         episodes = task.defaults.demonstrations if self.episodes is None else self.episodes
+        embodiments = getattr(expert_of(task), "embodiments", ())
+        if self.embodiment is not None and not embodiments:
+            raise ValueError(f"--embodiment was given, but task {task.name!r} has one embodiment alone")
+        if embodiments:
+            return self._film(episodes, embodiments)
         with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:  # refusals come without a bar
             return record_to_folder(
                 self.out,
@@ -67,3 +79,13 @@ class Demos(Command):
                 batch_size=self.batch_size,
                 disturbance=self.disturbance,
             )
+
+    def _film(self, episodes: int, embodiments: Sequence[str]) -> VideoReport:
+        """Records camera frames."""
+        if self.embodiment is None:
+            raise ValueError(f"say who demonstrates: --embodiment {' or '.join(embodiments)}")
+        lookup(embodiments, self.embodiment, "embodiment")
+        if self.disturbance:
+            raise ValueError("--disturbance was given, but demonstrations before a camera are not disturbed")
+        with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:
+            return record_videos(self.out, self.embodiment, episodes, self.seed, count_up_to(bar))

@@ -12,6 +12,7 @@ from torchrl_koap.commands.convert import Convert
 from torchrl_koap.commands.curve import Curve
 from torchrl_koap.commands.demos import Demos
 from torchrl_koap.commands.doctor import Doctor, Validate
+from torchrl_koap.commands.embed import Embed
 from torchrl_koap.commands.eval import Eval
 from torchrl_koap.commands.export import Export
 from torchrl_koap.commands.inspect import Inspect
@@ -22,6 +23,7 @@ from torchrl_koap.commands.train import Train
 Subcommand = (
     Annotated[Convert, tyro.conf.subcommand("convert")]
     | Annotated[Demos, tyro.conf.subcommand("demos")]
+    | Annotated[Embed, tyro.conf.subcommand("embed")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Curve, tyro.conf.subcommand("curve")]

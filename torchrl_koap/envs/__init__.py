@@ -6,6 +6,7 @@ from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.gym import AvoidingGymEnv, ManipulationGymEnv, register
 from torchrl_koap.envs.registry import make_env, mode_index_of
+from torchrl_koap.envs.scooping import ScoopingEnv
 from torchrl_koap.envs.sorting import SortingEnv
 from torchrl_koap.envs.stacking import StackingEnv
 
@@ -15,6 +16,7 @@ __all__ = [
     "AvoidingGymEnv",
     "ManipulationEnv",
     "ManipulationGymEnv",
+    "ScoopingEnv",
     "SortingEnv",
     "StackingEnv",
     "make_env",

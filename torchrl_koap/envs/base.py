@@ -14,6 +14,7 @@ so the observation is one control step old, and ``done`` comes one step after th
 from __future__ import annotations
 
 import abc
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -66,6 +67,7 @@ class ManipulationEnv(RawLog, Foresight, EnvBase):
             ``(i + j num_envs) mod C``. Default: random ones.
         reset_width (float): finger target (m) during the reset's substep.
         command_dim (int): numbers that make up a command.
+        simulations (optional): what is simulated instead of ``model``, where another arm than D3IL's moves.
 
     Raises:
         ValueError: for sizes below 1, a non-floating dtype, or contexts of a wrong shape or out of range.
@@ -80,7 +82,7 @@ class ManipulationEnv(RawLog, Foresight, EnvBase):
     def __init__(
         self,
         task: Task,
-        model: mujoco.MjModel,
+        model: mujoco.MjModel | None,
         *,
         start_joints,
         num_mode_flags: int,
@@ -96,6 +98,7 @@ class ManipulationEnv(RawLog, Foresight, EnvBase):
         contexts=None,
         reset_width: float = controller.FINGER_RESET,
         command_dim: int = 7,
+        simulations: Any = None,
     ):
         for name, value in (("num_envs", num_envs), ("num_threads", num_threads), ("max_steps", max_steps)):
             if not isinstance(value, int) or value < 1:
@@ -106,7 +109,7 @@ class ManipulationEnv(RawLog, Foresight, EnvBase):
         self.task = task
         self.max_steps = max_steps
         self.substeps = substeps
-        self.sims = SimulationBatch(model, num_envs, num_threads)
+        self.sims = SimulationBatch(model, num_envs, num_threads) if simulations is None else simulations
         self._start_joints = np.asarray(start_joints, dtype=np.float64)
         self._dtype = dtype
         self._observation = np.zeros((num_envs, task.observation_dim))

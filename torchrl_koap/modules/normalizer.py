@@ -18,6 +18,10 @@ def _standard(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return values.mean(0), values.std(0, correction=0)
 
 
+def _shared(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    return values.mean(0), values.std(0, correction=0).amax().expand(values.shape[-1]).clone()
+
+
 def _rms(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.zeros_like(values[0]), values.square().mean(0).sqrt()
 
@@ -26,7 +30,7 @@ def _identity(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.zeros_like(values[0]), torch.ones_like(values[0])
 
 
-MODES = {"minmax": _minmax, "standard": _standard, "rms": _rms, "identity": _identity}
+MODES = {"minmax": _minmax, "standard": _standard, "shared": _shared, "rms": _rms, "identity": _identity}
 
 
 class Normalizer(nn.Module):

@@ -5,7 +5,7 @@ from torchrl_koap.tasks.registry import TASKS, adopt_task, get_task, register_ta
 from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
 from torchrl_koap.tasks.task import CONTROL_HZ, HISTORY, HORIZON, REPLAN_INTERVAL, WINDOW, Defaults, Modes, Task
 
-from torchrl_koap.tasks import avoiding, aligning, sorting, stacking  # isort: skip  # in the order of TASKS
+from torchrl_koap.tasks import avoiding, aligning, sorting, stacking, scooping  # isort: skip  # in the order of TASKS
 
 __all__ = [
     "CONTROL_HZ",
@@ -26,6 +26,7 @@ __all__ = [
     "avoiding",
     "get_task",
     "register_task",
+    "scooping",
     "sorting",
     "stacking",
     "task_of",

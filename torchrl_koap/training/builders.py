@@ -56,6 +56,9 @@ def build_controller(
         normalizers = normalizers_of(Normalizer(), Normalizer())
     else:
         seen = labelled["has_action"] if method.labelled_only else None
+        if options.get("absolute") and options["preset"] == "default":
+            # places are far from zero compared with their spread; among principal components size is information
+            modes = {"state": "shared", "action": "standard"}
         normalizers = normalizers_of(
             Normalizer.fit(labelled["state"], mode=modes["state"], mask=seen),
             Normalizer.fit(labelled["action"], mode=modes["action"], mask=labelled["has_action"]),

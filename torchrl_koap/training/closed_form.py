@@ -16,6 +16,7 @@ from torchrl_koap.tasks import Task
 
 # one or two labelled trajectories cannot be left out to choose the penalty
 DEFAULT_PENALTY = 0.15
+PLACE_PENALTY = 1e-3  # the same where the present frame says most of the action
 
 
 def fit_closed_form(
@@ -75,7 +76,8 @@ def _fit_koopman(
 ) -> RidgeFit:
     """One fit, with tied axes where there are any: known ones, or likely ones if they help."""
     through_zero = not controller.action_normalizer.offset.any()
-    options: dict[str, Any] = {"groups": groups, "default_penalty": DEFAULT_PENALTY, "bias": not through_zero}
+    penalty = PLACE_PENALTY if getattr(controller.latent_action, "place", 0.0) else DEFAULT_PENALTY
+    options: dict[str, Any] = {"groups": groups, "default_penalty": penalty, "bias": not through_zero}
     if not (shared_axes or guessed_axes):
         return controller.fit_decoder(windows, mask, **options)
     options["tied_axes"] = shared_axes or guessed_axes

@@ -269,6 +269,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         controller["revised"] = True
     if method.tracks:
         controller["tracking"] = tracked_columns(task)
+    if len(task.absolute_actions) == task.action_dim and not task.action_targets:
+        controller["absolute"] = True
     return ResolvedConfig(
         options=options,
         task=task,

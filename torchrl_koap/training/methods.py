@@ -166,7 +166,13 @@ class Method:
         return self.kind != "policy"
 
 
+# where actions say where the robot is to be, what is read off the present frame counts more than the steps around it
+PLACE = {"place": 1.0, "curvature": 10.0, "position_scale": 2.0, "motion_scale": 3.0, "num_features": 1024}
+
+
 def _koap(state_dim, action_dim, normalizers, options, **overrides):
+    if options.get("absolute") and PRESETS[options["preset"]]["network"] == "fourier":
+        overrides = PLACE | overrides
     return make_koopman_inverse_dynamics(state_dim, action_dim, preset=options["preset"], **normalizers, **overrides)
 
 

@@ -167,6 +167,9 @@ class LatentActionFourier(LatentActionModule):
         curvature (float): prior variance ``c`` of the curved part against the linear one. Defaults to ``0.1``.
         motion_scale (float): length ``l_v``, in spreads of the steps. Defaults to ``1``.
         position_scale (float): length ``l_x``, in units of the normalised state. Defaults to ``4``.
+        place (float): prior standard deviation, against the linear part's, of a further linear part in ``x_t`` itself,
+            for actions that say where the robot is to be instead of how it moves; ``latent_dim`` grows by ``d``.
+            Defaults to ``0``: none.
 
     Examples:
         >>> import torch
@@ -185,12 +188,14 @@ class LatentActionFourier(LatentActionModule):
         curvature: float = 0.1,
         motion_scale: float = 1.0,
         position_scale: float = 4.0,
+        place: float = 0.0,
         **kwargs,
     ):
         num_past, look_ahead = kwargs.get("num_past", 1), kwargs.get("look_ahead", 8)
         motion_dim = (num_past + len(check_offsets(num_past, look_ahead))) * state_dim
-        super().__init__(state_dim, num_features + motion_dim, relative=True, **kwargs)
-        self.motion_dim = motion_dim
+        wide = num_features + motion_dim + (state_dim if place else 0)
+        super().__init__(state_dim, wide, relative=True, **kwargs)
+        self.motion_dim, self.place = motion_dim, place / math.sqrt(state_dim)
         self.amplitude = math.sqrt(2 * curvature / max(num_features, 1))
         self.motion_scale, self.position_scale = motion_scale, position_scale
         self.frequency = nn.Parameter(torch.empty(motion_dim + state_dim, num_features))
@@ -207,7 +212,8 @@ class LatentActionFourier(LatentActionModule):
         n = self.num_past
         motion = torch.cat([frames[..., :n, :], frames[..., n + 1 :, :]], -2).flatten(-2) / math.sqrt(self.motion_dim)
         where = torch.cat([motion / self.motion_scale, frames[..., n, :] / self.position_scale], -1)
-        return torch.cat([motion, self.amplitude * torch.cos(where @ self.frequency + self.phase)], -1)
+        curved = self.amplitude * torch.cos(where @ self.frequency + self.phase)
+        return torch.cat([motion, curved, *((self.place * frames[..., n, :],) if self.place else ())], -1)
 
     def steps(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
         """Where a latent action holds the steps along some state columns, and their size per unit of it.

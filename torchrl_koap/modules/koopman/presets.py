@@ -83,7 +83,7 @@ NARROW = 8
 
 # what only one kind of latent-action network takes, and its value where a preset does not name it
 NETWORK_OPTIONS = {
-    "fourier": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0},
+    "fourier": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0, "place": 0.0},
     "lstm": {"relative": False},
     "smoothed": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0},
     "mlp": {"relative": False, "linear_skip": False, "dropout": 0.0},

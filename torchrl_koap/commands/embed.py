@@ -1,0 +1,66 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap embed``: camera demonstrations as a data set of embeddings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from torchrl_koap.commands.command import Command
+from torchrl_koap.data import read_about
+from torchrl_koap.vision.demonstrations import Source, embed_demonstrations
+from torchrl_koap.vision.projections import load_encoder
+
+
+@dataclass(kw_only=True)
+class Embed(Command):
+    """Embed the frames of `koap demos --embodiment` with a frozen network, for `koap train --dataset`.
+
+    Nothing is downloaded: the weights are those of the extra "vision", or a file of your own.
+
+    Attributes:
+        sources: folders of demonstrations, in the order in which the data set has them.
+        out: folder to write: OUT/ted.
+        episodes: how many of each source, from the first (default: all).
+        mixed: the sources may be of several embodiments.
+        weights: file of the network's weights (default: EfficientNet-Lite0, extra "vision").
+        projection: file of the principal components (default: those of Scooping that come with the package).
+        cache: folder that keeps what went through the network.
+    """
+
+    sources: tyro.conf.Positional[tuple[Path, ...]]
+    out: Path
+    episodes: tuple[int, ...] = ()
+    mixed: bool = False
+    weights: Path | None = None
+    projection: Path | None = None
+    cache: Path | None = None
+
+    def __call__(self) -> dict[str, Any]:
+        """Reads, embeds and writes.
+
+        Raises:
+            WeightsError: if weights are missing or of another network.
+            ImageDataError: if a source is none, or embodiments are mixed without saying so.
+            CacheError: if the cache is of other weights.
+        """
+        if self.episodes and len(self.episodes) != len(self.sources):
+            raise ValueError(f"--episodes names {len(self.episodes)} numbers for {len(self.sources)} sources")
+        if (self.out / "ted").exists():
+            raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
+        encoder = load_encoder(self.projection, self.weights, cache=self.cache)
+        numbers = self.episodes or (None,) * len(self.sources)
+        sources = [Source(folder, number) for folder, number in zip(self.sources, numbers, strict=True)]
+        folder = embed_demonstrations(self.out, sources, encoder, mixed=self.mixed)
+        about = read_about(folder / "ted")
+        whose = about["notes"]["embodiments"]
+        return {
+            "data set": str(folder),
+            "trajectories": ", ".join(f"{whose.count(name)} {name}" for name in sorted(set(whose))),
+            "steps": about["steps"],
+            "labelled steps": about["labelled_steps"],
+            "next": f"koap train --task scooping --dataset {folder} --out runs/scooping",
+        }

@@ -1,0 +1,215 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Demonstrations with camera frames as a LeRobot data set (v2.1, pictures as PNG in parquet), written as they come."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+CAMERA = "observation.images.third_person"
+EMBODIMENT = "embodiment"
+_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+
+
+class ImageDataError(ValueError):
+    """A data set of camera frames that is unfinished, of another size or layout, or mixes embodiments unsaid."""
+
+
+@dataclass(frozen=True)
+class ImageEpisode:
+    """What a camera saw in one demonstration.
+
+    Args:
+        frames (np.ndarray): uint8 ``[T + 1, H, W, 3]``.
+        state (np.ndarray): what else is known ``[T + 1, d]``.
+        action (np.ndarray, optional): ``[T, act]``; None for an embodiment without.
+        embodiment (str): whose demonstration it is.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data.lerobot.images import ImageEpisode
+        >>> len(ImageEpisode(np.zeros((5, 8, 8, 3), np.uint8), np.zeros((5, 3)), None, "hand"))
+        4
+    """
+
+    frames: np.ndarray
+    state: np.ndarray
+    action: np.ndarray | None
+    embodiment: str
+
+    def __len__(self) -> int:
+        return len(self.frames) - 1
+
+
+def _pyarrow():
+    for package, extra in (("pyarrow", "lerobot"),):
+        if importlib.util.find_spec(package) is None:
+            raise RuntimeError(
+                f"data sets with pictures need {package}: install the extra, pip install 'torchrl_koap[{extra}]'"
+            )
+    import pyarrow
+    import pyarrow.parquet
+
+    return pyarrow
+
+
+class ImageEpisodeWriter:
+    """Writes episodes one after the other; the data set is finished by :meth:`close`.
+
+    Args:
+        folder (str or Path): folder to create; one that holds an unfinished recording of the same is gone on with.
+        fps (float): frames per second.
+        state_names (sequence of str): columns of ``observation.state``.
+        action_names (sequence of str): columns of ``action``; empty for an embodiment without.
+        embodiment (str): whose demonstrations they are.
+        task (str): what is done, in words.
+
+    Raises:
+        FileExistsError: if the folder holds a finished data set.
+    """
+
+    def __init__(self, folder: str | Path, *, fps: float, state_names, action_names, embodiment: str, task: str):
+        self.folder = Path(folder)
+        self._fps, self._names, self._actions = fps, list(state_names), list(action_names)
+        self._embodiment, self._task = embodiment, task
+        if (self.folder / "meta" / "info.json").exists():
+            raise FileExistsError(f"{self.folder} holds a data set already; choose another folder")
+        _pyarrow()
+        self._shape: list[int] = []
+        self._lengths: list[int] = []
+        self._before = 0
+
+    def add(self, episode: ImageEpisode) -> None:
+        """Writes an episode; its action after the last frame repeats the one before, as LeRobot has a row per frame."""
+        pyarrow = _pyarrow()
+        number, rows = len(self._lengths), len(episode.frames)
+        self._shape = list(episode.frames.shape[1:])
+        frames = np.arange(rows)
+        columns: dict[str, Any] = {
+            CAMERA: pyarrow.array(
+                [{"bytes": png, "path": None} for png in map(encode_png, episode.frames)],
+                type=pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())]),
+            ),
+            "observation.state": _matrix(pyarrow, episode.state),
+        }
+        if episode.action is not None:
+            columns["action"] = _matrix(pyarrow, np.concatenate([episode.action, episode.action[-1:]]))
+        columns |= {
+            "timestamp": (frames / self._fps).astype(np.float32),
+            "frame_index": frames,
+            "episode_index": np.full(rows, number),
+            "index": self._before + frames,
+            "task_index": np.zeros(rows, dtype=np.int64),
+        }
+        file = self.folder / _DATA.format(episode_chunk=0, episode_index=number)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        pyarrow.parquet.write_table(pyarrow.table(columns), file)
+        self._lengths.append(rows)
+        self._before += rows
+
+    def close(self) -> Path:
+        """Writes the description, which makes the data set a finished one."""
+        meta = self.folder / "meta"
+        meta.mkdir(parents=True, exist_ok=True)
+        lines = [{"episode_index": i, "tasks": [self._task], "length": n} for i, n in enumerate(self._lengths)]
+        (meta / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+        (meta / "tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": self._task}) + "\n")
+        single = {"shape": [1], "names": None}
+        numbers = ("frame_index", "episode_index", "index", "task_index")
+        features: dict[str, Any] = {
+            CAMERA: {"dtype": "image", "shape": self._shape, "names": ["height", "width", "channel"]},
+            "observation.state": {"dtype": "float32", "shape": [len(self._names)], "names": self._names},
+            **(
+                {"action": {"dtype": "float32", "shape": [len(self._actions)], "names": self._actions}}
+                if self._actions
+                else {}
+            ),
+            "timestamp": {"dtype": "float32", **single},
+            **{name: {"dtype": "int64", **single} for name in numbers},
+        }
+        info = {
+            "codebase_version": "v2.1",
+            "robot_type": self._embodiment,
+            EMBODIMENT: self._embodiment,
+            "fps": int(self._fps) if float(self._fps).is_integer() else self._fps,
+            "total_episodes": len(self._lengths),
+            "total_frames": self._before,
+            "total_tasks": 1,
+            "total_videos": 0,
+            "total_chunks": 1,
+            "chunks_size": 1000,
+            "splits": {"train": f"0:{len(self._lengths)}"},
+            "data_path": _DATA,
+            "video_path": None,
+            "features": features,
+        }
+        (meta / "info.json").write_text(json.dumps(info, indent=2) + "\n")
+        return self.folder
+
+
+def _matrix(pyarrow, values: np.ndarray):
+    values = np.ascontiguousarray(values, dtype=np.float32)
+    return pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(values.reshape(-1)), values.shape[1])
+
+
+def encode_png(frame: np.ndarray) -> bytes:
+    """A picture uint8 ``[H, W, 3]`` as PNG."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(frame).save(buffer, format="PNG", compress_level=3)
+    return buffer.getvalue()
+
+
+def read_image_info(folder: str | Path) -> dict[str, Any]:
+    """Description of a data set with camera frames.
+
+    Raises:
+        ImageDataError: if there is none, or it has no camera.
+    """
+    path = Path(folder) / "meta" / "info.json"
+    if not path.is_file():
+        raise ImageDataError(f"{folder} holds no finished data set (meta/info.json is missing); `koap demos` makes one")
+    info = json.loads(path.read_text())
+    if CAMERA not in info.get("features", {}):
+        raise ImageDataError(f"{folder} has no camera {CAMERA!r}: there is nothing to embed")
+    return info
+
+
+def read_image_episodes(
+    folder: str | Path, *, episodes: int | None = None, embodiment: str | None = None
+) -> list[ImageEpisode]:
+    """Episodes with their frames.
+
+    Args:
+        folder (str or Path): a data set that :class:`ImageEpisodeWriter` wrote.
+
+    Keyword Args:
+        episodes (int, optional): only so many, from the first. Default: all.
+        embodiment (str, optional): refuse demonstrations of another one.
+
+    Raises:
+        ImageDataError: if the folder holds no such data set, too few episodes, or those of another embodiment.
+    """
+    from PIL import Image
+
+    info, pyarrow = read_image_info(folder), _pyarrow()
+    own, total = info.get(EMBODIMENT, "unknown"), info["total_episodes"]
+    if embodiment is not None and own != embodiment:
+        raise ImageDataError(f"{folder} holds demonstrations of embodiment {own!r}, wanted {embodiment!r}")
+    if episodes is not None and not 1 <= episodes <= total:
+        raise ImageDataError(f"{folder} holds {total} episodes, asked for {episodes}")
+    found = []
+    for number in range(total if episodes is None else episodes):
+        table = pyarrow.parquet.read_table(Path(folder) / _DATA.format(episode_chunk=0, episode_index=number))
+        columns = {name: table[name].to_pylist() for name in table.column_names if not name.endswith("index")}
+        frames = np.stack([np.asarray(Image.open(io.BytesIO(cell["bytes"]))) for cell in columns[CAMERA]])
+        action = np.array(columns["action"], dtype=np.float32)[:-1] if "action" in columns else None
+        found.append(ImageEpisode(frames, np.array(columns["observation.state"], dtype=np.float32), action, own))
+    return found

@@ -1,0 +1,156 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A scripted scooper for both embodiments: over the bowl, down, along its floor, nose up, out; again if it is empty."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
+from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics, rotation_of
+from torchrl_koap.lookup import lookup
+from torchrl_koap.tasks.scooping import BOWL, FRAME_HZ, START_HEIGHT, STARTS
+
+
+@dataclass(frozen=True)
+class Habits:
+    """How an embodiment moves.
+
+    Args:
+        speed (float): of the spoon in the air (m/s).
+        drag (float): of the spoon in the bowl (m/s).
+        headings (tuple of float): direction of the stroke from each start position (rad).
+        heading_sigma (float): its spread (rad).
+        wander (float): typical deviation from the planned path (m).
+        tilt (float): typical roll of the spoon (rad).
+        above (float): height at which it comes over the bowl (m).
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.scooping import HABITS
+        >>> HABITS["hand"].speed > HABITS["robot"].speed
+        True
+    """
+
+    speed: float
+    drag: float
+    headings: tuple[float, ...]
+    heading_sigma: float
+    wander: float
+    tilt: float
+    above: float
+
+
+HABITS = {
+    "robot": Habits(0.16, 0.07, (-0.8, 0.0, 0.8), 0.12, 0.004, 0.02, 0.13),
+    "hand": Habits(0.26, 0.08, (-1.1, 0.35, 1.1), 0.2, 0.005, 0.04, 0.16),
+}
+_STROKE = (-0.025, 0.034)  # from where to where the spoon goes in the bowl, along the heading (m)
+_NOSE_DOWN, _NOSE_UP = 0.22, -0.5  # rad
+
+
+class ScoopingExpert:
+    """The scooper of one episode.
+
+    Args:
+        sims (ScoopingSimulations): where it acts; it sees the pieces and its spoon there.
+        row (int): which simulation.
+        start (int): number of the start position.
+        seed (int or sequence): of its variation.
+    """
+
+    embodiments = tuple(HABITS)
+
+    def __init__(self, sims: ScoopingSimulations, row: int, start: int, seed):
+        self.sims, self.row = sims, row
+        self.habits = lookup(HABITS, sims.embodiment, "embodiment")
+        self._generator = np.random.default_rng(seed)
+        self._arm = SpoonKinematics() if sims.embodiment == "robot" else None
+        self._start, self.attempts, self._wander = start, 0, np.zeros(3)
+        self._pose = np.array([*sims.spoon_position[row], 0.0, 0.0, 0.0])  # x, y, z, yaw, pitch, roll
+        self._queue: list[tuple[np.ndarray, float]] = []
+        self._segment: tuple[np.ndarray, np.ndarray, int, int] | None = None
+        self._tilt = self.habits.tilt * self._generator.standard_normal()
+        self._hurry = math.exp(0.12 * self._generator.standard_normal())
+        self.finished = False
+
+    def _plan(self) -> None:
+        """Way points of one attempt, each with the speed of the way to it (m/s)."""
+        draw, habits = self._generator, self.habits
+        heading = habits.headings[self._start] + habits.heading_sigma * draw.standard_normal()
+        ahead = np.array([math.cos(heading), math.sin(heading)])
+        aside = np.array([-ahead[1], ahead[0]])
+        pieces = self.sims.piece_positions[self.row]
+        local = np.stack([(pieces[:, :2] - BOWL) @ ahead, (pieces[:, :2] - BOWL) @ aside], 1)[pieces[:, 2] < 0.05]
+        offsets = np.linspace(-0.02, 0.02, 9)
+        ahead_of = local[local[:, 0] > _STROKE[0] + 0.01]
+        caught = [(np.abs(ahead_of[:, 1] - offset) < 0.015).sum() for offset in offsets]
+        offset = offsets[int(np.argmax(np.array(caught) + 0.5 * draw.random(len(offsets))))]
+
+        def at(along, height, pitch):
+            x, y = BOWL + along * ahead + offset * aside
+            return np.array([x, y, height, heading, pitch, self._tilt])
+
+        reach = _STROKE[1] - 0.3 * abs(offset) + 0.003 * draw.standard_normal()
+        above = habits.above + 0.008 * draw.standard_normal()
+        leave = BOWL + 0.5 * (np.array(list(STARTS.values())[self._start]) - BOWL)
+        self._queue = [
+            (at(_STROKE[0], above, _NOSE_DOWN), habits.speed),
+            (at(_STROKE[0], 0.006, _NOSE_DOWN), 0.8 * habits.speed),
+            (at(reach, 0.006, 0.6 * _NOSE_DOWN), habits.drag),
+            (at(reach - 0.004, 0.02, _NOSE_UP), habits.drag),
+            (at(0.2 * reach, 0.14, _NOSE_UP), 0.5 * habits.speed),
+            (np.array([*leave, START_HEIGHT, 0.7 * heading, _NOSE_UP, self._tilt]), habits.speed),
+        ]
+        self.attempts += 1
+
+    def target(self) -> np.ndarray:
+        """The joint targets of the next frame ``[nu]``: joints (rad), or position (m) and angles (rad) of the hand."""
+        if self._segment is None and not self._next():
+            self.finished = True
+        if self._segment is not None:
+            begin, end, steps, done = self._segment
+            done += 1
+            share = done / steps
+            self._pose = begin + (end - begin) * share**3 * (10 - 15 * share + 6 * share**2)
+            self._segment = None if done == steps else (begin, end, steps, done)
+        self._wander = 0.85 * self._wander + 0.53 * self.habits.wander * self._generator.standard_normal(3)
+        pose = self._pose.copy()
+        free = np.clip((pose[2] - 0.03) / 0.1, 0, 1)  # careful in the bowl
+        pose[:3] += np.array([0.3 + 0.7 * free, 0.3 + 0.7 * free, free]) * self._wander
+        if self._arm is None:
+            return pose
+        return self._arm.solve(pose[:3], rotation_of(*pose[3:]), self.sims.commands[self.row], iterations=12)
+
+    def _next(self) -> bool:
+        """Begins the way to the next way point; False where there is none left."""
+        lifted = len(self._queue) == 1 and self.attempts < 4
+        if lifted and not self.sims.pieces_on_spoon([self.row])[0]:
+            self._queue = []  # empty: once more
+        if not self._queue:
+            if self.attempts and (self.sims.success[self.row] or self.attempts >= 4):
+                return False
+            self._plan()
+        end, speed = self._queue.pop(0)
+        way = np.linalg.norm(end[:3] - self._pose[:3]) + 0.06 * np.abs(end[3:] - self._pose[3:]).max()
+        steps = max(round(1.5 * way / (speed * self._hurry) * FRAME_HZ), 2)
+        self._segment = (self._pose.copy(), end, steps, 0)
+        return True
+
+
+def start_joints(context: np.ndarray, embodiment: str, arm: SpoonKinematics | None = None) -> np.ndarray:
+    """Joints with which an episode begins.
+
+    Args:
+        context (np.ndarray): context ``[1, 3]``: where the spoon is, x, y (m); the last number is not looked at.
+        embodiment (str): ``"robot"`` or ``"hand"``.
+        arm (SpoonKinematics, optional): where there is one already.
+
+    Returns:
+        np.ndarray: ``[7]`` (rad), of the hand ``[6]`` (m, rad).
+    """
+    position = np.array([context[0, 0], context[0, 1], START_HEIGHT])
+    if embodiment == "hand":
+        return np.array([*position, 0.0, 0.0, 0.0])
+    return (arm or SpoonKinematics()).solve(position, np.eye(3), iterations=80)

@@ -1,0 +1,167 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recording Scooping: camera frames of a robot with its joint targets, or of a hand without."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from torchrl_koap.data.lerobot.images import ImageEpisode, ImageEpisodeWriter
+from torchrl_koap.envs.contexts import draw_contexts
+from torchrl_koap.envs.experts.scooping import HABITS, ScoopingExpert, start_joints
+from torchrl_koap.envs.mujoco.rendering import Renderer
+from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
+from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics
+from torchrl_koap.lookup import lookup
+from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.scooping import FRAME_HZ, IMAGE_SIZE, STARTS, start_of
+
+AFTERWARDS = 3  # frames that are recorded after a success
+MAX_ATTEMPTS = 10
+CAMERA = "third_person"
+
+
+@dataclass(frozen=True)
+class VideoReport:
+    """What a recording came to.
+
+    Args:
+        embodiment (str): who was recorded.
+        episodes (int): demonstrations that were kept.
+        attempts (int): demonstrations that were played.
+        frames (int): frames of those that were kept.
+        again (int): how many of those scooped more than once.
+    """
+
+    embodiment: str
+    episodes: int
+    attempts: int
+    frames: int
+    again: int
+
+
+def play_episodes(
+    embodiment: str, episodes: int, seed: int = 0, *, size: int = IMAGE_SIZE
+) -> Iterator[tuple[ImageEpisode, int, int]]:
+    """Demonstrations in their order; one that does not succeed is played again, from another place.
+
+    They begin at the start positions in turn, so that the first few of them have seen them all.
+
+    Args:
+        embodiment (str): ``"robot"`` or ``"hand"``.
+        episodes (int): number of demonstrations.
+        seed (int): of starts and players.
+
+    Keyword Args:
+        size (int): pixels of the frames, both ways.
+
+    Yields:
+        tuple: the demonstration, how often it was played, and how often the spoon went into the bowl.
+
+    Raises:
+        ValueError: for another embodiment, or a number out of range.
+        RuntimeError: if nothing can be drawn, or the expert fails again and again.
+    """
+    lookup(HABITS, embodiment, "embodiment")
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    if seed < 0:
+        raise ValueError(f"seed must be at least 0, got {seed}")
+    sims, arm = ScoopingSimulations(embodiment, 1), SpoonKinematics()
+    renderer = Renderer(sims.model, size, size, shadows=False)
+    stream, rows = sorted(HABITS).index(embodiment), np.zeros(1, dtype=np.int64)
+    try:
+        for number in range(episodes):
+            for attempt in range(MAX_ATTEMPTS):
+                own = (seed, stream, number, attempt)
+                context = _context_at(number % len(STARTS), np.random.default_rng((*own, 1)))
+                sims.reset(rows, start_joints(context, embodiment, arm)[None], [context[0, 2]])
+                expert = ScoopingExpert(sims, 0, start_of(context), own)
+                episode = _play(sims, expert, lambda: renderer.render(sims.data[0], CAMERA))
+                if episode is not None:
+                    yield episode, attempt + 1, expert.attempts
+                    break
+            else:
+                raise RuntimeError(f"the {embodiment} never succeeded in {MAX_ATTEMPTS} attempts, episode {number}")
+    finally:
+        renderer.close()
+        sims.close()
+
+
+def _context_at(start: int, generator: np.random.Generator) -> np.ndarray:
+    """A random context around one of the start positions."""
+    while True:
+        context = draw_contexts("scooping", 1, generator)[0]
+        if start_of(context) == start:
+            return context
+
+
+def _play(sims: ScoopingSimulations, expert: ScoopingExpert, draw: Callable[[], np.ndarray]) -> ImageEpisode | None:
+    rows = np.zeros(1, dtype=np.int64)
+    frames, spoons, actions, after = [draw()], [sims.spoon_position[0]], [], 0
+    for _ in range(get_task("scooping").max_steps):
+        target = expert.target()
+        if expert.finished:
+            break
+        sims.advance(rows, target[None])
+        frames.append(draw())
+        spoons.append(sims.spoon_position[0])
+        actions.append(target)
+        after += int(sims.success[0])
+        if after > AFTERWARDS:
+            break
+    if not sims.success[0]:
+        return None
+    labels = np.stack(actions) if sims.embodiment == "robot" else None
+    return ImageEpisode(np.stack(frames), np.stack(spoons), labels, sims.embodiment)
+
+
+def record_videos(
+    folder: str | Path,
+    embodiment: str,
+    episodes: int,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> VideoReport:
+    """Records demonstrations as a LeRobot data set with pictures.
+
+    Args:
+        folder (str or Path): folder to write.
+        embodiment (str): ``"robot"`` (with the joint targets as actions) or ``"hand"`` (frames alone).
+        episodes (int): number of demonstrations.
+        seed (int): of starts and players; the two embodiments never share a start.
+        progress (callable, optional): called with the number of demonstrations recorded and wanted.
+
+    Raises:
+        FileExistsError: if the folder holds demonstrations already.
+        ValueError: for another embodiment, or a number out of range.
+        RuntimeError: if there is no OpenGL library, pyarrow is missing, or the expert fails again and again.
+    """
+    task, folder = get_task("scooping"), Path(folder)
+    if folder.exists() and any(folder.iterdir()):
+        raise FileExistsError(f"{folder} is not empty; choose another folder")
+    players = play_episodes(embodiment, episodes, seed)
+    writer = ImageEpisodeWriter(
+        folder,
+        fps=FRAME_HZ,
+        state_names=("spoon_x", "spoon_y", "spoon_z"),
+        action_names=task.action_names if embodiment == "robot" else (),
+        embodiment=embodiment,
+        task="take a piece out of the bowl with the spoon",
+    )
+    attempts = frames = again = 0
+    try:
+        for number, (episode, played, scooped) in enumerate(players, 1):
+            writer.add(episode)
+            attempts, frames, again = attempts + played, frames + len(episode.frames), again + (scooped > 1)
+            if progress is not None:
+                progress(number, episodes)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    writer.close()
+    return VideoReport(embodiment, episodes, attempts, frames, again)

@@ -1,0 +1,213 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A batch of Scooping's simulations: joint targets in, the spoon's pose and the pieces in it out."""
+
+from __future__ import annotations
+
+import functools
+import math
+from concurrent.futures import ThreadPoolExecutor
+
+import mujoco
+import numpy as np
+
+from torchrl_koap.envs.mujoco.scooping_scene import SPOON_HALF, TIMESTEP, scooping_model
+from torchrl_koap.tasks.scooping import (
+    BOWL,
+    CONTROL_HZ,
+    FRAME_HZ,
+    NUM_PIECES,
+    PIECE_RADIUS,
+    RIM_HEIGHT,
+    RIM_RADIUS,
+)
+
+TICKS = round(CONTROL_HZ / FRAME_HZ)  # commands per frame
+SUBSTEPS = round(1 / (CONTROL_HZ * TIMESTEP))  # per command
+OVER_RIM = RIM_HEIGHT + 0.05  # m; lower than that over the bowl, the spoon has reached over its rim
+LEFT_BOWL = RIM_HEIGHT + 0.04  # m; higher than that, the spoon has left the bowl
+HELD_TICKS = 6  # commands for which a piece has to stay on a spoon that has left the bowl
+_LAYOUTS, _SIDES = 6, 16  # settled layouts of the pieces; turns by which they can be laid
+_PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION.value
+
+
+class ScoopingSimulations:
+    """Simulations of one embodiment that are advanced together, in one or several threads.
+
+    Args:
+        embodiment (str): ``"robot"`` or ``"hand"``.
+        num_sims (int): number of simulations.
+        num_threads (int): threads that advance them; results do not depend on it.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
+        >>> sims = ScoopingSimulations("hand", 2)
+        >>> target = np.array([[0.45, 0.0, 0.2, 0.0, 0.0, 0.0]] * 2)
+        >>> sims.reset(np.arange(2), target, turns=[0.0, 1.0])
+        >>> sims.advance(np.arange(2), target)
+        >>> sims.spoon_position.round(2).tolist(), sims.pieces_on_spoon().tolist()
+        ([[0.45, 0.0, 0.2], [0.45, 0.0, 0.2]], [0, 0])
+    """
+
+    def __init__(self, embodiment: str, num_sims: int, num_threads: int = 1):
+        self.embodiment, self.num_threads = embodiment, num_threads
+        self.model = scooping_model(embodiment)
+        self.data = [mujoco.MjData(self.model) for _ in range(num_sims)]
+        self.commands = np.zeros((num_sims, self.model.nu))
+        self.rim = np.zeros(num_sims, dtype=bool)
+        self.held = np.zeros(num_sims, dtype=np.int64)
+        self._site = self.model.site("spoon").id
+        self._pieces = 7 * NUM_PIECES  # numbers that make up the pieces' poses
+        self._executor: ThreadPoolExecutor | None = None
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    @property
+    def spoon_position(self) -> np.ndarray:
+        """Position of the spoon ``[n, 3]`` (m): the middle of its floor."""
+        return np.stack([data.site_xpos[self._site] for data in self.data])
+
+    @property
+    def spoon_rotation(self) -> np.ndarray:
+        """Axes of the spoon ``[n, 3, 3]``, in columns: its open front, its left, up."""
+        return np.stack([data.site_xmat[self._site].reshape(3, 3) for data in self.data])
+
+    @property
+    def joint_positions(self) -> np.ndarray:
+        """Measured joints ``[n, nu]`` (rad; the hand's first three in m)."""
+        return np.stack([data.qpos[self._pieces :] for data in self.data])
+
+    @property
+    def piece_positions(self) -> np.ndarray:
+        """Positions of the pieces ``[n, pieces, 3]`` (m)."""
+        return np.stack([_positions(data) for data in self.data])
+
+    @property
+    def success(self) -> np.ndarray:
+        """Whether the spoon has left the bowl with a piece, bool ``[n]``."""
+        return self.held >= HELD_TICKS
+
+    def pieces_on_spoon(self, rows=None) -> np.ndarray:
+        """Number of pieces that lie on the spoon, int64 ``[len(rows)]``, of all simulations by default."""
+        return np.array([self._on_spoon(self.data[row]) for row in (range(len(self)) if rows is None else rows)])
+
+    def _on_spoon(self, data: mujoco.MjData) -> int:
+        local = (_positions(data) - data.site_xpos[self._site]) @ data.site_xmat[self._site].reshape(3, 3)
+        inside = (np.abs(local[:, :2]) < np.array(SPOON_HALF) + 0.002).all(1)
+        return int((inside & (local[:, 2] > 0) & (local[:, 2] < 4 * PIECE_RADIUS)).sum())
+
+    def reset(self, rows: np.ndarray, joints: np.ndarray, turns) -> None:
+        """Starts episodes.
+
+        Args:
+            rows (np.ndarray): indices of the simulations.
+            joints (np.ndarray): joints ``[len(rows), nu]`` (rad; the hand's first three in m).
+            turns (sequence of float): number in -pi to pi for each of them that decides where the pieces lie.
+        """
+        bank = settled_layouts()
+        for row, own, turn in zip(rows, joints, turns, strict=True):
+            data = self.data[row]
+            mujoco.mj_resetData(self.model, data)
+            share = (turn + math.pi) / (2 * math.pi)
+            layout = bank[min(int(share * _LAYOUTS), _LAYOUTS - 1)]
+            angle = 2 * math.pi / _SIDES * int(share * _LAYOUTS * _SIDES % _SIDES)
+            poses = data.qpos[: self._pieces].reshape(NUM_PIECES, 7)
+            poses[:, :3] = _turned(layout, angle)
+            data.qpos[self._pieces :] = own
+            data.ctrl[:] = own
+            mujoco.mj_forward(self.model, data)
+            self.commands[row] = own
+        self.rim[rows] = False
+        self.held[rows] = 0
+
+    def advance(self, rows: np.ndarray, targets: np.ndarray) -> None:
+        """One frame: the commands go from the last target to the new one in equal parts.
+
+        Args:
+            rows (np.ndarray): indices of the simulations.
+            targets (np.ndarray): joint targets ``[n, nu]``; rows not advanced are ignored.
+
+        Raises:
+            RuntimeError: if a simulation becomes unstable.
+        """
+        if self.num_threads == 1 or len(rows) == 1:
+            for row in rows:
+                self._advance_one(int(row), targets[row])
+            return
+        if self._executor is None:
+            self._executor = ThreadPoolExecutor(self.num_threads, thread_name_prefix="koap-scooping")
+        for _ in self._executor.map(lambda row: self._advance_one(int(row), targets[row]), rows):
+            pass
+
+    def _advance_one(self, row: int, target: np.ndarray) -> None:
+        data, begin = self.data[row], self.commands[row].copy()
+        due = data.time + TICKS * SUBSTEPS * TIMESTEP
+        for tick in range(1, TICKS + 1):
+            data.ctrl[:] = begin + (target - begin) * tick / TICKS
+            mujoco.mj_step(self.model, data, SUBSTEPS)
+            self._judge(row, data)
+        mujoco.mj_kinematics(self.model, data)  # the spoon where the joints are now
+        self.commands[row] = target
+        if abs(data.time - due) > TIMESTEP:  # MuJoCo resets a state that blows up
+            raise RuntimeError(f"the simulation of environment {row} became unstable")
+
+    def _judge(self, row: int, data: mujoco.MjData) -> None:
+        x, y, height = data.site_xpos[self._site]
+        over = math.hypot(x - BOWL[0], y - BOWL[1]) < RIM_RADIUS
+        self.rim[row] |= over and height < OVER_RIM
+        left = self.rim[row] and height > LEFT_BOWL
+        if self.held[row] < HELD_TICKS:
+            self.held[row] = self.held[row] + 1 if left and self._on_spoon(data) else 0
+
+    def get_state(self, row: int) -> dict[str, np.ndarray]:
+        """Everything that decides the future of one simulation."""
+        physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
+        mujoco.mj_getState(self.model, self.data[row], physics, _PHYSICS)
+        return {"physics": physics} | {name: np.copy(getattr(self, name)[row]) for name in ("commands", "rim", "held")}
+
+    def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
+        """Restores what :meth:`get_state` returned."""
+        data = self.data[row]
+        mujoco.mj_resetData(self.model, data)
+        mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
+        mujoco.mj_forward(self.model, data)
+        mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
+        for name in ("commands", "rim", "held"):
+            getattr(self, name)[row] = state[name]
+
+    def close(self) -> None:
+        """Ends the threads; they start again when needed."""
+        if self._executor is not None:
+            self._executor.shutdown()
+            self._executor = None
+
+
+def _positions(data: mujoco.MjData) -> np.ndarray:
+    return data.qpos[: 7 * NUM_PIECES].reshape(NUM_PIECES, 7)[:, :3]
+
+
+def _turned(layout: np.ndarray, angle: float) -> np.ndarray:
+    c, s = math.cos(angle), math.sin(angle)
+    x, y = layout[:, 0] - BOWL[0], layout[:, 1] - BOWL[1]
+    return np.stack([BOWL[0] + c * x - s * y, BOWL[1] + s * x + c * y, layout[:, 2]], 1)
+
+
+@functools.cache
+def settled_layouts() -> np.ndarray:
+    """Pieces at rest in the bowl ``[layouts, pieces, 3]`` (m), dropped there once per process, always the same."""
+    model = scooping_model("hand")
+    data = mujoco.MjData(model)
+    layouts = []
+    for seed in range(_LAYOUTS):
+        generator = np.random.default_rng(seed)
+        mujoco.mj_resetData(model, data)
+        data.qpos[-6:] = data.ctrl[:] = (0.0, 0.0, 0.5, 0.0, 0.0, 0.0)
+        poses = data.qpos[: 7 * NUM_PIECES].reshape(NUM_PIECES, 7)
+        radius, angle = 0.05 * np.sqrt(generator.random(NUM_PIECES)), generator.uniform(0, 2 * math.pi, NUM_PIECES)
+        poses[:, 0], poses[:, 1] = BOWL[0] + radius * np.cos(angle), BOWL[1] + radius * np.sin(angle)
+        poses[:, 2] = 0.02 + 0.006 * np.arange(NUM_PIECES)
+        mujoco.mj_step(model, data, 360)
+        data.qvel[:] = 0
+        layouts.append(_positions(data).copy())
+    return np.stack(layouts)

@@ -1,0 +1,185 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Scooping: a Panda takes pieces out of a bowl with a spoon and sees embeddings of a camera's frames alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Unbounded
+
+from torchrl_koap.envs.base import ManipulationEnv
+from torchrl_koap.envs.experts.scooping import start_joints
+from torchrl_koap.envs.mujoco.rendering import Renderer
+from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
+from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics
+from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE
+from torchrl_koap.vision.encoder import FrozenImageEncoder
+from torchrl_koap.vision.projections import load_encoder
+
+JOINT_SPEED = 2.5  # rad/s; targets that are further away are gone towards at this speed
+PIXELS = "pixels"
+_CAMERA = "third_person"
+
+
+class ScoopingEnv(ManipulationEnv):
+    """Scooping as a native-batch TorchRL environment on MuJoCo.
+
+    =============== ============ ================= ============================================================
+    key             shape        dtype             meaning
+    =============== ============ ================= ============================================================
+    ``observation`` [n, 99]      ``dtype``         0-95 embedding of the camera's frame, 96-98 the spoon's
+                                                   position (m), which planner and controller never see
+    ``action``      [n, 7]       ``dtype``         joint targets (rad) for the end of the step, absolute
+    ``pixels``      [n, H, W, 3] uint8             the frame, where ``pixels`` was asked for
+    ``success``     [n, 1]       bool              the spoon has left the bowl with a piece on it
+    ``mode``        [n, 1]       bool              the spoon has reached over the rim
+    ``context``     [n, 1, 3]    ``dtype``         where the spoon starts, x, y (m); how the pieces lie (rad)
+    ``reward``      [n, 1]       ``dtype``         1 where ``success`` else 0
+    =============== ============ ================= ============================================================
+
+    A step is a frame of 100 ms, in which the joints' servos are commanded three times (30 Hz), on a straight line from
+    the last target to the new one. *Over the rim*: the middle of the spoon's floor is inside the rim's circle and less
+    than 5 cm above it. *Success*: afterwards the spoon is 4 cm above the rim and carries a piece for 0.2 s. There is no
+    failure, and what is observed is the present frame, unlike in D3IL's tasks.
+
+    Args:
+        num_envs (int): number of environments, the batch size.
+        num_threads (int): threads that advance the physics; frames are drawn one after the other.
+        max_steps (int): steps after which an episode is truncated.
+        seed (int, optional): seed of the random contexts.
+        device (torch.device, optional): device of the tensors handed out.
+        dtype (torch.dtype): floating type of observation, action and reward.
+
+    Keyword Args:
+        contexts (array, optional): table of contexts [C, 1, 3] to take in turn; random ones by default.
+        encoder (FrozenImageEncoder, str or Path, optional): what embeds the frames, or the file of its projection.
+            Default: EfficientNet-Lite0 and the projection that comes with the package.
+        embed (bool): embed the frames. Without, the embedding is zero and neither OpenGL nor weights are needed.
+        pixels (bool): hand the frames out too.
+
+    Raises:
+        ValueError: for sizes below 1, contexts out of range, an embedding of another size than the task's, actions of
+            a wrong shape or that are not finite.
+        RuntimeError: if there is no OpenGL library.
+        WeightsError: if there are no weights, or others than those of the projection.
+
+    Examples:
+        >>> from torchrl_koap.envs import ScoopingEnv
+        >>> env = ScoopingEnv(num_envs=2, seed=0, embed=False)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([2, 3, 99])
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        num_threads: int = 1,
+        max_steps: int = 120,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+        dtype: torch.dtype = torch.float32,
+        *,
+        contexts=None,
+        encoder: FrozenImageEncoder | str | Path | None = None,
+        embed: bool = True,
+        pixels: bool = False,
+    ):
+        self._arm = SpoonKinematics()
+        chosen = None
+        if embed:
+            chosen = encoder if isinstance(encoder, FrozenImageEncoder) else load_encoder(encoder)
+            dim = 0 if chosen.projection is None else chosen.projection.dim
+            if dim != EMBEDDING_DIM:
+                raise ValueError(f"the encoder's projection must have {EMBEDDING_DIM} components, got {dim}")
+        self._pixels = np.zeros((num_envs, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8) if embed or pixels else None
+        self._hand_out = pixels
+        self._camera: Renderer | None = None
+        super().__init__(
+            get_task("scooping"),
+            None,
+            start_joints=np.zeros(7),
+            num_mode_flags=1,
+            action_bound=(tuple(self._arm.low), tuple(self._arm.high)),
+            num_envs=num_envs,
+            num_threads=num_threads,
+            max_steps=max_steps,
+            seed=seed,
+            device=device,
+            dtype=dtype,
+            contexts=contexts,
+            simulations=ScoopingSimulations("robot", num_envs, num_threads),
+        )
+        self._encoder = chosen
+        if pixels:
+            self.observation_spec[PIXELS] = Unbounded(self._pixels.shape, dtype=torch.uint8, device=self.device)
+        if self._pixels is not None:
+            self._camera = Renderer(self.sims.model, IMAGE_SIZE, IMAGE_SIZE, shadows=False)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, *, contexts=None, **kwargs) -> TensorDictBase:
+        rows = self._rows(tensordict, "_reset")
+        self._draw_contexts(rows, contexts)
+        joints = np.stack([start_joints(context, "robot", self._arm) for context in self._contexts[rows]])
+        self.sims.reset(rows, joints, self._contexts[rows, 0, 2])
+        self._begin_episode(rows)
+        return self._leaves(np.zeros(self.batch_size[0], dtype=bool))
+
+    def _begin(self, rows: np.ndarray) -> None:
+        self._commands[rows] = self.sims.commands[rows]
+
+    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
+        reach = JOINT_SPEED / FRAME_HZ
+        targets = np.clip(action, self._arm.low, self._arm.high)
+        self._commands[rows] += np.clip(targets - self._commands[rows], -reach, reach)
+
+    def _advance(self, rows: np.ndarray) -> None:
+        self.sims.advance(rows, self._commands)
+
+    def _observe(self, rows: np.ndarray) -> np.ndarray:
+        embedding = np.zeros((len(rows), EMBEDDING_DIM))
+        if self._camera is not None:
+            self._pixels[rows] = [self._camera.render(self.sims.data[row], _CAMERA) for row in rows]
+            if self._encoder is not None:
+                embedding = self._encoder.embed(torch.from_numpy(self._pixels[rows])).double().numpy()
+        return np.concatenate([embedding, self.sims.spoon_position[rows]], axis=1)
+
+    def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.sims.success[rows], np.zeros(len(rows), dtype=bool)
+
+    def _update_mode(self, rows: np.ndarray) -> None:
+        self._mode[rows, 0] = self.sims.rim[rows]
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        rows = self._rows(tensordict, "_step")
+        rows = rows[~self._success[rows]]  # what is over stays as it is, and costs no frame
+        self._command(rows, self._checked_action(tensordict, rows))
+        self._advance(rows)
+        self._steps[rows] += 1
+        self._update_mode(rows)
+        self._success[rows] = self._check(rows)[0]
+        self._observation[rows] = self._observe(rows)
+        stepped = np.zeros(self.batch_size[0], dtype=bool)
+        stepped[rows] = True
+        out = self._leaves(stepped)
+        out.set("reward", self._tensor((self._success & stepped)[:, None], self._dtype))
+        return out
+
+    def _leaves(self, stepped: np.ndarray) -> TensorDictBase:
+        leaves = super()._leaves(stepped)
+        if self._hand_out:
+            leaves.set(PIXELS, self._tensor(self._pixels))
+        return leaves
+
+    def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str = _CAMERA) -> np.ndarray:
+        """Draws one environment, see :meth:`ManipulationEnv.render`; cameras: ``"third_person"`` and ``"front"``."""
+        return super().render(index, width, height, camera)
+
+    def close(self, **kwargs) -> None:
+        """Frees graphics memory and threads."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+        super().close(**kwargs)

@@ -1,0 +1,102 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Scooping: a spoon takes pieces out of a bowl; a camera is all that planner and controller see."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from torchrl_koap.tasks.registry import register_task
+from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.task import Defaults, Task
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+    from tensordict import TensorDictBase
+
+BOWL = (0.52, 0.0)  # centre of the bowl (m)
+BOWL_RADIUS = 0.055  # of its floor (m)
+RIM_RADIUS, RIM_HEIGHT = 0.11, 0.05  # m
+NUM_PIECES, PIECE_RADIUS = 36, 0.009  # m
+START_HEIGHT = 0.2  # of the spoon (m)
+START_HALF = 0.02  # half the extent of a start region (m)
+STARTS = {"left": (0.5, 0.22), "near": (0.33, 0.0), "right": (0.5, -0.22)}  # of the spoon: x, y (m)
+EMBODIMENTS = ("robot", "hand")
+FRAME_HZ = 10.0  # frames, and actions, per second
+CONTROL_HZ = 30.0  # commands per second
+EMBEDDING_DIM = 96  # columns
+IMAGE_SIZE = 96  # pixels, both ways
+
+
+def start_of(context: np.ndarray) -> int:
+    """Number of the start position that a context ``[1, 3]`` was drawn around, in the order of :data:`STARTS`.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.tasks.scooping import start_of
+        >>> start_of(np.array([[0.34, 0.01, 0.5]]))
+        1
+    """
+    x, y = context[0][:2]
+    distances = [(x - a) ** 2 + (y - b) ** 2 for a, b in STARTS.values()]
+    return distances.index(min(distances))
+
+
+def scores(
+    result: dict[str, Any], episodes: Sequence[TensorDictBase], contexts: Sequence[int] | None
+) -> dict[str, float]:
+    """How often the spoon came over the bowl, and how often it left with a piece from each start position.
+
+    Args:
+        result (dict): the scores so far.
+        episodes (sequence of TensorDictBase): one trajectory ``[T_i]`` each.
+        contexts (sequence of int, optional): not looked at.
+
+    Returns:
+        dict: ``rim_rate``, ``success_left``, ``success_near``, ``success_right``; a start position that no episode had
+        is left out.
+    """
+    rates = {"rim_rate": sum(float(episode[-1]["next", "mode"][0]) for episode in episodes) / len(episodes)}
+    starts = [start_of(episode[-1]["next", "context"].numpy()) for episode in episodes]
+    for number, name in enumerate(STARTS):
+        own = [
+            float(episode[-1]["next", "success"])
+            for episode, start in zip(episodes, starts, strict=True)
+            if start == number
+        ]
+        if own:
+            rates[f"success_{name}"] = sum(own) / len(own)
+    return rates
+
+
+register_task(
+    Task(
+        name="scooping",
+        observation_parts={"embedding": EMBEDDING_DIM, "spoon": ("x", "y", "z")},
+        observation_units=("",) * EMBEDDING_DIM + ("m",) * 3,
+        position="spoon",
+        hidden=("spoon",),
+        actions={f"joint {joint}": "rad" for joint in range(1, 8)},
+        absolute_actions=tuple(f"joint {joint}" for joint in range(1, 8)),
+        max_steps=120,
+        control_hz=FRAME_HZ,
+        score="torchrl_koap.tasks.scooping:scores",
+        bodies=(Body("spoon", "spoon", color="grey", half=(0.02, 0.02)),),
+        start_regions=StartRegions(
+            tuple(((x - START_HALF, x + START_HALF), (y - START_HALF, y + START_HALF)) for x, y in STARTS.values()),
+            dealt=True,
+            yaw=(-180.0, 180.0),
+        ),
+        env="torchrl_koap.envs.scooping:ScoopingEnv",
+        expert="torchrl_koap.envs.experts.scooping:ScoopingExpert",
+        scene=Scene(
+            shapes=(Shape("circle", BOWL, (RIM_RADIUS, RIM_RADIUS), "zone", label="bowl"),),
+            x=(0.25, 0.7),
+            y=(-0.3, 0.3),
+            caption=" The spoon's path; the circle is the rim of the bowl.",
+            camera="third_person",
+        ),
+        defaults=Defaults(demonstrations=100, planner_steps=4000, relative=False, recovery_sigma=0.0),
+    )
+)
