@@ -86,9 +86,8 @@ def test_every_file_that_ci_installs_has_a_checksum_and_the_version_that_is_pinn
     locked, pinned = pins("requirements-ci.txt"), pins("constraints.txt")
     assert "torch" not in locked  # its CPU wheel is another file than the public one of the same version
     absent = pinned.keys() - locked.keys() - {"torch"}
-    installed = "".join(
-        re.findall(r"^(?:dependencies|dev) = \[.*?^\]", (ROOT / "pyproject.toml").read_text(), re.M | re.S)
-    )
+    lists = r"^(?:dependencies|dev) = \[.*?^\]"
+    installed = "".join(re.findall(lists, (ROOT / "pyproject.toml").read_text(), re.MULTILINE | re.DOTALL))
     assert not [name for name in absent if name in installed.replace("_", "-")]  # extras that CI does without
     assert {name: pinned[name] for name in pinned.keys() & locked.keys()}.items() <= locked.items()
     entries = re.split(r"^(?=[\w.-]+==)", (ROOT / "requirements-ci.txt").read_text(), flags=re.MULTILINE)[1:]
