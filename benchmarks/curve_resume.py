@@ -6,7 +6,7 @@
 Cells get the files that a real one leaves, of made-up content; everything else (locks, checks, reading, the table,
 paired comparisons, plots and the page) is what ``koap curve`` does. The first call makes all cells, the second finds
 all of them done, the third one finds ``--missing`` of them gone. A call goes on with its cells after ``begins_after``
-seconds; plots and page come when they are through.
+seconds, of which its process had a processor for ``begins_processor``; plots and page come when they are through.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from tiny_runs import write_demonstrations  # noqa: E402
 
 TABLE = Path(__file__).parent / "results" / "curve_resume.csv"
-COLUMNS = ("call", "cells", "missing", "begins_after", "seconds", "cells_read", "command")
+COLUMNS = ("call", "cells", "missing", "begins_after", "begins_processor", "seconds", "cells_read", "command")
 EPISODES = 60
 
 
@@ -61,12 +61,12 @@ def finish(folder: Path, cell: dict[str, Any], evaluation: dict[str, Any]) -> No
         (folder / name).write_text(json.dumps(content))
 
 
-STARTED: list[float] = []
+STARTED: list[tuple[float, float]] = []
 
 
 def stub(jobs: Sequence[Job], **options: Any) -> Iterator[tuple[Job, str | None]]:
     """Takes the place of the launcher: every job leaves its files at once."""
-    STARTED.append(time.perf_counter())
+    STARTED.append((time.perf_counter(), time.process_time()))
     for job in jobs:
         if "cell" in job.arguments:
             finish(Path(job.arguments["folder"]), job.arguments["cell"], job.arguments["evaluation"])
@@ -105,12 +105,13 @@ def main() -> None:
             for path in gone:
                 shutil.rmtree(path)
             reads.clear()
-            began = time.perf_counter()
+            began, used = time.perf_counter(), time.process_time()
             result = run_curve(config)
-            seconds, begins = time.perf_counter() - began, STARTED[-1] - began
+            seconds, begins, processor = time.perf_counter() - began, STARTED[-1][0] - began, STARTED[-1][1] - used
             missing = result["done"] if not rows else len(gone)
             command = f"python benchmarks/curve_resume.py --seeds {options.seeds} --missing {options.missing} --write"
-            values = (call, result["done"], missing, f"{begins:.1f}", f"{seconds:.1f}", len(reads), command)
+            clocks = [f"{value:.1f}" for value in (begins, processor, seconds)]
+            values = (call, result["done"], missing, *clocks, len(reads), command)
             rows.append(dict(zip(COLUMNS, values, strict=True)))
             print(" ".join(f"{name} {value}" for name, value in rows[-1].items() if name != "command"), flush=True)
     if options.write:

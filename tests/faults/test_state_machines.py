@@ -172,6 +172,7 @@ QUICK = settings(max_examples=5, stateful_step_count=6, deadline=None, suppress_
 LONG = settings(QUICK, max_examples=150, stateful_step_count=20)
 
 
+@pytest.mark.timeout(1800)  # of the long ones, on a machine with other work
 @pytest.mark.parametrize("how", [QUICK, pytest.param(LONG, marks=pytest.mark.faults)], ids=["quick", "long"])
 @pytest.mark.parametrize("machine", [Resuming, Budgets])
 def test_in_any_order(machine, how):

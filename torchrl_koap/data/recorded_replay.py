@@ -71,13 +71,12 @@ class RecordedExperienceReplay(D3ILExperienceReplay):
         self.root = self._cache = self._data_path = None
         places = [Path(source), Path(source) / "ted"]
         folder = next((place for place in places if (place / "about.json").is_file()), None)
-        reading = {"control_hz": control_hz, "observations": observations, "action_columns": action_columns}
-        reading |= {"action_dim": action_dim, "description": description}
+        reading: dict[str, Any] = {"control_hz": control_hz, "observations": observations}
+        reading |= {"action_columns": action_columns, "action_dim": action_dim}
         if folder is None:
-            described = reading.pop("description") or {}
-            data, task = make_demonstrations(read_recordings(source, **reading), **described)
+            data, task = make_demonstrations(read_recordings(source, **reading), **(description or {}))
         else:
-            given = [name for name, value in reading.items() if value]
+            given = [name for name, value in {**reading, "description": description}.items() if value]
             if given:
                 raise ValueError(f"{folder} holds its description; {', '.join(given)} cannot be given as well")
             task = read_task(folder) or get_task(read_about(folder)["task"])
