@@ -36,6 +36,7 @@ from torchrl_koap.vision.projections import load_encoder
 RESULTS = Path(__file__).parent / "results"
 TABLE, PROBES = RESULTS / "scooping.csv", RESULTS / "scooping_probe.csv"
 UNLABELLED = ("robot", "hand", "both")
+METHODS = ["koap", "koap_paper", "dd", "vae", "lapo", "dp", "pca", "linear"]
 COLUMNS = (
     "labels", "unlabelled", "method", "seed", "n", "successes", "success_low", "success_high", "rims", "rim_low",
     "rim_high", "left", "near", "right", "action_error_mrad", "planner_steps", "planner_error",
@@ -80,7 +81,7 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
         settings = {"method": method, "seed": seed, "planner_from": planner, "steps": options.steps}
         settings |= {"controller_steps": options.controller_steps, "analysis": unlabelled != "hand"}
         train(_config(run, folder, unlabelled, labels, **settings))
-    result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1))
+    result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1, replan_interval=options.replan_interval))
     summary = json.loads((run / "summary.json").read_text())
     n = options.episodes
     successes, rims = round(result["success_rate"] * n), round(result["rim_rate"] * n)
@@ -143,7 +144,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--episodes", type=int, default=15)
     parser.add_argument("--steps", type=int, default=2000, help="planner updates")
-    parser.add_argument("--controller-steps", type=int, default=200)
+    parser.add_argument("--controller-steps", type=int, default=60)
+    parser.add_argument("--replan-interval", type=int, default=8, help="frames of each plan that are executed")
     parser.add_argument("--probe", action="store_true", help="write the table of the probes and stop")
     options = parser.parse_args()
     for who in EMBODIMENTS:

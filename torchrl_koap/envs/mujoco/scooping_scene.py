@@ -60,6 +60,9 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
   <default>
     <geom contype="0" conaffinity="0"/>
     <default class="solid"><geom contype="1" conaffinity="2" friction="0.5 0.005 0.0002" solref="0.01 1"/></default>
+    <default class="tool">
+      <geom contype="4" conaffinity="3" friction="0.5 0.005 0.0002" solref="0.01 1"/>
+    </default>
     <default class="piece">
       <geom contype="2" conaffinity="3" type="sphere" size="{PIECE_RADIUS}" mass="0.004" condim="3"
             friction="0.5 0.003 0.0005" solref="0.01 1" rgba="0.45 0.22 0.1 1"/>
@@ -118,7 +121,7 @@ def _piece(index: int) -> str:
 def _spoon() -> str:
     """A scoop open to the front (x); its origin is the middle of its floor, the handle rises from its back wall."""
     x, y = SPOON_HALF
-    solid = f'class="solid" type="box" rgba="{_STEEL}"'
+    solid = f'class="tool" type="box" rgba="{_STEEL}"'
     return f"""
 <geom name="spoon_floor" {solid} size="{x} {y} 0.001" pos="0 0 -0.001"/>
 <geom name="spoon_left" {solid} size="{x} 0.001 {WALL}" pos="0 {y} {WALL - 0.002}"/>
