@@ -28,10 +28,10 @@ from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS
 from torchrl_koap.training import TrainConfig, train
 from torchrl_koap.vision.backbones import load_backbone
-from torchrl_koap.vision.demonstrations import Source, embed_demonstrations
+from torchrl_koap.vision.demonstrations import Source, embed_demonstrations, fit_projection
 from torchrl_koap.vision.encoder import FrozenImageEncoder
 from torchrl_koap.vision.pooling import Projection
-from torchrl_koap.vision.projections import load_encoder
+from torchrl_koap.vision.projections import SCOOPING, load_encoder, save_encoder
 
 RESULTS = Path(__file__).parent / "results"
 TABLE, PROBES = RESULTS / "scooping.csv", RESULTS / "scooping_probe.csv"
@@ -147,10 +147,18 @@ def main() -> None:
     parser.add_argument("--controller-steps", type=int, default=60)
     parser.add_argument("--replan-interval", type=int, default=8, help="frames of each plan that are executed")
     parser.add_argument("--probe", action="store_true", help="write the table of the probes and stop")
+    parser.add_argument("--fit-projection", action="store_true", help="make the package's projection anew and stop")
     options = parser.parse_args()
     for who in EMBODIMENTS:
         if not (options.folder / who).exists():
             record_videos(options.folder / who, who, options.demonstrations)
+    if options.fit_projection:
+        encoder = FrozenImageEncoder(load_backbone(), pooling="grid", cache=options.folder / "cache")
+        encoder.projection = fit_projection(
+            encoder, [Source(options.folder / who) for who in EMBODIMENTS], EMBEDDING_DIM
+        )
+        save_encoder(encoder, SCOOPING, stride=8, fitted_on="unlabelled frames of robot and hand, koap demos, seed 0")
+        return
     if options.probe:
         rows = probe(options.folder)
         with PROBES.open("w", newline="") as file:
