@@ -4,15 +4,22 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/demo
 
-.PHONY: setup demo test slow faults lint types docs tutorials dist clean
+.PHONY: setup demo test slow faults test-matrix lock lint types docs tutorials dist clean
 
 setup: $(VENV)/.ready
 
-# torch first, from the CPU wheel: anything that lets pip choose another torch downloads gigabytes of CUDA packages
+# torch first, from the CPU wheel: anything that lets pip choose another torch downloads gigabytes of CUDA packages;
+# HASHES=1 takes the files of requirements-ci.txt and no others (Python 3.11, x86-64 Linux)
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet $$(grep '^torch==' constraints.txt)
+	$(BIN)/python -m pip install --quiet $(if $(HASHES),--no-deps) $$(grep '^torch==' constraints.txt)
+ifdef HASHES
+	$(BIN)/python -m pip install --quiet --no-deps --require-hashes --requirement requirements-ci.txt
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m pip check
+else
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+endif
 	touch $@
 
 # demonstrations, training with 2 % of the labels, 60 rollouts, report
@@ -31,6 +38,18 @@ slow: setup
 faults: setup
 	$(BIN)/python -m pytest -n 2 -q -m "faults or not faults" tests/faults
 	$(BIN)/python -m pytest -n 2 -q -m faults tests/commands tests/studies
+
+# lowest and newest dependencies on every Python that is here (needs uv); TORCH is the version of the CPU wheels
+test-matrix:
+	$(PYTHON) tests/try_versions.py
+
+# what CI installs, with checksums (needs uv)
+lock:
+	mkdir -p build
+	uv pip compile --quiet --generate-hashes --no-emit-package torch --no-annotate --no-header --extra dev \
+	    --python-version 3.11 --python-platform x86_64-manylinux_2_28 --constraint constraints.txt pyproject.toml \
+	    --output-file build/requirements-ci.txt
+	(grep '^# ' requirements-ci.txt; cat build/requirements-ci.txt) > build/lock && mv build/lock requirements-ci.txt
 
 lint: types
 	$(BIN)/ruff check .

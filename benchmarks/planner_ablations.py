@@ -27,7 +27,7 @@ from torchrl_koap.training.run_directory import RunDirectory
 TABLE = Path(__file__).parent / "results" / "planner_ablations.csv"
 SIZES = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay")
 UNITS = {"trajectory": "trajectories", "window": "windows", "transition": "transitions"}
-OLDER = {"controller": "learned"}  # in rows that were written before the column
+OLDER = {"controller": "learned", "stacked": ""}  # in rows that were written before the column
 OTHERS = ("first_steps_weight", "precision", "recovery_sigma", "planner_learning_rate")
 
 
@@ -92,7 +92,16 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
         "note": note,
         "command": config["command"],
         "controller": controller,
+        "stacked": stacked_of(results),
     }
+
+
+def stacked_of(results: list[dict]) -> str:
+    """Rollouts with one, two and three boxes in the zone of Stacking, empty for other tasks."""
+    names = [f"stacked_{count}_rate" for count in (1, 2, 3)]
+    if any(name not in results[0] for name in names):
+        return ""
+    return " ".join(str(sum(round(result[name] * result["episodes"]) for result in results)) for name in names)
 
 
 def append(row: dict, table: Path) -> None:

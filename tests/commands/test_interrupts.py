@@ -10,6 +10,7 @@ import sys
 import time
 
 import pytest
+from tiny_runs import TINY, write_demonstrations
 
 from torchrl_koap.commands import cli
 from torchrl_koap.commands.interrupts import Interrupted, describe_interrupt, ending_like_ctrl_c
@@ -125,6 +126,33 @@ def test_a_full_device(words):
         status, said = ended(*words, output=full)
     assert status == 1 and said.startswith("koap: the output could not be written: No space left on device")
     assert len(said.splitlines()) == 1
+
+
+CLOSED = """
+import os, sys
+from torchrl_koap.commands.printing import open_closed_streams
+open_closed_streams()
+print("lost"), print("lost", file=sys.stderr), sys.stdin.read(), sys.stdout.flush(), sys.stderr.flush()
+os.write(1, b"lost"), os.write(2, b"lost")
+with open(sys.argv[1], "w") as file:
+    file.write(str(file.fileno()))
+"""
+
+
+def test_a_process_without_streams_prints_nowhere_and_into_no_file(tmp_path):
+    """A file that is opened with one of the three numbers would get what a library prints."""
+    closed = lambda: [os.close(number) for number in range(3)]  # noqa: E731
+    done = subprocess.run([sys.executable, "-c", CLOSED, tmp_path / "file"], preexec_fn=closed, close_fds=True)
+    assert done.returncode == 0 and int((tmp_path / "file").read_text()) > 2
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("shell", ["2>/dev/full", "2>&-", ">&- 2>&- <&-"])
+def test_a_training_goes_on_without_its_bar(shell, tmp_path):
+    data = write_demonstrations(tmp_path / "data")
+    words = [*COMMAND, "train", "--out", tmp_path / "run", "--dataset", data, *TINY]
+    assert subprocess.run(["bash", "-c", f'"$@" {shell}', "bash", *words]).returncode == 0
+    assert (tmp_path / "run" / "summary.json").exists()
 
 
 @pytest.mark.faults

@@ -193,7 +193,7 @@ def test_the_second_order_way_back_sets_out_from_rest():
     # critically damped: y'' + 2 k y' + k^2 y = 0, which in steps of one frame is (1 - 0.7 S)^2 y = 0
     second = ways["second_order"]
     torch.testing.assert_close(second[2:] - 1.4 * second[1:-1] + 0.49 * second[:-2], torch.zeros(15).double())
-    with pytest.raises(ValueError, match="unknown response 'third_order'"):
+    with pytest.raises(ValueError, match="unknown recovery response 'third_order'"):
         RecoveryAugmentation(0.01, response="third_order")
 
 

@@ -44,7 +44,7 @@ WRONG: dict[Any, tuple[str, ...]] = {
 }
 # values that are right after all: names of one's own, and 0 where it means "none of it"
 RIGHT = {
-    "convert": ("--name n0nsense", "--out /dev/null/below", "--action-columns n0nsense"),
+    "convert": ("--name n0nsense", "--out /dev/null/below"),
     "demos": ("--seed 0",),
     "eval": ("--seed 0",),
     "inspect": ("--seed 0",),
@@ -64,12 +64,14 @@ SAYS = {
     "--controller-steps": "steps",
     "--solver-steps": "solver-steps|num_steps",
     "--controller-state": "part of the state|controller-state",
-    "--action-kind": "kind of action",
+    "--recovery-response": "recovery response|recovery-response",
+    "--action-kind": "kind of action|action-kind",
+    "--to": "unknown format|--to",
     "--tasks": "task",
     "--methods": "method",
     "--units": "unit",
     "--planners": "planners|n0nsense",
-    "--data-share": "share of the data|data-share",
+    "--data-share": "share of the data|data[-_]share",
     "--planner-from": "/dev/null/below|planner-from",
 }
 

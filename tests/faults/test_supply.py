@@ -13,6 +13,7 @@ import pytest
 import torchrl_koap
 
 PACKAGE = Path(torchrl_koap.__file__).parent
+ROOT = PACKAGE.parent
 UNPICKLER = PACKAGE / "data/d3il/unpickling.py"
 RAW = PACKAGE / "data/d3il/raw.py"  # writes what D3IL's own tools read
 FORBIDDEN = {
@@ -73,3 +74,26 @@ def test_nothing_is_looked_for_on_the_network(place):
     calls = f"--version|doctor|validate {place.get('data')}|{train}"
     done = subprocess.run([sys.executable, "-c", OFFLINE, calls], capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.rstrip().endswith("offline"), done.stderr[-2000:]
+
+
+def pins(name):
+    """Versions by name of a file of requirements."""
+    lines = re.findall(r"^([\w.-]+)==([^\s;]+)", (ROOT / name).read_text(), re.MULTILINE)
+    return {package.lower().replace("_", "-"): version for package, version in lines}
+
+
+def test_every_file_that_ci_installs_has_a_checksum_and_the_version_that_is_pinned():
+    locked, pinned = pins("requirements-ci.txt"), pins("constraints.txt")
+    assert "torch" not in locked  # its CPU wheel is another file than the public one of the same version
+    assert {name: version for name, version in pinned.items() if name != "torch"}.items() <= locked.items()
+    entries = re.split(r"^(?=[\w.-]+==)", (ROOT / "requirements-ci.txt").read_text(), flags=re.MULTILINE)[1:]
+    assert len(entries) == len(locked) > 100
+    assert not [entry for entry in entries if not re.search(r"--hash=sha256:[0-9a-f]{64}", entry)]
+
+
+def test_every_dependency_has_a_lowest_version():
+    """Without one a resolver may take a release of ten years ago."""
+    listed = re.search(r"^dependencies = \[(.*?)\]", (ROOT / "pyproject.toml").read_text(), re.MULTILINE | re.DOTALL)
+    names = re.findall(r'"([^"]+)"', listed[1])
+    assert len(names) > 10 and not [name for name in names if ">=" not in name]
+    assert {re.match(r"[\w-]+", name)[0] for name in names} <= {*pins("requirements-ci.txt"), "torch"}

@@ -40,6 +40,7 @@ def test_a_cell_is_read_when_it_has_ended_and_not_again(tmp_path, monkeypatch):
         curve_table, "cell_row", lambda root, cell, **options: read.append(cell.seed) or original(root, cell, **options)
     )
     monkeypatch.setattr(curve_table, "EVERY", 0.0)
+    monkeypatch.setattr(curve_table, "_SHARE", 1e9)
     table = CurveTable(tmp_path, cells(3), task="avoiding", label_unit="trajectory")
     assert read == [0, 1, 2] and not any(table.is_done(cell) for cell in cells(3))
     finish(tmp_path, cells(3)[1])
@@ -47,6 +48,25 @@ def test_a_cell_is_read_when_it_has_ended_and_not_again(tmp_path, monkeypatch):
     table.ended(cells(3)[2], "no memory")
     assert read == [0, 1, 2, 1, 2] and table.is_done(cells(3)[1])
     assert [row["status"] for row in read_cells(tmp_path / "cells.csv")] == ["missing", "done", "failed"]
+
+
+def test_the_table_of_a_curve_that_goes_on_reads_each_cell_once(tmp_path, monkeypatch):
+    """What was finished before, and what another cell ended after, is not read again; the table holds all of it."""
+    for cell in cells(30)[:25]:
+        finish(tmp_path, cell)
+    read = []
+    original = curve_table.cell_row
+    monkeypatch.setattr(
+        curve_table, "cell_row", lambda root, cell, **options: read.append(cell.seed) or original(root, cell, **options)
+    )
+    table = CurveTable(tmp_path, cells(30), task="avoiding", label_unit="trajectory")
+    todo = [cell for cell in cells(30) if not table.is_done(cell)]
+    for cell in todo:
+        finish(tmp_path, cell)
+        table.ended(cell, None)
+    table.write()
+    assert read == [*range(30), *range(25, 30)]
+    assert [row["status"] for row in read_cells(tmp_path / "cells.csv")] == 30 * ["done"]
 
 
 @pytest.mark.faults

@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import errno
+import hashlib
+import json
 import os
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import nn
 
 from torchrl_koap.modules import Normalizer
@@ -176,3 +179,29 @@ def test_a_state_of_another_model_or_none_at_all_is_refused(tmp_path):
     save_weights(tmp_path / "weights", model, {"task": "avoiding"})
     with pytest.raises(CheckpointError, match="is no state of a training"):
         load_training_state(tmp_path / "weights", model, make_optimizer(model))
+
+
+def test_no_bit_of_the_header_can_change_unseen(tmp_path):
+    """The facts, a training's step among them, are as precious as the tensors."""
+    path = tmp_path / "a.safetensors"
+    save_tensors(path, {"x": torch.ones(1)}, {"step": 24, "lr": [1e-05, 0.5], "phase": "planner"})
+    whole = path.read_bytes()
+    for place in range(len(whole)):
+        broken = bytearray(whole)
+        broken[place] ^= 1 << (place % 7)
+        path.write_bytes(broken)
+        with pytest.raises(CheckpointError, match="a.safetensors"):
+            load_tensors(path)
+
+
+def test_checksums_of_before_are_of_the_tensors_alone(tmp_path):
+    path, tensors = tmp_path / "a.safetensors", {"x": torch.ones(2)}
+    content = hashlib.sha256(b"x torch.float32 [2]" + tensors["x"].numpy().tobytes()).hexdigest()
+    for facts in ({"step": 3, "sha256": content}, {"step": 3}):
+        save_file(tensors, path, metadata={"about": json.dumps(facts)})
+        assert load_tensors(path)[1] == {"step": 3}
+    save_file(tensors, path)
+    assert load_tensors(path)[1] == {}
+    save_file(tensors, path, metadata={"about": json.dumps({"step": 3, "sha256": content[::-1]})})
+    with pytest.raises(CheckpointError, match="checksum"):
+        load_tensors(path)

@@ -24,7 +24,12 @@ def data():
 
 def make(name, data):
     torch.manual_seed(0)
-    return build_controller({"method": name, "preset": "default", "revised": True}, 3, 2, data)
+    tracking = {
+        "states": [0, 1],
+        "commands": [0, 1],
+        "actions": [0, 1],
+    }  # read by methods that follow plans by prediction
+    return build_controller({"method": name, "preset": "default", "revised": True, "tracking": tracking}, 3, 2, data)
 
 
 def same(first, second):

@@ -151,6 +151,14 @@ def test_a_log_with_the_columns_of_before_is_read_and_goes_on(tmp_path):
     assert run.last_metrics("controller") == {"loss_mine": 2.0}
 
 
+def test_a_half_written_checkpoint_is_taken_away_by_the_next_one_who_works_there(tmp_path):
+    rest = tmp_path / "checkpoints" / ".planner.safetensors.x1.tmp"
+    rest.parent.mkdir()
+    rest.write_bytes(b"half"), (rest.parent / "planner.safetensors").write_bytes(b"whole")
+    with RunDirectory(tmp_path).locked("koap train"):
+        assert [path.name for path in rest.parent.iterdir()] == ["planner.safetensors"]
+
+
 def test_one_at_a_time_works_in_a_folder(tmp_path):
     run = RunDirectory(tmp_path / "run")
     with run.locked("koap train"):

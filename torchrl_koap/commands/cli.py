@@ -17,7 +17,7 @@ from typing import Any
 
 from torchrl_koap import __version__
 from torchrl_koap.commands.interrupts import describe_interrupt, ending_at_once, ending_like_ctrl_c
-from torchrl_koap.commands.printing import HINT, complain, discard_output, one_line, show
+from torchrl_koap.commands.printing import HINT, complain, discard_output, one_line, open_closed_streams, show
 from torchrl_koap.commands.sanity import check_options
 
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
@@ -42,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments (sequence of str, optional): the words of the command line. Default: those of the process.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    open_closed_streams()
     try:
         with ending_like_ctrl_c():
             return _run(arguments)

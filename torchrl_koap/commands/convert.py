@@ -23,13 +23,14 @@ class Convert(Command):
     Attributes:
         source: a folder of *.npz, *.csv or *.parquet files, a LeRobot data set, an HDF5 file in robomimic's layout,
             minari:NAME, or a data set of this library.
-        out: folder to write; a file for robomimic.
-        to: another format than this library's: "npz", "robomimic", "lerobot" (3.0) or "lerobot-2.1".
+        out: folder to write; a file for robomimic, minari:NAME for Minari.
+        to: another format than this library's: "npz", "robomimic", "lerobot" (3.0), "lerobot-2.1", "minari" or "d3il"
+            (raw pickles of a D3IL task).
         name: name of the task (default: that of the folder).
         control_hz: frames per second (default: as the source says).
         observations: features of a LeRobot data set or entries of an HDF5 file that make up the state (default: all
             that are no images).
-        action_columns: columns of tables that are actions, if they are not named action...
+        action_columns: columns of CSV or parquet tables that are actions, if they are not named action...
         action_dim: number of action columns, where nothing has actions.
         robot: state columns of the robot itself, which the controller reads (default: all that are no command).
         command: neighbouring columns that repeat the last command; nothing that learns sees them.

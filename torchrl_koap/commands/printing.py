@@ -40,6 +40,23 @@ def show(result: Any) -> None:
         print(f"{name:<{width}}  {text}")
 
 
+def open_closed_streams() -> None:
+    """Sends stdin, stdout and stderr nowhere if the process was started without them (``2>&-``).
+
+    The next file that is opened would otherwise get their number, and what a library prints would land in it.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if number == 0 else "w", encoding="utf-8", closefd=False))
+
+
 def discard_output() -> None:
     """Sends what is left for stdout nowhere: the interpreter would complain about it once more when it ends."""
     if sys.stdout is sys.__stdout__:

@@ -14,6 +14,7 @@ from torchrl_koap.data.d3il.unpickling import DamagedPickleError, UnsafePickleEr
 from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstrations
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands, subsample_trajectories
 from torchrl_koap.data.lerobot.reader import read_lerobot
+from torchrl_koap.data.recorded_replay import RecordedExperienceReplay
 from torchrl_koap.data.recordings import Recordings, RecordingsError, make_recordings
 from torchrl_koap.data.sources import read_recordings
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, read_task, save_ted
@@ -40,6 +41,7 @@ __all__ = [
     "RawEpisode",
     "RawEpisodeError",
     "RawFolderError",
+    "RecordedExperienceReplay",
     "Recordings",
     "RecordingsError",
     "RecoveryAugmentation",

@@ -98,7 +98,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
         self.in_keys = self.out_keys = [key] if moved_by is None else [key, action_key]
         self.moved_by = None if moved_by is None else list(moved_by)
         self.sigma, self.history, self.decay = sigma, history, decay
-        self.response = lookup(RESPONSES, response, "response")
+        self.response = lookup(RESPONSES, response, "recovery response")
         self.columns = None if columns is None else list(columns)
         self.tool = None if tool is None else list(tool)
         self.kinematics = kinematics

@@ -39,7 +39,8 @@ def read_recordings(
         control_hz (float, optional): frames per second. Default: as the source says.
         observations (sequence of str): features of a LeRobot data set, or entries of an HDF5 file, that make up the
             state. Default: all that are no images.
-        action_columns (sequence of str): columns of tables that are actions, if they are not named ``action...``.
+        action_columns (sequence of str): columns of CSV and parquet tables that are actions, if they are not named
+            ``action...``.
         action_dim (int, optional): number of action columns of tables without actions.
 
     Raises:

@@ -7,6 +7,7 @@ import itertools
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from torchrl_koap.evaluation.scores import OUTCOMES, outcome_of
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
+from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
 from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
 from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
 
@@ -40,6 +42,8 @@ def make_policy(
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two.
 
+    A controller that has a ``response`` follows plans by it (:class:`~torchrl_koap.modules.PredictiveTracking`).
+
     Args:
         planner (StatePlanner): the planner.
         controller (TensorDictModuleBase): the inverse dynamics.
@@ -55,11 +59,14 @@ def make_policy(
         candidates (int): plans sampled whenever one is due.
         choice (str): the rule by which one of them is taken.
     """
-    return PlanThenControl(
+    response = getattr(controller, "response", None)
+    frames = [planner.history, controller.num_past + 1] + ([] if response is None else [response.history])
+    kind = PlanThenControl if response is None else partial(PredictiveTracking, response=response)
+    return kind(
         planner,
         controller,
         state_columns=state_columns,
-        history=max(planner.history, controller.num_past + 1),
+        history=max(frames),
         execution=execution,
         replan_interval=replan_interval,
         blend_decay=blend_decay,

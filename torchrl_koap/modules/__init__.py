@@ -16,6 +16,7 @@ from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.unet import TemporalUnet
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.koopman.command_response import CommandResponse
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import (
     LatentActionFourier,
@@ -31,6 +32,7 @@ from torchrl_koap.modules.policies.agent import Agent
 from torchrl_koap.modules.policies.asynchronous import AsynchronousAgent
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
 from torchrl_koap.modules.policies.policy_env import PolicyEnv, SeededNoise
+from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
 from torchrl_koap.modules.policies.receding_horizon import RecedingHorizonPolicy, policy_transforms
 from torchrl_koap.modules.policies.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
 from torchrl_koap.modules.time_alignment import FrameGatherer
@@ -40,6 +42,7 @@ __all__ = [
     "Agent",
     "AsynchronousAgent",
     "ChunkedPolicy",
+    "CommandResponse",
     "DiffusionPolicy",
     "EpisodeNoise",
     "FiniteScalarQuantizer",
@@ -61,6 +64,7 @@ __all__ = [
     "Normalizer",
     "PlanThenControl",
     "PolicyEnv",
+    "PredictiveTracking",
     "PrincipalInverseDynamics",
     "QuantizedInverseDynamics",
     "RecedingHorizonPolicy",

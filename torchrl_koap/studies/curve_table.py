@@ -12,6 +12,7 @@ from torchrl_koap.studies.cells import Cell, cell_row
 from torchrl_koap.studies.table import write_cells
 
 EVERY = 1.0  # s between two writes while cells end
+_SHARE = 0.05  # of the time that writes may take, where there are thousands of cells
 
 
 class CurveTable:
@@ -40,7 +41,7 @@ class CurveTable:
     def __init__(self, root: Path, cells: Sequence[Cell], *, task: str, label_unit: str):
         self.root, self.task, self.label_unit = root, task, label_unit
         self._rows = {cell: self._read(cell) for cell in cells}
-        self._written = -EVERY
+        self._next = 0.0
 
     def _read(self, cell: Cell, reason: str | None = None) -> dict[str, Any]:
         return cell_row(self.root, cell, task=self.task, label_unit=self.label_unit, reason=reason)
@@ -57,12 +58,13 @@ class CurveTable:
             reason (str, optional): why it failed.
         """
         self._rows[cell] = self._read(cell, reason)
-        if time.monotonic() - self._written >= EVERY:
+        if time.monotonic() >= self._next:
             self.write()
 
     def write(self) -> list[dict[str, Any]]:
         """Writes the table and returns its rows."""
-        rows = list(self._rows.values())
+        rows, began = list(self._rows.values()), time.monotonic()
         write_cells(self.root / "cells.csv", rows)
-        self._written = time.monotonic()
+        ended = time.monotonic()
+        self._next = ended + max(EVERY, (ended - began) / _SHARE)
         return rows

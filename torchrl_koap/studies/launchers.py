@@ -8,7 +8,9 @@ import graphlib
 import importlib.util
 import multiprocessing
 import os
+import secrets
 import signal
+import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -261,10 +263,14 @@ class _RayPool:
 
         self.ray = ray
         self.owned = not ray.is_initialized()
+        self.left = contextlib.ExitStack()
         if self.owned:
+            if address is None:
+                self.left.enter_context(_own_token())
             # "local", as None means a cluster that happens to run already, which takes no sizes
             size = {} if address is not None else {"num_cpus": workers, "include_dashboard": False}
-            ray.init(address=address or "local", log_to_driver=False, **size)
+            with _keeping_signals():
+                ray.init(address=address or "local", log_to_driver=False, **size)
         self.workers = max(int(ray.cluster_resources().get("CPU", workers)), 1)
         self.task = ray.remote(num_cpus=1, max_retries=0)(run_logged)
         self.running: dict[Any, Job] = {}
@@ -291,6 +297,38 @@ class _RayPool:
         self.running.clear()
         if self.owned:
             self.ray.shutdown()
+            self.left.close()
+
+
+@contextlib.contextmanager
+def _keeping_signals() -> Iterator[None]:
+    """Behind the block signals mean what they did before; Ray would end the process without a word on SIGTERM."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    earlier = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in earlier.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+@contextlib.contextmanager
+def _own_token() -> Iterator[None]:
+    """Inside the block Ray has a token for its own use; it would write one into the home folder and leave it there."""
+    if any(name.startswith("RAY_AUTH") for name in os.environ) or (Path.home() / ".ray" / "auth_token").exists():
+        yield
+        return
+    with tempfile.TemporaryDirectory(prefix="koap-ray-") as folder:
+        token = Path(folder) / "token"
+        token.write_text(secrets.token_hex(32))
+        token.chmod(0o600)
+        os.environ["RAY_AUTH_TOKEN_PATH"] = str(token)
+        try:
+            yield
+        finally:
+            os.environ.pop("RAY_AUTH_TOKEN_PATH", None)
 
 
 LAUNCHERS = {"local": _LocalPool, "ray": _RayPool}

@@ -20,7 +20,8 @@ from torchrl_koap.files import replacing_file
 from torchrl_koap.modules import Normalizer
 from torchrl_koap.training.compact_weights import expand
 
-_SHA256 = "sha256"  # among the facts of a file: the checksum of its tensors
+_LENGTH = 64  # digits of a checksum
+_SHA256 = "sha256"  # among the facts of a file: the checksum of its tensors and of the other facts
 
 
 _MOMENTS = {"step", "exp_avg", "exp_avg_sq"}  # what AdamW keeps of a parameter
@@ -103,8 +104,8 @@ def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping
     with replacing_file(path) as aside:
         try:
             # one entry alone: of several the order in the file would be another one every time
-            facts = {**(about or {}), _SHA256: _digest(tensors)}
-            save_file(tensors, aside, metadata={"about": json.dumps(facts)})
+            facts = dict(about or {})
+            save_file(tensors, aside, metadata={"about": json.dumps(facts | {_SHA256: _digest(tensors, facts)})})
         except SafetensorError as error:  # it has no errno
             raise OSError(errno.EIO, str(error)) from error
 
@@ -127,21 +128,38 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise CheckpointError(f"{path} is missing")
     try:
         with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-        about = json.loads(metadata.get("about", "{}"))
+            metadata = file.metadata() or {"about": "{}"}
+        if "about" not in metadata:
+            raise ValueError(f"its header has {', '.join(metadata)} instead of facts")
+        about = json.loads(metadata["about"])
         if not isinstance(about, dict):
             raise ValueError(f"its facts are no object but {type(about).__name__}")
         tensors = load_file(path)
     except (SafetensorError, ValueError, RecursionError, OSError) as error:
         raise CheckpointError(f"{path} is damaged: {error}") from error
-    digest = _digest(tensors)
-    if about.pop(_SHA256, digest) != digest:  # files of before have none
-        raise CheckpointError(f"{path} is damaged: its tensors are not those that were written (checksum)")
-    return tensors, about
+    facts = {name: value for name, value in about.items() if name != _SHA256}
+    if not _is_as_written(tensors, facts, about, metadata["about"]):
+        raise CheckpointError(f"{path} is damaged: its content is not what was written (checksum)")
+    return tensors, facts
 
 
-def _digest(tensors: Mapping[str, Tensor]) -> str:
+def _is_as_written(
+    tensors: Mapping[str, Tensor], facts: Mapping[str, Any], about: Mapping[str, Any], text: str
+) -> bool:
+    """Whether tensors and facts have their checksum; in files of before that is of the tensors alone, or missing."""
+    if _SHA256 not in about:
+        called = [name for name, value in facts.items() if isinstance(value, str) and len(value) == _LENGTH]
+        rests = [{name: value for name, value in facts.items() if name != other} for other in called]
+        return not any(facts[name] == _digest(tensors, rest) for name, rest in zip(called, rests, strict=True))
+    if about[_SHA256] == _digest(tensors, facts):
+        return json.dumps(about) == text
+    return about[_SHA256] == _digest(tensors)
+
+
+def _digest(tensors: Mapping[str, Tensor], facts: Mapping[str, Any] | None = None) -> str:
     digest = hashlib.sha256()
+    if facts is not None:
+        digest.update(json.dumps(facts).encode())
     for name in sorted(tensors):
         value = tensors[name].detach().cpu().contiguous()
         digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())

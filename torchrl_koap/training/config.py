@@ -19,6 +19,7 @@ from torchrl_koap.training.loggers import check_logger
 from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
 from torchrl_koap.training.plugins import Plugins
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
+from torchrl_koap.training.response import tracked_columns
 from torchrl_koap.training.run_directory import RunDirectory
 from torchrl_koap.training.validation import default_fraction
 
@@ -266,6 +267,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     }
     if method.earlier:
         controller["revised"] = True
+    if method.tracks:
+        controller["tracking"] = tracked_columns(task)
     if len(task.absolute_actions) == task.action_dim and not task.action_targets:
         controller["absolute"] = True
     return ResolvedConfig(

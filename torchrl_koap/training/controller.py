@@ -26,6 +26,7 @@ from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.methods import COEFFICIENTS, LABELLED_SHARES, Method, Phase
 from torchrl_koap.training.planner import augmentation, planner_weight_decay, training_dtype
 from torchrl_koap.training.progress import progress_bar, show_losses
+from torchrl_koap.training.response import fit_response
 from torchrl_koap.training.run_directory import RunDirectory
 
 _KEYS = ["state", "action", "has_action"]
@@ -78,6 +79,8 @@ def learn_actions(
     if method.has_planner:
         view = resolved.controller_view(data)
         controller, fit, values = _train_network(train_one, method, resolved.controller, view)
+        if method.tracks:
+            fit = fit | {"response": fit_response(controller.response, data)}
     else:
         controller, values = _train_policy(train_one, resolved, data)
     values["updates"] = train_one.updates

@@ -33,6 +33,7 @@ from torchrl.objectives import LossModule
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import (
     PRESETS,
+    CommandResponse,
     LinearInverseDynamics,
     NonlinearInverseDynamics,
     PrincipalInverseDynamics,
@@ -118,6 +119,9 @@ class Method:
         teacher (str): the method whose controller labels the rest of the data first.
         other_decoder (str): the same method with the other way to get a decoder.
         presets (tuple of str): values of ``--preset`` that it can be built with; the first is its own.
+        tracks (bool): its controller has a ``response`` (:class:`~torchrl_koap.modules.CommandResponse`), which is
+            fitted to the labelled steps; plans are followed by it (:class:`~torchrl_koap.modules.PredictiveTracking`);
+            ``build`` finds its columns under ``"tracking"`` of the options.
         earlier (str): the method that runs hold which name this one but were trained before it was what it is now:
             those whose ``controller`` entry does not say ``"revised"``.
 
@@ -144,6 +148,7 @@ class Method:
     other_decoder: str = ""
     presets: tuple[str, ...] = ("default",)
     earlier: str = ""
+    tracks: bool = False
 
     def __post_init__(self):
         lookup(KINDS, self.kind, "kind of method")
@@ -169,6 +174,12 @@ def _koap(state_dim, action_dim, normalizers, options, **overrides):
     if options.get("absolute") and PRESETS[options["preset"]]["network"] == "fourier":
         overrides = PLACE | overrides
     return make_koopman_inverse_dynamics(state_dim, action_dim, preset=options["preset"], **normalizers, **overrides)
+
+
+def _koap_mpc(state_dim, action_dim, normalizers, options):
+    model = _koap(state_dim, action_dim, normalizers, options)
+    model.response = CommandResponse(**options["tracking"])
+    return model
 
 
 def _linear(state_dim, action_dim, normalizers, options):
@@ -271,6 +282,15 @@ for _method in (
         closed_form=True,
         other_decoder="koap_sgd",
         presets=_ANY_PRESET,
+    ),
+    Method(
+        "koap_mpc",
+        "KOAP, plans followed by prediction",
+        _koap_mpc,
+        (Phase("controller", without_actions),),
+        closed_form=True,
+        presets=_ANY_PRESET,
+        tracks=True,
     ),
     Method("koap_sgd", "KOAP, decoder trained with the rest", _koap, _JOINT, other_decoder="koap", presets=_ANY_PRESET),
     Method("koap_paper", "KOAP as in the paper", _koap, _JOINT, presets=("paper",)),

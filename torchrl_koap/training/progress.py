@@ -1,20 +1,40 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Progress bars, which can be turned off for a while."""
+"""Progress bars, which can be turned off for a while and never end what they are the bar of."""
 
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, TextIO
 
 from tqdm import tqdm
 
 _SHOWN: ContextVar[bool] = ContextVar("shown", default=True)
 
 
+class _Forgiving:
+    """A stream on which nobody depends: what cannot be written (a full device, a closed terminal) is left out."""
+
+    def __init__(self, stream: TextIO):
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.flush()
+
+
 def progress_bar(total: int | None, description: str, *, unit: str = "it", shown: bool = True, **options: Any) -> tqdm:
-    """A bar on stderr that counts to ``total``.
+    """A bar on stderr that counts to ``total``; where stderr cannot be written to, there is none.
 
     Args:
         total (int, optional): where it ends.
@@ -32,7 +52,9 @@ def progress_bar(total: int | None, description: str, *, unit: str = "it", shown
         ...     bar.disable
         True
     """
-    return tqdm(total=total, desc=description, unit=unit, disable=not (shown and _SHOWN.get()), **options)
+    disable = not (shown and _SHOWN.get()) or sys.stderr is None
+    stream = None if disable else _Forgiving(sys.stderr)
+    return tqdm(total=total, desc=description, unit=unit, disable=disable, file=stream, **options)
 
 
 @contextlib.contextmanager

@@ -169,6 +169,8 @@ class RunDirectory:
     def locked(self, what: str, name: str = ".lock") -> Iterator[None]:
         """Keeps others out of the folder as long as the block lasts.
 
+        What a process that was killed had half written of a checkpoint is taken away first.
+
         Args:
             what (str): what works in the folder, for the message: ``"koap train"``.
             name (str): the lock file in the folder.
@@ -181,6 +183,8 @@ class RunDirectory:
                 held.enter_context(one_at_a_time(self.path / name, busy=f"another `{what}` is working in {self.path}"))
             except LockedError as error:
                 raise RunDirectoryError(str(error)) from None
+            for rest in (self.path / "checkpoints").glob(".*.tmp"):  # nobody but the holder of the lock writes there
+                rest.unlink(missing_ok=True)
             yield
 
 

@@ -49,6 +49,12 @@ def test_named_action_columns_and_episodes(tmp_path):
     assert [steps.shape for steps in recordings.actions] == [(2, 1), (2, 1)]
 
 
+def test_archives_have_no_columns_to_name(tmp_path):
+    np.savez(tmp_path / "a.npz", states=np.zeros((5, 2)), actions=np.ones((4, 1)), control_hz=30.0)
+    with pytest.raises(ValueError, match=r"action_columns: not an option for NumPy archives \(a.npz\)"):
+        read_tables(tmp_path, action_columns=["action_0"])
+
+
 def test_parquet_is_read_as_csv_is(tmp_path):
     pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")
     parquet = pytest.importorskip("pyarrow.parquet")

@@ -54,10 +54,11 @@ def read_tables(
     Keyword Args:
         control_hz (float, optional): frames per second. Default: from the files' time stamps or ``control_hz`` entry.
         action_columns (sequence of str, optional): columns of CSV and parquet files that are actions, if they are not
-            named ``action...``.
+            named ``action...``. In NumPy archives actions are an entry of their own.
         action_dim (int, optional): number of action columns, where no file has actions.
 
     Raises:
+        ValueError: for ``action_columns`` where a file is a NumPy archive.
         RecordingsError: with the faults of all files, named: unreadable, without states, of other columns, or without
             a rate in time.
         FileNotFoundError: if the folder holds no such file.
@@ -76,6 +77,12 @@ def read_tables(
     files = _files(folder)
     if not files:
         raise FileNotFoundError(f"{folder} holds no *.npz, *.csv or *.parquet files")
+    archives = [file.name for file in files if file.suffix == ".npz"]
+    if action_columns is not None and archives:
+        raise ValueError(
+            f"action_columns: not an option for NumPy archives ({archives[0]}), whose actions are the entry"
+            f" {' or '.join(map(repr, ACTIONS))}"
+        )
     problems: list[str] = []
     states, actions, sources, rates, named = [], [], [], [], []
     for file in files:

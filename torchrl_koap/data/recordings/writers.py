@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings in other formats: tables, an HDF5 file in robomimic's layout, LeRobot 2.1 and 3.0.
+"""Recordings in other formats: tables, robomimic's HDF5, LeRobot 2.1 and 3.0, Minari, D3IL's raw pickles.
 
 Each writes what its reader reads back: states, actions, which of them are unknown, names of the columns, the rate.
 LeRobot holds float32, the others float64. A data set of this library becomes recordings by :func:`recordings_of`.
@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.data.recordings.minari import write_minari
 from torchrl_koap.data.recordings.recordings import Recordings, RecordingsError, make_recordings
 from torchrl_koap.data.ted import load_ted, read_about, read_task
 from torchrl_koap.lookup import lookup
@@ -68,7 +69,8 @@ def write_recordings(recordings: Recordings, out: str | Path, kind: str) -> Path
 
     Args:
         recordings (Recordings): what to write; its rate is needed by all formats but tables.
-        out (str or Path): file of ``"robomimic"``, folder of the others; it must not exist yet.
+        out (str or Path): file of ``"robomimic"``, ``minari:NAME`` for ``"minari"``, folder of the others; it must not
+            exist yet.
         kind (str): a name in ``WRITERS``.
 
     Returns:
@@ -92,7 +94,7 @@ def write_recordings(recordings: Recordings, out: str | Path, kind: str) -> Path
     """
     write: Callable[[Recordings, Path], None] = lookup(WRITERS, kind, "format")
     out = Path(out)
-    if out.exists():
+    if out.exists() and kind != "minari":
         raise FileExistsError(f"{out} exists already; choose another --out")
     if recordings.control_hz is None and kind != "npz":
         raise RecordingsError(str(out), ["the rate is not known: pass control_hz"])
@@ -222,9 +224,17 @@ def _feature(names: tuple[str, ...]) -> dict[str, Any]:
     return {"dtype": "float32", "shape": [len(names)], "names": list(names)}
 
 
+def _write_d3il(recordings: Recordings, out: Path) -> None:
+    from torchrl_koap.data.d3il.writing import write_d3il
+
+    write_d3il(recordings, out)
+
+
 WRITERS: dict[str, Callable[[Recordings, Path], None]] = {
     "npz": _write_npz,
     "robomimic": _write_robomimic,
     "lerobot": _write_lerobot_3,
     "lerobot-2.1": _write_lerobot_2,
+    "minari": write_minari,
+    "d3il": _write_d3il,
 }

@@ -1,0 +1,84 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The response to commands: what it predicts, and that a fit finds the system that made the data."""
+
+import pytest
+import torch
+
+from torchrl_koap.modules import CommandResponse
+
+AXES = 2
+
+
+def a_system() -> CommandResponse:
+    """A stable, coupled system of two axes."""
+    system = CommandResponse([0, 1], [0, 1], [0, 1])
+    system.weight[[0, 1], [0, 1], 0] = torch.tensor([0.7, 0.5])  # momentum
+    system.weight[[0, 1], [0, 1], 2] = torch.tensor([0.1, 0.2])  # pull of the command
+    system.weight[[0, 1], [0, 1], 1] = torch.tensor([-0.2, 0.1])  # else its coordinates depend on each other
+    system.weight[[0, 1], [0, 1], 3] = torch.tensor([0.2, 0.3])
+    system.weight[[0, 1], [0, 1], 4] = torch.tensor([-0.1, 0.1])
+    system.weight[1, 0, 3] = -0.1  # the second axis is moved by the first command
+    return system.double()
+
+
+def rollout(system: CommandResponse, changes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions ``[T, J]`` and commands ``[T, J]`` (those in force at each of them) from rest at 0."""
+    nothing = torch.zeros(3, AXES, dtype=torch.float64)
+    moved = system.predict(nothing, nothing[0], nothing[1:], changes)
+    positions = torch.cat([nothing[:1], moved[:-1]])
+    return positions, torch.cat([nothing[:1], changes[:-1].cumsum(0)])
+
+
+def steps_of(system: CommandResponse, count: int = 60) -> tuple[torch.Tensor, torch.Tensor]:
+    torch.manual_seed(0)
+    changes = 0.01 * torch.randn(count, AXES, dtype=torch.float64)
+    x, c = rollout(system, changes)
+    t = torch.arange(2, count - 1)
+    history = torch.stack([x[t - 2], x[t - 1], x[t]], 1)
+    past = torch.stack([changes[t - 2], changes[t - 1]], 1)
+    return system.coordinates(history, c[t] - x[t], past), x[t + 1] - x[t]
+
+
+def test_a_fit_finds_the_system():
+    system = a_system()
+    fitted = CommandResponse([0, 1], [0, 1], [0, 1]).double().fit_ridge(*steps_of(system), penalty=1e-12)
+    torch.testing.assert_close(fitted.weight, system.weight, atol=1e-5, rtol=0)
+
+
+def test_uncoupled_axes_know_nothing_of_each_other():
+    fitted = (
+        CommandResponse([0, 1], [0, 1], [0, 1]).double().fit_ridge(*steps_of(a_system()), penalty=1e-12, coupled=False)
+    )
+    assert not fitted.weight[0, 1].any() and not fitted.weight[1, 0].any()
+    torch.testing.assert_close(fitted.weight[0, 0], a_system().weight[0, 0], atol=1e-2, rtol=0)
+
+
+def test_impulses_add_up_to_the_prediction():
+    system, steps = a_system(), 6
+    changes = torch.randn(steps, AXES, dtype=torch.float64)
+    nothing = torch.zeros(3, AXES, dtype=torch.float64)
+    wanted = system.predict(nothing, nothing[0], nothing[1:], changes)
+    matrix = system.impulse_matrix(steps)
+    assert matrix.shape == (steps, AXES, steps - 1, AXES)
+    torch.testing.assert_close(torch.einsum("njka,ka->nj", matrix, changes[:-1]), wanted)
+    assert not matrix[0].any()  # what is commanded now is not in the next measurement
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_any_batch(batch):
+    system = a_system()
+    x, a = torch.randn(*batch, 3, AXES).double(), torch.randn(*batch, 2, AXES).double()
+    future = torch.randn(*batch, 5, AXES).double()
+    out = system.predict(x, x[..., -1, :], a, future)
+    assert out.shape == (*batch, 5, AXES)
+    first = (0,) * len(batch)
+    torch.testing.assert_close(out[first], system.predict(x[first], x[first][-1], a[first], future[first]))
+
+
+def test_bad_columns_and_shapes_are_refused():
+    with pytest.raises(ValueError, match="'commands': 1"):
+        CommandResponse([0, 1], [0], [0, 1])
+    with pytest.raises(ValueError, match="memory must be >= 1, got 0"):
+        CommandResponse([0], [0], [0], memory=0)
+    with pytest.raises(ValueError, match=r"wanted coordinates \[n, 1, 5\]"):
+        CommandResponse([0], [0], [0]).fit_ridge(torch.zeros(0, 1, 5), torch.zeros(0, 1))

@@ -1,0 +1,118 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Plans that are followed by prediction: on a robot whose response is known, and as a policy."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.modules import (
+    CommandResponse,
+    MLPDenoiser,
+    PlanThenControl,
+    PredictiveTracking,
+    StatePlanner,
+    make_koopman_inverse_dynamics,
+)
+
+
+def sluggish() -> CommandResponse:
+    """Two axes that follow their commands late, one of them slower."""
+    response = CommandResponse([0, 1], [0, 1], [0, 1])
+    response.weight[[0, 1], [0, 1], 0] = torch.tensor([0.8, 0.6])
+    response.weight[[0, 1], [0, 1], 2] = torch.tensor([0.05, 0.1])
+    response.weight[[0, 1], [0, 1], 3] = torch.tensor([0.2, 0.1])
+    return response
+
+
+def policy_of(response=None, kind=PredictiveTracking, **options):
+    torch.manual_seed(0)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2, num_steps=2)
+    controller = make_koopman_inverse_dynamics(2, 2)
+    args = (planner, controller) if kind is PlanThenControl else (planner, controller, response or sluggish())
+    return kind(*args, state_columns=(2, 3), history=5, **options).eval()
+
+
+def follow(policy: PredictiveTracking, path: torch.Tensor) -> torch.Tensor:
+    """Positions of a robot that answers as ``sluggish`` while ``path [T, 2]`` is tracked: ``[steps, 2]``."""
+    robot, size = sluggish(), policy.look_ahead
+    x, c, a = torch.zeros(5, 2), torch.zeros(5, 2), torch.zeros(2, 2)
+    been = []
+    for step in range(len(path) - size):
+        observed = torch.cat([c, x], -1)
+        change = policy.track(observed, x, path[step + 1 : step + 1 + size])[0]
+        if policy.response.absolute:
+            change = change - c[-1]
+        moved = robot.predict(x[-3:], c[-1], a, torch.zeros(1, 2))
+        x, c = torch.cat([x[1:], moved]), torch.cat([c[1:], c[-1:] + change])
+        a = torch.cat([a[1:], change.unsqueeze(0)])
+        been.append(moved[0])
+    return torch.stack(been)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_a_known_robot_stays_on_the_path(absolute):
+    time = torch.linspace(0, 3, 80)
+    path = torch.stack([0.1 * (1 - time.cos()), 0.05 * time * time.sin()], -1)
+    response = sluggish()
+    response.absolute = absolute
+    policy = policy_of(response, smoothness=0.1, blend_decay=0.0)
+    been = follow(policy, path)
+    error = (been - path[1 : len(been) + 1]).norm(dim=-1)
+    assert error[10:].max() < 1e-3  # m; executing the path as commands leaves most of a centimetre
+    behind = sluggish().predict(torch.zeros(3, 2), torch.zeros(2), torch.zeros(2, 2), path.diff(dim=0))
+    assert (behind[: len(been)] - path[1 : len(been) + 1]).norm(dim=-1)[10:].max() > 5e-3
+
+
+def test_smooth_commands_are_bought_with_distance():
+    time = torch.linspace(0, 3, 60)
+    path = torch.stack([0.1 * (8 * time).sin(), 0 * time], -1)
+    errors = []
+    for smoothness in (0.1, 100.0):
+        been = follow(policy_of(smoothness=smoothness), path)
+        errors.append((been - path[1 : len(been) + 1]).pow(2).mean())
+    assert errors[0] < 0.5 * errors[1]
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_tracked_entries_are_replaced_and_others_decoded(batch):
+    one_axis = CommandResponse([1], [1], [1])
+    one_axis.weight[0, 0, 2] = 0.3
+    policy, decoded = policy_of(one_axis), policy_of(kind=PlanThenControl)
+    decoded.load_state_dict({k: v for k, v in policy.state_dict().items() if not k.startswith("response.")})
+    observed = TensorDict(
+        {
+            "observation_history": torch.randn(*batch, 5, 4),
+            "is_init": torch.ones(*batch, 1, dtype=torch.bool),
+            "noise": torch.randn(*batch, *policy.noise_shape),
+        },
+        batch,
+    )
+    policy.planner.noise_key = decoded.planner.noise_key = "noise"
+    mine, theirs = policy(observed.clone()), decoded(observed.clone())
+    torch.testing.assert_close(mine["action"][..., 0], theirs["action"][..., 0])
+    wanted = policy.track(
+        observed["observation_history"], policy.state_of(observed["observation_history"]), mine["remaining_plan"]
+    )
+    torch.testing.assert_close(mine["action"][..., 1:], wanted[..., 0, :])
+    assert not torch.allclose(mine["action"][..., 1], theirs["action"][..., 1])
+
+
+def test_chunks_for_export_begin_with_the_action_of_the_step():
+    policy = policy_of()
+    observed, noise = torch.randn(3, 5, 4), torch.randn(3, *policy.noise_shape)
+    chunk = policy.plan_and_decode(observed, noise)
+    assert chunk.shape == (3, 4, 2)
+    policy.planner.noise_key = "noise"
+    td = TensorDict({"observation_history": observed, "is_init": torch.ones(3, 1, dtype=torch.bool), "noise": noise}, 3)
+    torch.testing.assert_close(policy(td)["action"], chunk[:, 0])
+
+
+def test_options_out_of_range_are_refused():
+    with pytest.raises(ValueError, match="execution must be 'feedback', got 'open_loop'"):
+        policy_of(execution="open_loop")
+    with pytest.raises(ValueError, match="look_ahead must be 2 to 14"):
+        policy_of(look_ahead=15)
+    with pytest.raises(ValueError, match="smoothness must be > 0"):
+        policy_of(smoothness=0.0)
+    with pytest.raises(ValueError, match="reads 6 observed frames, history is only 5"):
+        policy_of(CommandResponse([0, 1], [0, 1], [0, 1], memory=5))

@@ -1,0 +1,126 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Fitting the response on labelled steps: known systems are found, hidden labels are not read."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.modules import CommandResponse
+from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.training import TrainConfig, resolve
+from torchrl_koap.training.response import fit_response, labelled_steps, tracked_columns
+
+
+def columns(**options) -> CommandResponse:
+    return CommandResponse([0, 1], [0, 1], [0, 1], **options)
+
+
+def a_system() -> CommandResponse:
+    system = columns()
+    system.weight[[0, 1], [0, 1], 0] = torch.tensor([0.7, 0.5])
+    system.weight[[0, 1], [0, 1], 2] = torch.tensor([0.1, 0.2])
+    system.weight[[0, 1], [0, 1], 1] = torch.tensor([-0.2, 0.1])  # else its coordinates depend on each other
+    system.weight[[0, 1], [0, 1], 3] = torch.tensor([0.2, 0.3])
+    system.weight[[0, 1], [0, 1], 4] = torch.tensor([-0.1, 0.1])
+    return system.double()
+
+
+def recordings(episodes: int = 6, length: int = 60) -> TensorDict:
+    """Fully labelled flat data of the system, each episode at a place of its own: observation is command, position."""
+    torch.manual_seed(0)
+    parts = []
+    for episode in range(episodes):
+        action = (0.01 * torch.randn(length, 2, dtype=torch.float64)).cumsum(0) * 0.3
+        start = torch.randn(2, dtype=torch.float64)
+        moved = a_system().predict(start.expand(3, 2), start, torch.zeros(2, 2, dtype=torch.float64), action)
+        position = torch.cat([start.unsqueeze(0), moved[:-1]])
+        command = torch.cat([start.unsqueeze(0), start + action[:-1].cumsum(0)])
+        parts.append(
+            TensorDict(
+                {
+                    "state": position,
+                    "observation": torch.cat([command, position], -1),
+                    "action": action,
+                    "has_action": torch.ones(length, 1, dtype=torch.bool),
+                    "episode": torch.full((length,), episode),
+                    "step_count": torch.arange(length),
+                },
+                length,
+            )
+        )
+    return torch.cat(parts)
+
+
+def test_the_system_is_found_from_one_labelled_trajectory():
+    data, response = recordings(), columns()
+    data["has_action"] = (data["episode"] == 2).unsqueeze(-1)
+    found = fit_response(response, data)
+    assert found["labels_used"] < 60 and found["held_out_error"] < 1e-4
+    torch.testing.assert_close(response.weight.double(), a_system().weight, atol=2e-3, rtol=0)
+
+
+def test_stretches_with_hidden_commands_have_offsets_of_their_own():
+    data, response = recordings(), columns()
+    labelled = (torch.arange(len(data)) % 30 < 16).unsqueeze(-1)
+    data["has_action"] = labelled
+    data["action"] = torch.where(labelled, data["action"], math.nan)
+    data["observation"][:, :2] = math.nan
+    found = fit_response(response, data)
+    steps, _ = labelled_steps(response, data)
+    assert not steps.known.any() and found["labels_used"] == len(steps.row)
+    assert found["held_out_error"] < 1e-4
+    torch.testing.assert_close(response.weight.double(), a_system().weight, atol=2e-3, rtol=0)
+
+
+def test_absolute_commands_give_the_same_model():
+    data, delta, absolute = recordings(), columns(), columns(absolute=True)
+    fit_response(delta, data)
+    data["action"] = data["observation"][:, :2] + data["action"]
+    data["observation"][:, :2] = math.nan  # not needed: an action is the command
+    fit_response(absolute, data)
+    torch.testing.assert_close(absolute.weight, delta.weight, atol=2e-3, rtol=0)
+
+
+def test_hidden_labels_are_not_read():
+    weights = []
+    for poison in (0.0, 1e9):
+        data = recordings()
+        hidden = (data["episode"] > 1).unsqueeze(-1)
+        data["has_action"] = ~hidden
+        data["action"] = torch.where(hidden, poison, data["action"])
+        data["observation"][:, :2] = torch.where(hidden, poison, data["observation"][:, :2])
+        response = columns()
+        fit_response(response, data)
+        weights.append(response.weight.clone())
+    assert torch.equal(*weights) and weights[0].any()
+
+
+def test_steps_across_episodes_and_gaps_are_left_out():
+    data = recordings(episodes=2, length=10)
+    data["has_action"][4] = False
+    steps, changes = labelled_steps(columns(), data)
+    # two changes before, and one step after: rows 2..8 of each episode, but for those that need the change of row 4
+    assert steps.row.tolist() == [2, 3, 4, 7, 8, 12, 13, 14, 15, 16, 17, 18]
+    assert steps.segment.tolist() == [0] * 3 + [1] * 2 + [2] * 7
+    assert changes[4].isnan().all() and not changes[5].isnan().any()
+
+
+def test_too_few_labels_in_a_row_are_refused():
+    data = recordings(episodes=1, length=20)
+    data["has_action"][::2] = False
+    with pytest.raises(ValueError, match="2 labelled steps in a row"):
+        fit_response(columns(), data)
+
+
+def test_columns_of_the_tasks():
+    assert tracked_columns(get_task("aligning"))["states"] == [0, 1, 2]
+    stacking = tracked_columns(get_task("stacking"))
+    assert stacking["actions"] == list(range(7)) == stacking["commands"] and len(stacking["states"]) == 7
+
+
+def test_a_task_without_commands_is_refused_before_any_work():
+    task = Task("arm", {"joints": 2}, {"a": "rad", "b": "rad"}, position="joints")
+    with pytest.raises(ValueError, match=r"task 'arm' .* repeats the last command \(Task.command\)"):
+        resolve(TrainConfig(out="", method="koap_mpc"), task)

@@ -1,0 +1,222 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Fitting the response of a robot to its commands on the labelled steps, and on no others."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_koap.modules import CommandResponse
+from torchrl_koap.tasks import Task
+
+AHEAD = 8  # control steps over which labelled steps left out are predicted
+PENALTIES = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+_FOLDS = 5
+
+
+def tracked_columns(task: Task) -> dict[str, Any]:
+    """What a :class:`~torchrl_koap.modules.CommandResponse` is built with: which columns a task's actions move.
+
+    Args:
+        task (Task): the task.
+
+    Raises:
+        ValueError: if its observation does not repeat the last command, or it is not known what the actions move.
+
+    Examples:
+        >>> from torchrl_koap.tasks import get_task
+        >>> from torchrl_koap.training.response import tracked_columns
+        >>> tracked_columns(get_task("avoiding"))
+        {'states': [0, 1], 'commands': [0, 1], 'actions': [0, 1], 'absolute': False}
+    """
+    absolute = bool(task.action_targets)
+    actions = [i for i, name in enumerate(task.actions) if absolute or name not in task.absolute_actions]
+    moved = list(task.action_targets or task.actuated or task.robot[: len(actions)])
+    if task.command is None:
+        raise ValueError(
+            f"task {task.name!r} cannot follow plans by prediction: its observation has no part that repeats the last"
+            " command (Task.command)"
+        )
+    commands = list(range(task.observation_dim))[task.command_columns][: len(actions)]
+    if not len(actions) == len(moved) == len(commands):
+        raise ValueError(
+            f"task {task.name!r} cannot follow plans by prediction: {len(actions)} actions, {len(commands)} commands"
+            f" ({task.command!r}) and {len(moved)} state columns that they move (Task.actuated or Task.robot)"
+        )
+    return {"states": moved, "commands": commands, "actions": actions, "absolute": absolute}
+
+
+class LabelledSteps(NamedTuple):
+    """Steps ``[n]`` whose commands are known, in the order of time.
+
+    Args:
+        coordinates (Tensor): what the model reads ``[n, J, f]``.
+        steps (Tensor): what followed ``[n, J]``.
+        segment (Tensor): number of the unbroken stretch that each one lies in ``[n]``.
+        known (Tensor): the command itself is known, not its changes alone, bool ``[n]``.
+        row (Tensor): where it is in the data ``[n]``.
+    """
+
+    coordinates: Tensor
+    steps: Tensor
+    segment: Tensor
+    known: Tensor
+    row: Tensor
+
+    def take(self, chosen: Tensor) -> LabelledSteps:
+        """Some of them."""
+        return LabelledSteps(*(field[chosen] for field in self))
+
+
+def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, Any]:
+    """Fits a response to the labelled steps; penalty and coupling are those that predict left-out stretches best.
+
+    Where a trajectory has labels on parts of it only, its commands are hidden and the changes alone are known: every
+    such stretch then has an unknown offset of its own, which is taken out (fixed effects).
+
+    Args:
+        response (CommandResponse): the model, whose weights are set.
+        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
+
+    Returns:
+        dict: ``penalty``, ``coupled``, ``labels_used`` and ``held_out_error``: root mean square of predictions over up
+        to 8 steps, in the unit of the axes; None if there was too little to leave out.
+
+    Raises:
+        ValueError: if no stretch of labelled steps is long enough.
+    """
+    steps, changes = labelled_steps(response, data)
+    if not len(steps.row):
+        raise ValueError(
+            f"following plans by prediction needs {response.memory} labelled steps in a row at least, there are none"
+        )
+    best = None
+    choices = list(product((False, True), PENALTIES)) if response.num_axes > 1 else list(product((False,), PENALTIES))
+    folds = _folds(steps)
+    for coupled, penalty in choices if folds is not None else ():
+        errors = []
+        for fold in range(_FOLDS):
+            out = folds == fold
+            if not out.any() or out.all():
+                continue
+            _fit(response, steps.take(~out), penalty=penalty, coupled=coupled)
+            errors.append(_prediction_errors(response, data, steps.take(out), changes).flatten())
+        errors = torch.cat(errors)
+        error = errors.pow(2).mean().sqrt().item() if len(errors) else float("inf")
+        if best is None or error < best[0]:
+            best = error, coupled, penalty
+    error, coupled, penalty = best if best is not None and best[0] < float("inf") else (None, False, 1e-5)
+    _fit(response, steps, penalty=penalty, coupled=coupled)
+    return {
+        "penalty": penalty,
+        "coupled": coupled,
+        "labels_used": len(steps.row),
+        "held_out_error": None if error is None else float(f"{error:.4g}"),
+    }
+
+
+def labelled_steps(response: CommandResponse, data: TensorDictBase) -> tuple[LabelledSteps, Tensor]:
+    """The steps that may be fitted to, and the changes of the command.
+
+    Args:
+        response (CommandResponse): which columns to read.
+        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
+
+    Returns:
+        tuple: the steps, and the changes ``[N, J]``, NaN where they are not known.
+    """
+    memory, axes = response.memory, response.num_axes
+    episode, labelled = data["episode"], data["has_action"].reshape(-1)
+    positions = data["state"][:, response.states].double()
+    action = torch.where(labelled.unsqueeze(-1), data["action"][:, response.actions].double(), torch.nan)
+    if response.absolute:
+        after, changes = action, torch.full_like(action, torch.nan)
+        same = (episode[1:] == episode[:-1]).unsqueeze(-1)
+        changes[1:] = torch.where(same, action.diff(dim=0), torch.nan)
+    else:
+        changes = action
+        after = data["observation"][:, response.commands].double() + changes
+    row = torch.arange(memory, len(episode) - 1, device=episode.device)
+    good = (episode[row - memory] == episode[row + 1]) & ~positions[row + 1].isnan().any(-1)
+    for back in range(1, memory + 1):
+        good &= ~changes[row - back].isnan().any(-1) & ~positions[row - back].isnan().any(-1)
+    row = row[good & ~positions[row].isnan().any(-1)]
+    broken = torch.ones_like(row, dtype=torch.bool)
+    broken[1:] = (row.diff() != 1) | (episode[row[1:]] != episode[row[:-1]])
+    segment = broken.cumsum(0) - 1
+    known = ~after[row - 1].isnan().any(-1)
+    # where the command is hidden, it is counted from the beginning of the stretch
+    command = torch.where(known.unsqueeze(-1), after[row - 1], _counted(changes[row - 1], segment))
+    history = torch.stack([positions[row - back] for back in range(memory, -1, -1)], 1)
+    past = torch.stack([changes[row - back] for back in range(memory, 0, -1)], 1)
+    read = response.coordinates(history, command - positions[row], past)
+    steps = (positions[row + 1] - positions[row]).reshape(-1, axes)
+    return LabelledSteps(read, steps, segment, known, row), changes
+
+
+def _counted(changes: Tensor, segment: Tensor) -> Tensor:
+    """Sums of ``changes [n, J]`` from the beginning of each segment on."""
+    total = changes.cumsum(0)
+    first = torch.ones_like(segment, dtype=torch.bool)
+    first[1:] = segment.diff() != 0
+    before = (total - changes)[first]
+    return total - before[segment]
+
+
+def _fit(response: CommandResponse, steps: LabelledSteps, **options: Any) -> None:
+    """A ridge after the means of the stretches with unknown commands were taken out."""
+    read, wanted = steps.coordinates, steps.steps
+    if not steps.known.all():
+        _, group, size = steps.segment.unique(return_inverse=True, return_counts=True)
+        hidden = (~steps.known).to(read.dtype)
+        means = []
+        for value in (read.flatten(1), wanted):
+            total = value.new_zeros(len(size), value.shape[1]).index_add_(0, group, value)
+            means.append((total / size.unsqueeze(-1))[group] * hidden.unsqueeze(-1))
+        read, wanted = read - means[0].view_as(read), wanted - means[1]
+    response.fit_ridge(read, wanted, **options)
+
+
+def _folds(steps: LabelledSteps) -> Tensor | None:
+    """Stretches to leave out together ``[n]``; a single one is cut into blocks. None if there is too little."""
+    count = int(steps.segment[-1]) + 1
+    if count >= _FOLDS:
+        return steps.segment % _FOLDS
+    if len(steps.row) < _FOLDS * (AHEAD + 1):
+        return None
+    return torch.arange(len(steps.row), device=steps.row.device) * _FOLDS // len(steps.row)
+
+
+def _prediction_errors(
+    response: CommandResponse, data: TensorDictBase, steps: LabelledSteps, changes: Tensor
+) -> Tensor:
+    """Errors ``[m, AHEAD, J]`` of the positions predicted from every second step that has as many after it."""
+    row, memory = steps.row, response.memory
+    length = min(AHEAD, int(steps.segment.bincount().max()))
+    enough = torch.zeros_like(row, dtype=torch.bool)
+    enough[: len(row) - length + 1] = row[length - 1 :] - row[: len(row) - length + 1] == length - 1
+    enough &= steps.segment == torch.roll(steps.segment, -(length - 1)) if length > 1 else True
+    start = steps.take(enough)
+    start = start.take(torch.arange(0, len(start.row), 2, device=row.device))
+    if not len(start.row):
+        return changes.new_zeros(0, length, response.num_axes)
+    row = start.row
+    positions = data["state"][:, response.states].double()
+    history = torch.stack([positions[row - back] for back in range(memory, -1, -1)], 1)
+    past = torch.stack([changes[row - back] for back in range(memory, 0, -1)], 1)
+    future = torch.stack([changes[row + ahead] for ahead in range(length)], 1).nan_to_num(0.0)  # the last has no effect
+    command = positions[row] + start.coordinates[..., memory]  # the lead
+    predicted = response.predict(history, command, past, future)
+    error = predicted - torch.stack([positions[row + 1 + ahead] for ahead in range(length)], 1)
+    if start.known.all():
+        return error
+    # a hidden command differs by a constant, whose effect is linear: what no constant explains is the error
+    axes, nothing = response.num_axes, torch.zeros(response.num_axes, memory + 1, response.num_axes).to(error)
+    offset = torch.eye(axes).to(error)
+    effect = response.predict(nothing, offset, nothing[:, 1:], torch.zeros(axes, length, axes).to(error)).flatten(1).T
+    explained = effect @ torch.linalg.lstsq(effect, error.flatten(1).T).solution
+    return torch.where(start.known[:, None, None], error, error - explained.T.view_as(error))
