@@ -58,7 +58,8 @@ def test_the_system_is_found_from_one_labelled_trajectory():
     data["has_action"] = (data["episode"] == 2).unsqueeze(-1)
     found = fit_response(response, data)
     assert found["labels_used"] < 60 and found["held_out_error"] < 1e-4
-    torch.testing.assert_close(response.weight.double(), a_system().weight, atol=2e-3, rtol=0)
+    # the coordinates are nearly dependent: what counts is the answer to a command
+    torch.testing.assert_close(response.double().impulse_matrix(8), a_system().impulse_matrix(8), atol=5e-3, rtol=0)
 
 
 def test_stretches_with_hidden_commands_have_offsets_of_their_own():
@@ -71,7 +72,8 @@ def test_stretches_with_hidden_commands_have_offsets_of_their_own():
     steps, _ = labelled_steps(response, data)
     assert not steps.known.any() and found["labels_used"] == len(steps.row)
     assert found["held_out_error"] < 1e-4
-    torch.testing.assert_close(response.weight.double(), a_system().weight, atol=2e-3, rtol=0)
+    # the coordinates are nearly dependent: what counts is the answer to a command
+    torch.testing.assert_close(response.double().impulse_matrix(8), a_system().impulse_matrix(8), atol=5e-3, rtol=0)
 
 
 def test_absolute_commands_give_the_same_model():

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Any, NamedTuple
 
 import torch
@@ -14,7 +13,7 @@ from torchrl_koap.modules import CommandResponse
 from torchrl_koap.tasks import Task
 
 AHEAD = 8  # control steps over which labelled steps left out are predicted
-PENALTIES = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+PENALTY = 1e-5  # relative; larger ones predict labels left out as well, but shrink momentum, and plans are lost
 _FOLDS = 5
 
 
@@ -73,7 +72,7 @@ class LabelledSteps(NamedTuple):
 
 
 def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, Any]:
-    """Fits a response to the labelled steps; penalty and coupling are those that predict left-out stretches best.
+    """Fits a response to the labelled steps; axes are coupled if stretches left out are predicted better by it.
 
     Where a trajectory has labels on parts of it only, its commands are hidden and the changes alone are known: every
     such stretch then has an unknown offset of its own, which is taken out (fixed effects).
@@ -83,7 +82,7 @@ def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, A
         data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
 
     Returns:
-        dict: ``penalty``, ``coupled``, ``labels_used`` and ``held_out_error``: root mean square of predictions over up
+        dict: ``coupled``, ``labels_used`` and ``held_out_error``: root mean square of predictions over up
         to 8 steps, in the unit of the axes; None if there was too little to leave out.
 
     Raises:
@@ -95,24 +94,22 @@ def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, A
             f"following plans by prediction needs {response.memory} labelled steps in a row at least, there are none"
         )
     best = None
-    choices = list(product((False, True), PENALTIES)) if response.num_axes > 1 else list(product((False,), PENALTIES))
     folds = _folds(steps)
-    for coupled, penalty in choices if folds is not None else ():
+    for coupled in (False, True) if folds is not None else ():
         errors = []
         for fold in range(_FOLDS):
             out = folds == fold
             if not out.any() or out.all():
                 continue
-            _fit(response, steps.take(~out), penalty=penalty, coupled=coupled)
+            _fit(response, steps.take(~out), coupled=coupled)
             errors.append(_prediction_errors(response, data, steps.take(out), changes).flatten())
         errors = torch.cat(errors)
         error = errors.pow(2).mean().sqrt().item() if len(errors) else float("inf")
         if best is None or error < best[0]:
-            best = error, coupled, penalty
-    error, coupled, penalty = best if best is not None and best[0] < float("inf") else (None, False, 1e-5)
-    _fit(response, steps, penalty=penalty, coupled=coupled)
+            best = error, coupled
+    error, coupled = best if best is not None and best[0] < float("inf") else (None, False)
+    _fit(response, steps, coupled=coupled)
     return {
-        "penalty": penalty,
         "coupled": coupled,
         "labels_used": len(steps.row),
         "held_out_error": None if error is None else float(f"{error:.4g}"),
@@ -167,7 +164,7 @@ def _counted(changes: Tensor, segment: Tensor) -> Tensor:
     return total - before[segment]
 
 
-def _fit(response: CommandResponse, steps: LabelledSteps, **options: Any) -> None:
+def _fit(response: CommandResponse, steps: LabelledSteps, *, coupled: bool) -> None:
     """A ridge after the means of the stretches with unknown commands were taken out."""
     read, wanted = steps.coordinates, steps.steps
     if not steps.known.all():
@@ -178,7 +175,7 @@ def _fit(response: CommandResponse, steps: LabelledSteps, **options: Any) -> Non
             total = value.new_zeros(len(size), value.shape[1]).index_add_(0, group, value)
             means.append((total / size.unsqueeze(-1))[group] * hidden.unsqueeze(-1))
         read, wanted = read - means[0].view_as(read), wanted - means[1]
-    response.fit_ridge(read, wanted, **options)
+    response.fit_ridge(read, wanted, penalty=PENALTY, coupled=coupled)
 
 
 def _folds(steps: LabelledSteps) -> Tensor | None:
