@@ -142,7 +142,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--episodes", type=int, default=15)
     parser.add_argument("--steps", type=int, default=2000, help="planner updates")
-    parser.add_argument("--controller-steps", type=int, default=60)
+    parser.add_argument("--controller-steps", type=int, default=200)
     parser.add_argument("--replan-interval", type=int, default=8, help="frames of each plan that are executed")
     parser.add_argument("--probe", action="store_true", help="write the table of the probes and stop")
     parser.add_argument("--fit-projection", action="store_true", help="make the package's projection anew and stop")
