@@ -8,6 +8,7 @@ of the detailed meshes at a small part of their cost in software rendering.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
 
@@ -132,7 +133,7 @@ def _spoon() -> str:
 
 
 # offset (m), quarter turn about x, range of the joint (rad) and capsules (from, to, radius, dark) of the links
-_LINKS = (
+_LINKS: tuple[tuple[Any, ...], ...] = (
     ((0, 0, 0.333), 0, 2.8973, [((0, 0, -0.19), (0, 0, -0.03), 0.06, False)]),
     ((0, 0, 0), -1, 1.7628, [((0, -0.06, 0), (0, 0.06, 0), 0.06, False), ((0, 0, 0), (0, -0.13, 0), 0.06, False)]),
     (
