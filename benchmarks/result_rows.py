@@ -105,11 +105,19 @@ def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
             row["candidates"] if row["candidates"] == "1" else f"{row['candidates']}, {row['choice']}",
             success(row),
             row["mean_steps"],
-            row["note"],
+            row["note"] or boxes(row),
         ]
         for row in rows
     ]
     return table(head, body)
+
+
+def boxes(row: Mapping[str, str]) -> str:
+    """How often the first box of Stacking reached its zone, and two did, empty for other tasks."""
+    if not row.get("stacked"):
+        return ""
+    first, two, _ = (100 * int(count) / int(row["n"]) for count in row["stacked"].split())
+    return f"first box {first:.1f} %, two {two:.1f} %"
 
 
 def difference(row: Mapping[str, str]) -> str:

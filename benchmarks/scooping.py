@@ -28,14 +28,15 @@ from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS
 from torchrl_koap.training import TrainConfig, train
 from torchrl_koap.vision.backbones import load_backbone
-from torchrl_koap.vision.demonstrations import Source, embed_demonstrations
+from torchrl_koap.vision.demonstrations import Source, embed_demonstrations, fit_projection
 from torchrl_koap.vision.encoder import FrozenImageEncoder
-from torchrl_koap.vision.pooling import Projection
-from torchrl_koap.vision.projections import load_encoder
+from torchrl_koap.vision.pooling import POOLINGS, Projection
+from torchrl_koap.vision.projections import SCOOPING, load_encoder, save_encoder
 
 RESULTS = Path(__file__).parent / "results"
 TABLE, PROBES = RESULTS / "scooping.csv", RESULTS / "scooping_probe.csv"
 UNLABELLED = ("robot", "hand", "both")
+METHODS = ["koap", "koap_paper", "dd", "vae", "lapo", "dp", "pca", "linear"]
 COLUMNS = (
     "labels", "unlabelled", "method", "seed", "n", "successes", "success_low", "success_high", "rims", "rim_low",
     "rim_high", "left", "near", "right", "action_error_mrad", "planner_steps", "planner_error",
@@ -80,7 +81,7 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
         settings = {"method": method, "seed": seed, "planner_from": planner, "steps": options.steps}
         settings |= {"controller_steps": options.controller_steps, "analysis": unlabelled != "hand"}
         train(_config(run, folder, unlabelled, labels, **settings))
-    result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1))
+    result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1, replan_interval=options.replan_interval))
     summary = json.loads((run / "summary.json").read_text())
     n = options.episodes
     successes, rims = round(result["success_rate"] * n), round(result["rim_rate"] * n)
@@ -103,27 +104,25 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
 
 def probe(folder: Path) -> list[dict]:
     """Errors of a linear map from embeddings to the spoon's position, by pooling: what the embedding keeps of it."""
+    backbone, poolings = load_backbone(), ("average", "spatial_softmax", "grid")
+    features, spoons = {}, {}
+    with torch.no_grad():
+        for who in EMBODIMENTS:
+            read = read_image_episodes(folder / who)
+            spoons[who] = [torch.from_numpy(episode.state).double() for episode in read]
+            maps = (backbone(torch.from_numpy(e.frames).permute(0, 3, 1, 2).float() / 255) for e in read)
+            features[who] = [{pooling: POOLINGS[pooling](part) for pooling in poolings} for part in maps]
     rows = []
-    for pooling in ("average", "spatial_softmax", "grid"):
-        kept = folder / ("cache" if pooling == "grid" else f"cache_{pooling}")
-        encoder = FrozenImageEncoder(load_backbone(), pooling=pooling, cache=kept)
-        read = {who: read_image_episodes(folder / who) for who in EMBODIMENTS}
-        features = {who: [encoder.features(torch.from_numpy(e.frames)) for e in read[who]] for who in read}
-        every = torch.cat([part for parts in features.values() for part in parts])
-        dim = min(EMBEDDING_DIM, every.shape[1] - 1)
-        if pooling == "grid":
-            fitted: Projection = load_encoder().projection
-        else:
-            fitted = Projection.fit(
-                every[torch.randperm(len(every), generator=torch.Generator().manual_seed(0))[:3000]], dim
-            )
+    for pooling in poolings:
+        every = torch.cat([part[pooling] for parts in features.values() for part in parts])
+        chosen = torch.randperm(len(every), generator=torch.Generator().manual_seed(0))[:3000]
+        fitted = Projection.fit(every[chosen], min(EMBEDDING_DIM, every.shape[1] - 1))
         for who, parts in features.items():
-            seen = [torch.cat([fitted(part).double(), torch.ones(len(part), 1)], 1) for part in parts]
-            spoon = [torch.from_numpy(episode.state).double() for episode in read[who]]
+            seen = [torch.cat([fitted(p[pooling]).double(), torch.ones(len(p[pooling]), 1)], 1) for p in parts]
             cut = round(len(seen) * (1 - HELD_OUT))
-            x, y = torch.cat(seen[:cut]), torch.cat(spoon[:cut])
+            x, y = torch.cat(seen[:cut]), torch.cat(spoons[who][:cut])
             weight = torch.linalg.solve(x.T @ x + 1e-3 * torch.eye(x.shape[1]).double(), x.T @ y)
-            errors = (torch.cat(seen[cut:]) @ weight - torch.cat(spoon[cut:])).norm(dim=1) * 1000
+            errors = (torch.cat(seen[cut:]) @ weight - torch.cat(spoons[who][cut:])).norm(dim=1) * 1000
             rows.append(
                 {"pooling": pooling, "columns": fitted.dim, "embodiment": who, "demonstrations": cut}
                 | {"held_out": len(seen) - cut, "error_mm": f"{errors.mean():.1f}"}
@@ -144,11 +143,20 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=15)
     parser.add_argument("--steps", type=int, default=2000, help="planner updates")
     parser.add_argument("--controller-steps", type=int, default=200)
+    parser.add_argument("--replan-interval", type=int, default=8, help="frames of each plan that are executed")
     parser.add_argument("--probe", action="store_true", help="write the table of the probes and stop")
+    parser.add_argument("--fit-projection", action="store_true", help="make the package's projection anew and stop")
     options = parser.parse_args()
     for who in EMBODIMENTS:
         if not (options.folder / who).exists():
             record_videos(options.folder / who, who, options.demonstrations)
+    if options.fit_projection:
+        encoder = FrozenImageEncoder(load_backbone(), pooling="grid", cache=options.folder / "cache")
+        encoder.projection = fit_projection(
+            encoder, [Source(options.folder / who) for who in EMBODIMENTS], EMBEDDING_DIM
+        )
+        save_encoder(encoder, SCOOPING, stride=8, fitted_on="unlabelled frames of robot and hand, koap demos, seed 0")
+        return
     if options.probe:
         rows = probe(options.folder)
         with PROBES.open("w", newline="") as file:

@@ -168,3 +168,10 @@ def test_compiles_without_breaks():
     compiled = torch.compile(normalizer, fullgraph=True, backend="eager")
     x = torch.rand(4, 2)
     assert torch.equal(compiled(x), normalizer(x))
+
+
+def test_shared_keeps_how_much_larger_one_column_is_than_another():
+    values = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([4.0, 1.0, 0.1]) + 7
+    spread = Normalizer.fit(values, mode="shared")(values).std(0)
+    assert spread[0].item() == pytest.approx(1, rel=1e-2)
+    torch.testing.assert_close(spread / spread[0], values.std(0) / values[:, 0].std())

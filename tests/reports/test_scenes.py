@@ -21,7 +21,7 @@ def models():
     return {
         name: registry.make_env(name).sims.model
         for name in TASKS
-        if (TASKS[name].env or "").startswith("torchrl_koap.")
+        if (TASKS[name].env or "").startswith("torchrl_koap.") and TASKS[name].converter
     }
 
 
@@ -85,7 +85,7 @@ def test_regions_of_aligning_are_those_of_the_contexts():
         np.testing.assert_allclose(contexts[:, index, :2].max(0), high, atol=1e-3)
 
 
-@pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].objects])
+@pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].objects and TASKS[task].converter])
 def test_bodies_have_the_sizes_and_colours_of_the_environment(task, models):
     model, looks = models[task], objects.object_looks(task, len(TASKS[task].objects))
     assert len(looks) == len(TASKS[task].objects)

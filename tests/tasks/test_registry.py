@@ -33,7 +33,7 @@ def test_columns_of_every_task(name):
     assert task.name == name
     covered = [column for part in task.observation.values() for column in range(part.start, part.stop)]
     assert covered == list(range(task.observation_dim))  # no gap, no overlap, in order
-    command = task.observation[task.command]
+    command = slice(0, 0) if task.command is None else task.observation[task.command]
     assert not set(range(command.start, command.stop)) & set(task.state_columns)
     assert set(task.hidden) < set(task.observation)
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from torchrl_koap.training.builders import (
     build_controller,
     set_up_torch,
 )
+from torchrl_koap.training.config import TrainConfig, resolve
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.diffusion_builders import DENOISERS, build_planner
 from torchrl_koap.training.methods import METHODS
@@ -188,3 +190,16 @@ def test_sizes_of_the_denoiser_are_options():
         build_planner(PLANNER | {"denoiser": "unet", "width": 64}, 2)
     with pytest.raises(ValueError, match="denoiser 'released' has no depth to choose, only none"):
         build_planner(PLANNER | {"denoiser": "released", "depth": 2}, 2)
+
+
+def test_absolute_actions_are_centred_and_read_off_the_present_frame():
+    entry = resolve(TrainConfig(out=Path("run"), task="scooping")).controller
+    assert entry["absolute"] and "absolute" not in resolve(TrainConfig(out=Path("run"), task="stacking")).controller
+    state, action = torch.randn(60, 6) * torch.arange(1.0, 7.0), torch.randn(60, 2) + 5
+    labelled = TensorDict({"state": state, "action": action, "has_action": torch.ones(60, 1, dtype=torch.bool)}, [60])
+    controller = build_controller(entry, 6, 2, labelled)
+    assert controller.latent_action.place > 0 and (controller.action_normalizer.offset > 4).all()
+    assert controller.state_normalizer.scale.unique().numel() == 1
+    assert build_controller(entry | {"method": "linear_steps"}, 6, 2, labelled).latent_action.place > 0
+    plain = build_controller({**entry, "absolute": False}, 6, 2, labelled)
+    assert plain.latent_action.place == 0 and not plain.action_normalizer.offset.any()

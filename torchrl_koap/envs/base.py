@@ -109,7 +109,7 @@ class ManipulationEnv(RawLog, Foresight, EnvBase):
         self.task = task
         self.max_steps = max_steps
         self.substeps = substeps
-        self.sims = SimulationBatch(model, num_envs, num_threads) if simulations is None else simulations
+        self.sims: Any = SimulationBatch(model, num_envs, num_threads) if simulations is None else simulations
         self._start_joints = np.asarray(start_joints, dtype=np.float64)
         self._dtype = dtype
         self._observation = np.zeros((num_envs, task.observation_dim))

@@ -29,6 +29,13 @@ class Backbone(nn.Module):
         stages (nn.Module): pictures ``[B, 3, H, W]``, normalised, to feature maps ``[B, C, h, w]``.
         digest (str): SHA-256 of the weights' file.
         name (str): of the network.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.vision.backbones import Backbone
+        >>> from torchrl_koap.vision.resnet import ResNet
+        >>> Backbone(ResNet("resnet18").up_to(8), "random", "resnet18")(torch.zeros(1, 3, 64, 64)).shape
+        torch.Size([1, 128, 8, 8])
     """
 
     def __init__(self, stages: nn.Module, digest: str, name: str):

@@ -57,8 +57,8 @@ def made_up(task, lengths=(5, 8), seed=0):
     """Random observations of a task whose command follows from the actions."""
     generator = torch.Generator().manual_seed(seed)
     facts = get_task(task)
-    command, size = facts.observation[facts.command], facts.num_delta_actions
-    frames_of, steps_of = [], []
+    size, frames_of, steps_of = facts.num_delta_actions, [], []
+    command = facts.observation[facts.command] if facts.command else slice(0, facts.action_dim)
     for length in lengths:
         frames = torch.randn(length, facts.observation_dim, generator=generator, dtype=torch.float64)
         changes = frames[:, command].diff(dim=0)

@@ -197,3 +197,15 @@ def test_steps_tells_where_a_latent_action_holds_the_steps_of_an_axis():
     entries, factors = network.steps((2, 0))
     expected = torch.stack([state[:, b] - state[:, a] for a, b in ((2, 3), (3, 4), (4, 6), (6, 9))], 1)[..., [2, 0]]
     torch.testing.assert_close(latent[:, entries] * factors, expected)
+
+
+def test_the_place_is_a_further_linear_part_and_changes_nothing_else():
+    torch.manual_seed(0)
+    plain = LatentActionFourier(3, 8, num_past=1, look_ahead=(2, 3))
+    torch.manual_seed(0)
+    placed = LatentActionFourier(3, 8, num_past=1, look_ahead=(2, 3), place=2.0)
+    frames = torch.randn(5, 4, 3)
+    with_place = placed.infer(frames)
+    assert placed.latent_dim == plain.latent_dim + 3 == with_place.shape[-1]
+    torch.testing.assert_close(with_place[..., :-3], plain.infer(frames))
+    torch.testing.assert_close(with_place[..., -3:], 2 / 3**0.5 * frames[..., 1, :])

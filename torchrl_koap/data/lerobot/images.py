@@ -48,11 +48,8 @@ class ImageEpisode:
 
 
 def _pyarrow():
-    for package, extra in (("pyarrow", "lerobot"),):
-        if importlib.util.find_spec(package) is None:
-            raise RuntimeError(
-                f"data sets with pictures need {package}: install the extra, pip install 'torchrl_koap[{extra}]'"
-            )
+    if importlib.util.find_spec("pyarrow") is None:
+        raise RuntimeError("data sets with pictures need an extra: pip install 'torchrl_koap[lerobot]'")
     import pyarrow
     import pyarrow.parquet
 
@@ -72,6 +69,17 @@ class ImageEpisodeWriter:
 
     Raises:
         FileExistsError: if the folder holds a finished data set.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from torchrl_koap.data.lerobot.images import ImageEpisode, ImageEpisodeWriter, read_image_episodes
+        >>> about = {"state_names": ["x"], "action_names": [], "embodiment": "hand", "task": "wave"}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     writer = ImageEpisodeWriter(folder, fps=10, **about)
+        ...     writer.add(ImageEpisode(np.zeros((4, 8, 8, 3), np.uint8), np.zeros((4, 1)), None, "hand"))
+        ...     read_image_episodes(writer.close())[0].frames.shape
+        (4, 8, 8, 3)
     """
 
     def __init__(self, folder: str | Path, *, fps: float, state_names, action_names, embodiment: str, task: str):

@@ -147,6 +147,8 @@ def _checked_actions(task: Task, frames: np.ndarray, actions: np.ndarray, kind: 
     """Changes of the desired position ``[T - 1, act]`` that lead from each row to the next one."""
     if actions.shape[1] != task.action_dim:
         raise ValueError(f"column 'action' has {actions.shape[1]} entries, task {task.name!r} has {task.action_dim}")
+    if task.command is None:
+        return actions[:-1]  # no command is observed that they could be compared with
     desired, size = frames[:, task.command_columns], task.num_delta_actions
     changes = np.concatenate([np.diff(desired[:, :size], axis=0), desired[1:, size:]], 1)
     gaps = {

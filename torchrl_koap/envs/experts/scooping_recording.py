@@ -35,6 +35,11 @@ class VideoReport:
         attempts (int): demonstrations that were played.
         frames (int): frames of those that were kept.
         again (int): how many of those scooped more than once.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.scooping_recording import VideoReport
+        >>> VideoReport("hand", episodes=2, attempts=3, frames=130, again=0).attempts
+        3
     """
 
     embodiment: str

@@ -8,6 +8,7 @@ of the detailed meshes at a small part of their cost in software rendering.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mujoco
 
@@ -60,6 +61,9 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
   <default>
     <geom contype="0" conaffinity="0"/>
     <default class="solid"><geom contype="1" conaffinity="2" friction="0.5 0.005 0.0002" solref="0.01 1"/></default>
+    <default class="tool">
+      <geom contype="4" conaffinity="3" friction="0.5 0.005 0.0002" solref="0.01 1"/>
+    </default>
     <default class="piece">
       <geom contype="2" conaffinity="3" type="sphere" size="{PIECE_RADIUS}" mass="0.004" condim="3"
             friction="0.5 0.003 0.0005" solref="0.01 1" rgba="0.45 0.22 0.1 1"/>
@@ -118,7 +122,7 @@ def _piece(index: int) -> str:
 def _spoon() -> str:
     """A scoop open to the front (x); its origin is the middle of its floor, the handle rises from its back wall."""
     x, y = SPOON_HALF
-    solid = f'class="solid" type="box" rgba="{_STEEL}"'
+    solid = f'class="tool" type="box" rgba="{_STEEL}"'
     return f"""
 <geom name="spoon_floor" {solid} size="{x} {y} 0.001" pos="0 0 -0.001"/>
 <geom name="spoon_left" {solid} size="{x} 0.001 {WALL}" pos="0 {y} {WALL - 0.002}"/>
@@ -129,7 +133,7 @@ def _spoon() -> str:
 
 
 # offset (m), quarter turn about x, range of the joint (rad) and capsules (from, to, radius, dark) of the links
-_LINKS = (
+_LINKS: tuple[tuple[Any, ...], ...] = (
     ((0, 0, 0.333), 0, 2.8973, [((0, 0, -0.19), (0, 0, -0.03), 0.06, False)]),
     ((0, 0, 0), -1, 1.7628, [((0, -0.06, 0), (0, 0.06, 0), 0.06, False), ((0, 0, 0), (0, -0.13, 0), 0.06, False)]),
     (

@@ -13,7 +13,12 @@ _DAMPING, _PULL = 1e-4, 0.05
 
 
 def rotation_of(yaw: float, pitch: float, roll: float = 0.0) -> np.ndarray:
-    """Axes of a spoon ``[3, 3]``, in columns, turned by yaw, then pitch (nose down), then roll (rad).
+    """Axes of a spoon ``[3, 3]``, in columns, turned by yaw, then pitch (nose down), then roll.
+
+    Args:
+        yaw (float): about z (rad).
+        pitch (float): about the turned y, positive nose down (rad).
+        roll (float): about the turned x (rad).
 
     Examples:
         >>> from torchrl_koap.envs.mujoco.spoon_kinematics import rotation_of

@@ -1,0 +1,143 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Scooping: physics, outcome, absolute targets, and an expert that succeeds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_koap.commands.demos import Demos
+from torchrl_koap.envs import ScoopingEnv
+from torchrl_koap.envs.contexts import draw_contexts
+from torchrl_koap.envs.experts.scooping import ScoopingExpert, start_joints
+from torchrl_koap.envs.mujoco.rendering import Renderer
+from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations, settled_layouts
+from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics, rotation_of
+from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.scooping import BOWL, PIECE_RADIUS, RIM_RADIUS, START_HEIGHT, STARTS, start_of
+
+NEAR = np.array([[*STARTS["near"], 0.4]])
+
+
+def play(embodiment, context=NEAR, seed=0):
+    """An episode of the expert; its targets and its simulation."""
+    sims = ScoopingSimulations(embodiment, 1)
+    sims.reset(np.arange(1), start_joints(context, embodiment)[None], context[:, 2])
+    expert, targets = ScoopingExpert(sims, 0, start_of(context), seed), []
+    while not sims.success[0] and len(targets) < 120:
+        targets.append(expert.target())
+        sims.advance(np.arange(1), targets[-1][None])
+    return np.stack(targets), sims
+
+
+def test_pieces_rest_in_the_bowl():
+    layouts = settled_layouts()
+    assert layouts.shape[1:] == (36, 3)
+    assert np.linalg.norm(layouts[..., :2] - BOWL, axis=-1).max() < RIM_RADIUS
+    assert layouts[..., 2].min() > 0.9 * PIECE_RADIUS  # none has sunk
+
+
+def test_specs_and_start():
+    env = ScoopingEnv(num_envs=2, seed=0, embed=False)
+    check_env_specs(env)
+    contexts = draw_contexts("scooping", 2, 3)
+    start = env.reset(contexts=contexts)
+    spoon = start["observation"][:, get_task("scooping").observation["spoon"]].numpy()
+    np.testing.assert_allclose(spoon[:, :2], contexts[:, 0, :2], atol=2e-3)
+    np.testing.assert_allclose(spoon[:, 2], START_HEIGHT, atol=2e-3)
+    assert not start["success"].any() and not start["mode"].any()
+
+
+def test_the_robot_s_demonstration_succeeds_in_the_environment_too():
+    targets, sims = play("robot")
+    assert sims.success[0] and sims.rim[0] and sims.pieces_on_spoon()[0] >= 1
+    env = ScoopingEnv(num_envs=1, embed=False)
+    data = env.reset(contexts=NEAR[None])
+    for target in targets:
+        data = env.step(data.set("action", torch.tensor(target[None], dtype=torch.float32)))["next"]
+    assert data["success"].item() and data["terminated"].item() and data["mode"].item()
+
+
+def test_the_hand_succeeds_without_joints():
+    targets, sims = play("hand", np.array([[*STARTS["left"], -1.0]]))
+    assert sims.success[0] and targets.shape[1] == 6
+
+
+def test_holding_still_is_no_success_and_the_spoon_stays_above_the_table():
+    arm, env = SpoonKinematics(), ScoopingEnv(num_envs=1, embed=False)
+    data = env.reset(contexts=NEAR[None])
+    below = arm.solve(np.array([0.36, 0.15, -0.06]), np.eye(3), iterations=80)
+    for _ in range(30):
+        data = env.step(data.set("action", torch.tensor(below[None], dtype=torch.float32)))["next"]
+    assert env.sims.spoon_position[0, 2] > -0.004  # pressed upon the table, not through it
+    assert not data["success"].item() and not data["mode"].item()
+
+
+def test_targets_that_are_far_away_are_approached_at_a_limited_speed():
+    env = ScoopingEnv(num_envs=1, embed=False)
+    data = env.reset(contexts=NEAR[None])
+    before = env.commands
+    env.step(data.set("action", torch.tensor(before + 1.0, dtype=torch.float32)))
+    np.testing.assert_allclose(np.abs(env.commands - before).max(), 0.25, atol=1e-6)
+    with pytest.raises(ValueError, match="must be finite"):
+        env.step(data.set("action", torch.full((1, 7), torch.nan)))
+
+
+def test_an_episode_goes_on_bit_for_bit():
+    env, other = ScoopingEnv(num_envs=1, embed=False), ScoopingEnv(num_envs=1, embed=False)
+    data = env.reset(contexts=NEAR[None])
+    action = torch.tensor(env.commands + 0.02, dtype=torch.float32)
+    env.step(data.set("action", action))
+    other.reset()
+    other.set_state(0, env.get_state(0))
+    ends = [each.step(data.clone().set("action", action))["next", "observation"] for each in (env, other)]
+    assert torch.equal(*ends)
+
+
+def test_inverse_kinematics_reaches_turned_poses():
+    arm = SpoonKinematics()
+    for x, y, z, yaw, pitch in ((0.5, 0.2, 0.2, 0.0, 0.0), (0.55, 0.0, 0.01, 0.8, 0.2), (0.5, 0.05, 0.14, -0.8, -0.5)):
+        joints = arm.solve(np.array([x, y, z]), rotation_of(yaw, pitch), iterations=80)
+        np.testing.assert_allclose(arm.position(joints), (x, y, z), atol=2e-3)
+
+
+def test_scores_tell_the_starts_apart():
+    env = ScoopingEnv(num_envs=2, embed=False, contexts=np.array([[[0.5, 0.22, 0]], [[0.33, 0, 0]]]), max_steps=2)
+    episodes = list(env.rollout(2))
+    from torchrl_koap.tasks.scooping import scores
+
+    assert scores({}, episodes, None) == {"rim_rate": 0.0, "success_left": 0.0, "success_near": 0.0}
+
+
+@pytest.mark.parametrize("embodiment", ["robot", "hand"])
+def test_the_camera_sees_the_embodiments_differ(embodiment):
+    try:
+        renderer = Renderer(ScoopingSimulations(embodiment, 1).model, 96, 96, shadows=False)
+    except RuntimeError as error:
+        pytest.skip(f"no OpenGL library: {error}")
+    sims = ScoopingSimulations(embodiment, 1)
+    sims.reset(np.arange(1), start_joints(NEAR, embodiment)[None], [0.0])
+    picture = renderer.render(sims.data[0], "third_person").astype(int)
+    renderer.close()
+    assert picture.shape == (96, 96, 3)
+    skin = (picture[..., 0] > 150) & (picture[..., 0] - picture[..., 2] > 50) & (picture[..., 1] < 170)
+    assert (skin.sum() > 40) == (embodiment == "hand")
+
+
+def test_who_demonstrates_has_to_be_said(tmp_path):
+    with pytest.raises(ValueError, match="--embodiment robot or hand"):
+        Demos(out=tmp_path / "a", task="scooping")()
+    with pytest.raises(ValueError, match="unknown embodiment 'foot'"):
+        Demos(out=tmp_path / "a", task="scooping", embodiment="foot")()
+    with pytest.raises(ValueError, match="one embodiment alone"):
+        Demos(out=tmp_path / "a", task="avoiding", embodiment="hand")()
+    assert not (tmp_path / "a").exists()
+
+
+def test_no_graphics_is_one_clear_error(tmp_path, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with pytest.raises(RuntimeError, match="switched off by the environment variable MUJOCO_GL=off"):
+        Demos(out=tmp_path / "a", task="scooping", embodiment="hand", episodes=1)()
+    assert not (tmp_path / "a").exists()
