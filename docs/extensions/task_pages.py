@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from typing import Any
 
@@ -116,8 +117,11 @@ def action_rows(task: Task) -> list[tuple[str, ...]]:
 def action_limits(task: Task) -> tuple[list[float] | None, list[float] | None]:
     """Bounds of the environment's actions, as its specification says."""
     from torchrl_koap.envs.registry import make_env
+    from torchrl_koap.tasks.import_strings import resolve
 
-    env = make_env(task.name, num_envs=1, num_threads=1)
+    known = inspect.signature(resolve(task.env, "env")).parameters
+    blind = {"embed": False} if "embed" in known else {}  # what is commanded is known without a camera
+    env = make_env(task.name, num_envs=1, num_threads=1, **blind)
     space = env.action_spec.space
     env.close()
     if not hasattr(space, "low"):
