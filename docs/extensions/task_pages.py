@@ -119,7 +119,7 @@ def action_limits(task: Task) -> tuple[list[float] | None, list[float] | None]:
     from torchrl_koap.envs.registry import make_env
     from torchrl_koap.tasks.import_strings import resolve
 
-    known = inspect.signature(resolve(task.env, "env")).parameters
+    known = inspect.signature(resolve(task.env, "env").__init__).parameters
     blind = {"embed": False} if "embed" in known else {}  # what is commanded is known without a camera
     env = make_env(task.name, num_envs=1, num_threads=1, **blind)
     space = env.action_spec.space
