@@ -119,7 +119,8 @@ def append(row: dict, table: Path) -> None:
     with replacing_file(table) as aside, aside.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(row), restval="", lineterminator="\n")
         writer.writeheader()
-        writer.writerows([OLDER | line for line in earlier])
+        added = {name: value for name, value in OLDER.items() if name in row}
+        writer.writerows([added | line for line in earlier])
         writer.writerow(row)
 
 
