@@ -35,6 +35,7 @@ BASE = {
     "doctor": (),
     "validate": ("{data}",),
 }
+LEFT_OUT = ("embed",)  # reads camera demonstrations with the weights of an extra: tests/vision has its wrong inputs
 WRONG: dict[Any, tuple[str, ...]] = {
     int: ("many", "1.5", "-1", "0", HUGE),
     float: ("many", "-1", "nan", "inf"),
@@ -100,7 +101,7 @@ def faults() -> Iterator[Fault]:
     for part in get_args(Subcommand):
         command, configuration = get_args(part)[:2]
         name = configuration.name
-        for option, kind in options(command):
+        for option, kind in options(command) if name not in LEFT_OUT else ():
             kind, _ = plain(kind)
             for value in WRONG[kind]:
                 call = f"{option} {value}"

@@ -125,7 +125,8 @@ def test_unknown_planner_options_suggest_the_nearest(option, value, message):
 )
 def test_every_controller_acts_and_takes_over_weights(method, preset, data):
     labelled, _ = LabelBudget(2).apply(data)
-    options = {"method": method, "preset": preset, "revised": True}
+    tracking = {"states": [0, 1], "commands": [0, 1], "actions": [0, 1]}
+    options = {"method": method, "preset": preset, "revised": True, "tracking": tracking}
     torch.manual_seed(0)
     controller = build_controller(options, 2, 2, labelled).eval()
     restored = build_controller(options, 2, 2).eval()
