@@ -35,7 +35,7 @@ BASE = {
     "doctor": (),
     "validate": ("{data}",),
 }
-LEFT_OUT = ("embed",)  # reads camera demonstrations with the weights of an extra: tests/vision has its wrong inputs
+LEFT_OUT = ("embed",)  # reads camera demonstrations with the weights of an extra; see tests/data/lerobot/test_images.py
 WRONG: dict[Any, tuple[str, ...]] = {
     int: ("many", "1.5", "-1", "0", HUGE),
     float: ("many", "-1", "nan", "inf"),
