@@ -196,7 +196,6 @@ def _prediction_errors(
     length = min(AHEAD, int(steps.segment.bincount().max()))
     enough = torch.zeros_like(row, dtype=torch.bool)
     enough[: len(row) - length + 1] = row[length - 1 :] - row[: len(row) - length + 1] == length - 1
-    enough &= steps.segment == torch.roll(steps.segment, -(length - 1)) if length > 1 else True
     start = steps.take(enough)
     start = start.take(torch.arange(0, len(start.row), 2, device=row.device))
     if not len(start.row):

@@ -116,3 +116,22 @@ def test_options_out_of_range_are_refused():
         policy_of(smoothness=0.0)
     with pytest.raises(ValueError, match="reads 6 observed frames, history is only 5"):
         policy_of(CommandResponse([0, 1], [0, 1], [0, 1], memory=5))
+
+
+def test_actions_minimise_what_is_documented():
+    torch.manual_seed(0)
+    policy = policy_of(look_ahead=4, smoothness=2.0, end_speed=3.0, blend_decay=0.0)
+    observed, plan = torch.randn(5, 4).double(), torch.randn(14, 2).double()
+    states, changes = observed[:, 2:], observed[-3:, :2].diff(dim=0)
+
+    def cost(future):
+        held = torch.cat([future, future.new_zeros(1, 2)])  # the last change is not seen
+        y = policy.response.predict(states[-3:], observed[-1, :2], changes, held)
+        jerk = torch.cat([changes[-1:], future]).diff(dim=0)
+        speed = (y[-1] - y[-2]) - (plan[3] - plan[2])
+        return (y - plan[:4]).pow(2).sum() + 9.0 * speed.pow(2).sum() + 2.0 * jerk.pow(2).sum()
+
+    best = policy.track(observed, states, plan).requires_grad_()
+    assert best.shape == (3, 2)
+    (slope,) = torch.autograd.grad(cost(best), best)
+    torch.testing.assert_close(slope, torch.zeros_like(slope), atol=1e-9, rtol=0)

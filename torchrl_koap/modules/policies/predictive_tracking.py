@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.koopman.command_response import CommandResponse
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
+from torchrl_koap.modules.policies.receding_horizon import STATE_HISTORY
 
 SMOOTHNESS = 3.0  # weight of a change of the commanded velocity against a distance from the plan
 END_SPEED = 5.0  # weight of the speed at the end of the look-ahead: a short one is unstable without
@@ -141,7 +142,7 @@ class PredictiveTracking(PlanThenControl):
         tensordict = super()._step(tensordict)
         observed, action = tensordict.get(self.in_keys[0]), tensordict.get(self.out_keys[0])
         plan = tensordict.get(self.receding.action_keys[0])
-        tracked = self.track(observed, self.state_of(observed), plan)[..., 0, :]
+        tracked = self.track(observed, tensordict.get(STATE_HISTORY), plan)[..., 0, :]
         return tensordict.set(self.out_keys[0], self._with_tracked(action, tracked))
 
     def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
