@@ -6,7 +6,8 @@
 
 For each pair, ``uv`` looks for versions that fit together, wheels only. Where the torch among them is a CPU wheel
 (``UV_FIND_LINKS``, or ``UV_TORCH_BACKEND=cpu`` with a network that has it), they are installed and a fast part of the
-suite runs; where it would bring CUDA, gigabytes that no test needs, that pair is resolved only, and the table says so.
+suite runs; where it would bring CUDA, gigabytes that no test needs, that pair is resolved only, and the table says so
+(``--any-torch`` brings them all the same).
 """
 
 from __future__ import annotations
@@ -83,6 +84,7 @@ def main() -> int:
     parser.add_argument("--pythons", nargs="+", default=PYTHONS)
     parser.add_argument("--versions", nargs="+", default=list(STRATEGIES), choices=STRATEGIES)
     parser.add_argument("--torch", help="version of the CPU wheels that are at hand (default: as resolved)")
+    parser.add_argument("--any-torch", action="store_true", help="install and test what brings CUDA, too")
     parser.add_argument("--tests", nargs="+", default=list(TESTS))
     parser.add_argument("--table", type=Path)
     options = parser.parse_args()
@@ -94,7 +96,7 @@ def main() -> int:
                 row = {"python": python, "versions": versions, "outcome": f"does not resolve: {problem}"}
                 if found:
                     row["outcome"] = "resolved"
-                    if "+cpu" in found["torch"]:
+                    if "+cpu" in found["torch"] or options.any_torch:
                         row["outcome"], row["passed"], row["failed"] = run_tests(
                             python, made, options.tests, Path(name)
                         )
