@@ -21,6 +21,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 
 from torchrl_koap import keys
+from torchrl_koap.data.steps_on_disk import PART, join_on_disk
 from torchrl_koap.data.ted_guard import steps_problem
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import read_bytes, replacing_folder, sha256_of
@@ -90,7 +91,7 @@ def save_ted(
         "notes": dict(notes or {}),
     }
     with replacing_folder(folder) as aside:
-        data.to_tensordict().cpu().memmap(aside / _STEPS, copy_existing=True)
+        join_on_disk(data.split(PART), len(data), aside / _STEPS)
         about["sha256"] = _checksums(aside)
         (aside / _ABOUT).write_text(json.dumps(about, indent=1))
     return folder
@@ -201,13 +202,27 @@ def _statistics(data: TensorDictBase) -> dict[str, dict[str, list[float | None]]
     for key in (keys.OBSERVATION, keys.STATE, keys.ACTION):
         if key not in data.keys():
             continue
-        values = data.get(key).double()
-        values = values[values.isfinite().all(-1)]
-        if len(values):
+        parts = data.get(key).split(PART)
+        count, mean = 0, torch.zeros(data.get(key).shape[-1], dtype=torch.double)
+        lowest: list[torch.Tensor] = []
+        highest: list[torch.Tensor] = []
+        for values in map(_finite_rows, parts):
+            if len(values):
+                count += len(values)
+                mean = mean + (values - mean).sum(0) / count
+                lowest.append(values.amin(0))
+                highest.append(values.amax(0))
+        if count:
+            squares = torch.stack([(_finite_rows(values) - mean).square().sum(0) for values in parts]).sum(0)
             statistics[key] = {
-                "mean": values.mean(0).tolist(),
-                "std": values.std(0, correction=0).tolist(),
-                "min": values.amin(0).tolist(),
-                "max": values.amax(0).tolist(),
+                "mean": mean.tolist(),
+                "std": (squares / count).sqrt().tolist(),
+                "min": torch.stack(lowest).amin(0).tolist(),
+                "max": torch.stack(highest).amax(0).tolist(),
             }
     return statistics
+
+
+def _finite_rows(values: torch.Tensor) -> torch.Tensor:
+    values = values.double().cpu()
+    return values[values.isfinite().all(-1)]

@@ -17,6 +17,7 @@ def flatten_trajectories(
     *,
     action_dim: int | None = None,
     dtype: torch.dtype = torch.float32,
+    first: int = 0,
 ) -> TensorDict:
     """Lays recorded trajectories one after the other in the storage layout.
 
@@ -32,6 +33,7 @@ def flatten_trajectories(
     Keyword Args:
         action_dim (int, optional): size of an action; needed where no trajectory has one.
         dtype (torch.dtype): floating type of the entries.
+        first (int): number of the first trajectory.
 
     Returns:
         TensorDict: flat data ``[sum(T_i - 1)]``.
@@ -58,9 +60,9 @@ def flatten_trajectories(
     if given is None and action_dim is None:
         raise ValueError("no trajectory has actions: action_dim is needed")
     width = given.shape[1] if action_dim is None else action_dim
-    for index, (frames, steps) in enumerate(zip(observations, actions, strict=True)):
+    for index, (frames, steps) in enumerate(zip(observations, actions, strict=True), first):
         if frames.ndim == 2 and steps is None:
-            actions[index] = steps = torch.full((max(len(frames) - 1, 0), width), torch.nan, dtype=dtype)
+            actions[index - first] = steps = torch.full((max(len(frames) - 1, 0), width), torch.nan, dtype=dtype)
         if frames.ndim != 2 or steps is None or steps.ndim != 2 or len(frames) < 2 or len(steps) != len(frames) - 1:
             raise ValueError(
                 f"trajectory {index}: wanted observations [T, obs] and actions [T - 1, act] with T >= 2,"
@@ -85,7 +87,7 @@ def flatten_trajectories(
             keys.OBSERVATION: torch.cat([frames[:-1] for frames in observations]).to(dtype),
             keys.ACTION: torch.cat(actions).to(dtype),
             keys.HAS_ACTION: ~torch.cat([steps.isnan().all(-1, keepdim=True) for steps in actions]),
-            keys.EPISODE: torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths)),
+            keys.EPISODE: torch.arange(first, first + len(lengths)).repeat_interleave(torch.tensor(lengths)),
             keys.STEP_COUNT: torch.cat([torch.arange(length) for length in lengths]),
             "next": {
                 "observation": torch.cat([frames[1:] for frames in observations]).to(dtype),

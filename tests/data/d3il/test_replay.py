@@ -147,7 +147,7 @@ def test_the_cache_is_used_and_follows_the_files(folder, monkeypatch):
     def never(*args, **kwargs):
         raise AssertionError("converted again")
 
-    monkeypatch.setattr(d3il_module, "convert_raw_files", never)
+    monkeypatch.setattr(d3il_module, "read_trajectories", never)
     again = D3ILExperienceReplay("avoiding", folder)
     assert again.data_path == first.data_path
     assert (again.data == first.data).all()
@@ -188,7 +188,7 @@ def test_a_full_disk_while_converting(folder, cache, monkeypatch):
     def full(self, *args, **kwargs):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(TensorDict, "memmap", full)
+    monkeypatch.setattr(TensorDict, "memmap_like", full)
     with pytest.raises(OSError, match="No space left"):
         D3ILExperienceReplay("avoiding", folder)
     assert all(entry.suffix == ".lock" for entry in (cache / "d3il").iterdir())

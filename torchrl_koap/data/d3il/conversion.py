@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -181,7 +181,33 @@ def convert_raw_files(
     Raises:
         RawFolderError: with the problems of all files.
     """
-    problems, observations, actions = [], [], []
+    observations, actions = [], []
+    for frames, steps in read_trajectories(converter, files, folder, progress=progress):
+        observations.append(frames.to(dtype))
+        actions.append(steps.to(dtype))
+    return flatten_trajectories(observations, actions, dtype=dtype)
+
+
+def read_trajectories(
+    converter: Converter, files: Sequence[Path], folder: Path, *, progress: Callable[[int, int], None] | None = None
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """Reads raw demonstrations one by one, each when it is asked for.
+
+    Args:
+        converter (Converter): that of the task.
+        files (sequence of Path): the demonstrations, one trajectory each.
+        folder (Path): what to call the whole in an error message.
+
+    Keyword Args:
+        progress (callable, optional): called with the number of files read and that of all.
+
+    Yields:
+        tuple: frames ``[T, obs]`` and actions ``[T - 1, act]``, float64; none behind a file that has a problem.
+
+    Raises:
+        RawFolderError: at the end, with the problems of all files.
+    """
+    problems: list[str] = []
     for index, file in enumerate(files):
         if progress is not None and index:
             progress(index, len(files))
@@ -196,13 +222,11 @@ def convert_raw_files(
         if not _logs(episode, converter):
             problems.append(_origin(file, episode, converter))
             continue
-        observation, action = converter.convert(episode)
-        # of thousands of files only this is kept: not their bytes, and not twice the digits
-        observations.append(torch.from_numpy(observation).to(dtype))
-        actions.append(torch.from_numpy(action).to(dtype))
+        if not problems:
+            observation, action = converter.convert(episode)
+            yield torch.from_numpy(observation), torch.from_numpy(action)
     if problems:
         raise RawFolderError(folder, problems)
-    return flatten_trajectories(observations, actions, dtype=dtype)
 
 
 def get_converter(task: str) -> Converter:

@@ -26,10 +26,11 @@ from torchrl.data.datasets import register_dataset
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 
 from torchrl_koap import keys
-from torchrl_koap.data.d3il.conversion import convert_raw_files, find_raw_files, get_converter
+from torchrl_koap.data.d3il.conversion import find_raw_files, get_converter, read_trajectories
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport
 from torchrl_koap.data.lerobot.files import find_lerobot_files, is_lerobot
 from torchrl_koap.data.lerobot.reader import read_lerobot
+from torchrl_koap.data.steps_on_disk import flatten_on_disk
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, save_ted
 from torchrl_koap.data.trajectories import select_state
 from torchrl_koap.files import one_at_a_time
@@ -100,12 +101,12 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         facts = get_task(task)
         if is_lerobot(root):
             self.root, files, kind = Path(root).expanduser(), find_lerobot_files(root), [actions, split_file]
-            convert = partial(read_lerobot, self.root, task, actions=actions, split=split_file, dtype=dtype)
+            convert = partial(_read_lerobot, self.root, facts, actions=actions, split=split_file, dtype=dtype)
         elif actions != "delta":
             raise ValueError(f"actions={actions!r} is for LeRobot data sets; {root} is none")
         else:
             (self.root, files), kind = find_raw_files(task, root, split_file=split_file), []
-            convert = partial(convert_raw_files, get_converter(task), files, self.root, dtype=dtype, progress=progress)
+            convert = partial(_read_raw, self.root, facts, files, dtype=dtype, progress=progress)
         self._cache = _cache_folder(cache)
         self._data_path = self._cache / "d3il" / f"{task}-{_fingerprint(facts, files, dtype, kind)}"
         # several processes may open the same folder at the same time: one converts, the others wait for it
@@ -184,15 +185,20 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         kwargs = {"writer": ImmutableDatasetWriter(), **kwargs}
         super().__init__(storage=TensorStorage(data), **kwargs)
 
-    def _open(self, task: Task, files: Sequence[Path], convert: Callable[[], TensorDictBase]) -> TensorDictBase:
+    def _open(self, task: Task, files: Sequence[Path], convert: Callable[[Path], TensorDictBase]) -> TensorDictBase:
         if self._is_downloaded():
             try:
                 return load_ted(self._data_path, task=task.name)
             except (DamagedDataError, ValueError) as error:
                 torchrl_logger.warning("converting %s again: %s", self.root, error)
                 shutil.rmtree(self._data_path, ignore_errors=True)
-        data = select_state(convert(), task.state_of)
-        save_ted(data, self._data_path, task=task.name, notes={"files": [file.name for file in files]})
+        parts = self._data_path.with_name(f".{self._data_path.name}.parts")
+        shutil.rmtree(parts, ignore_errors=True)  # of a call that was killed
+        try:
+            notes = {"files": [file.name for file in files]}
+            save_ted(convert(parts), self._data_path, task=task.name, notes=notes)
+        finally:
+            shutil.rmtree(parts, ignore_errors=True)
         return load_ted(self._data_path, task=task.name)
 
     @property
@@ -222,6 +228,17 @@ class D3ILExperienceReplay(BaseDatasetExperienceReplay):
         if self._data_path is None or self._data_path == self.root:
             raise RuntimeError("only data converted from raw files are kept in a cache that can be deleted")
         shutil.rmtree(self._data_path)
+
+
+def _read_raw(
+    root: Path, task: Task, files: Sequence[Path], parts: Path, *, dtype: torch.dtype, progress: Callable | None
+) -> TensorDictBase:
+    trajectories = read_trajectories(get_converter(task.name), files, root, progress=progress)
+    return flatten_on_disk(trajectories, parts, dtype=dtype, finish=partial(select_state, columns=task.state_of))
+
+
+def _read_lerobot(root: Path, task: Task, _parts: Path, **options: Any) -> TensorDictBase:
+    return select_state(read_lerobot(root, task.name, **options), task.state_of)
 
 
 def _cache_folder(cache: str | Path | None) -> Path:
