@@ -34,6 +34,12 @@ def soak_rows(rows: Sequence[Row], every: int = 4) -> list[list[str]]:
     return [[row["episodes"], row["in_use_mb"], row["resident_mb"]] for row in chosen]
 
 
+def raw_rows(rows: Sequence[Row]) -> list[list[str]]:
+    """Raw files, their steps and size, and what it takes to convert and to check them."""
+    names = ("files", "steps", "data_mb", "seconds", "convert_mb", "validate_mb")
+    return [[row[name] for name in names] for row in rows]
+
+
 def resume_rows(rows: Sequence[Row]) -> list[list[str]]:
     """What a call finds, and how long it takes to go on with the cells that are missing."""
     names = ("call", "cells", "missing", "cells_read", "begins_processor", "begins_after", "seconds")

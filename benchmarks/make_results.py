@@ -15,7 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fault_rows import kill_rows, ledger_rows, resume_rows, soak_rows, version_rows
+from fault_rows import kill_rows, ledger_rows, raw_rows, resume_rows, soak_rows, version_rows
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from readme_pictures import draw_label_curves, draw_pipeline
 from result_rows import (
@@ -102,7 +102,7 @@ def bench_size(name: str) -> str:
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
 _PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size)
 _UNLABELLED = (unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
-_FAULTS = (ledger_rows, kill_rows, soak_rows, resume_rows, version_rows)
+_FAULTS = (ledger_rows, kill_rows, soak_rows, raw_rows, resume_rows, version_rows)
 _HELPERS = (
     first,
     label_sizes,

@@ -3,7 +3,7 @@
 
 python benchmarks/soak.py --run quick --episodes 10000 --table benchmarks/results/soak.csv
 python benchmarks/soak.py --run quick --episodes 1000 --batch-size 1000 --table benchmarks/results/soak_wide.csv
-python benchmarks/soak.py --raw-files 500 1000 2500 5000 --table benchmarks/results/soak_raw.csv
+python benchmarks/soak.py --raw-files 500 2500 5000 10000 --table benchmarks/results/soak_raw.csv
 
 ``--run quick`` is a policy of a few kilobytes that plans in no time: episodes are the load. The same command goes on
 where its table ends, in a process that has a number of its own there, as its memory is its own.
@@ -32,16 +32,17 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from tiny_runs import TINY, demonstration, koap, write_demonstrations  # noqa: E402
 
-from torchrl_koap.data import RawEpisode, write_raw_episode
+from torchrl_koap.data import D3ILExperienceReplay, RawEpisode, write_raw_episode
 from torchrl_koap.envs.registry import make_env_of
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.files import replacing_file
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.pretrained import find_run
+from torchrl_koap.training.progress import count_up_to, progress_bar
 
 COLUMNS = ("process", "episodes", "seconds", "in_use_mb", "resident_mb", "largest_mb")
-RAW_COLUMNS = ("files", "steps", "seconds", "anonymous_mb", "more_mb")
+RAW_COLUMNS = ("files", "steps", "seconds", "data_mb", "convert_mb", "validate_mb")
 
 
 class _Allocated(ctypes.Structure):
@@ -133,23 +134,25 @@ def watching_memory() -> Iterator[list[float]]:
 
 
 def convert(files: int) -> dict[str, float]:
-    """Writes raw files of 60 to 99 rows and reads them as a data set, through the command line."""
+    """Writes raw files of 60 to 99 rows; memory that their conversion takes, and their check, which reads them all."""
     lengths = [60 + index % 40 for index in range(files)]
     with tempfile.TemporaryDirectory() as folder:
         os.environ["KOAP_CACHE"] = f"{folder}/cache"
+        written = Path(folder) / "data"
         for index, rows in enumerate(lengths):
             commanded, measured = demonstration(index % 8, rows)
             paths = {"des_c_pos": commanded, "c_pos": measured + 1e-7 * index}  # no episode is there twice
             paths = {name: np.pad(path, ((0, 0), (0, 1)), constant_values=0.12) for name, path in paths.items()}
-            write_raw_episode(Path(folder) / "data" / f"env_{index:05d}_00.pkl", RawEpisode(robot=paths))
+            write_raw_episode(written / f"env_{index:05d}_00.pkl", RawEpisode(robot=paths))
         before, began = anonymous(), time.perf_counter()
-        with watching_memory() as found:
-            status = koap("validate", f"{folder}/data", "--task", "avoiding")
+        with watching_memory() as converting, progress_bar(None, "demonstrations", unit="episode", delay=0) as bar:
+            data = D3ILExperienceReplay("avoiding", written, progress=count_up_to(bar)).data
         seconds = time.perf_counter() - began
-    if status:
-        raise SystemExit(f"koap validate ended with {status}")
-    steps = sum(lengths) - files
-    return {"files": files, "steps": steps, "seconds": seconds, "anonymous_mb": found[0], "more_mb": found[0] - before}
+        row = {"files": files, "steps": len(data), "seconds": seconds, "data_mb": data.bytes() / 1e6}
+        with watching_memory() as checking:
+            if koap("validate", written, "--task", "avoiding"):
+                raise SystemExit("koap validate found something")
+    return row | {"convert_mb": converting[0] - before, "validate_mb": checking[0] - before}
 
 
 def convert_each(options: argparse.Namespace) -> None:

@@ -160,7 +160,7 @@ def _value_problems(data: TensorDictBase, present: set, command: slice | None) -
     same = episode[1:] == episode[:-1]
     edge = torch.ones(1, dtype=torch.bool, device=same.device)
     starts = torch.cat([edge, ~same])
-    if int(starts.sum()) != episode.unique().numel():
+    if int(starts.sum()) != episode[starts].unique().numel():
         problems.append("'episode': the steps of a trajectory must lie one after the other")
     wrong = starts & (step_count != 0)
     wrong[1:] |= same & (step_count[1:] != step_count[:-1] + 1)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Sequence
 
 import torch
@@ -47,10 +48,10 @@ def find_doubts(
     first: dict[bytes, str] = {}
     lengths = trajectory_lengths(data).tolist()
     looked_at = [column for column, unit in enumerate(units) if unit in ("m", "rad")]
-    for index, part in enumerate(data.split(lengths)):
+    entries = [data.get(key) for key in (keys.OBSERVATION, keys.ACTION, keys.HAS_ACTION, keys.NEXT_OBSERVATION)]
+    for index, end in enumerate(itertools.accumulate(lengths)):
         name = names[index] if index < len(names) else f"trajectory {index}"
-        observed, actions = part.get(keys.OBSERVATION), part.get(keys.ACTION)
-        last = part.get(("next", keys.OBSERVATION))
+        observed, actions, has_action, last = (entry[end - lengths[index] : end] for entry in entries)
         digest = hashlib.sha256()
         for value in (observed, actions, last[-1:]):
             digest.update(value.contiguous().reshape(-1).view(torch.uint8).cpu().numpy())
@@ -58,7 +59,7 @@ def find_doubts(
         if same is not name:
             doubts.append(f"{name} repeats {same}: every step is the same")
             continue
-        labelled = actions[part.get(keys.HAS_ACTION).squeeze(-1)]
+        labelled = actions[has_action.squeeze(-1)]
         if len(labelled) and not labelled.any():
             doubts.append(f"{name}: all {len(labelled)} labelled actions are zero")
         if bool((observed == observed[:1]).all()) and bool((last == observed[:1]).all()):
