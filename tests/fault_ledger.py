@@ -33,6 +33,11 @@ WORK = (
     "torchrl_koap.commands.export.export_part",
     "torchrl_koap.data.demonstrations.save_ted",
 )
+# a call of `koap embed` that would do, without the weights of an extra
+EMBED = (
+    *("{frames}", "--out", "{out}", "--weights", "{network}/resnet18.pth"),
+    *("--projection", "{network}/projection.safetensors"),
+)
 
 
 class AcceptedError(BaseException):
@@ -49,7 +54,8 @@ class Place:
 
     Args:
         root (Path): an empty folder.
-        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set and ``arrays``; not written to.
+        template (Path): folder with a trained ``run``, raw ``data``, a ``ted`` data set, ``arrays``, camera ``frames``
+            and a ``network`` for them; not written to.
     """
 
     root: Path
@@ -69,8 +75,8 @@ class Fault:
 
     Args:
         name (str): what is wrong.
-        words (tuple of str): the call; ``{run}``, ``{data}``, ``{ted}`` and ``{arrays}`` stand for folders that are
-            there, ``{out}`` for one that is not.
+        words (tuple of str): the call; ``{run}``, ``{data}``, ``{ted}``, ``{arrays}``, ``{frames}`` and ``{network}``
+            stand for folders that are there, ``{out}`` for one that is not.
         says (str): regular expression that the one line matches.
         damage (callable, optional): does the damage; called with the :class:`Place`.
         status (int or tuple): exit status that is right.
@@ -170,7 +176,37 @@ def make_template(root: Path) -> Path:
         generator = np.random.default_rng(index)
         states = generator.normal(size=(40, 3)).cumsum(0)
         np.savez(root / "arrays" / f"{index}.npz", states=states, actions=np.diff(states[:, :2], axis=0))
+    make_camera_template(root)
     return root
+
+
+def make_camera_template(root: Path) -> None:
+    """Demonstrations that a camera saw, a network as torchvision saves one, and a projection fitted behind it."""
+    import numpy as np
+    import torch
+
+    from torchrl_koap.data.lerobot.images import ImageEpisode, ImageEpisodeWriter
+    from torchrl_koap.tasks import get_task
+    from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
+    from torchrl_koap.vision.projections import save_encoder
+    from torchrl_koap.vision.resnet import ResNet
+
+    task, (network, width) = get_task("scooping"), (root / "network", 32)
+    network.mkdir()
+    torch.manual_seed(0)
+    torch.save(ResNet("resnet18").state_dict(), network / "resnet18.pth")
+    backbone = load_backbone(network / "resnet18.pth")
+    about = {"state_names": "xyz", "action_names": task.action_names, "embodiment": "robot", "task": "scoop"}
+    writer = ImageEpisodeWriter(root / "frames", fps=10, **about)
+    generator = np.random.default_rng(0)
+    for length in (4, 6):
+        frames = generator.integers(0, 256, (length + 1, width, width, 3), dtype=np.uint8)
+        action = generator.normal(size=(length, task.action_dim))
+        writer.add(ImageEpisode(frames, generator.normal(size=(length + 1, 3)), action, "robot"))
+    writer.close()
+    fitted = Projection.fit(torch.randn(200, 128), task.observation_dim - 3)
+    encoder = FrozenImageEncoder(backbone, pooling="average", projection=fitted, size=width)
+    save_encoder(encoder, network / "projection.safetensors", stride=8, fitted_on="noise")
 
 
 @contextlib.contextmanager
@@ -201,7 +237,7 @@ def _in_time() -> Iterator[None]:
 
 
 def _filled(word: str, place: Place) -> str:
-    for name in ("run", "data", "ted", "arrays", "out"):
+    for name in ("run", "data", "ted", "arrays", "frames", "network", "out"):
         if f"{{{name}}}" in word:
             word = word.replace(f"{{{name}}}", str(place.get(name)))
     return word

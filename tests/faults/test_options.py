@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import pytest
-from fault_ledger import Fault, check, meet, table
+from fault_ledger import EMBED, Fault, check, meet, table
 from tiny_runs import TINY
 
 from torchrl_koap.commands.subcommands import Subcommand
@@ -34,8 +34,8 @@ BASE = {
     "latency": ("{run}", "--steps", "2"),
     "doctor": (),
     "validate": ("{data}",),
+    "embed": EMBED,
 }
-LEFT_OUT = ("embed",)  # reads camera demonstrations with the weights of an extra; see tests/data/lerobot/test_images.py
 WRONG: dict[Any, tuple[str, ...]] = {
     int: ("many", "1.5", "-1", "0", HUGE),
     float: ("many", "-1", "nan", "inf"),
@@ -101,7 +101,7 @@ def faults() -> Iterator[Fault]:
     for part in get_args(Subcommand):
         command, configuration = get_args(part)[:2]
         name = configuration.name
-        for option, kind in options(command) if name not in LEFT_OUT else ():
+        for option, kind in options(command):
             kind, _ = plain(kind)
             for value in WRONG[kind]:
                 call = f"{option} {value}"

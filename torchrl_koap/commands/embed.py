@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,9 @@ import tyro
 
 from torchrl_koap.commands.command import Command
 from torchrl_koap.data import read_about
+from torchrl_koap.files import check_file
+from torchrl_koap.vision.backbones import WeightsError
+from torchrl_koap.vision.cache import CacheError
 from torchrl_koap.vision.demonstrations import Source, embed_demonstrations
 from torchrl_koap.vision.projections import load_encoder
 
@@ -46,12 +51,17 @@ class Embed(Command):
             WeightsError: if weights are missing or of another network.
             ImageDataError: if a source is none, or embodiments are mixed without saying so.
             CacheError: if the cache is of other weights.
+            ValueError: if projection or cache are damaged.
         """
         if self.episodes and len(self.episodes) != len(self.sources):
             raise ValueError(f"--episodes names {len(self.episodes)} numbers for {len(self.sources)} sources")
         if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
-        encoder = load_encoder(self.projection, self.weights, cache=self.cache)
+        with _naming("projection", self.projection):
+            encoder = load_encoder(self.projection, self.weights)
+        if self.cache is not None:
+            with _naming("cache", self.cache):
+                encoder = load_encoder(self.projection, self.weights, cache=self.cache)
         numbers = self.episodes or (None,) * len(self.sources)
         sources = [Source(folder, number) for folder, number in zip(self.sources, numbers, strict=True)]
         folder = embed_demonstrations(self.out, sources, encoder, mixed=self.mixed)
@@ -64,3 +74,17 @@ class Embed(Command):
             "labelled steps": about["labelled_steps"],
             "next": f"koap train --task scooping --dataset {folder} --out runs/scooping",
         }
+
+
+@contextlib.contextmanager
+def _naming(what: str, path: Path | None) -> Iterator[None]:
+    """Whatever a damaged file leads to inside the block says which file it is."""
+    try:
+        if path is not None and path.exists() and not path.is_dir():
+            check_file(path)
+        yield
+    except (WeightsError, CacheError, FileNotFoundError):  # they say so themselves
+        raise
+    except Exception as error:
+        fault = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"the {what} {path or 'of Scooping'} cannot be used: {fault}") from error

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.files import check_file, read_bytes
+
 CAMERA = "observation.images.third_person"
 EMBODIMENT = "embodiment"
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
@@ -179,12 +181,20 @@ def read_image_info(folder: str | Path) -> dict[str, Any]:
     """Description of a data set with camera frames.
 
     Raises:
-        ImageDataError: if there is none, or it has no camera.
+        ImageDataError: if there is none, it is damaged, or it has no camera.
     """
     path = Path(folder) / "meta" / "info.json"
     if not path.is_file():
         raise ImageDataError(f"{folder} holds no finished data set (meta/info.json is missing); `koap demos` makes one")
-    info = json.loads(path.read_text())
+    try:
+        info = json.loads(read_bytes(path))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ImageDataError(f"{path} cannot be read: {error}") from error
+    if not isinstance(info, dict) or not isinstance(info.get("features", {}), dict):
+        raise ImageDataError(f"{path} is no description of a data set: wanted an object whose features are one")
+    total = info.get("total_episodes")
+    if type(total) is not int or total < 1:
+        raise ImageDataError(f"{path}: total_episodes must be a whole number >= 1, got {total!r}")
     if CAMERA not in info.get("features", {}):
         raise ImageDataError(f"{folder} has no camera {CAMERA!r}: there is nothing to embed")
     return info
@@ -203,11 +213,10 @@ def read_image_episodes(
         embodiment (str, optional): refuse demonstrations of another one.
 
     Raises:
-        ImageDataError: if the folder holds no such data set, too few episodes, or those of another embodiment.
+        ImageDataError: if the folder holds no such data set, too few episodes, or those of another embodiment; or if
+            an episode is damaged.
     """
-    from PIL import Image
-
-    info, pyarrow = read_image_info(folder), _pyarrow()
+    info = read_image_info(folder)
     own, total = info.get(EMBODIMENT, "unknown"), info["total_episodes"]
     if embodiment is not None and own != embodiment:
         raise ImageDataError(f"{folder} holds demonstrations of embodiment {own!r}, wanted {embodiment!r}")
@@ -215,9 +224,56 @@ def read_image_episodes(
         raise ImageDataError(f"{folder} holds {total} episodes, asked for {episodes}")
     found = []
     for number in range(total if episodes is None else episodes):
-        table = pyarrow.parquet.read_table(Path(folder) / _DATA.format(episode_chunk=0, episode_index=number))
-        columns = {name: table[name].to_pylist() for name in table.column_names if not name.endswith("index")}
-        frames = np.stack([np.asarray(Image.open(io.BytesIO(cell["bytes"]))) for cell in columns[CAMERA]])
-        action = np.array(columns["action"], dtype=np.float32)[:-1] if "action" in columns else None
-        found.append(ImageEpisode(frames, np.array(columns["observation.state"], dtype=np.float32), action, own))
+        file = Path(folder) / _DATA.format(episode_chunk=0, episode_index=number)
+        try:
+            columns = _read_columns(file)
+            action = _numbers(columns, "action")[:-1] if "action" in columns else None
+            episode = ImageEpisode(_pictures(columns[CAMERA]), _numbers(columns, "observation.state"), action, own)
+        except RuntimeError:  # no pyarrow
+            raise
+        except Exception as error:  # a damaged file can be wrong in any way
+            raise ImageDataError(f"{file} cannot be used: {error}") from error
+        found.append(episode)
     return found
+
+
+def _read_columns(file: Path) -> dict[str, list]:
+    pyarrow = _pyarrow()
+    check_file(file)
+    table = pyarrow.parquet.read_table(file)
+    missing = [name for name in (CAMERA, "observation.state") if name not in table.column_names]
+    if missing:
+        raise ValueError(f"column {missing[0]!r} is missing")
+    if len(table) < 2:
+        raise ValueError(f"{len(table)} row(s): an episode has two frames at least")
+    return {name: table[name].to_pylist() for name in table.column_names if not name.endswith("index")}
+
+
+def _numbers(columns: dict[str, list], name: str) -> np.ndarray:
+    """A column of vectors ``[T, d]``."""
+    try:
+        values = np.array(columns[name], dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"column {name!r} holds no vectors of one size: {error}") from None
+    if values.ndim != 2:
+        raise ValueError(f"column {name!r} holds no vectors: wanted [T, d], got shape {list(values.shape)}")
+    return values
+
+
+def _pictures(cells: list) -> np.ndarray:
+    """Frames uint8 ``[T, H, W, 3]``."""
+    from PIL import Image
+
+    frames = []
+    for row, cell in enumerate(cells):
+        content = cell.get("bytes") if isinstance(cell, dict) else None
+        if not isinstance(content, bytes):
+            raise ValueError(f"column {CAMERA!r} has no picture in row {row}")
+        try:
+            frames.append(np.asarray(Image.open(io.BytesIO(content))))
+        except Exception as error:  # what a damaged picture makes of a decoder
+            raise ValueError(f"column {CAMERA!r} has a damaged picture in row {row}: {error}") from None
+    shapes = sorted({frame.shape for frame in frames})
+    if len(shapes) > 1 or len(shapes[0]) != 3 or shapes[0][-1] != 3:
+        raise ValueError(f"column {CAMERA!r} has pictures of shapes {shapes}: wanted one [H, W, 3]")
+    return np.stack(frames)

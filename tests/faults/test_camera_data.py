@@ -1,0 +1,183 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Camera demonstrations, networks and projections that ``koap embed`` is given, damaged in every way."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fault_damage import DAMAGE
+from fault_ledger import EMBED as WORDS
+from fault_ledger import Fault, Place, check, edit_json, meet, table
+
+pytest.importorskip("pyarrow")
+
+EMBED = ("embed", *WORDS)
+INFO, FIRST = "meta/info.json", "data/chunk-000/episode_000000.parquet"
+WEIGHTS, PROJECTION = "resnet18.pth", "projection.safetensors"
+
+
+def damaged(part: str, file: str, damage: Callable[[Path], object]) -> Callable[[Place], None]:
+    return lambda place: damage(place.get(part) / file) and None
+
+
+def info(change: Callable[[dict[str, Any]], Any]) -> Callable[[Place], None]:
+    return lambda place: edit_json(place.get("frames") / INFO, change)
+
+
+def columns(change: Callable[[dict[str, Any]], Any]) -> Callable[[Place], None]:
+    """Rewrites the first episode after a change of its columns."""
+
+    def do(place: Place) -> None:
+        import pyarrow
+        from pyarrow import parquet
+
+        file = place.get("frames") / FIRST
+        read = parquet.read_table(file)
+        content = {name: read[name].to_pylist() for name in read.column_names}
+        change(content)
+        parquet.write_table(pyarrow.table(content), file)
+
+    return do
+
+
+def without(name: str) -> Callable[[dict[str, Any]], Any]:
+    return lambda content: content.pop(name)
+
+
+def put(name: str, value: Any) -> Callable[[dict[str, Any]], Any]:
+    return lambda content: content.update({name: value})
+
+
+def cell(name: str, value: Any) -> Callable[[dict[str, Any]], Any]:
+    return lambda content: content[name].__setitem__(0, value)
+
+
+def torch_file(content: Any) -> Callable[[Place], None]:
+    def do(place: Place) -> None:
+        import torch
+
+        torch.save(content, place.get("network") / WEIGHTS)
+
+    return do
+
+
+def projection(change: Callable[[dict[str, Any], dict[str, str]], Any]) -> Callable[[Place], None]:
+    """Rewrites the projection after a change of its tensors and its description."""
+
+    def do(place: Place) -> None:
+        from safetensors import safe_open
+        from safetensors.torch import save_file
+
+        path = place.get("network") / PROJECTION
+        with safe_open(str(path), "pt") as file:
+            tensors, about = {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata())
+        change(tensors, about)
+        save_file(tensors, path, about)
+
+    return do
+
+
+def cache(content: str | None) -> Callable[[Place], None]:
+    def do(place: Place) -> None:
+        folder = place.root / "cache"
+        folder.mkdir()
+        (folder / ("other.txt" if content is None else "cache.json")).write_text(content or "")
+
+    return do
+
+
+def faults() -> Iterator[Fault]:
+    for name, damage in DAMAGE.items():
+        for part, file in (("frames", INFO), ("frames", FIRST), ("network", WEIGHTS), ("network", PROJECTION)):
+            stem = Path(file).name
+            yield Fault(f"{stem} {name}", EMBED, stem.replace(".", r"\."), damaged(part, file, damage))
+    for name in ("codebase_version", "data_path"):
+        yield Fault(f"info.json without {name}", EMBED, damage=info(without(name)), accepted=True)
+    for name in ("features", "total_episodes"):
+        yield Fault(f"info.json without {name}", EMBED, "camera|total_episodes", info(without(name)))
+    for value in (None, -1, 0, 1e9, "many", [2]):
+        yield Fault(f"total_episodes {value}", EMBED, "total_episodes|episodes", info(put("total_episodes", value)))
+    for name, value in {"a list": [], "empty": {}, "null": None, "3": 3, "blind": {"observation.state": {}}}.items():
+        yield Fault(f"features {name}", EMBED, "camera|features", info(put("features", value)))
+    for name in ("observation.images.third_person", "observation.state"):
+        yield Fault(f"episode without {name}", EMBED, name, columns(without(name)))
+        yield Fault(f"{name} is null", EMBED, name, columns(cell(name, None)))
+    yield Fault("frames of no picture", EMBED, "picture|image", columns(cell(_CAMERA, {"bytes": b"PNG", "path": None})))
+    yield Fault("frames of no bytes", EMBED, "picture|image", columns(cell(_CAMERA, {"bytes": None, "path": "x.png"})))
+    yield Fault("frames of another size", EMBED, "size|shape", columns(cell(_CAMERA, {"bytes": _png(16), "path": ""})))
+    yield Fault("frames with alpha", EMBED, "shape|colours", columns(cell(_CAMERA, {"bytes": _png(32, 4), "path": ""})))
+    yield Fault("state of another width", EMBED, "observation.state", columns(cell("observation.state", [1.0])))
+    yield Fault("state is NaN", EMBED, "NaN", columns(cell("observation.state", [float("nan")] * 3)))
+    yield Fault("state is text", EMBED, "observation.state", columns(put("observation.state", ["x"] * 5)))
+    yield Fault("action of another width", EMBED, "action", columns(cell("action", [1.0])))
+    yield Fault("action is infinite", EMBED, "infinite|NaN", columns(cell("action", [float("inf")] * 7)))
+    yield Fault(
+        "one row", EMBED, "row|frame", columns(lambda content: [content.update({k: content[k][:1]}) for k in content])
+    )
+    yield Fault(
+        "no rows", EMBED, "row|frame", columns(lambda content: [content.update({k: content[k][:0]}) for k in content])
+    )
+
+    yield Fault("weights are code", EMBED, "weights", lambda place: _write(place, WEIGHTS, pickle.dumps(os.system)))
+    for name, content in {"a list": [1], "a number": 3, "numbers by name": {"conv1.weight": 3}, "nothing": {}}.items():
+        yield Fault(f"weights are {name}", EMBED, "weights|state_dict", torch_file(content))
+    yield Fault(
+        "projection of other weights", EMBED, "other|fitted", projection(lambda _, a: a.update(weights="0" * 64))
+    )
+    for name in ("weights", "stride", "size", "pooling", "network"):
+        needed = name != "network"
+        yield Fault(
+            f"projection without {name}", EMBED, name, projection(lambda _, a, n=name: a.pop(n)), accepted=not needed
+        )
+    for name, value in {"stride": "9", "size": "-1", "pooling": "n0nsense"}.items():
+        yield Fault(
+            f"projection {name} {value}",
+            EMBED,
+            f"{name}|frames must be",
+            projection(lambda _, a, n=name, v=value: a.update({n: v})),
+        )
+        yield Fault(
+            f"projection {name} empty",
+            EMBED,
+            rf"{name}|projection\.safetensors",
+            projection(lambda _, a, n=name: a.update({n: ""})),
+        )
+    for name in ("mean", "components"):
+        yield Fault(f"projection without {name}", EMBED, name, projection(lambda t, _, n=name: t.pop(n)))
+        yield Fault(
+            f"projection {name} cut",
+            EMBED,
+            "mean|features",
+            projection(lambda t, _, n=name: t.update({n: t[n][:9].clone()})),
+        )
+        yield Fault(f"projection {name} NaN", EMBED, "NaN", projection(lambda t, _, n=name: t[n].fill_(float("nan"))))
+    words = (*EMBED, "--cache", "cache")
+    yield Fault("cache is another folder", words, "no cache", cache(None))
+    for name, content in {"text": "{", "a list": "[]", "other weights": json.dumps({"weights": "x"})}.items():
+        yield Fault(f"cache.json is {name}", words, "cache", cache(content))
+
+
+_CAMERA = "observation.images.third_person"
+
+
+def _write(place: Place, name: str, content: bytes) -> None:
+    (place.get("network") / name).write_bytes(content)
+
+
+def _png(size: int, channels: int = 3) -> bytes:
+    import numpy as np
+
+    from torchrl_koap.data.lerobot.images import encode_png
+
+    return encode_png(np.zeros((size, size, channels), dtype=np.uint8))
+
+
+@pytest.mark.parametrize("fault", table(faults(), every=8))
+def test_damaged_camera_data_are_refused_by_name(fault, place):
+    check(fault, meet(fault, place))
