@@ -38,7 +38,7 @@ from torchrl_koap.training.progress import progress_bar
 TABLE = Path(__file__).parent / "results" / "unlabelled_data.csv"
 COLUMNS = ("dataset", "regime", "labels", "seed", "method", "error", "unit", "choice", "updates")
 # what --methods calls them: method, preset, updates, does training read labels
-LIFT = {"controller_batch_size": 16, "controller_learning_rate": 5e-3}
+LIFT = {"controller_batch_size": 64, "controller_learning_rate": 5e-3}
 METHODS = {
     "semi_supervised": ("koap", "semi_supervised", 1000, False, LIFT),
     "semi_supervised, untrained": ("koap_untrained", "semi_supervised", 0, False, {}),

@@ -16,6 +16,7 @@ from torchrl_koap.data import LabelBudget, save_ted
 from torchrl_koap.envs.registry import make_env_of, mode_index_of
 from torchrl_koap.keys import validate
 from torchrl_koap.modules import PRESETS
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.builders import (
     NORMALIZATION,
@@ -204,3 +205,15 @@ def test_absolute_actions_are_centred_and_read_off_the_present_frame():
     assert build_controller(entry | {"method": "linear_steps"}, 6, 2, labelled).latent_action.place > 0
     plain = build_controller({**entry, "absolute": False}, 6, 2, labelled)
     assert plain.latent_action.place == 0 and not plain.action_normalizer.offset.any()
+
+
+def test_runs_of_before_have_the_single_lifting():
+    config = TrainConfig(out=Path("run"), task="avoiding", preset="semi_supervised")
+    entry = resolve(config).controller
+    data = TensorDict({"state": torch.randn(60, 20), "action": torch.randn(60, 2)}, [60])
+    data["has_action"] = torch.ones(60, 1, dtype=torch.bool)
+    assert isinstance(build_controller(entry, 20, 2, data).lifting, CompactLifting)
+    entry.pop("lifting")
+    earlier = build_controller(entry, 20, 2, data).lifting
+    assert not isinstance(earlier, CompactLifting) and earlier.latent_dim == 2
+    assert "lifting" not in resolve(TrainConfig(out=Path("run"), task="avoiding")).controller

@@ -33,8 +33,7 @@ class _KoopmanLoss(WindowLoss):
         super().__init__(network, reduction=reduction)
 
     def _reconstruction(self, state: Tensor, lifted: Tensor) -> Tensor:
-        target = self.network.normalize_state(state)
-        error = (self.network.lifting.decode(lifted) - target).square().mean(-1)
+        error = self.network.lifting.reconstruction_error(lifted, self.network.normalize_state(state))
         return self._reduce(error, torch.ones_like(error, dtype=torch.bool))
 
     def _latent(self, state: Tensor) -> tuple[Tensor, range]:

@@ -17,6 +17,9 @@ from torchrl_koap.tasks import Task
 # one or two labelled trajectories cannot be left out to choose the penalty
 DEFAULT_PENALTY = 0.15
 PLACE_PENALTY = 1e-3  # the same where the present frame says most of the action
+# the raw window of a smoothed latent action is read if its held-out error is below this share of the lifted one's:
+# few labels left out say little, and unlabelled windows made the lifted one for the purpose
+RAW_SHARE = 0.85
 
 
 def fit_closed_form(
@@ -93,7 +96,7 @@ def _best_block(
     shared_axes: Sequence[int],
     guessed_axes: Sequence[int],
 ) -> RidgeFit:
-    """Fits each block of a smoothed latent action and keeps the one with the smallest held-out labelled error."""
+    """Fits each block of a smoothed latent action; keeps the lifted one unless the other's held-out error says no."""
     chooser = controller.latent_action
     kept: tuple[float, str, RidgeFit, dict[str, Tensor]] | None = None
     for block in chooser.choices:
@@ -101,7 +104,7 @@ def _best_block(
         own_columns = chooser.identity or block == RAW
         axes = (shared_axes, guessed_axes) if own_columns else ((), ())
         fit = _fit_koopman(controller, windows, mask, groups, *axes)
-        error = fit.errors[fit.penalty]
+        error = fit.errors[fit.penalty] / (RAW_SHARE if block == RAW else 1.0)
         if kept is None or error < kept[0]:
             weights = {name: value.clone() for name, value in controller.action_decoder.state_dict().items()}
             kept = error, block, fit, weights

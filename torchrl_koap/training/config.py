@@ -265,6 +265,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         "preset": "released" if options.released_settings else options.preset or method.presets[0],
         "state": options.controller_state if method.has_planner else "all",
     }
+    if "lifting" in PRESETS[controller["preset"]]:
+        controller["lifting"] = PRESETS[controller["preset"]]["lifting"]
     if method.earlier:
         controller["revised"] = True
     if method.tracks:

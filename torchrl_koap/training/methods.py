@@ -173,6 +173,8 @@ PLACE = {"place": 1.0, "curvature": 10.0, "position_scale": 2.0, "motion_scale":
 def _koap(state_dim, action_dim, normalizers, options, **overrides):
     if options.get("absolute") and PRESETS[options["preset"]]["network"] == "fourier":
         overrides = PLACE | overrides
+    if "lifting" in PRESETS[options["preset"]]:  # runs of before had no other and did not say so
+        overrides = {"lifting": options.get("lifting", "single")} | overrides
     return make_koopman_inverse_dynamics(state_dim, action_dim, preset=options["preset"], **normalizers, **overrides)
 
 

@@ -42,6 +42,7 @@ CONTROLLER = {
     "preset": str,
     "state": str,
     "revised": bool,
+    "lifting": str,
 }
 _LARGEST = 2**63 - 1
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl_koap.keys import ACTION, STATE
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
@@ -172,8 +173,7 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
         Args:
             windows (Tensor): raw states ``[*B, T, d]``; no label is read.
         """
-        if self.lifting.encoder_skip is not None:
-            self.lifting.fit_linear(self.normalize_state(windows))
+        self.lifting.fit_unlabelled(self.normalize_state(windows))
         super().fit_scales(windows)
 
     @torch.no_grad()
@@ -183,6 +183,8 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
         Args:
             windows (Tensor): raw states ``[*B, T, d]``; no label is read.
         """
+        if isinstance(self.lifting, CompactLifting):
+            self.lifting.choose_size(self.normalize_state(windows))
         if isinstance(self.latent_action, LatentActionSmoothed):
             self.latent_action.fit_unlabelled(self.normalize_state(windows))
 

@@ -89,6 +89,16 @@ class KoopmanLifting(TensorDictModuleBase):
         self.encoder_skip = nn.Linear(state_dim, latent_dim, bias=False) if linear_skip else None
         self.decoder_skip = nn.Linear(latent_dim, state_dim, bias=False) if linear_skip else None
 
+    @property
+    def keeps_state(self) -> bool:
+        """Whether the lifted state is the state itself and nothing else."""
+        return self.encoder is None
+
+    def fit_unlabelled(self, windows: Tensor) -> None:
+        """Sets what is known before training from unlabelled windows ``[*B, T, d]``: the linear maps, if it has any."""
+        if self.encoder_skip is not None:
+            self.fit_linear(windows)
+
     @torch.no_grad()
     def fit_linear(self, states: Tensor) -> None:
         """Sets the linear maps to the principal components of states ``[*B, d]``, at unit spread; no label is read.
@@ -122,6 +132,10 @@ class KoopmanLifting(TensorDictModuleBase):
         """Maps lifted states ``[*B, T, m]`` back to ``[*B, T, d]``."""
         state = self.decoder(lifted)
         return state if self.decoder_skip is None else state + self.decoder_skip(lifted)
+
+    def reconstruction_error(self, lifted: Tensor, state: Tensor) -> Tensor:
+        """Mean squared error ``[*B, T]`` of mapping lifted states ``[*B, T, m]`` back to states ``[*B, T, d]``."""
+        return (self.decode(lifted) - state).square().mean(-1)
 
     def forward(self, tensordict):
         """Writes the lifted states."""

@@ -8,6 +8,7 @@ from torch import nn
 from torchrl_koap.keys import STATE
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.inverse_dynamics import NORMALIZED_STATE, KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionLSTM, LatentActionMLP
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
@@ -38,6 +39,7 @@ PRESETS = {
         "include_state": False,
         "structure": "dense",
         "operator_init": "identity",
+        "lifting": "compact",
         "network": "smoothed",
         "num_features": 512,
         "num_past": 8,
@@ -78,6 +80,8 @@ PRESETS = {
     },
 }
 
+LIFTINGS = ("single", "compact")
+
 # a smoothed lifting keeps states of at most so many columns as they are
 NARROW = 8
 
@@ -85,7 +89,10 @@ NARROW = 8
 NETWORK_OPTIONS = {
     "fourier": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0, "place": 0.0},
     "lstm": {"relative": False},
-    "smoothed": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0},
+    "smoothed": {
+        **{"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0},
+        "lifting": "single",  # or "compact": CompactLifting, where the lifting is learned
+    },
     "mlp": {"relative": False, "linear_skip": False, "dropout": 0.0},
 }
 
@@ -136,7 +143,7 @@ def make_koopman_inverse_dynamics(
         latent_dim = state_dim if include_state else action_dim
     if "latent_dim" not in overrides and "include_state" not in overrides and latent_dim < state_dim:
         include_state = False  # a preset's size is too small for a wide state to be part of the lifting
-    frames = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *options)}
+    frames = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *options) if key != "lifting"}
     # networks are built in this order: their first weights are drawn one after the other
     latent_action = None
     if network == "fourier":
@@ -145,18 +152,23 @@ def make_koopman_inverse_dynamics(
         latent_action = LatentActionLSTM(state_dim, latent_dim, hidden_dim=hidden, **frames)
     elif network == "mlp":
         latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=(hidden, hidden), **frames)
-    lifting = KoopmanLifting(
-        state_dim,
-        latent_dim,
-        hidden_dims=(hidden, hidden),
-        include_state=include_state,
-        recurrent=choice["recurrent_lifting"],
-        linear_skip=skip and not include_state and not choice["recurrent_lifting"],
-        in_key=NORMALIZED_STATE if state_normalizer is not None else STATE,
-    )
+    in_key = NORMALIZED_STATE if state_normalizer is not None else STATE
+    if lookup(LIFTINGS, choice.get("lifting", "single"), "lifting") == "compact" and not include_state:
+        widths = {"hidden_dims": (hidden, hidden)} if "hidden_dim" in overrides else {}
+        lifting = CompactLifting(state_dim, latent_dim, in_key=in_key, **widths)
+    else:
+        lifting = KoopmanLifting(
+            state_dim,
+            latent_dim,
+            hidden_dims=(hidden, hidden),
+            include_state=include_state,
+            recurrent=choice["recurrent_lifting"],
+            linear_skip=skip and not include_state and not choice["recurrent_lifting"],
+            in_key=in_key,
+        )
     latent_action = LatentActionSmoothed(lifting, **frames) if latent_action is None else latent_action
     operator = KoopmanOperator(
-        latent_dim,
+        lifting.latent_dim,
         input_dim=latent_action.latent_dim if network in ("fourier", "smoothed") else None,
         structure=choice["structure"],
         init=choice["operator_init"],

@@ -86,7 +86,7 @@ class LatentActionSmoothed(LatentActionModule):
         kwargs |= {"num_past": num_past, "look_ahead": look_ahead}
         super().__init__(lifting.state_dim, lifted.latent_dim + raw.latent_dim, **kwargs)
         del self._buffers["scales"]  # each block has its own
-        self.identity = lifting.encoder is None
+        self.identity = lifting.keeps_state
         self.lifted, self.raw = lifted, raw
         self._lifting = (lifting,)  # shared: the Koopman model holds its weights
         self.smoother = WindowSmoother(self.num_frames, dim)
@@ -178,6 +178,9 @@ class LatentActionSmoothed(LatentActionModule):
         read = self._frames(lifted, range(span.start, span.start + 1)).squeeze(-3)
         self.smoother.fit(read, lifted)
         steps = self._steps(self.smoother(read)).square().mean(0).sqrt()
+        moving = spread > 1e-9
+        # a lifting may leave coordinates at 0: those that are left count as if there were no others
+        steps = steps * (moving.sum() / moving.numel()).clamp_min(1e-9).sqrt()
         steps[self.num_past] = 1.0
         self.lifted.scales.copy_(torch.where(steps > 1e-9, steps, torch.ones_like(steps)))
         self.raw.fit_scales(windows)

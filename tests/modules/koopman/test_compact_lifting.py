@@ -1,0 +1,133 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Components in units of the noise, and a lifting that finds out how many coordinates there are."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+
+from torchrl_koap.modules import make_koopman_inverse_dynamics
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting, NoiseAdjustedComponents
+from torchrl_koap.objectives import KOAPLoss
+
+
+def turning(count=400, length=17, bodies=1):
+    """Phases of bodies that turn at speeds of their own, ``[count, length, bodies]``."""
+    torch.manual_seed(0)
+    speed = 0.15 * (1 + torch.arange(bodies) / 2)
+    return 6.28 * torch.rand(count, 1, bodies) + speed * torch.arange(length)[:, None]
+
+
+def embedded(motion, columns=24, noise=0.02):
+    """A random network of the motion's coordinates, with noise."""
+    torch.manual_seed(1)
+    weight, bias = torch.randn(motion.shape[-1], columns), torch.randn(columns)
+    seen = torch.tanh(motion @ weight + bias)
+    return seen + noise * torch.randn_like(seen)
+
+
+def train(lifting, windows, steps=250):
+    """A short training on the reconstruction alone."""
+    lifting.fit_unlabelled(windows)
+    optimiser = torch.optim.Adam(lifting.parameters(), 5e-3)
+    for step in range(steps):
+        batch = windows[torch.randint(len(windows), (32,), generator=torch.Generator().manual_seed(step))]
+        optimiser.zero_grad()
+        lifting.reconstruction_error(lifting.encode(batch), batch).mean().backward()
+        optimiser.step()
+
+
+class TestNoiseAdjustedComponents:
+    def test_the_best_measured_come_first(self):
+        phase = turning()
+        clean = torch.cat([phase.sin(), phase.cos()], -1)
+        windows = torch.cat([0.1 * clean, 10 * torch.randn(400, 17, 2)], -1)
+        windows[..., :2] += 0.01 * torch.randn(400, 17, 2)
+        components = NoiseAdjustedComponents(4, 3)
+        components.fit(windows)
+        assert (components.weights > 0).tolist() == [True, True, False]
+        # the loud columns are noise alone: a principal component would be one of them
+        assert (components.analysis[:2, 2:].abs() < 0.02 * components.analysis[:2, :2].abs().max()).all()
+
+    def test_components_have_unit_spread_and_are_inverted(self):
+        windows = embedded(turning(bodies=2).sin(), columns=6, noise=0.0)
+        components = NoiseAdjustedComponents(6, 6)
+        components.fit(windows)
+        made = components(windows).flatten(0, 1)
+        torch.testing.assert_close(made.std(0), torch.ones(6), rtol=1e-2, atol=0)
+        torch.testing.assert_close(components.invert(components(windows)), windows, rtol=0, atol=1e-3)
+        assert abs(components.weights.mean().item() - 1) < 1e-4
+
+    def test_noise_alone_still_leaves_a_component(self):
+        components = NoiseAdjustedComponents(3, 3)
+        components.fit(torch.randn(300, 17, 3))
+        assert (components.weights > 0).any() and components.weights.isfinite().all()
+
+    def test_a_state_that_never_moves(self):
+        components = NoiseAdjustedComponents(3, 2)
+        components.fit(torch.zeros(20, 17, 3))
+        assert components(torch.ones(4, 3)).isfinite().all() and components.weights.isfinite().all()
+
+    @pytest.mark.parametrize("count", [0, 5])
+    def test_wrong_numbers_of_components(self, count):
+        with pytest.raises(ValueError, match="num_components must be 1 to 4"):
+            NoiseAdjustedComponents(4, count)
+
+
+class TestCompactLifting:
+    @pytest.mark.parametrize(("bodies", "kept"), [(2, 2), (4, 4)])
+    def test_as_many_coordinates_as_move(self, bodies, kept):
+        windows = embedded(turning(bodies=bodies).sin())
+        lifting = CompactLifting(24, 2)
+        train(lifting, windows)
+        assert lifting.choose_size(windows) == kept
+        lifted = lifting.encode(windows)
+        assert (lifted.flatten(0, 1).std(0) > 1e-3).sum() == kept
+        error = (lifting.decode(lifted) - windows).square().mean() / windows.var()
+        assert error < 0.2
+
+    def test_training_makes_the_error_smaller(self):
+        windows = embedded(turning(bodies=2).sin())
+        lifting = CompactLifting(24, 2)
+        lifting.fit_unlabelled(windows)
+        before = lifting.reconstruction_error(lifting.encode(windows), windows).mean()
+        train(lifting, windows)
+        assert lifting.reconstruction_error(lifting.encode(windows), windows).mean() < 0.5 * before
+
+    def test_its_size_is_kept_by_the_weights(self):
+        windows = embedded(turning().sin())
+        lifting, other = CompactLifting(24, 2), CompactLifting(24, 2)
+        lifting.fit_unlabelled(windows)
+        lifting.choose_size(windows)
+        other.load_state_dict(lifting.state_dict())
+        torch.testing.assert_close(other.encode(windows), lifting.encode(windows))
+
+    def test_other_columns_are_refused(self):
+        with pytest.raises(ValueError, match="expected states with 24 columns"):
+            CompactLifting(24, 2).encode(torch.randn(3, 25))
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_alone_in_a_sequence_and_with_other_keys(self, dtype):
+        lifting = CompactLifting(24, 2, in_key=("seen", "wide"), out_key="z").to(dtype)
+        batch = TensorDict({("seen", "wide"): torch.randn(2, 3, 16, 24, dtype=dtype)}, [2, 3])
+        made = TensorDictSequential(lifting)(batch)["z"]
+        assert made.shape == (2, 3, 16, 6) and made.dtype == dtype
+
+    def test_the_model_of_the_preset(self):
+        model = make_koopman_inverse_dynamics(24, 2, preset="semi_supervised", num_features=16)
+        windows = embedded(turning().sin())
+        model.fit_scales(windows)
+        batch = TensorDict({"state": windows, "action": torch.zeros(400, 17, 2)}, [400])
+        batch["has_action"] = torch.zeros(400, 17, 1, dtype=torch.bool)
+        losses = KOAPLoss(model)(batch)
+        sum(losses[name] for name in ("loss_reconstruction", "loss_koopman")).backward()
+        for network in (model.lifting.small, model.lifting.large):
+            assert network.encoder[0].weight.grad is not None
+        model.fit_unlabelled(windows)
+        assert int(model.lifting.kept.sum()) in (2, 4)
+
+    def test_narrow_states_are_kept_as_they_are(self):
+        model = make_koopman_inverse_dynamics(4, 2, preset="semi_supervised")
+        assert model.lifting.keeps_state

@@ -1,0 +1,229 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A lifting of wide, noisy states to the few coordinates behind them, trained in units of the measurement noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from torchrl_koap.keys import LIFTED_STATE, STATE
+from torchrl_koap.modules.koopman.lifting import KoopmanLifting
+from torchrl_koap.modules.koopman.smoothing import noise_covariance
+
+MOST_WINDOWS = 2000  # for the covariance of the noise; neighbouring windows hold nearly the same frames
+MIN_RATIO = 2.0  # a component with less variance than so many times the noise's is left out
+GAIN = 0.7  # twice the coordinates are read if they leave less than this share of the reconstruction error
+
+
+class NoiseAdjustedComponents(nn.Module):
+    r"""Linear components of the state, ordered by how far they stand out of the measurement noise.
+
+    .. math::
+        y = \Lambda^{-1/2} U^T W^T x, \qquad W^T R W = I, \quad W^T C W = U \Lambda U^T
+
+    with the covariance ``C`` of the states and ``R`` of the white noise in them
+    (:func:`~torchrl_koap.modules.koopman.smoothing.noise_covariance`): the minimum noise fraction transform (Green et
+    al. 1988), at unit spread. Where columns differ in their noise, principal components follow the loudest; these
+    follow the best measured. No column counts as measured to more than a hundredth of its spread, and components that
+    stand out by less than a factor of two are 0, but for the first.
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        num_components (int): number ``k`` of components.
+
+    Raises:
+        ValueError: for more components than columns.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.koopman.compact_lifting import NoiseAdjustedComponents
+        >>> _ = torch.manual_seed(0)
+        >>> time = 0.2 * torch.arange(12) + 6.28 * torch.rand(500, 1)
+        >>> windows = torch.stack([time.sin(), torch.zeros_like(time)], -1)  # the second column is noise alone
+        >>> windows = windows + torch.tensor([0.02, 5.0]) * torch.randn_like(windows)
+        >>> components = NoiseAdjustedComponents(2, 2)
+        >>> components.fit(windows)
+        >>> (components.weights > 0).tolist()
+        [True, False]
+    """
+
+    analysis: Tensor
+    synthesis: Tensor
+    weights: Tensor
+
+    def __init__(self, state_dim: int, num_components: int):
+        super().__init__()
+        if not 1 <= num_components <= state_dim:
+            raise ValueError(f"num_components must be 1 to {state_dim}, the state's columns, got {num_components}")
+        self.register_buffer("analysis", torch.eye(num_components, state_dim))
+        self.register_buffer("synthesis", torch.eye(state_dim, num_components))
+        self.register_buffer("weights", torch.ones(num_components))
+
+    def forward(self, state: Tensor) -> Tensor:
+        """Components ``[*B, k]`` of states ``[*B, d]``."""
+        return state @ self.analysis.mT
+
+    def invert(self, components: Tensor) -> Tensor:
+        """States ``[*B, d]`` with the given components ``[*B, k]``; what those leave out is 0."""
+        return components @ self.synthesis.mT
+
+    @torch.no_grad()
+    def fit(self, windows: Tensor) -> None:
+        """Fits the components; no label is read.
+
+        Args:
+            windows (Tensor): ``[N, T, d]`` of frames one control step apart, in the networks' units.
+
+        Raises:
+            ValueError: for windows of less than five frames.
+        """
+        windows = windows.flatten(0, -3)
+        noise = noise_covariance(windows[:: -(-len(windows) // MOST_WINDOWS)])
+        states = windows.flatten(0, -2).double()
+        states = states - states.mean(0)
+        total = states.mT @ states / len(states)
+        # nothing is measured to more than a hundredth of its spread
+        values, vectors = torch.linalg.eigh(noise.to(total) + torch.diag(1e-4 * total.diagonal() + 1e-12))
+        spread = values.sqrt()
+        whiten, colour = vectors / spread, vectors * spread  # inverse transposes of each other
+        ratio, turn = torch.linalg.eigh(whiten.mT @ total @ whiten)
+        count = len(self.weights)
+        ratio, turn = ratio[-count:].flip(-1), turn[:, -count:].flip(-1)
+        analysis, synthesis = (whiten @ turn).mT, colour @ turn
+        sign = torch.where(analysis.sum(-1) < 0, -1.0, 1.0)  # the solver's whim
+        kept = ratio > MIN_RATIO
+        kept[0] = True
+        size = torch.where(ratio > 1e-9, ratio.clamp_min(1e-9).sqrt(), torch.ones_like(ratio))
+        self.analysis.copy_(analysis * (sign * kept / size)[:, None])
+        self.synthesis.copy_(synthesis * (sign * kept * size))
+        self.weights.copy_(torch.where(kept, ratio, 0.0) * count / ratio[kept].sum().clamp_min(1e-9))
+
+
+class CompactLifting(KoopmanLifting):
+    r"""Lifts wide states to few coordinates, and finds out without labels whether twice as many are needed.
+
+    .. math::
+        y = P x, \quad z = (g_1(y), g_2(y)), \quad
+        L_{recon} = \tfrac12 \sum_{i=1}^{2} \overline{w\, |h_i(g_i(y)) - y|^2}
+
+    ``P`` are the :class:`NoiseAdjustedComponents` and ``w`` their variances in units of the noise, so that columns of
+    much noise or little motion do not fill the coordinates. ``g_1`` has ``m`` coordinates and ``g_2`` twice as many;
+    both are trained. :meth:`choose_size` keeps the smaller one unless the larger one leaves less than 70 % of its
+    reconstruction error, as it does where something moves by itself beside the robot. The coordinates of the other are
+    0.
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+        coordinates (int): ``m``; a lifted state has ``3 m`` entries.
+
+    Keyword Args:
+        num_components (int): number of components at most. Defaults to ``64``.
+        hidden_dims (sequence of int): widths of all networks. Defaults to ``(128, 128)``.
+        in_key (NestedKey): states ``[*B, T, d]``. Defaults to ``"state"``.
+        out_key (NestedKey): lifted states ``[*B, T, 3 m]``. Defaults to ``"lifted_state"``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
+        >>> lifting = CompactLifting(32, 2)
+        >>> lifting(TensorDict({"state": torch.randn(5, 16, 32)}, [5]))["lifted_state"].shape
+        torch.Size([5, 16, 6])
+    """
+
+    kept: Tensor
+
+    def __init__(
+        self,
+        state_dim: int,
+        coordinates: int,
+        *,
+        num_components: int = 64,
+        hidden_dims: Sequence[int] = (128, 128),
+        in_key: NestedKey = STATE,
+        out_key: NestedKey = LIFTED_STATE,
+    ):
+        TensorDictModuleBase.__init__(self)  # its networks are the two below
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        self.state_dim, self.coordinates, self.latent_dim = state_dim, coordinates, 3 * coordinates
+        self.include_state, self.encoder_skip, self.decoder_skip = False, None, None
+        self.components = NoiseAdjustedComponents(state_dim, min(num_components, state_dim))
+        count = len(self.components.weights)
+        self.small = KoopmanLifting(count, coordinates, hidden_dims=hidden_dims, linear_skip=True)
+        self.large = KoopmanLifting(count, 2 * coordinates, hidden_dims=hidden_dims, linear_skip=True)
+        self.register_buffer("kept", torch.ones(self.latent_dim))
+
+    @property
+    def keeps_state(self) -> bool:
+        """The state is no part of the lifted state."""
+        return False
+
+    def encode(self, state: Tensor) -> Tensor:
+        """Lifts states ``[*B, T, d]`` to ``[*B, T, 3 m]``; coordinates that were not chosen are 0."""
+        if state.shape[-1] != self.state_dim:
+            raise ValueError(f"expected states with {self.state_dim} columns, got shape {list(state.shape)}")
+        components = self.components(state)
+        return torch.cat([self.small.encode(components), self.large.encode(components)], -1) * self.kept
+
+    def _decoded(self, lifted: Tensor) -> tuple[Tensor, Tensor]:
+        """Components by either network."""
+        small, large = lifted.split([self.coordinates, 2 * self.coordinates], -1)
+        return self.small.decode(small), self.large.decode(large)
+
+    def decode(self, lifted: Tensor) -> Tensor:
+        """Maps lifted states ``[*B, T, 3 m]`` back to ``[*B, T, d]``."""
+        small, large = self._decoded(lifted)
+        share = self.kept[[0, -1]] / self.kept[[0, -1]].sum()
+        return self.components.invert(share[0] * small + share[1] * large)
+
+    def reconstruction_error(self, lifted: Tensor, state: Tensor) -> Tensor:
+        """Squared error ``[*B, T]`` in components, weighted by their variance in units of the noise."""
+        target = self.components(state)
+        errors = [((made - target).square() * self.components.weights).mean(-1) for made in self._decoded(lifted)]
+        return (errors[0] + errors[1]) / 2
+
+    @torch.no_grad()
+    def fit_unlabelled(self, windows: Tensor) -> None:
+        """Fits the components, and sets the linear part of both networks to the first of them; before training.
+
+        Args:
+            windows (Tensor): ``[*B, T, d]`` in the networks' units; no label is read.
+        """
+        self.kept.fill_(1.0)
+        self.components.fit(windows)
+        components, size = self.components(windows), self.components.weights.sqrt()
+        for network in (self.small, self.large):
+            network.fit_linear(components * size)
+            for linear, factor in (
+                (network.encoder_skip, size),
+                (network.decoder_skip, torch.where(size > 0, 1 / size.clamp_min(1e-6), 0.0)[:, None]),
+            ):
+                assert linear is not None
+                linear.weight.mul_(factor)
+
+    @torch.no_grad()
+    def choose_size(self, windows: Tensor, *, batch_size: int = 2048) -> int:
+        """Keeps the coordinates of one network, by what both leave of the state; after training.
+
+        Args:
+            windows (Tensor): ``[*B, T, d]`` in the networks' units; no label is read.
+
+        Keyword Args:
+            batch_size (int): windows lifted at once.
+
+        Returns:
+            int: coordinates kept, ``m`` or ``2 m``.
+        """
+        self.kept.fill_(1.0)
+        sums = torch.zeros(2, dtype=torch.float64)
+        for part in windows.flatten(0, -3).split(batch_size):
+            target = self.components(part)
+            for index, made in enumerate(self._decoded(self.encode(part))):
+                sums[index] += ((made - target).square() * self.components.weights).sum().double().cpu()
+        large = bool(sums[1].sqrt() < GAIN * sums[0].sqrt())
+        self.kept[: self.coordinates], self.kept[self.coordinates :] = float(not large), float(large)
+        return int(self.kept.sum())
