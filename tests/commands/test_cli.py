@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tiny_runs import TINY, grid, koap, write_demonstrations
 
 import torchrl_koap
@@ -591,6 +592,26 @@ def test_wandb_stays_on_this_machine(demonstrations, tmp_path, monkeypatch):
     (log,) = (out / "wandb").glob("offline-run-*/*.wandb")
     assert log.stat().st_size > 500
     assert len(RunDirectory(out).read_metrics()) == 2
+
+
+def test_films_of_an_evaluation_go_to_wandb_on_this_machine(copied_run, tmp_path, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.chdir(tmp_path)
+
+    def report(folder, *, animation):
+        pictures = [Image.new("RGB", (9, 7), color) for color in ("red", "blue")]
+        (folder / "plots").mkdir()
+        pictures[0].save(folder / "plots" / "rollouts.gif", save_all=True, append_images=pictures[1:])
+
+    monkeypatch.setattr("torchrl_koap.commands.eval.write_report", report)
+    assert koap("eval", copied_run, "--episodes", "1", "--threads", "1", "--logger", "wandb") == 0
+    film = (copied_run / "plots" / "rollouts.gif").read_bytes()
+    logged = [path for path in (copied_run / "wandb").rglob("*") if path.is_file()]
+    assert any(path.suffix == ".gif" and path.read_bytes() == film for path in logged)
+    assert any(b"eval/success_rate" in path.read_bytes() for path in logged)
+    assert not (tmp_path / "wandb").exists()
 
 
 def test_wandb_that_is_not_installed_names_the_extra(demonstrations, tmp_path, monkeypatch, capsys):

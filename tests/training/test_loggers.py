@@ -6,8 +6,9 @@ from __future__ import annotations
 import importlib.util
 
 import pytest
+from PIL import Image
 
-from torchrl_koap.training.loggers import LOGGERS, check_logger, close_logger, make_logger
+from torchrl_koap.training.loggers import LOGGERS, check_logger, close_logger, log_evaluation, make_logger
 
 
 @pytest.mark.parametrize("name", [name for name, (module, _) in LOGGERS.items() if module])
@@ -38,3 +39,26 @@ def test_scalars_arrive_in_the_run_directory(name, tmp_path, monkeypatch):
         close_logger(logger)
     files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) > 50
+
+
+@pytest.mark.parametrize("name", ["wandb", "tensorboard", "mlflow"])
+def test_figures_and_films_of_an_evaluation_arrive_in_the_run_directory(name, tmp_path, monkeypatch):
+    pytest.importorskip(name)
+    for variable in ("WANDB_MODE", "WANDB_DIR", "MLFLOW_TRACKING_URI"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "run"
+    run.mkdir()
+    pictures = [Image.new("RGB", (8, 6), color) for color in ("red", "blue")]
+    pictures[0].save(run / "rollouts.gif", save_all=True, append_images=pictures[1:])
+    film = (run / "rollouts.gif").read_bytes()
+    logger = make_logger(name, run)
+    figures = {"success_rate": 0.625, "episodes": 8, "kind": "closed loop", "entropy": float("nan")}
+    log_evaluation(logger, figures, [run / "rollouts.gif"])
+    close_logger(logger)
+    written = [path for path in tmp_path.rglob("*") if path.is_file() and path != run / "rollouts.gif"]
+    assert any(film in path.read_bytes() for path in written)
+    assert not any(b"eval/entropy" in path.read_bytes() for path in written)
+    assert any(b"eval/success_rate" in path.read_bytes() for path in written)
+    assert all(run in path.parents for path in written), written

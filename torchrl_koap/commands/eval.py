@@ -12,7 +12,11 @@ import tyro
 from torchrl_koap.commands.command import Command, Options
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.offline import KIND, describe_offline
+from torchrl_koap.reports.pictures import FOLDER
 from torchrl_koap.reports.run_report import write_report
+from torchrl_koap.training.loggers import check_logger, close_logger, log_evaluation, make_logger
+
+FILMS = ("rollouts.gif", "film.gif")
 
 
 @dataclass(kw_only=True)
@@ -24,16 +28,32 @@ class Eval(Command):
         config: all options of the rollouts.
         report: draw the pictures and write the report.
         animate: make an animation of the rollouts for the report.
+        logger: where figures and films go besides the run directory: wandb (offline unless WANDB_MODE says otherwise),
+            tensorboard or mlflow; each needs its extra.
     """
 
     run: tyro.conf.Positional[str]
     config: Options[EvalConfig]
     report: bool = True
     animate: bool = True
+    logger: str = "csv"
 
     def __call__(self) -> dict[str, Any] | str:
         """Evaluates and reports; the figures of an evaluation without an environment come in words."""
+        check_logger(self.logger)
         result = evaluate(self.run, self.config)
+        folder = Path(self.run) if self.config.out is None else self.config.out
         if self.report:
-            write_report(Path(self.run) if self.config.out is None else self.config.out, animation=self.animate)
+            write_report(folder, animation=self.animate)
+        logger = make_logger(self.logger, folder)
+        if logger is not None:
+            films = [
+                film
+                for film in map((folder / FOLDER).joinpath, FILMS)
+                if self.report and self.animate and film.is_file()
+            ]
+            try:
+                log_evaluation(logger, result, films)
+            finally:
+                close_logger(logger)
         return describe_offline(result) if result.get("kind") == KIND else result
