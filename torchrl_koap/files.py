@@ -124,9 +124,9 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _naming(path):
-        handle, aside = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
         os.close(handle)
-        aside = Path(aside)
+        aside = Path(name)
         try:
             yield aside
             aside.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read

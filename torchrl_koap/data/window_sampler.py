@@ -104,6 +104,9 @@ class WindowSampler(Sampler):
         torch.Size([8, 16, 4])
     """
 
+    _table: WindowTable | None
+    _pools: tuple[torch.Tensor, ...]
+
     def __init__(
         self,
         window: int,
@@ -214,8 +217,8 @@ class WindowSampler(Sampler):
         self._table = None
 
     def _empty(self) -> None:
-        self._table: WindowTable | None = None
-        self._pools: tuple[torch.Tensor, torch.Tensor] = ()
+        self._table = None
+        self._pools = ()
 
     def _options(self) -> dict[str, Any]:
         share = -1.0 if self.labelled_share is None else float(self.labelled_share)

@@ -185,7 +185,8 @@ def measure_latency(policy: PlanThenControl, observation_dim: int, *, repeats: i
     device = _device_of(policy)
     observed = torch.zeros(1, policy.history, observation_dim, device=device)
     td = TensorDict({OBSERVATION_HISTORY: observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1], device=device)
-    between, with_plan = [], []
+    between: list[float] = []
+    with_plan: list[float] = []
     for repeat in range(repeats + 3):
         td["is_init"] = torch.ones(1, 1, dtype=torch.bool, device=device)
         for kind in (with_plan, between):

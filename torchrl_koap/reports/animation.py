@@ -189,7 +189,7 @@ def render_rollout(
     from torchrl_koap.envs.registry import make_env
 
     env = make_env(facts, 1, max_steps=len(actions) + 1, dtype=torch.float64)
-    renderer = None
+    renderer: Any = None
 
     def pictures() -> Iterator[np.ndarray]:
         data = env.reset() if context is None else env.reset(contexts=context)

@@ -133,7 +133,7 @@ def draw_object_paths(axes: Axes, paths: Sequence[np.ndarray], looks: Sequence[B
         if look.still:
             continue
         lines = [path[:, index] for path, _ in shown]
-        style = {"linewidths": 0.7, "alpha": opacity, "zorder": 2}
+        style: dict[str, Any] = {"linewidths": 0.7, "alpha": opacity, "zorder": 2}
         axes.add_collection(LineCollection(lines, colors=look.color, **style))
         for fine, mark in ((True, "o"), (False, "X")):
             ends = np.array([path[-1, index] for path, kind in shown if bool(kind) is fine]).reshape(-1, 2)
@@ -151,7 +151,7 @@ def legend_handles(looks: Sequence[Body], good: Sequence[bool] = ()) -> list[Lin
     Returns:
         list of Line2D: handles with labels, for ``axes.legend(handles=...)``.
     """
-    handles = {}
+    handles: dict[Any, Line2D] = {}
     for look in looks:
         style = {"linestyle": "--" if look.still else "-", "linewidth": 1.6}
         handles.setdefault(look.label, Line2D([], [], color=look.color, label=look.label, **style))

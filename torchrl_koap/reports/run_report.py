@@ -122,7 +122,7 @@ def _read(run_dir: Path, name: str) -> tuple[dict[str, Any], list[str]]:
     if not (run_dir / name).exists():
         return {}, []
     try:
-        content = RunDirectory(run_dir).read_json(name)
+        content: Any = RunDirectory(run_dir).read_json(name)
     except (RunDirectoryError, OSError) as error:
         return {}, [str(error)]
     if not isinstance(content, dict):
@@ -251,12 +251,13 @@ def _figures(
     run_dir: Path, problems: Mapping[str, str], task: str | None, *, offline: bool
 ) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
     """What is to be shown, and for each command the titles of the pictures whose source it would leave."""
-    figures, missing = [], {}
+    figures: list[dict[str, Any]] = []
+    missing: dict[str, list[str]] = {}
     for name, item in all_pictures().items():
         file = next((n for n in (name, Path(name).stem + ".mp4") if (run_dir / FOLDER / n).exists()), None)
         if name in problems:
             continue
-        figure = {"name": name, "title": item.title, "caption": item.caption_for(task), "empty": ""}
+        figure: dict[str, Any] = {"name": name, "title": item.title, "caption": item.caption_for(task), "empty": ""}
         if file is not None:
             moving = file.endswith((".gif", ".mp4"))
             figures.append(figure | {"source": f"{FOLDER}/{file}", "beside": moving})

@@ -201,7 +201,7 @@ def _counts(result: dict[str, Any]) -> dict[str, Any]:
 
 def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
     labels = done["labels"]
-    errors = next((value for name, value in summary.items() if name.startswith("action_error")), {})
+    errors: dict[str, Any] = next((value for name, value in summary.items() if name.startswith("action_error")), {})
     common = {
         "labelled_units": labels["selected_units"],
         "labelled_transitions": labels["labelled_transitions"],

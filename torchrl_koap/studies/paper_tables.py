@@ -220,7 +220,13 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
     quick = dict(QUICK) if config.quick else {}
     if config.study is not None:
         quick.pop("demonstrations", None)  # 1 % of fewer trajectories is none
-    values = {"seeds": 3, "episodes": 60, "controller_steps": 1000, "demonstrations": None, "steps": None} | quick
+    values: dict[str, Any] = {
+        "seeds": 3,
+        "episodes": 60,
+        "controller_steps": 1000,
+        "demonstrations": None,
+        "steps": None,
+    } | quick
     values |= {name: getattr(config, name) for name in values if getattr(config, name) is not None}
     own = {name: getattr(config, name) for name in OPTION_NAMES}
     if config.denoiser is None and not config.released_settings:

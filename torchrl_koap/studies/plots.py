@@ -132,23 +132,23 @@ def plot_success(
     if not panels:
         raise ValueError("there is no success to draw: no cell is done")
     figure = Figure(figsize=(1.9 + 4.1 * len(panels), 4.1), layout="constrained")
-    for index, (name, lines) in enumerate(panels):
+    for index, (name, drawn) in enumerate(panels):
         axes = figure.add_subplot(1, len(panels), index + 1)
-        draw_lines(axes, lines)
+        draw_lines(axes, drawn)
         axes.set_ylim(-3, 103)
         axes.set_yticks(range(0, 101, 20))
         axes.set_xlabel(AXES[name] + (f" ({label})" if label and name == "fraction" else ""))
         if index == 0:
             axes.set_ylabel("success (%)")
-        _log_x(axes, lines, ticks=name != "labelled_transitions")
+        _log_x(axes, drawn, ticks=name != "labelled_transitions")
         axes.grid(axis="y", color=FAINT, linewidth=0.5)
         title = "success, 95 % interval"
-        if any(line.paper for line in lines):
+        if any(line.paper for line in drawn):
             title += "\nhollow, dashed: the paper, whose demonstrations are others"
         set_title(axes, title if index == 0 else "")
         tidy(axes)
-        if index == len(panels) - 1 or {line.name for line in lines} - {line.name for line in panels[-1][1]}:
-            name_lines(axes, lines)
+        if index == len(panels) - 1 or {line.name for line in drawn} - {line.name for line in panels[-1][1]}:
+            name_lines(axes, drawn)
     return save_figure(figure, path)
 
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from torchrl_koap.tasks.import_strings import resolve
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from torch import Tensor
 
 # names that a feature gives to its columns; those of a plain part, and of a feature of one's own, are numbered
@@ -24,6 +26,17 @@ class StateParts:
         >>> avoiding.observation_dim, avoiding.command_columns, avoiding.state_dim
         (4, slice(0, 2, None), 2)
     """
+
+    if TYPE_CHECKING:  # fields of a task
+        name: str
+        observation_parts: Mapping[str, int | tuple[str, ...]]
+        position: str
+        command: str | None
+        state: dict[str, str]
+        hidden: tuple[str, ...]
+        tool_kinematics: str | None
+        planar_parts: tuple[str, ...]
+        interchangeable: tuple[tuple[str, ...], ...]
 
     @cached_property
     def observation(self) -> dict[str, slice]:

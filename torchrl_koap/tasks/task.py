@@ -172,7 +172,7 @@ class Task(StateParts):
     """
 
     name: str
-    observation_parts: dict[str, int | tuple[str, ...]]
+    observation_parts: Mapping[str, int | tuple[str, ...]]
     actions: dict[str, str]
     position: str
     max_steps: int = 400

@@ -142,8 +142,8 @@ def train_phase(
             if run is not None:
                 run.log(phase, done, values)
             if logger is not None:
-                for key, value in values.items():
-                    logger.log_scalar(f"{phase}/{key}", value, step=done)
+                for key, number in values.items():
+                    logger.log_scalar(f"{phase}/{key}", number, step=done)
         if progress is not None:
             progress(done, values)
         if checkpoint is not None and (done % checkpoint_every == 0 or done == num_steps):

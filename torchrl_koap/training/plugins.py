@@ -56,8 +56,8 @@ def _load(name: str) -> None:
     try:
         importlib.import_module(name)
     except Exception as error:
-        absent = isinstance(error, ModuleNotFoundError) and error.name is not None
-        if absent and (name == error.name or name.startswith(f"{error.name}.")):
+        absent = error.name if isinstance(error, ModuleNotFoundError) else None
+        if absent is not None and (name == absent or name.startswith(f"{absent}.")):
             places = dict.fromkeys(path or os.getcwd() for path in [os.getcwd(), *sys.path])
             raise PluginError(f"there is no plugin {name!r}; looked for it in {', '.join(places)}") from error
         raise PluginError(f"plugin {name!r} failed when it was imported: {type(error).__name__}: {error}") from error

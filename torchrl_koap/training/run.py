@@ -92,7 +92,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         logger = make_logger(options.logger, options.out)
         try:
             torch.manual_seed(options.seed)
-            planner, planner_values = None, {}
+            planner, planner_values = None, dict[str, Any]()
             if resolved.method.has_planner:
                 planner, planner_values = train_planner(run, resolved, planner_data, logger)
             planned = time.perf_counter()

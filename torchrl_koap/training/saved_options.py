@@ -71,7 +71,8 @@ def check_config(path: str | Path, content: Mapping[str, Any]) -> None:
     kinds = get_type_hints(TrainConfig)
     kinds |= {"task": str, "planner": dict, "controller": dict, "validation_episodes": tuple[int, ...], "data": dict}
     check_types(path, content, kinds)
-    for name, inner in {"planner": PLANNER, "controller": CONTROLLER}.items():
+    parts: dict[str, Mapping[str, Any]] = {"planner": PLANNER, "controller": CONTROLLER}
+    for name, inner in parts.items():
         check_types(path, content.get(name, {}), inner, prefix=f"{name}.")
 
 

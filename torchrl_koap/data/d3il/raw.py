@@ -158,10 +158,10 @@ def write_raw_episode(path: str | Path, episode: RawEpisode) -> None:
 
 def _problems(episode: RawEpisode, *, robot, objects, min_length) -> list[str]:
     problems = []
-    tables = [("robot", episode.robot, ROBOT_COLUMNS, robot)]
+    tables: list[tuple[str, Any, Mapping, Sequence[str]]] = [("robot", episode.robot, ROBOT_COLUMNS, robot)]
     for name in (*episode.objects, *(name for name in objects if name not in episode.objects)):
-        required = ("pos", "quat") if name in objects else ()
-        tables.append((name, episode.objects.get(name), OBJECT_COLUMNS, required))
+        needed = ("pos", "quat") if name in objects else ()
+        tables.append((name, episode.objects.get(name), OBJECT_COLUMNS, needed))
 
     lengths = {}
     for name, entries, columns, required in tables:

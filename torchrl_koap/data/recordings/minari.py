@@ -149,7 +149,8 @@ def _unbounded(gymnasium: Any, size: int) -> Any:
 def _tables(observations: Any, name: str = "") -> tuple[dict[str, np.ndarray], list[str]]:
     """Entries ``[T, d]`` by name, and the names of those that are images."""
     if isinstance(observations, Mapping):
-        tables, images = {}, []
+        tables: dict[str, np.ndarray] = {}
+        images: list[str] = []
         for key in sorted(observations):
             inner, left = _tables(observations[key], f"{name}_{key}" if name else str(key))
             tables |= inner

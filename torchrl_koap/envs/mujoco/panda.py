@@ -196,8 +196,8 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
         root.contact.add("exclude", body1=first, body2=second)
     motors = [(f"joint{i + 1}", limit) for i, limit in enumerate(_MOTOR_LIMITS)]
     motors += [("finger_left", _FINGER_LIMIT), ("finger_right", _FINGER_LIMIT)]
-    for joint, limit in motors:
-        root.actuator.add("motor", name=joint, joint=joint, gear=(1,), forcelimited=True, forcerange=(-limit, limit))
+    for motor, limit in motors:
+        root.actuator.add("motor", name=motor, joint=motor, gear=(1,), forcelimited=True, forcerange=(-limit, limit))
     return root
 
 

@@ -49,6 +49,8 @@ class Agent:
         ((3,), (3,))
     """
 
+    _frames: Tensor | None  # [n, history, obs]
+
     def __init__(self, policy: RecedingHorizonPolicy, *, seed: int = 0, noise: TensorDictModuleBase | None = None):
         self.policy, self.seed, self.noise = policy, seed, noise
         example = next(policy.parameters(), torch.empty(0))
@@ -99,7 +101,7 @@ class Agent:
 
     def _forget(self) -> None:
         self._carried: TensorDict | None = None  # what the policy wrote in the last step
-        self._frames: Tensor | None = None  # [n, history, obs]
+        self._frames = None
         self._generators: list[torch.Generator] = []
         self._shape: tuple[int, ...] | None = None  # of the observations
 

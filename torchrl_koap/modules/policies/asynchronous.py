@@ -54,6 +54,8 @@ class AsynchronousAgent(Agent):
         (3,)
     """
 
+    _plan: Tensor | None  # [n, H, d], in force
+
     def __init__(self, policy: PlanThenControl, *, control_hz: float, seed: int = 0):
         if not isinstance(policy, PlanThenControl) or policy.execution != "feedback":
             raise ValueError("plans are made asynchronously for a PlanThenControl with execution 'feedback' only")
@@ -93,7 +95,7 @@ class AsynchronousAgent(Agent):
         if self._pending is not None:
             self._pending.result()
         self._pending = None
-        self._plan: Tensor | None = None  # [n, H, d], in force
+        self._plan = None
         self._age = 0  # steps since the plan was begun
         self._begun = 0  # steps since the pending one was begun
 

@@ -41,7 +41,8 @@ class EpisodeNoise(TensorDictModuleBase):
 
     def __init__(self, seeds: Sequence[int], shape: Sequence[int], *, num_steps: int):
         super().__init__()
-        self.in_keys, self.out_keys = [], [NOISE]
+        self.in_keys: list[str] = []
+        self.out_keys = [NOISE]
         draws = [torch.randn(num_steps, *shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         self.register_buffer("draws", torch.stack(draws), persistent=False)  # [E, steps, *shape]
         self.step = 0
@@ -72,7 +73,8 @@ class RecordedFutures(TensorDictModuleBase):
 
     def __init__(self, futures: Tensor):
         super().__init__()
-        self.in_keys, self.out_keys = [], [RECORDED_FUTURE]
+        self.in_keys: list[str] = []
+        self.out_keys = [RECORDED_FUTURE]
         self.register_buffer("futures", futures, persistent=False)
         self.step = 0
 
