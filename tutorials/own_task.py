@@ -78,7 +78,17 @@ task = register_task(
             x=(0.25, 0.75),
             y=(-0.05, 0.5),
         ),
-        defaults=Defaults(demonstrations=60, planner_steps=2000, channels=(32, 64), relative=False),
+        defaults=Defaults(
+            demonstrations=200,
+            planner_steps=4000,
+            planner={
+                "denoiser": "mlp",
+                "denoiser_width": 256,
+                "denoiser_depth": 3,
+                "batch_size": 256,
+                "planner_learning_rate": 1e-3,
+            },
+        ),
     )
 )
 print(f"the planner sees {task.state_names}, the controller {[task.state_names[c] for c in task.robot]}")
