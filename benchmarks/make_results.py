@@ -45,7 +45,7 @@ from result_rows import (
     training_rows,
     window_rows,
 )
-from scooping_rows import scooping_probe_table, scooping_table
+from scooping_rows import scooping_parts_table, scooping_probe_table, scooping_table
 from unlabelled_picture import REGIMES, draw_errors
 from unlabelled_rows import unlabelled_cells, unlabelled_gains, unlabelled_labels, unlabelled_missing, unlabelled_rows
 
@@ -114,6 +114,7 @@ _HELPERS = (
     *_PAPER,
     *_UNLABELLED,
     *_FAULTS,
+    scooping_parts_table,
     scooping_probe_table,
     scooping_table,
 )

@@ -25,6 +25,7 @@ from torchrl_koap.data.lerobot.images import read_image_episodes
 from torchrl_koap.envs.experts.scooping_recording import record_videos
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS
 from torchrl_koap.training import TrainConfig, train
 from torchrl_koap.vision.backbones import load_backbone
@@ -38,8 +39,8 @@ TABLE, PROBES = RESULTS / "scooping.csv", RESULTS / "scooping_probe.csv"
 UNLABELLED = ("robot", "hand", "both")
 METHODS = ["koap", "koap_paper", "dd", "vae", "lapo", "dp", "pca", "linear"]
 COLUMNS = (
-    "labels", "unlabelled", "method", "seed", "n", "successes", "success_low", "success_high", "rims", "rim_low",
-    "rim_high", "left", "near", "right", "action_error_mrad", "planner_steps", "planner_error",
+    "labels", "unlabelled", "method", "execution", "seed", "n", "successes", "success_low", "success_high", "rims",
+    "rim_low", "rim_high", "left", "near", "right", "action_error_mrad", "planner_steps", "planner_error",
 )  # fmt: skip
 HELD_OUT = 0.25  # share of the demonstrations that probes are judged on
 
@@ -81,7 +82,8 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
         settings = {"method": method, "seed": seed, "planner_from": planner, "steps": options.steps}
         settings |= {"controller_steps": options.controller_steps, "analysis": unlabelled != "hand"}
         train(_config(run, folder, unlabelled, labels, **settings))
-    result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1, replan_interval=options.replan_interval))
+    ways = {name: getattr(options, name) for name in ("execution", "replan_interval", "blend_decay")}
+    result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1, **ways))
     summary = json.loads((run / "summary.json").read_text())
     n = options.episodes
     successes, rims = round(result["success_rate"] * n), round(result["rim_rate"] * n)
@@ -92,7 +94,7 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
         zip(
             COLUMNS,
             (
-                labels, unlabelled, method, seed, n, successes, *spans[:2], rims, *spans[2:],
+                labels, unlabelled, method, options.execution, seed, n, successes, *spans[:2], rims, *spans[2:],
                 *(f"{result[f'success_{start}']:.3f}" for start in ("left", "near", "right")),
                 f"{errors['controller']:.1f}" if errors else "", options.steps,
                 f"{made.get('loss_planner', float('nan')):.4f}",
@@ -144,6 +146,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2000, help="planner updates")
     parser.add_argument("--controller-steps", type=int, default=200)
     parser.add_argument("--replan-interval", type=int, default=8, help="frames of each plan that are executed")
+    parser.add_argument("--execution", choices=EXECUTIONS, default="open_loop", help="of plans")
+    parser.add_argument("--blend-decay", type=float, default=0.0, help="of plans; 0 leaves them as they are")
     parser.add_argument("--probe", action="store_true", help="write the table of the probes and stop")
     parser.add_argument("--fit-projection", action="store_true", help="make the package's projection anew and stop")
     options = parser.parse_args()
@@ -164,7 +168,7 @@ def main() -> None:
             writer.writeheader()
             writer.writerows(rows)
         return
-    keys = COLUMNS[:5]
+    keys = COLUMNS[:6]
     done = []
     if TABLE.exists():
         with TABLE.open(newline="") as file:
@@ -173,7 +177,7 @@ def main() -> None:
         for unlabelled in options.unlabelled:
             for labels in options.labels:
                 for method in options.methods:
-                    cell = tuple(map(str, (labels, unlabelled, method, seed, options.episodes)))
+                    cell = tuple(map(str, (labels, unlabelled, method, options.execution, seed, options.episodes)))
                     if cell in done:
                         continue
                     row = run_cell(options.folder, unlabelled, labels, method, seed, options)

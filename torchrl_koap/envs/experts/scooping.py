@@ -48,6 +48,7 @@ HABITS = {
 }
 _STROKE = (-0.025, 0.034)  # from where to where the spoon goes in the bowl, along the heading (m)
 _NOSE_DOWN, _NOSE_UP = 0.22, -0.5  # rad
+_FLOOR = -0.01  # height that is aimed at in the bowl (m): the spoon is pressed onto the table and scrapes along it
 
 
 class ScoopingExpert:
@@ -107,8 +108,8 @@ class ScoopingExpert:
         leave = BOWL + 0.5 * (np.array(list(STARTS.values())[self._start]) - BOWL)
         self._queue = [
             (at(_STROKE[0], above, _NOSE_DOWN), habits.speed),
-            (at(_STROKE[0], 0.006, _NOSE_DOWN), 0.8 * habits.speed),
-            (at(reach, 0.006, 0.6 * _NOSE_DOWN), habits.drag),
+            (at(_STROKE[0], _FLOOR, _NOSE_DOWN), 0.8 * habits.speed),
+            (at(reach, _FLOOR, 0.6 * _NOSE_DOWN), habits.drag),
             (at(reach - 0.004, 0.02, _NOSE_UP), habits.drag),
             (at(0.2 * reach, 0.14, _NOSE_UP), 0.5 * habits.speed),
             (np.array([*leave, START_HEIGHT, 0.7 * heading, _NOSE_UP, self._tilt]), habits.speed),

@@ -20,7 +20,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import FRAME_HZ, IMAGE_SIZE, STARTS, start_of
 
-AFTERWARDS = 3  # frames that are recorded after a success
+AFTERWARDS = 12  # frames that are recorded after a success: a controller's labels end before its look-ahead does
 MAX_ATTEMPTS = 10
 CAMERA = "third_person"
 
