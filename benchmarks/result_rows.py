@@ -53,6 +53,14 @@ def success(row: Mapping[str, str]) -> str:
     return f"{100 * successes / trials:.1f} ({low:.0f}-{high:.0f}){entropy}"
 
 
+def pooled(rows: Sequence[Mapping[str, str]]) -> str:
+    """Success of several rows together with its Wilson interval and number, and the range of their entropies."""
+    counts = {key: str(sum(int(row[key]) for row in rows)) for key in ("successes", "n")}
+    entropy = sorted(f"{float(row['entropy']):.2f}" for row in rows)
+    ends = entropy[0] if entropy[0] == entropy[-1] else f"{entropy[0]} to {entropy[-1]}"
+    return f"{percent(counts)} of {counts['n']} rollouts (entropy {ends})"
+
+
 def share(fraction: str | float) -> str:
     """A fraction in percent."""
     return f"{100 * float(fraction):.6g} %"
