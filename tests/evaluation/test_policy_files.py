@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from tiny_runs import TINY, koap
 from torchrl_koap import Agent, EvalConfig, build_policy, fit_controller, fit_planner, load_policy, save_policy
 from torchrl_koap.data import make_demonstrations
 from torchrl_koap.evaluation.policy_files import PolicyDescription
+from torchrl_koap.evaluation.run import load_run
 from torchrl_koap.modules import ChunkedPolicy, PlanThenControl
+from torchrl_koap.tasks import get_task
 from torchrl_koap.training.checkpoints import CheckpointError, load_tensors, save_tensors
 
 PATH = np.random.default_rng(0).normal(size=(9, 4)) / 100 + np.array([0.5, -0.2, 0.5, -0.2])
@@ -50,7 +53,20 @@ def test_a_run_as_one_file(trained_run, tmp_path):
     assert (loaded.planner.solver, loaded.planner.num_steps) == ("ddim", 3)
     np.testing.assert_array_equal(actions(loaded), expected)
     other = load_policy(str(path), EvalConfig(replan_interval=4))
-    assert (other.execution, other.replan_interval, other.planner.solver) == ("feedback", 4, "ddim")
+    assert (other.execution, other.replan_interval, other.planner.solver) == ("open_loop", 4, "ddim")
+
+
+def test_a_task_says_how_plans_are_followed_where_nobody_else_does(trained_run):
+    trained = load_run(trained_run)
+    own = {"execution": "open_loop", "replan_interval": 8, "blend_decay": 0.0}
+    task = replace(trained.task, defaults=replace(trained.task.defaults, execution=own))
+    policy = load_policy(replace(trained, task=task))
+    assert {name: getattr(policy, name) for name in own} == own
+    policy = load_policy(replace(trained, task=task), EvalConfig(execution="feedback", replan_interval=2))
+    assert (policy.execution, policy.replan_interval, policy.blend_decay) == ("feedback", 2, 0.0)
+    policy = load_policy(trained)
+    assert (policy.execution, policy.replan_interval, policy.blend_decay) == ("feedback", 4, 0.8)
+    assert get_task("scooping").defaults.execution == own
 
 
 def test_a_policy_of_its_own(demonstrations, tmp_path):

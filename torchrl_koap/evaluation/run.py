@@ -51,11 +51,13 @@ class EvalConfig:
         seed: seed of the first rollout; the others count on from it.
         controller: "learned", or "oracle": the simulator's own inverse map, which takes the tool where the plan says:
             what fails then is the planner's.
-        execution: "feedback" (decode at every step) or "open_loop" (decode once per plan).
+        execution: "feedback" (decode at every step) or "open_loop" (decode once per plan) (default: feedback, or the
+            task's).
         solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
         solver_steps: another number of solver steps.
-        replan_interval: control steps per plan.
-        blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are.
+        replan_interval: control steps per plan (default: 4, or the task's).
+        blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are
+            (default: 0.8, or the task's).
         candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
             the one in force (default: as the run says, else 1).
         choice: rule of that choice: "quarter", "typical" or "nearest".
@@ -81,11 +83,11 @@ class EvalConfig:
     rollouts_per_context: int = 1
     seed: int = 100
     controller: str = "learned"
-    execution: str = "feedback"
+    execution: str | None = None
     solver: str | None = None
     solver_steps: int | None = None
-    replan_interval: int = REPLAN_INTERVAL
-    blend_decay: float = BLEND_DECAY
+    replan_interval: int | None = None
+    blend_decay: float | None = None
     candidates: int | None = None
     choice: str = "quarter"
     out: Path | None = None
@@ -185,21 +187,20 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     Args:
         run (str, Path or TrainedRun): a run directory, what :func:`load_run` made of one, or a file.
         config (EvalConfig, optional): execution, solver, interval between plans, device and plugins; the rest is not
-            used. Default: as ``koap eval`` has them, for a file as it was saved.
+            used. What is not asked for is as ``koap eval`` has it, for a file as it was saved.
 
     Raises:
         ValueError: for an unknown execution or solver, or an interval out of range.
         RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`; a :class:`CheckpointError` names the file.
     """
     given, config = config, EvalConfig() if config is None else config
-    lookup(EXECUTIONS, config.execution, "execution")
+    _check_execution(config)
     lookup(CONTROLLERS, config.controller, "controller")
-    oracle = config.controller == "oracle"
-    names = ("execution", "replan_interval", "blend_decay", "choice")
-    options = {name: getattr(config, name) for name in names}
-    options |= {} if config.candidates is None else {"candidates": config.candidates}
-    if oracle:
-        policy = _oracle(run if isinstance(run, TrainedRun) else load_run(run, task=config.task), options)
+    names = ("execution", "replan_interval", "blend_decay", "choice", "candidates")
+    options = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
+    if config.controller == "oracle":
+        trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
+        policy = _oracle(trained, options | _execution(trained, config))
     elif isinstance(run, (str, Path)) and Path(run).is_file():
         policy = read_policy(run, plugins=config.plugins, **({} if given is None else options))
         trained_on = policy.description.task.name
@@ -207,7 +208,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             raise CheckpointError(f"{run} was trained on task {trained_on!r}, not on {config.task!r}")
     else:
         trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
-        if trained.planner is None and config.execution != "feedback":
+        if trained.planner is None and config.execution not in (None, "feedback"):
             raise ValueError(
                 f"execution {config.execution!r} was asked of {trained.directory.path}, but method"
                 f" {trained.method.name!r} is a policy of its own: it executes chunks of actions"
@@ -220,12 +221,29 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             tuple(trained.config.get("plugins") or ()),
         )
         kept = {"candidates": trained.config.get("candidates") or 1}
-        policy = assemble_policy(trained.planner, trained.controller, description, **kept | options)
+        policy = assemble_policy(
+            trained.planner, trained.controller, description, **kept | options | _execution(trained, config)
+        )
     if config.solver is not None:
         policy.planner.solver = config.solver
     if config.solver_steps is not None:
         policy.planner.num_steps = config.solver_steps
     return policy.to(config.device)
+
+
+def _check_execution(config: EvalConfig) -> None:
+    if config.execution is not None:
+        lookup(EXECUTIONS, config.execution, "execution")
+
+
+def _execution(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:
+    """How plans are followed: as was asked for, else as the task has it, else in feedback."""
+    options: dict[str, Any] = {"execution": "feedback", "replan_interval": REPLAN_INTERVAL, "blend_decay": BLEND_DECAY}
+    own = dict(trained.task.defaults.execution)
+    if trained.planner is None or config.controller == "oracle":  # chunks are executed as they are; an oracle looks
+        own.pop("execution", None)
+    asked = {name: getattr(config, name) for name in options if getattr(config, name) is not None}
+    return options | own | asked
 
 
 def _oracle(trained: TrainedRun, options: dict[str, Any]) -> RecedingHorizonPolicy:
@@ -348,7 +366,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         )
     if config.seed < 0:
         raise ValueError(f"seed must be >= 0, got {config.seed}")
-    lookup(EXECUTIONS, config.execution, "execution")
+    _check_execution(config)
     if config.success_key is not None and config.env is None:
         raise ValueError(
             f"success_key was given, but no env that could report {config.success_key!r}: name an environment of"
@@ -365,7 +383,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         raise ValueError("the oracle controller reads the task's own simulation; it cannot be combined with env")
     if config.dataset is not None:
         raise ValueError(f"dataset is for judging without an environment; task {task.name!r} is rolled out in one")
-    policy = load_policy(trained, config)
+    policy, execution = load_policy(trained, config), _execution(trained, config)
     sampler = trained.controller if trained.planner is None else trained.planner
     seeds = list(range(config.seed, config.seed + config.episodes))
     place = _place(task, config)
@@ -395,11 +413,10 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     result |= measure_latency(timed, task.observation_dim)
     result |= {
         "controller": config.controller,
-        "execution": "chunks" if trained.planner is None else config.execution,
+        **execution,
+        "execution": "chunks" if trained.planner is None else execution["execution"],
         "solver": sampler.solver,
         "solver_steps": sampler.num_steps,
-        "replan_interval": config.replan_interval,
-        "blend_decay": config.blend_decay,
         "candidates": policy.candidates,
         "episode": rows,
     }
@@ -409,7 +426,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         [episode.cpu() for episode in episodes],
         position=task.observation[task.position],
         mode_index=place.mode_index,
-        interval=config.replan_interval,
+        interval=execution["replan_interval"],
         objects=[task.observation[part] for part in task.plotted.values()] if config.env is None else (),
         plans_position=task.plans_position,
     )

@@ -82,6 +82,9 @@ class Defaults:
             no denoiser is asked for: ``denoiser``, its sizes, ``batch_size``, ``planner_learning_rate``.
         recovery_response (str): how that augmentation leads back, ``"first_order"`` or ``"second_order"``.
         released_epochs (int): epochs of a controller in KOAP's first public code.
+        execution (dict): how plans are followed where a command does not say: ``execution``, ``replan_interval``,
+            ``blend_decay`` of :class:`~torchrl_koap.evaluation.EvalConfig`. Policies without a planner take the
+            interval alone.
 
     Examples:
         >>> from torchrl_koap.tasks.task import Defaults
@@ -97,6 +100,7 @@ class Defaults:
     recovery_response: str = "first_order"
     planner: Mapping[str, Any] = field(default_factory=dict)
     released_epochs: int = 400
+    execution: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
