@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import time
 
 import pytest
 from PIL import Image
@@ -41,6 +42,16 @@ def test_scalars_arrive_in_the_run_directory(name, tmp_path, monkeypatch):
     assert sum(path.stat().st_size for path in files) > 50
 
 
+def wait_for(text, folder, seconds=30):
+    """Whether a file holds the text before long: wandb's process writes a little later than ``finish`` returns."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if any(path.is_file() and text in path.read_bytes() for path in folder.rglob("*")):
+            return True
+        time.sleep(0.2)
+    return False
+
+
 @pytest.mark.parametrize("name", ["wandb", "tensorboard", "mlflow"])
 def test_figures_and_films_of_an_evaluation_arrive_in_the_run_directory(name, tmp_path, monkeypatch):
     pytest.importorskip(name)
@@ -57,8 +68,8 @@ def test_figures_and_films_of_an_evaluation_arrive_in_the_run_directory(name, tm
     figures = {"success_rate": 0.625, "episodes": 8, "kind": "closed loop", "entropy": float("nan")}
     log_evaluation(logger, figures, [run / "rollouts.gif"])
     close_logger(logger)
+    assert wait_for(b"eval/success_rate", tmp_path)
     written = [path for path in tmp_path.rglob("*") if path.is_file() and path != run / "rollouts.gif"]
     assert any(film in path.read_bytes() for path in written)
     assert not any(b"eval/entropy" in path.read_bytes() for path in written)
-    assert any(b"eval/success_rate" in path.read_bytes() for path in written)
     assert all(run in path.parents for path in written), written
