@@ -10,6 +10,7 @@ from tensordict.nn import TensorDictSequential
 
 from torchrl_koap.modules import make_koopman_inverse_dynamics
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting, NoiseAdjustedComponents
+from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 from torchrl_koap.objectives import KOAPLoss
 
 
@@ -95,6 +96,32 @@ class TestCompactLifting:
         before = lifting.reconstruction_error(lifting.encode(windows), windows).mean()
         train(lifting, windows)
         assert lifting.reconstruction_error(lifting.encode(windows), windows).mean() < 0.5 * before
+
+    def test_the_error_counts_components_by_how_far_they_stand_out(self):
+        windows = embedded(turning(bodies=2).sin())
+        lifting = CompactLifting(24, 2)
+        lifting.fit_unlabelled(windows)
+        lifted, weights = lifting.encode(windows), lifting.components.weights
+        assert weights.max() > 2 * weights[weights > 0].min()
+        target = windows @ lifting.components.analysis.mT
+        errors = [
+            (made - target).square() @ weights / len(weights)
+            for made in (lifting.small.decode(lifted[..., :2]), lifting.large.decode(lifted[..., 2:]))
+        ]
+        torch.testing.assert_close(lifting.reconstruction_error(lifted, windows), sum(errors) / 2)
+
+    def test_coordinates_left_out_do_not_shrink_the_others(self):
+        windows = embedded(turning(bodies=2).sin())
+        lifting = CompactLifting(24, 2)
+        lifting.fit_unlabelled(windows)
+        sizes = []
+        for kept in ([1, 1, 0, 0, 0, 0], [0, 0, 1, 1, 1, 1]):
+            lifting.kept.copy_(torch.tensor(kept))
+            infer = LatentActionSmoothed(lifting, 0, num_past=8, look_ahead=range(2, 9))
+            infer.fit_unlabelled(windows)
+            motion = infer.infer(infer.gather(windows, range(8, 9)))[..., : infer.lifted.latent_dim]
+            sizes.append(motion.square().sum(-1).mean())
+        torch.testing.assert_close(torch.stack(sizes), torch.ones(2), rtol=0.05, atol=0)
 
     def test_its_size_is_kept_by_the_weights(self):
         windows = embedded(turning().sin())
