@@ -112,7 +112,9 @@ _STACKING = register_task(
             " never moved and for those dropped on the way.",
             camera="front",
         ),
-        defaults=Defaults(demonstrations=1000, planner_steps=18000, planner=WIDE_MLP, released_epochs=400),
+        defaults=Defaults(
+            method="koap_mpc", demonstrations=1000, planner_steps=18000, planner=WIDE_MLP, released_epochs=400
+        ),
     )
 )
 _STACKING_1 = register_task(
@@ -139,6 +141,7 @@ register_task(
         robot=tuple(range(4)),  # position of the tool, width of the gripper
         tool_kinematics=None,
         gripper=None,
+        defaults=replace(_STACKING.defaults, method="koap"),  # what the commands move is not seen
         in_paper=True,
     )
 )

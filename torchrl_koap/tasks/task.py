@@ -73,6 +73,7 @@ class Defaults:
     """Settings that are a task's own unless a command gives others.
 
     Args:
+        method (str): what `koap train` trains.
         demonstrations (int): number of scripted demonstrations to record.
         planner_steps (int): planner updates.
         channels (tuple of int): widths of the planner's U-Net.
@@ -92,6 +93,7 @@ class Defaults:
         12000
     """
 
+    method: str = "koap"
     demonstrations: int = 200
     planner_steps: int = 12000
     channels: tuple[int, ...] = (64, 128)

@@ -45,8 +45,9 @@ class TrainConfig:
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
         validation_fraction: share of the trajectories that the planner never sees, those without labels first, for
             `koap eval` to judge its plans by (default: 0.1 for a task without an environment, else none).
-        method: "koap", "linear" (ridge on raw frames), "dd" (supervised inverse dynamics), "dp" (Diffusion Policy), or
-            another name in torchrl_koap.training.methods.METHODS, those that plugins register included.
+        method: "koap", "koap_mpc" (plans followed by prediction), "linear" (ridge on raw frames), "dd" (supervised
+            inverse dynamics), "dp" (Diffusion Policy), or another name in torchrl_koap.training.methods.METHODS, those
+            that plugins register included (default: that of the task; "koap" with --released-settings).
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
         preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the method's own).
@@ -121,7 +122,7 @@ class TrainConfig:
     observation_fraction: float = 1.0
     validation_fraction: float | None = None
     seed: int = 0
-    method: str = "koap"
+    method: str | None = None
     released_settings: bool = False
     epochs: int | None = None
     preset: str | None = None
@@ -250,7 +251,7 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     _check(options, method)
     if not method.has_planner:
         if config.forecast:
-            raise ValueError(f"method {config.method!r} is a policy of its own and has no plans to forecast")
+            raise ValueError(f"method {options.method!r} is a policy of its own and has no plans to forecast")
         options = replace(options, forecast=None)
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
@@ -295,6 +296,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
         _UNET
         | dict(own)
         | {
+            "method": "koap" if options.released_settings else task.defaults.method,
             "steps": task.defaults.planner_steps,
             "recovery_sigma": task.defaults.recovery_sigma,
             "recovery_response": task.defaults.recovery_response,

@@ -130,7 +130,7 @@ def fit_controller(
     data: TensorDictBase,
     task: Task | None = None,
     *,
-    method: str = "koap",
+    method: str | None = None,
     steps: int = 500,
     seed: int = 0,
     device: str = "cpu",
@@ -157,7 +157,7 @@ def fit_controller(
 
     Keyword Args:
         method (str): a name in :data:`~torchrl_koap.training.METHODS` of a controller, such as ``"koap"``,
-            ``"linear"`` (ridge on raw frames) or ``"dd"`` (supervised).
+            ``"linear"`` (ridge on raw frames) or ``"dd"`` (supervised). Default: the task's, mostly ``"koap"``.
         steps (int): updates; with 0 only the closed form is fitted, if the method has one.
         seed (int): as for :func:`fit_planner`.
         device (str): likewise.
@@ -192,7 +192,8 @@ def fit_controller(
         task, method=method, steps=max(steps, 1), controller_steps=steps, seed=seed, device=device, **options
     )
     if not resolved.method.has_planner:
-        raise ValueError(f"method {method!r} is a policy of its own, no controller: train it with `koap train`")
+        name = resolved.method.name
+        raise ValueError(f"method {name!r} is a policy of its own, no controller: train it with `koap train`")
     if not data[keys.HAS_ACTION].any():
         raise ValueError(f"none of the {len(data)} steps has an action: there are no labels to learn from")
     data = data.to(device)
