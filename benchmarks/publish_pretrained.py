@@ -9,11 +9,10 @@ What is evaluated is the compact policy itself, in 60 episodes per seed.
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from pathlib import Path
 
-from planner_ablations import labels_of, planner_of, row_of
+from planner_ablations import row_of
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.training.pretrained import publish
@@ -57,24 +56,20 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=1)
     parser.add_argument("--root", type=Path, default=ROOT)
     options = parser.parse_args()
-    folder = publish(options.run, options.root / options.name, "")
+    folder = publish(options.run, options.root / options.name, "", candidates=options.candidates)
     metrics = (folder / "metrics.csv").read_text().splitlines(keepends=True)
     kept = [metrics[0], *metrics[1::5]]  # for the report's curves a fifth of the rows is enough
     (folder / "metrics.csv").write_text("".join(kept))
-    config = json.loads((folder / "config.json").read_text())
-    for name in ("out", "dataset", "planner_from"):  # where they were on another machine tells nobody anything
-        if config.get(name) is not None:
-            config[name] = Path(config[name]).name
-    config["candidates"] = options.candidates if options.candidates > 1 else None
-    RunDirectory(folder).write_json("config.json", config)
     with tempfile.TemporaryDirectory() as out:
         results = [
             evaluate(folder, EvalConfig(out=Path(out) / "run", episodes=60, seed=seed, threads=1))
             for seed in options.seeds
         ]
     choices = {"candidates": options.candidates}
-    row = row_of(folder, results, choices, "")
-    row |= {"denoiser": planner_of(config), "labels": labels_of(config), "name": options.name, "seeds": options.seeds}
+    row = row_of(options.run, results, choices, "") | {"name": options.name, "seeds": options.seeds}
+    source = RunDirectory(options.run).read_json("config.json").get("planner_from")
+    if source:  # the planner was trained by another command
+        row["command"] = f"{RunDirectory(source).read_json('config.json')['command']}\n    {row['command']}"
     row["contexts"] = "the 60 fixed contexts with every seed" if "contexts" in results[0] else "all from the same start"
     (folder / "README.md").write_text(CARD.format(**row))
     size = sum(file.stat().st_size for file in folder.iterdir())

@@ -115,7 +115,7 @@ figure.savefig("planners.png", dpi=90)
 # Conclusion
 # ----------
 # A single step draws the *mean* of the ways, the same for all; with ten the plans fan out. In closed loop few steps
-# cost variety before they cost success: the entropy of the modes is lower and fewer ways are taken, while nearly as
-# many rollouts succeed. The two solvers hardly differ here. What candidates do to success cannot be told from 24
+# cost variety before they cost much success: the entropy of the modes is lower and fewer ways are taken, while most
+# rollouts still succeed. The two solvers hardly differ here. What candidates do to success cannot be told from 24
 # rollouts, whose intervals are 25 points wide; the committed study with 180 rollouts each is in the results. Times
 # are those of the machine that made this page, beside other work.

@@ -66,6 +66,17 @@ def test_a_published_policy_is_small_and_plans_the_same(run, policies):
     assert not (policies / "avoiding" / "checkpoints").exists()
 
 
+def test_places_are_left_out_and_what_is_left_is_sealed(run, tmp_path):
+    folder = publish(run, tmp_path / "mine", "# mine\n", candidates=3)
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["out"], config["dataset"], config["candidates"]) == ("run", "data", 3)
+    assert load_run(folder).directory.path == folder  # which compares the checksums
+    (folder / "config.json").write_text(json.dumps(config | {"steps": 1}))
+    with pytest.raises(RunDirectoryError, match="config.json changed since the training ended"):
+        load_run(folder)
+    assert load_run(publish(run, folder, "# again\n")).directory.path == folder  # over another policy of that name
+
+
 def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
     out = tmp_path / "mine"
     rolled = ("--episodes", "2", "--threads", "1", "--no-animate")
