@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import importlib.util
 import os
@@ -145,14 +146,14 @@ def check_run(folder: Path) -> dict[str, str]:
     for name in ("config.json", "summary.json", *_LATER):
         if name in _LATER and not (folder / name).exists():
             continue
-        problem = _problem(lambda name=name: run.read_json(name))
+        problem = _problem(functools.partial(run.read_json, name))
         found[name] = "readable"
         problems += problem
     if not problems:  # its networks are made of what config.json says
         problems += _problem(lambda: load_run(folder))
     problems += _problem(run.read_metrics)
     for path in sorted([*folder.glob("*.safetensors"), *folder.glob("checkpoints/*.safetensors")]):
-        problems += _problem(lambda path=path: load_tensors(path))
+        problems += _problem(functools.partial(load_tensors, path))
         found[str(path.relative_to(folder))] = "readable"
     if problems:
         said = "; ".join(dict.fromkeys(problems))

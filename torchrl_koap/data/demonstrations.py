@@ -123,8 +123,11 @@ def make_demonstrations(
         (3, 2, (0, 1), False)
     """
     lookup(ACTION_KINDS, action_kind, "kind of action")
-    recordings = states
-    if not isinstance(states, Recordings):
+    if isinstance(states, Recordings):
+        if actions is not None:
+            raise ValueError("recordings hold their actions already; actions must be None")
+        recordings = states
+    else:
         recordings = make_recordings(
             states,
             actions,
@@ -133,8 +136,6 @@ def make_demonstrations(
             action_names=action_names,
             control_hz=control_hz,
         )
-    elif actions is not None:
-        raise ValueError("recordings hold their actions already; actions must be None")
     problems: list[str] = []
     names, acting = recordings.state_names, recordings.action_names
     rate = control_hz or recordings.control_hz

@@ -148,13 +148,15 @@ class LabelBudget:
         if self.episodes and (self.unit != "trajectory" or self.amount != len(self.episodes)):
             raise ValueError("episodes are given with LabelBudget.of_episodes(), without an amount or a unit")
         lookup(get_args(Unit), self.unit, "unit")
-        if isinstance(self.amount, bool) or not isinstance(self.amount, numbers.Real):
-            raise ValueError(f"amount must be a fraction in (0, 1] or a count >= 1, got {self.amount!r}")
-        if isinstance(self.amount, numbers.Integral):
-            if self.amount < 1:
-                raise ValueError(f"a count of labelled units must be at least 1, got {self.amount}")
-        elif not 0 < self.amount <= 1:
-            raise ValueError(f"a fraction must be in (0, 1], got {self.amount}; counts are integers")
+        amount = self.amount
+        real, counted = (isinstance(amount, kind) for kind in (numbers.Real, numbers.Integral))
+        if isinstance(amount, bool) or not real:
+            raise ValueError(f"amount must be a fraction in (0, 1] or a count >= 1, got {amount!r}")
+        if counted:
+            if amount < 1:
+                raise ValueError(f"a count of labelled units must be at least 1, got {amount}")
+        elif not 0 < amount <= 1:
+            raise ValueError(f"a fraction must be in (0, 1], got {amount}; counts are integers")
         if not 1 <= self.history < self.window:
             raise ValueError(f"wanted 1 <= history < window, got history {self.history} and window {self.window}")
 
@@ -237,24 +239,25 @@ class LabelBudget:
     def _number_of(self, total: int, usable: int) -> int:
         """Units to draw, of ``total`` of which ``usable`` have a label."""
         plural = _plural(self.unit)
-        if isinstance(self.amount, numbers.Integral):
-            if self.amount > usable:
+        amount, counted = self.amount, isinstance(self.amount, numbers.Integral)
+        if counted:
+            if amount > usable:
                 have = f"there are {total}" if usable == total else f"only {usable} of {total} have a label"
-                raise ValueError(f"{self.amount} labelled {plural} asked for, {have}")
-            return int(self.amount)
-        if self.amount == 1:
+                raise ValueError(f"{amount} labelled {plural} asked for, {have}")
+            return int(amount)
+        if amount == 1:
             return usable
         # in decimals, so that 0.145 of 100 is 14.5 and not 14.499999999999998
-        number = int((Decimal(repr(float(self.amount))) * total).to_integral_value(ROUND_HALF_UP))
+        number = int((Decimal(repr(float(amount))) * total).to_integral_value(ROUND_HALF_UP))
         if number == 0:
             least = Context(prec=4, rounding=ROUND_CEILING).divide(Decimal("0.5"), Decimal(total))
             raise ValueError(
-                f"a label fraction of {self.amount} selects none of the {total} {plural};"
+                f"a label fraction of {amount} selects none of the {total} {plural};"
                 f" the smallest fraction that selects one is {least}"
             )
         if number > usable:
             raise ValueError(
-                f"a label fraction of {self.amount} is {number} of {total} {plural}, but only {usable} have a label"
+                f"a label fraction of {amount} is {number} of {total} {plural}, but only {usable} have a label"
                 f" ({usable / total:.4g}); 1.0 keeps every label there is"
             )
         return number

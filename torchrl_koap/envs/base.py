@@ -125,7 +125,7 @@ class ManipulationEnv(RawLog, Foresight, EnvBase):
         self._seen = np.zeros((num_envs, 2), dtype=bool)  # success, failure of the present state, told a step later
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._ready = np.zeros(num_envs, dtype=bool)
-        self._renderer = None
+        self._renderer: Renderer | None = None
         self._make_specs(action_bound)
         self._set_seed(seed)
 

@@ -52,14 +52,14 @@ def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | i
     starts = _starts(task)
     if num < 1:
         raise ValueError(f"the number of contexts must be at least 1, got {num}")
-    generator = np.random.default_rng(generator)
+    drawing = np.random.default_rng(generator)
     contexts = np.empty((num, len(task.objects), 3))
     for context in contexts:
         regions = starts.regions
         if starts.dealt:
-            regions = [regions[index] for index in generator.permutation(len(regions))]
+            regions = tuple(regions[index] for index in drawing.permutation(len(regions)))
         for row, (x, y) in zip(context, regions, strict=False):
-            row[:] = generator.uniform(*x), generator.uniform(*y), math.radians(generator.uniform(*starts.yaw))
+            row[:] = drawing.uniform(*x), drawing.uniform(*y), math.radians(drawing.uniform(*starts.yaw))
     return contexts
 
 

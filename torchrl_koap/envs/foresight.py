@@ -3,7 +3,29 @@
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import numpy as np
+import torch
+
+from torchrl_koap.tasks import Task
+
+
+class _Simulated(Protocol):
+    """What looking ahead asks of the environment that it is mixed into."""
+
+    batch_size: torch.Size
+    task: Task
+
+    def get_state(self, row: int) -> dict[str, Any]: ...
+
+    def set_state(self, row: int, state: dict[str, Any]) -> None: ...
+
+    def _command(self, rows: np.ndarray, action: np.ndarray) -> None: ...
+
+    def _advance(self, rows: np.ndarray) -> None: ...
+
+    def _observe(self, rows: np.ndarray) -> np.ndarray: ...
 
 
 class Foresight:
@@ -21,7 +43,7 @@ class Foresight:
         ((2, 6, 4), True)
     """
 
-    def foresee(self, actions: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+    def foresee(self: _Simulated, actions: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """States after each of the next control steps under given actions; the present stays as it is.
 
         What comes back is not one control step old as what :meth:`step` observes: entry ``k`` is the state that the

@@ -54,7 +54,7 @@ class ManipulationGymEnv(gymnasium.Env):
         ((10,), -1, (2, 3))
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 29}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 29}
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class ManipulationGymEnv(gymnasium.Env):
         self.batched = make_env(facts, 1, max_steps=facts.max_steps if max_steps is None else max_steps)
         self._mode_index = mode_index_of(facts)
         self._picture = {"width": width, "height": height, "camera": camera}
-        self._context = None
+        self._context: np.ndarray | None = None
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (facts.observation_dim,), np.float32)
         low, high = (bound[0].numpy() for bound in (self.batched.action_spec.low, self.batched.action_spec.high))
         self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)

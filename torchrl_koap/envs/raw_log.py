@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_koap.envs.mujoco import controller
+from torchrl_koap.envs.mujoco.simulation import SimulationBatch
+from torchrl_koap.tasks import Task
 
 
 class RawLog:
@@ -19,6 +21,10 @@ class RawLog:
         >>> env.rollout(2)["action"].shape, env.raw_log()["j_pos"].shape
         (torch.Size([2, 2, 2]), (2, 7))
     """
+
+    sims: SimulationBatch
+    commands: np.ndarray
+    task: Task
 
     def raw_log(self) -> dict[str, np.ndarray]:
         """What D3IL's recorder logs for the last control step, one row per environment (docs/d3il.md, Recordings).

@@ -138,7 +138,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
 def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBase) -> dict[str, Any]:
     task = trained.task
     planner, controller = trained.planner.to(config.device), trained.controller.to(config.device)
-    settings = {
+    settings: dict[str, Any] = {
         "replan_interval": config.replan_interval,
         "blend_decay": config.blend_decay,
         "controller_columns": trained.columns,

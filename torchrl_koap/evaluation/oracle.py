@@ -84,7 +84,7 @@ class OracleControl(PlanThenControl):
             raise ValueError(f"task {task.name!r} does not say which state columns its actions move (Task.actuated)")
         units = list(task.actions.values())
         self._pushes = np.array([_PUSH.get(units[i], 0.01) for i in self._changes])
-        self._env = None
+        self._env: EnvBase | None = None
 
     def attach(self, env: EnvBase) -> None:
         """Tells the environment whose episodes are about to begin.

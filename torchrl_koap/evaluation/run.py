@@ -220,7 +220,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             trained.columns,
             tuple(trained.config.get("plugins") or ()),
         )
-        kept = {"candidates": trained.config.get("candidates") or 1}
+        kept: dict[str, Any] = {"candidates": trained.config.get("candidates") or 1}
         policy = assemble_policy(
             trained.planner, trained.controller, description, **kept | options | _execution(trained, config)
         )

@@ -58,7 +58,7 @@ def score(
     Raises:
         ValueError: if the numbers of episodes, seeds or contexts differ.
     """
-    rows = []
+    rows: list[dict[str, Any]] = []
     for seed, episode in zip(seeds, episodes, strict=True):
         mode = int(mode_index(episode[-1]["next", MODE]))
         rows.append({"seed": seed, "outcome": outcome_of(episode), "mode": mode, "steps": len(episode)})

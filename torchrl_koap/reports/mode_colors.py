@@ -63,7 +63,8 @@ def _oklch(lightness: float, chroma: float, hue: float) -> tuple[float, float, f
             -0.0041960863 * long - 0.7034186147 * medium + 1.7076147010 * short,
         )
         if min(linear) >= -1e-6 and max(linear) <= 1 + 1e-6:
-            return tuple(
+            red, green, blue = (
                 12.92 * max(v, 0) if v <= 0.0031308 else 1.055 * min(v, 1) ** (1 / 2.4) - 0.055 for v in linear
             )
+            return red, green, blue
         chroma *= 0.97

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, read_task, save_ted, subsample_trajectories
+from torchrl_koap.data.label_budget import Unit
 from torchrl_koap.studies.cells import Cell
 from torchrl_koap.studies.curve_folder import dataset_of
 from torchrl_koap.tasks import HISTORY, WINDOW, Task, get_task
@@ -43,7 +44,7 @@ def first_look(root: RunDirectory, options: CurveConfig, task: Task) -> TensorDi
     if (root.path / "demonstrations" / "ted").exists():
         return thin(load_demonstrations(str(root.path / "demonstrations"), task), options.data_share)
     if options.units != "trajectory":
-        LabelBudget(1, unit=options.units)  # knows the units
+        LabelBudget(1, unit=cast("Unit", options.units))  # knows the units
         return None
     number = options.demonstrations or task.defaults.demonstrations
     return thin(flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number), options.data_share)
@@ -123,5 +124,6 @@ def check_budgets(cells: Sequence[Cell], options: CurveConfig, data: TensorDictB
     # windows of another seed lie in another number of trajectories
     for fraction, share, seed in dict.fromkeys((cell.fraction, cell.observations, cell.seed) for cell in cells):
         amount = fraction / options.data_share
-        budget = LabelBudget(amount, unit=options.units, seed=seed, window=WINDOW, history=HISTORY)
+        unit = cast("Unit", options.units)  # another one is refused there
+        budget = LabelBudget(amount, unit=unit, seed=seed, window=WINDOW, history=HISTORY)
         subsample_trajectories(budget.apply(data)[0], share)

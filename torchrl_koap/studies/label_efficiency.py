@@ -173,7 +173,7 @@ def check_curve(config: CurveConfig) -> tuple[CurveConfig, Task, list[Cell], Run
 def _check_method(name: str, options: CurveConfig, task: Task) -> None:
     """Refuses a method whose networks cannot be built for the task, or for the planner that is to be shared."""
     method = get_method(name)
-    settings = {
+    settings: dict[str, Any] = {
         "out": options.out,
         "task": task.name,
         "method": name,
@@ -258,7 +258,7 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
             "label_fraction": cell.fraction / options.data_share,
             "evaluation": {"episodes": options.episodes, "threads": 1} | evaluation_options(options, cell.method),
         }
-        needs = ()
+        needs: tuple[str, ...] = ()
         if planner is not None and options.planner_from is None and not is_trained(planner):
             planners[planner.name] = (planner, _planner_share(cell, options), _planner_seed(cell, options))
             needs = (planner.name,)

@@ -13,7 +13,7 @@ import signal
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing import connection, forkserver
 from pathlib import Path
@@ -56,7 +56,7 @@ def launch(
     workers: int = 2,
     address: str | None = None,
     preload: Sequence[str] = (),
-) -> Iterator[tuple[Job, str | None]]:
+) -> Generator[tuple[Job, str | None], None, None]:
     """Runs jobs, each in a process of its own, and yields them as they end with the reason if they failed.
 
     A job whose need failed is not run and fails too. Closing the iterator stops what is running.
@@ -112,7 +112,7 @@ def check_launcher(launcher: str, *, workers: int = 1, address: str | None = Non
         raise ValueError("launcher 'ray' needs an extra: pip install 'torchrl_koap[ray]'")
 
 
-def _schedule(waiting: list[Job], pool: Any) -> Iterator[tuple[Job, str | None]]:
+def _schedule(waiting: list[Job], pool: Any) -> Generator[tuple[Job, str | None], None, None]:
     succeeded: set[str] = set()
     failed: dict[str, str] = {}
     running = 0

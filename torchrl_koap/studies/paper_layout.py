@@ -79,12 +79,13 @@ def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
         >>> [(entry.level, entry.paper.success) for entry in paper_entries([cell])]
         [(2, 0.9805)]
     """
-    found = {}
+    found: dict[tuple[str, int, str], Summary] = {}
     for item in summarise(rows):
         levels = _levels_of(item.task)
         if item.fraction in levels:
             found[item.task, levels.index(item.fraction) + 1, item.method] = item
-    tasks, methods = (list(dict.fromkeys(key[place] for key in found)) for place in (0, 2))
+    tasks = list(dict.fromkeys(task for task, _, _ in found))
+    methods = list(dict.fromkeys(method for _, _, method in found))
     return [
         Entry(task, method, level, share, found.get((task, level, method)), paper_cell(task, method, level))
         for task in tasks

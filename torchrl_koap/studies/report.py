@@ -169,7 +169,8 @@ def _draw(
         shares = sorted({item.observations for item in items})
         main = [item for item in items if item.observations == shares[-1]]
         name = task if sum(task == other for other, _ in groups) == 1 else f"{task}_{unit}"
-        base, common = folder / FOLDER, {"methods": methods, "label": plural(unit) if unit else ""}
+        base = folder / FOLDER
+        common: dict[str, Any] = {"methods": methods, "label": plural(unit) if unit else ""}
         points = [row for row in paper if row.get("task", task) == task]
         if any(item.success is not None for item in main):
             plot_success(main, base / f"{name}_success.png", paper=points, **common)

@@ -6,11 +6,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import LabelBudget, controller_view
+from torchrl_koap.data.label_budget import Unit
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
@@ -259,15 +260,16 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         planner = _planner_entry(options, task)
     if released is not None and not method.has_planner:
         planner |= POLICY
-    controller = {
+    preset = "released" if options.released_settings else options.preset or method.presets[0]
+    controller: dict[str, Any] = {
         "method": options.method,
         "decoder": options.decoder,
         "released": options.released_settings,
-        "preset": "released" if options.released_settings else options.preset or method.presets[0],
+        "preset": preset,
         "state": options.controller_state if method.has_planner else "all",
     }
-    if "lifting" in PRESETS[controller["preset"]]:
-        controller["lifting"] = PRESETS[controller["preset"]]["lifting"]
+    if "lifting" in PRESETS[preset]:
+        controller["lifting"] = PRESETS[preset]["lifting"]
     if method.earlier:
         controller["revised"] = True
     if method.tracks:
@@ -292,7 +294,7 @@ _UNET = {"denoiser": "unet", "batch_size": 128, "planner_learning_rate": 3e-3}
 def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
     # a network that is asked for by name, or that of the first public code, comes with its own sizes
     own = task.defaults.planner if options.denoiser is None and not options.released_settings else {}
-    defaults = (
+    defaults: dict[str, Any] = (
         _UNET
         | dict(own)
         | {
@@ -386,7 +388,8 @@ def _budget(options: TrainConfig) -> LabelBudget:
         return LabelBudget.of_episodes(options.label_episodes)
     amount = options.label_fraction if options.label_count is None else options.label_count
     amount = LABEL_FRACTION if amount is None else amount
-    return LabelBudget(amount, unit=options.label_unit, seed=options.seed, window=WINDOW, history=HISTORY)
+    unit = cast("Unit", options.label_unit)  # another one is refused there
+    return LabelBudget(amount, unit=unit, seed=options.seed, window=WINDOW, history=HISTORY)
 
 
 def _frame_of(task: Task, name: str) -> dict[str, list]:

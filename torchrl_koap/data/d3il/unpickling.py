@@ -12,6 +12,7 @@ A pickle is a program. Two gates stand before this one runs:
 
 from __future__ import annotations
 
+import functools
 import io
 import math
 import pickle
@@ -363,7 +364,7 @@ def _finish(value, name: str, *, depth: int, finished: dict, open_containers: se
     if depth > _MAX_DEPTH:
         raise UnsafePickleError(f"{name}: containers are nested more than {_MAX_DEPTH} deep")
     open_containers.add(id(value))
-    step = {"depth": depth + 1, "finished": finished, "open_containers": open_containers}
+    finish = functools.partial(_finish, name=name, depth=depth + 1, finished=finished, open_containers=open_containers)
     if isinstance(value, _Array) and value.value is not None:
         result = value.value
     elif isinstance(value, _ElementType):
@@ -372,13 +373,13 @@ def _finish(value, name: str, *, depth: int, finished: dict, open_containers: se
         for key, entry in value.items():
             if not isinstance(key, (*_PLAIN, np.generic, tuple)):
                 raise UnsafePickleError(f"{name}: a {type(key).__name__} is refused as a dictionary key")
-            value[key] = _finish(entry, name, **step)
+            value[key] = finish(entry)
         result = value
     elif type(value) is list:
-        value[:] = [_finish(entry, name, **step) for entry in value]
+        value[:] = [finish(entry) for entry in value]
         result = value
     elif type(value) is tuple:
-        result = tuple(_finish(entry, name, **step) for entry in value)
+        result = tuple(finish(entry) for entry in value)
     elif type(value) is bytearray:
         result = bytes(value)
     else:

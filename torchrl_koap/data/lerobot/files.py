@@ -192,7 +192,8 @@ def _read_rows(root: Path, chosen: Sequence[str] | None, optional_width: int | N
 
     ``optional_width`` is the width of actions that may be missing, None if none may.
     """
-    pyarrow, problems, tables = _pyarrow(), [], []
+    pyarrow, problems = _pyarrow(), []
+    tables: list[tuple[Path, list[str], dict[str, np.ndarray]]] = []
     needed = [OBSERVATIONS[0]] if chosen is None else list(chosen)
     for file in _parquet_files(root):
         try:
@@ -214,8 +215,9 @@ def _read_rows(root: Path, chosen: Sequence[str] | None, optional_width: int | N
         if not labels:
             found[ACTION] = np.full((len(table), optional_width), np.nan)
         problems += [f"{file}: column {name!r} {fault}" for name, fault in found.items() if isinstance(fault, str)]
-        if not any(isinstance(column, str) for column in found.values()):
-            tables.append((file, features, found))
+        columns = {name: column for name, column in found.items() if not isinstance(column, str)}
+        if len(columns) == len(found):
+            tables.append((file, features, columns))
     widths = [{name: columns[name].shape[1] for name in (*features, ACTION)} for _, features, columns in tables]
     for (file, _, _), width in zip(tables, widths, strict=True):
         if width != widths[0]:

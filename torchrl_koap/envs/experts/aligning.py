@@ -148,7 +148,8 @@ class _Player:
         self.mode = mode
         self.doing = self._travel
         self.time = self.since_success = self.waited = 0
-        self.contact, self.plan = None, np.empty(PLAN_SIZE)
+        self.contact: np.ndarray | None = None
+        self.plan = np.empty(PLAN_SIZE)
         self.choices = 0
         self.action, self.last_tcp, self.last_pose = np.zeros(3), np.zeros(3), np.zeros(3)
         self._restart_push()

@@ -21,8 +21,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torchrl_koap.data import RawEpisode
 from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import Episode, RecordingRules
+from torchrl_koap.envs.experts.recording import RecordingRules
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS, ROW_Y
 
 FULL_PUSH = 0.0124  # m per control step at full deflection
@@ -69,7 +70,7 @@ def mode_gaps(mode: int) -> tuple[int, int, int]:
     return mode // 12, mode % 12 // 4, mode % 4
 
 
-def clearance(episode: Episode) -> float:
+def clearance(episode: RawEpisode) -> float:
     """Least distance of a recording between the rod, taken as upright, and any cylinder (m)."""
     path = episode.robot["c_pos"][:, :2]
     gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
@@ -107,6 +108,30 @@ class AvoidingExpert:
         least_clearance=0.003,
     )
 
+    # habits and slips, set from _draw
+    _attention: np.ndarray
+    _caution: np.ndarray
+    _cruise: np.ndarray
+    _creep: np.ndarray
+    _ease: np.ndarray
+    _gap_x: np.ndarray
+    _gate: np.ndarray
+    _grip: np.ndarray
+    _haste: np.ndarray
+    _head_start: np.ndarray
+    _last_forward: np.ndarray
+    _last_side: np.ndarray
+    _linger: np.ndarray
+    _margin: np.ndarray
+    _misjudgement: np.ndarray
+    _open: np.ndarray
+    _patience: np.ndarray
+    _pause: np.ndarray
+    _release: np.ndarray
+    _side_pause: np.ndarray
+    _tolerance: np.ndarray
+    _tremor: np.ndarray
+
     def __init__(self, modes: Sequence[int], seeds: Sequence, contexts: None = None):
         modes, seeds = list(modes), list(seeds)
         if not modes or len(modes) != len(seeds):
@@ -122,8 +147,8 @@ class AvoidingExpert:
         self._side = np.zeros(count)  # sideways push that is held, m per step
         self._crossed = np.full(count, -1)  # time at which the finish line was seen crossed
         self._decisions = np.zeros((count, len(_HAND), 2))  # latest first
-        self._commanded = None
-        self._measured = None
+        self._commanded: np.ndarray | None = None
+        self._measured: np.ndarray | None = None
 
     @property
     def finished(self) -> np.ndarray:

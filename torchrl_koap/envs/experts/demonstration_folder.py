@@ -13,19 +13,22 @@ Memory holds one batch of episodes, and at the end the data set itself in single
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
 
-from torchrl_koap.data import flatten_trajectories, read_raw_episode, save_ted, write_raw_episode
+from torchrl_koap.data import RawEpisode, flatten_trajectories, read_raw_episode, save_ted, write_raw_episode
 from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, iterate_takes
+from torchrl_koap.envs.experts.recording import PlainEpisode
 from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.files import one_at_a_time, replacing_file
 from torchrl_koap.tasks import Task, get_task
@@ -76,15 +79,17 @@ def record_to_folder(
     """
     start, task = time.perf_counter(), get_task(task.source)
     request = {"task": task.name, "episodes": episodes, "seed": seed, "disturbance": disturbance}
-    options = {"batch_size": batch_size, "disturbance": disturbance}
-    iterate_takes(task, episodes, seed, num_threads, **options)  # looks at the arguments before anything is written
+    iterating = functools.partial(
+        iterate_takes, task, episodes, seed, num_threads, batch_size=batch_size, disturbance=disturbance
+    )
+    iterating()  # looks at the arguments before anything is written
     files = _Files(Path(folder), task, episodes)
     files.refuse_others(request)
     with one_at_a_time(files.unfinished / ".lock", busy=f"another process records into {folder}"):
         done = files.begin(request)
         if progress is not None:
             progress(len(done), episodes)
-        for take in iterate_takes(task, episodes, seed, num_threads, progress, done=done, **options):
+        for take in iterating(progress, done=done):
             files.add(take)
         account = files.account()
         seconds = time.perf_counter() - start
@@ -130,10 +135,11 @@ class _Files:
     def add(self, take: Take) -> None:
         path = self._file(self.unfinished / "raw", take.index)
         if self._raw:
-            write_raw_episode(path, take.episode)
+            write_raw_episode(path, cast("RawEpisode", take.episode))
         else:
+            plain = cast("PlainEpisode", take.episode)
             with replacing_file(path) as aside, open(aside, "wb") as file:
-                np.savez(file, observation=take.episode.observation, action=take.episode.action)
+                np.savez(file, observation=plain.observation, action=plain.action)
         line = {name: value for name, value in vars(take).items() if name != "episode"}
         with open(self.unfinished / _ACCOUNT, "a") as file:
             file.write(json.dumps(line) + "\n")

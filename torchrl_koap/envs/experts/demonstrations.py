@@ -83,8 +83,9 @@ def record_demonstrations(
         >>> data["action"].shape[1], data["has_action"].all().item(), len(report.modes)
         (2, True, 3)
     """
-    options = {"batch_size": batch_size, "disturbance": disturbance}
-    raw, report = record_episodes(task, episodes, seed, num_threads, progress, **options)
+    raw, report = record_episodes(
+        task, episodes, seed, num_threads, progress, batch_size=batch_size, disturbance=disturbance
+    )
     return episodes_to_ted(raw, task, dtype=dtype), report
 
 
@@ -120,8 +121,9 @@ def record_episodes(
         RecordingError: if an episode fails again and again.
     """
     start, facts = time.perf_counter(), get_task(get_task(task).source)
-    options = {"batch_size": batch_size, "disturbance": disturbance}
-    takes = list(iterate_takes(facts, episodes, seed, num_threads, progress, **options))
+    takes = list(
+        iterate_takes(facts, episodes, seed, num_threads, progress, batch_size=batch_size, disturbance=disturbance)
+    )
     report = RecordingReport.of(facts, seed, takes, time.perf_counter() - start, disturbance)
     return [take.episode for take in takes], report
 
@@ -271,9 +273,9 @@ def _play_batches(
     size, shown = min(batch_size, len(left)), 0
     env = make_env(task, size, num_threads=num_threads, max_steps=task.max_steps, dtype=torch.float64)
 
-    def show(over: int) -> None:  # attempts that turn out bad are played again: the bar waits for them
+    def show(found: int, over: int) -> None:  # attempts that turn out bad are played again: the bar waits for them
         nonlocal shown
-        shown = max(shown, over)
+        shown = max(shown, found + over)
         if progress is not None:
             progress(shown, episodes)
 
@@ -302,7 +304,7 @@ def _play_batches(
                     [modes[row] for row in rows],
                     None if contexts is None else contexts[np.resize(rows, size)],  # the rest of the batch idles
                     seeds,
-                    lambda over, found=found: show(found + over),
+                    functools.partial(show, found),
                     disturbances=hand,
                 )
                 for place, (row, (episode, fault)) in enumerate(zip(rows, results, strict=True)):

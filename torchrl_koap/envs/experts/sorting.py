@@ -247,6 +247,12 @@ class SortingExpert:
 
     rules = RecordingRules(most_rows=699)
 
+    # set from _draw
+    _taste: np.ndarray
+    _aim: np.ndarray
+    _pause: np.ndarray
+    _tempo: np.ndarray
+
     def __init__(self, modes: Sequence[int], contexts, seeds: Sequence, *, num_boxes: int = 4):
         modes, seeds, contexts = list(modes), list(seeds), np.asarray(contexts)
         if not modes or len(modes) != len(seeds) or contexts.shape != (len(modes), num_boxes, 3):

@@ -133,14 +133,16 @@ class _Person:
     """One episode: commanded TCP position (m) and yaw (rad), stage, and habits drawn from the generator."""
 
     def __init__(self, order: tuple[int, ...], generator: np.random.Generator):
-        self.order, self.position, self.yaw = order, None, 0.0
+        self.order, self.yaw = order, 0.0
+        self.position: np.ndarray | None = None
+        self._grasp: tuple[float, float] | None = None
         self.finished = False
         self._pace = generator.uniform(0.85, 1.05)
         self._centre = np.array(TARGET) + generator.uniform(-0.004, 0.004, 2)
         self._wobble = np.stack([ar1_noise(generator, 12, 0.0012, _HORIZON) for _ in range(3)], axis=1)
         self._hesitation = generator.integers(0, 4, 16)
         self._velocity, self._spin = np.zeros(3), 0.0
-        self._time, self._placed, self._grasp, self._grip_width = 0, 0, None, 0.0
+        self._time, self._placed, self._grip_width = 0, 0, 0.0
         self._speed, self._seen = 0.0, np.zeros(3)
         self._enter(_REACH)
 

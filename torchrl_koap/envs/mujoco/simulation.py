@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -62,11 +62,11 @@ class SimulationBatch:
         self._tcp_views = [data.xpos[self._tcp] for data in self.data]
         self._arm_views = [data.qpos[self._qpos_start :] for data in self.data]
         self._object_views = [data.qpos[: self._qpos_start] for data in self.data]
-        self._executor = None
-        self._executor_pid = None
+        self._executor: ThreadPoolExecutor | None = None
+        self._executor_pid: int | None = None
 
     def _arrays(self, data: mujoco.MjData) -> list[int]:
-        arrays = [None] * controller.NUM_POINTERS
+        arrays: list[np.ndarray | None] = [None] * controller.NUM_POINTERS
         arrays[controller.QPOS] = data.qpos[self._qpos_start :]
         arrays[controller.QVEL] = data.qvel[self._qvel_start :]
         arrays[controller.CTRL] = data.ctrl
@@ -167,7 +167,7 @@ class SimulationBatch:
             if abs(self.data[row].time - time) > 0.5 * controller.TIMESTEP:  # MuJoCo resets a state that blows up
                 raise RuntimeError(f"the simulation of environment {row} became unstable")
 
-    def _dispatch(self, kernel, rows: np.ndarray, arguments: tuple) -> None:
+    def _dispatch(self, kernel: Callable[..., None], rows: np.ndarray, arguments: tuple) -> None:
         fixed = (self._step, self.model._address, self._data_addresses, self._pointers)
         if self.num_threads == 1 or len(rows) == 1:
             kernel(*fixed, rows, *arguments)

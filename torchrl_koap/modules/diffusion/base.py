@@ -8,13 +8,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.nn.probabilistic import InteractionType, interaction_type
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.solvers import SOLVERS
 from torchrl_koap.modules.normalizer import Normalizer
-
-Tensor = torch.Tensor
 
 
 class ConditionedDiffusion(TensorDictModuleBase):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_koap import keys
 from torchrl_koap.modules.diffusion.base import ConditionedDiffusion, identity_normalizer
@@ -15,8 +15,6 @@ from torchrl_koap.modules.diffusion.forecast import LinearForecast
 from torchrl_koap.modules.diffusion.planar_frame import PlanarFrame
 from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.normalizer import Normalizer
-
-Tensor = torch.Tensor
 
 
 class StatePlanner(ConditionedDiffusion):

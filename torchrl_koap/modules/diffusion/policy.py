@@ -3,16 +3,14 @@
 
 from __future__ import annotations
 
-import torch
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_koap import keys
 from torchrl_koap.modules.diffusion.base import ConditionedDiffusion, identity_normalizer
 from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.normalizer import Normalizer
 
-Tensor = torch.Tensor
 ACTION_CHUNK = "action_chunk"
 
 

@@ -17,12 +17,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.diffusion.solvers import SOLVERS, Node
+from torchrl_koap.modules.diffusion.solvers import SOLVERS, Draws, Node
 
-Tensor = torch.Tensor
 Network = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -254,7 +253,7 @@ class NoiseSchedule(nn.Module):
         """
         self.check_solver(solver)
         nodes = self.nodes(num_steps, times)
-        draws: Sequence[Tensor] = ()
+        draws: Draws = ()
         if SOLVERS[solver].stochastic:
             draws = step_noise if step_noise is not None else _Draws(noise, generator)
         batch = noise.shape[:-2]

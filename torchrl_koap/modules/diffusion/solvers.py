@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-import torch
-
-Tensor = torch.Tensor
+from torch import Tensor
 
 
 class Node(NamedTuple):
@@ -23,10 +21,26 @@ class Node(NamedTuple):
     noise: float
 
 
+class Draws(Protocol):
+    """Noise of a stochastic solver by step: a sequence of tensors, or something that draws when it is asked.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.diffusion.solvers import Draws
+        >>> draws: Draws = [torch.zeros(1, 12, 2), torch.ones(1, 12, 2)]  # two steps of a plan of 12 states
+        >>> draws[1].shape
+        torch.Size([1, 12, 2])
+    """
+
+    def __getitem__(self, index: int, /) -> Tensor:
+        """Standard normal noise ``[*B, H, d]`` of step ``index``."""
+        ...
+
+
 Denoise = Callable[[Tensor, Node], tuple[Tensor, Tensor]]
 
 
-def ddpm(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
+def ddpm(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Draws) -> Tensor:
     """Ancestral sampling with the posterior's variance (Ho et al. 2020, eq. 7); step i adds ``draws[i]``.
 
     Args:
@@ -34,7 +48,7 @@ def ddpm(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
             both ``[*B, H, d]``.
         x (Tensor): start noise ``[*B, H, d]``.
         nodes (sequence of Node): stops from much noise to none, one more than steps.
-        draws (sequence of Tensor): standard normal noise ``[*B, H, d]``, one per step.
+        draws (Draws): standard normal noise ``[*B, H, d]``, one per step.
 
     Returns:
         Tensor: clean sequences ``[*B, H, d]``.
@@ -49,7 +63,7 @@ def ddpm(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
     return x
 
 
-def ddim(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
+def ddim(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Draws) -> Tensor:
     """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0).
 
     Args:
@@ -57,7 +71,7 @@ def ddim(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
             both ``[*B, H, d]``.
         x (Tensor): start noise ``[*B, H, d]``.
         nodes (sequence of Node): stops from much noise to none, one more than steps.
-        draws (sequence of Tensor): not looked at: the solver is deterministic.
+        draws (Draws): not looked at: the solver is deterministic.
 
     Returns:
         Tensor: clean sequences ``[*B, H, d]``.
@@ -68,7 +82,7 @@ def ddim(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
     return x
 
 
-def dpm_solver_2m(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
+def dpm_solver_2m(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Draws) -> Tensor:
     """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2).
 
     Args:
@@ -76,7 +90,7 @@ def dpm_solver_2m(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Seq
             both ``[*B, H, d]``.
         x (Tensor): start noise ``[*B, H, d]``.
         nodes (sequence of Node): stops from much noise to none, one more than steps.
-        draws (sequence of Tensor): not looked at: the solver is deterministic.
+        draws (Draws): not looked at: the solver is deterministic.
 
     Returns:
         Tensor: clean sequences ``[*B, H, d]``.
@@ -95,7 +109,7 @@ def dpm_solver_2m(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Seq
     return x
 
 
-def euler(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
+def euler(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Draws) -> Tensor:
     """Straight steps along the velocity ``eps - x_0``.
 
     Args:
@@ -103,7 +117,7 @@ def euler(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Te
             both ``[*B, H, d]``.
         x (Tensor): start noise ``[*B, H, d]``.
         nodes (sequence of Node): stops from much noise to none, one more than steps.
-        draws (sequence of Tensor): not looked at: the solver is deterministic.
+        draws (Draws): not looked at: the solver is deterministic.
 
     Returns:
         Tensor: clean sequences ``[*B, H, d]``.
@@ -114,7 +128,7 @@ def euler(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Te
     return x
 
 
-def heun(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Tensor]) -> Tensor:
+def heun(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Draws) -> Tensor:
     """Trapezoidal steps: two network calls each, one in the last step (no velocity is defined at zero noise).
 
     Args:
@@ -122,7 +136,7 @@ def heun(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
             both ``[*B, H, d]``.
         x (Tensor): start noise ``[*B, H, d]``.
         nodes (sequence of Node): stops from much noise to none, one more than steps.
-        draws (sequence of Tensor): not looked at: the solver is deterministic.
+        draws (Draws): not looked at: the solver is deterministic.
 
     Returns:
         Tensor: clean sequences ``[*B, H, d]``.
@@ -140,7 +154,7 @@ def heun(denoise: Denoise, x: Tensor, nodes: Sequence[Node], draws: Sequence[Ten
 class Solver(NamedTuple):
     """A solver function, the kind of path it walks, and whether it draws noise on the way."""
 
-    run: Callable[[Denoise, Tensor, Sequence[Node], Sequence[Tensor]], Tensor]
+    run: Callable[[Denoise, Tensor, Sequence[Node], Draws], Tensor]
     path: str
     stochastic: bool = False
 

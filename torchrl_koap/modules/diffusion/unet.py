@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_koap.modules.diffusion.denoisers import (
     ACTIVATIONS,
@@ -16,8 +16,6 @@ from torchrl_koap.modules.diffusion.denoisers import (
     check_activation,
     check_input,
 )
-
-Tensor = torch.Tensor
 
 
 class TemporalUnet(nn.Module):

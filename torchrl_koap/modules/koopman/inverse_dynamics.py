@@ -113,8 +113,9 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
             self.module[-1].out_keys = [action]
         self.in_keys, self.out_keys = self._compute_in_and_out_keys(self.module)
 
+    # a property: assigned like that of other controllers, the network would be saved under two names
     @property
-    def reader(self) -> LatentActionModule:
+    def reader(self) -> LatentActionModule:  # type: ignore[override]
         """The network ``f``, which gathers what it reads."""
         return self.latent_action
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.modules import LSTM, MLP
@@ -68,7 +68,8 @@ class LatentActionModule(FrameGatherer, TensorDictModuleBase):
         """Latent actions ``[*B, T, m]`` from frames ``[*B, T, F, d]``."""
         raise NotImplementedError
 
-    def forward(self, tensordict):
+    # reads and writes entries, where a gatherer alone takes states
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # type: ignore[override]
         """Writes the latent action of every frame of the window."""
         return tensordict.set(self.out_keys[0], self.infer(self.gather(tensordict.get(self.in_keys[0]))))
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from torch import nn
 
 from torchrl_koap.keys import STATE
@@ -14,7 +16,7 @@ from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, Late
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
-PRESETS = {
+PRESETS: dict[str, dict[str, Any]] = {
     # best measured (benchmarks/RESULTS.md): observables of the frames relative to the current one, an input matrix
     # B, no clamped look-ahead, a decoder in closed form
     "default": {
@@ -86,7 +88,7 @@ LIFTINGS = ("single", "compact")
 NARROW = 8
 
 # what only one kind of latent-action network takes, and its value where a preset does not name it
-NETWORK_OPTIONS = {
+NETWORK_OPTIONS: dict[str, dict[str, Any]] = {
     "fourier": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0, "place": 0.0},
     "lstm": {"relative": False},
     "smoothed": {
@@ -154,7 +156,7 @@ def make_koopman_inverse_dynamics(
         latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=(hidden, hidden), **frames)
     in_key = NORMALIZED_STATE if state_normalizer is not None else STATE
     if lookup(LIFTINGS, choice.get("lifting", "single"), "lifting") == "compact" and not include_state:
-        widths = {"hidden_dims": (hidden, hidden)} if "hidden_dim" in overrides else {}
+        widths: dict[str, Any] = {"hidden_dims": (hidden, hidden)} if "hidden_dim" in overrides else {}
         lifting = CompactLifting(state_dim, latent_dim, in_key=in_key, **widths)
     else:
         lifting = KoopmanLifting(
