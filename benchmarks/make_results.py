@@ -48,7 +48,14 @@ from result_rows import (
 )
 from scooping_rows import scooping_parts_table, scooping_probe_table, scooping_table
 from unlabelled_picture import REGIMES, draw_errors
-from unlabelled_rows import unlabelled_cells, unlabelled_gains, unlabelled_labels, unlabelled_missing, unlabelled_rows
+from unlabelled_rows import (
+    followed_rows,
+    unlabelled_cells,
+    unlabelled_gains,
+    unlabelled_labels,
+    unlabelled_missing,
+    unlabelled_rows,
+)
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layout_rows, paper_entries
@@ -102,7 +109,7 @@ def bench_size(name: str) -> str:
 
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
 _PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size)
-_UNLABELLED = (unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
+_UNLABELLED = (followed_rows, unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
 _FAULTS = (ledger_rows, kill_rows, soak_rows, raw_rows, resume_rows, version_rows)
 _HELPERS = (
     first,

@@ -95,35 +95,48 @@ def choice_of(controller: InverseDynamics, fit: dict) -> str:
     return fit.get("block", "") if gate is None else str(int(gate.sum()))
 
 
+def controllers(full: TensorDictBase, task: Task, numbers: torch.Tensor, seed: int, wanted: list[tuple[str, int]]):
+    """Trained controllers by method and number of labelled trajectories, the first of ``numbers``.
+
+    Yields:
+        tuple: method, labelled trajectories, controller, what fitting it reported, updates.
+    """
+    last, trained = None, None
+    for method, labels in wanted:
+        kind, preset, updates, reads_labels, settings = METHODS[method]
+        if preset == "semi_supervised" and full["state"].shape[-1] <= 8:
+            updates = 0  # the state is its own lifting: nothing that is trained would be read
+        part = with_labels(full, numbers[:labels])
+        if last != method or reads_labels:
+            given = {"preset": preset} if preset else {}
+            trained = fit_controller(
+                part, task, method=kind, steps=updates, seed=seed, progress=False, **given, **settings
+            )
+            controller, fit, last = trained, trained.recipe.results, method
+        else:
+            controller, fit = refit(trained, part, task)
+        yield method, labels, controller, fit, updates
+
+
+def shuffled_trajectories(data: TensorDictBase, seed: int) -> torch.Tensor:
+    """Numbers of the trajectories in the order of a seed: the first ones get labels, the last ones are judged."""
+    numbers = data["episode"].unique()
+    return numbers[torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))]
+
+
 def run_regime(data, unit, name, regime, options, write, done, bar) -> None:
     """All cells of one regime."""
     for seed in options.seeds:
-        seen = apply_regime(data, regime, seed=seed)
-        full, task = as_own_data(seen)
-        numbers = full["episode"].unique()
-        numbers = numbers[torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))]
-        for method in options.methods:
-            kind, preset, updates, reads_labels, settings = METHODS[method]
-            if preset == "semi_supervised" and full["state"].shape[-1] <= 8:
-                updates = 0  # the state is its own lifting: nothing that is trained would be read
-            trained = None
-            for labels in options.labels:
-                key = (str(name), regime.name, str(labels), str(seed), method)
-                bar.update()
-                if key in done:
-                    continue
-                part = with_labels(full, numbers[:labels])
-                if trained is None or reads_labels:
-                    given = {"preset": preset} if preset else {}
-                    trained = fit_controller(
-                        part, task, method=kind, steps=updates, seed=seed, progress=False, **given, **settings
-                    )
-                    controller, fit = trained, trained.recipe.results
-                else:
-                    controller, fit = refit(trained, part, task)
-                predicted, true, _ = first_actions(controller, full, numbers[-JUDGED:])
-                row = (*key, f"{rmse(predicted, true, unit):.4f}", {"m": "mm", "rad": "mrad"}[unit])
-                write((*row, choice_of(controller, fit), updates))
+        full, task = as_own_data(apply_regime(data, regime, seed=seed))
+        numbers = shuffled_trajectories(full, seed)
+        cells = [(method, labels) for method in options.methods for labels in options.labels]
+        wanted = [cell for cell in cells if (str(name), regime.name, str(cell[1]), str(seed), cell[0]) not in done]
+        bar.update(len(cells) - len(wanted))
+        for method, labels, controller, fit, updates in controllers(full, task, numbers, seed, wanted):
+            predicted, true, _ = first_actions(controller, full, numbers[-JUDGED:])
+            row = (str(name), regime.name, str(labels), str(seed), method, f"{rmse(predicted, true, unit):.4f}")
+            write((*row, {"m": "mm", "rad": "mrad"}[unit], choice_of(controller, fit), updates))
+            bar.update()
 
 
 def main() -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 
-from result_rows import read_rows
+from result_rows import percent, read_rows
 from scipy.stats import t as student
 from unlabelled_picture import CONTROLS, REGIMES
 
@@ -61,10 +61,48 @@ def unlabelled_gains(regimes: Sequence[str], against: Sequence[str]) -> list[lis
     return body
 
 
-def paired_gain(gains: Sequence[float]) -> str:
-    """Mean of some gains in percent with its 95 % t-interval; no interval below three."""
+def followed_rows(against: Sequence[str]) -> list[list[str]]:
+    """Successes of controllers that follow demonstrations not seen before, and how much ``semi_supervised`` is ahead.
+
+    Args:
+        against (sequence of str): methods that it is compared with.
+    """
+    found: dict[tuple[str, int], dict[str, dict[int, dict]]] = {}
+    for row in read_rows("unlabelled_rollouts"):
+        cell = found.setdefault((row["regime"], int(row["labels"])), {})
+        cell.setdefault(row["method"], {})[int(row["seed"])] = row
+    body = []
+    for (regime, labels), methods in sorted(
+        found.items(), key=lambda item: (list(REGIMES).index(item[0][0]), item[0][1])
+    ):
+        own = methods["semi_supervised"]
+        row = [REGIMES[regime], str(labels), _together(own)]
+        for method in against:
+            other = methods.get(method, {})
+            ahead = [100 * (_successes(own[seed]) - _successes(other[seed])) for seed in own.keys() & other.keys()]
+            row += [_together(other) if other else "not run", paired_gain(ahead, unit="points")]
+        body.append(row)
+    return body
+
+
+def _together(seeds: dict[int, dict]) -> str:
+    counts = {key: str(sum(int(row[key]) for row in seeds.values())) for key in ("successes", "n")}
+    return f"{percent(counts, 0)}, {counts['n']}"
+
+
+def _successes(row: dict) -> float:
+    return int(row["successes"]) / int(row["n"])
+
+
+def paired_gain(gains: Sequence[float], unit: str = "%") -> str:
+    """Mean of some gains in percent with its 95 % t-interval; no interval below three.
+
+    Args:
+        gains (sequence of float): one per seed.
+        unit (str): what they are called, such as percentage ``"points"``.
+    """
     if len(gains) < 3:
-        return f"{statistics.fmean(gains):+.0f} % ({len(gains)} seeds)" if gains else "not run"
+        return f"{statistics.fmean(gains):+.0f} {unit} ({len(gains)} seeds)" if gains else "not run"
     half = student.ppf(0.975, len(gains) - 1) * statistics.stdev(gains) / len(gains) ** 0.5
     mean = statistics.fmean(gains)
-    return f"{mean:+.0f} % ({mean - half:+.0f} to {mean + half:+.0f})"
+    return f"{mean:+.0f} {unit} ({mean - half:+.0f} to {mean + half:+.0f})"

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.data.regimes import REGIMES, Regime, apply_regime
+from torchrl_koap.data.regimes import REGIMES, Regime, RegimeSensor, apply_regime
 
 
 def make_data(length=600, columns=2):
@@ -48,3 +48,33 @@ def test_hidden_columns_are_gone():
         apply_regime(data, Regime("dark", "", hidden=(4,)))
     with pytest.raises(ValueError, match="unknown regime 'wide_65'; did you mean 'wide_64'"):
         apply_regime(data, "wide_65")
+
+
+class TestRegimeSensor:
+    def test_shows_other_states_as_it_showed_the_recorded_ones(self):
+        data = make_data()
+        sensor = RegimeSensor(data, "wide_64")
+        torch.testing.assert_close(sensor.show(data["state"][40:50]), sensor.recorded[40:50])
+        middle = (data["state"][3] + data["state"][4]) / 2
+        assert (sensor.show(middle[None]) - sensor.recorded[3]).abs().max() > 0
+
+    def test_noise_is_new_at_every_call_and_as_strong_as_in_the_data(self):
+        data = make_data(6000)
+        sensor = RegimeSensor(data, "noise", seed=2)
+        recorded, later = (sensor.noisy(sensor.recorded) - sensor.recorded for _ in range(2))
+        torch.testing.assert_close(recorded, apply_regime(data, "noise", seed=2)["state"] - data["state"])
+        assert not torch.equal(recorded, later)
+        torch.testing.assert_close(later.std(0), 3 * sensor.step, rtol=0.05, atol=0)
+
+    def test_distractors_are_shown_beside_the_state(self):
+        data = make_data()
+        sensor = RegimeSensor(data, "distractors")
+        shown = sensor.show(data["state"][:5], sensor.distractors[:5])
+        torch.testing.assert_close(shown, sensor.recorded[:5])
+        assert not torch.allclose(sensor.show(data["state"][:5], sensor.distractors[5:10]), shown)
+        with pytest.raises(ValueError, match="'distractors' shows 2 distractors beside the state"):
+            sensor.show(data["state"][:5])
+
+    def test_components_of_pictures_know_the_recorded_states_alone(self):
+        with pytest.raises(ValueError, match="'pictures' is fitted to the recorded states"):
+            RegimeSensor(make_data(), "pictures").show(torch.zeros(3, 2))

@@ -33,6 +33,7 @@ class Regime:
         distractors (int): coordinates beside the state that move by themselves (a slow random oscillation each) and
             are embedded with it.
         hidden (tuple of int): columns of the state that no sensor shows.
+        fitted (bool): ``embed`` is fitted to the states that it is given, and does not know what others look like.
 
     Examples:
         >>> from torchrl_koap.data.regimes import REGIMES
@@ -46,6 +47,7 @@ class Regime:
     noise: float = 0.0
     distractors: int = 0
     hidden: tuple[int, ...] = ()
+    fitted: bool = False
 
 
 def apply_regime(data: TensorDictBase, regime: str | Regime, *, seed: int = 0) -> TensorDictBase:
@@ -72,22 +74,90 @@ def apply_regime(data: TensorDictBase, regime: str | Regime, *, seed: int = 0) -
         >>> apply_regime(data, "wide_64")["state"].shape
         torch.Size([50, 64])
     """
-    regime = lookup(REGIMES, regime, "regime") if isinstance(regime, str) else regime
-    state, episode = data["state"], data["episode"]
-    if regime.hidden and max(regime.hidden) >= state.shape[-1]:
-        raise ValueError(f"regime {regime.name!r} hides column {max(regime.hidden)}, the state has {state.shape[-1]}")
-    seen = state[:, [column for column in range(state.shape[-1]) if column not in regime.hidden]]
-    generator = torch.Generator().manual_seed(1000 + seed)
-    if regime.embed is not None:
-        seen = (seen - seen.mean(0)) / seen.std(0).clamp_min(1e-9)
-        if regime.distractors:
-            seen = torch.cat([seen, _oscillations(episode, regime.distractors, generator).to(seen)], -1)
-        seen = regime.embed(seen)
-    if regime.noise:
+    sensor = RegimeSensor(data, regime, seed=seed)
+    return data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
+
+
+class RegimeSensor:
+    """What a regime shows of a state: fitted to recorded data, it can be asked for the states of a rollout too.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` with ``state`` and ``episode``; they set the scales.
+        regime (str or Regime): a name in :data:`REGIMES`, or a regime.
+
+    Keyword Args:
+        seed (int): of noise and distractors.
+
+    Attributes:
+        recorded (Tensor): the data as they are shown without noise ``[N, c]``.
+        distractors (Tensor, optional): coordinates that move by themselves, as they did beside the data ``[N, k]``.
+        step (Tensor): typical step of every column ``[c]``, the unit of the noise.
+
+    Raises:
+        ValueError: for an unknown regime, or a state that has no such columns to hide.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data.regimes import RegimeSensor
+        >>> data = TensorDict({"state": torch.randn(50, 2).cumsum(0), "episode": torch.arange(50) // 25}, [50])
+        >>> sensor = RegimeSensor(data, "wide_64")
+        >>> sensor.noisy(sensor.show(torch.zeros(3, 2))).shape
+        torch.Size([3, 64])
+    """
+
+    def __init__(self, data: TensorDictBase, regime: str | Regime, *, seed: int = 0):
+        self.regime = lookup(REGIMES, regime, "regime") if isinstance(regime, str) else regime
+        state, episode, hidden = data["state"], data["episode"], self.regime.hidden
+        if hidden and max(hidden) >= state.shape[-1]:
+            raise ValueError(f"regime {self.regime.name!r} hides column {max(hidden)}, the state has {state.shape[-1]}")
+        self._generator = torch.Generator().manual_seed(1000 + seed)
+        self._columns = [column for column in range(state.shape[-1]) if column not in hidden]
+        self._mean = state[:, self._columns].mean(0)
+        self._spread = state[:, self._columns].std(0).clamp_min(1e-9)
+        self.distractors = None
+        if self.regime.distractors:
+            self.distractors = _oscillations(episode, self.regime.distractors, self._generator).to(state)
+        self.recorded = self._embedded(state, self.distractors)
         within = (episode[1:] == episode[:-1])[:, None]
-        step = (torch.where(within, seen.diff(dim=0), 0.0).square().sum(0) / within.sum()).sqrt()
-        seen = seen + regime.noise * step * torch.randn(seen.shape, generator=generator).to(seen)
-    return data.copy().set("state", seen.to(state.dtype))
+        moved = torch.where(within, self.recorded.diff(dim=0), 0.0)
+        self.step = (moved.square().sum(0) / within.sum()).sqrt()
+
+    def show(self, state: Tensor, distractors: Tensor | None = None) -> Tensor:
+        """What the sensor shows without noise ``[N, c]``.
+
+        Args:
+            state (Tensor): states ``[N, d]``.
+            distractors (Tensor, optional): coordinates beside them ``[N, k]``.
+
+        Raises:
+            ValueError: if the regime has distractors and none are given, or knows the recorded states alone.
+        """
+        if self.regime.fitted:
+            raise ValueError(f"regime {self.regime.name!r} is fitted to the recorded states and cannot show others")
+        return self._embedded(state, distractors)
+
+    def _embedded(self, state: Tensor, distractors: Tensor | None) -> Tensor:
+        seen = state[:, self._columns]
+        if self.regime.embed is None:
+            return seen
+        if self.regime.distractors and distractors is None:
+            raise ValueError(
+                f"regime {self.regime.name!r} shows {self.regime.distractors} distractors beside the state"
+            )
+        seen = (seen - self._mean) / self._spread
+        return self.regime.embed(seen if distractors is None else torch.cat([seen, distractors], -1))
+
+    def noisy(self, shown: Tensor) -> Tensor:
+        """The same with noise, other noise at every call.
+
+        Args:
+            shown (Tensor): from :meth:`show` ``[N, c]``.
+        """
+        if not self.regime.noise:
+            return shown
+        noise = torch.randn(shown.shape, generator=self._generator).to(shown)
+        return shown + self.regime.noise * self.step * noise
 
 
 def _oscillations(episode: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -151,7 +221,7 @@ REGIMES = {
         Regime("wide_64_gain_1", "64 columns, weaker", random_network(64, 1.0), noise=2.0),
         Regime("wide_64_gain_4", "64 columns, stronger", random_network(64, 4.0), noise=2.0),
         Regime("wide_512", "512 nonlinear columns", random_network(512, 2.0), noise=2.0),
-        Regime("pictures", "32 x 32 pictures", disc_picture, noise=1.0),
+        Regime("pictures", "32 x 32 pictures", disc_picture, noise=1.0, fitted=True),
         Regime("distractors", "64 columns, 2 distractors", random_network(64, 1.0), noise=1.0, distractors=2),
     )
 }

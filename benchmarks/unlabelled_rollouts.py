@@ -1,0 +1,162 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Where unlabelled data pay, in closed loop: controllers follow demonstrations not seen before, by regime.
+
+    koap demos --out runs/avoiding96 --episodes 96 --seed 11
+    python benchmarks/unlabelled_rollouts.py --dataset runs/avoiding96 --regimes noise wide_64 distractors
+
+The planner takes no part: at every step the plan is what the demonstration did next, as the sensor of the regime showed
+it (with its noise), bent towards the present observation as the library's policies do. The robot's own motion is
+simulated, and what the controller sees of it goes through the same sensor, with fresh noise. Training, labels and seeds
+are those of ``unlabelled_data.py``; judged are the last trajectories of a seed's order. Success is that of the task.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import warnings
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.utils import step_mdp
+from unlabelled_data import METHODS, as_own_data, controllers, load_positions, shuffled_trajectories
+
+from torchrl_koap.data.regimes import REGIMES, RegimeSensor
+from torchrl_koap.envs.registry import make_env
+from torchrl_koap.evaluation.policy_files import BLEND_DECAY
+from torchrl_koap.modules import InverseDynamics, blend_plan
+from torchrl_koap.training.datasets import find_task_of
+from torchrl_koap.training.progress import progress_bar
+
+TABLE = Path(__file__).parent / "results" / "unlabelled_rollouts.csv"
+COLUMNS = (
+    "dataset",
+    "regime",
+    "labels",
+    "seed",
+    "method",
+    "blend_decay",
+    "n",
+    "successes",
+    "collisions",
+    "distance_mm",
+)
+HORIZON = 14
+SPARE = 40  # control steps that a rollout may take longer than its demonstration
+
+
+def padded(paths: list[torch.Tensor], length: int) -> torch.Tensor:
+    """Paths as ``[E, length, ...]``, their last row repeated."""
+    return torch.stack([path[torch.arange(length).clamp_max(len(path) - 1)] for path in paths])
+
+
+@torch.no_grad()
+def follow(
+    controller: InverseDynamics, sensor: RegimeSensor, shown: TensorDictBase, task, episodes: torch.Tensor, decay: float
+) -> dict[str, float]:
+    """Rolls out one episode per demonstration.
+
+    Args:
+        controller (InverseDynamics): reads windows of what the sensor shows.
+        sensor (RegimeSensor): of the regime.
+        shown (TensorDictBase): flat data with the recorded positions as ``observation``, what the sensor showed of them
+            as ``state``, and ``distractors`` where the regime has some.
+        task (Task): has the environment; the robot's position is what the sensor is asked for.
+        episodes (Tensor): numbers of the demonstrations.
+        decay (float): with which plans are bent towards the present observation.
+
+    Returns:
+        dict: successes, collisions, mean distance to the demonstration over the steps of running episodes (mm).
+    """
+    parts = [shown[shown["episode"] == number] for number in episodes]
+    steps = max(len(part) for part in parts) + SPARE
+    plans, paths = (padded([part[key] for part in parts], steps + HORIZON) for key in ("state", "observation"))
+    moving = padded([part["distractors"] for part in parts], steps + 1) if sensor.distractors is not None else None
+    columns = list(task.state_columns)[: paths.shape[-1]]
+    env = make_env(task, len(parts), max_steps=steps)
+    td, history = env.reset(), []
+    running, distances = torch.ones(len(parts), dtype=torch.bool), []
+    outcome = torch.zeros(2, len(parts), dtype=torch.bool)
+    for step in range(steps):
+        beside = None if moving is None else moving[:, max(step - 1, 0)]
+        seen = sensor.noisy(sensor.show(td["observation"][:, columns].to(paths), beside)).to(plans)
+        history = ([seen] * (controller.num_past + 1) if not history else [*history, seen])[-controller.num_past - 1 :]
+        observed = torch.stack(history, 1)
+        plan = blend_plan(observed, plans[:, step : step + HORIZON], decay)
+        window = TensorDict({"state": torch.cat([observed, plan], 1)}, [len(parts)])
+        td = env.step(td.set("action", controller(window)["action"][:, controller.num_past]))["next"]
+        ended = running & td["done"].squeeze(-1)
+        outcome[0] |= ended & td["success"].squeeze(-1)
+        outcome[1] |= ended & td["terminated"].squeeze(-1) & ~td["success"].squeeze(-1)
+        running &= ~ended
+        if not running.any():
+            break
+        distances.append((td["observation"][:, columns] - paths[:, step]).norm(dim=-1)[running])
+        td = step_mdp(TensorDict({"next": td}, td.batch_size))
+    env.close()
+    return {
+        "successes": int(outcome[0].sum()),
+        "collisions": int(outcome[1].sum()),
+        "distance_mm": 1e3 * float(torch.cat(distances).mean()),
+    }
+
+
+def main() -> None:
+    """Runs what the table lacks."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dataset", required=True, help="folder written by koap demos --task avoiding")
+    parser.add_argument("--regimes", nargs="+", default=["noise", "wide_64", "distractors"], choices=list(REGIMES))
+    methods = ["semi_supervised", "koap_untrained", "koap_labelled_only", "pca", "linear_steps"]
+    parser.add_argument("--methods", nargs="+", default=methods, choices=list(METHODS))
+    parser.add_argument("--labels", nargs="+", type=int, default=[1, 2, 4])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--judged", type=int, default=60, help="demonstrations followed per seed")
+    parser.add_argument("--blend-decay", type=float, default=BLEND_DECAY)
+    parser.add_argument("--table", type=Path, default=TABLE)
+    options = parser.parse_args()
+    warnings.filterwarnings("ignore", category=UserWarning)
+    torch.set_num_threads(1)
+    data, _ = load_positions(options.dataset, 10**6)
+    source = find_task_of(options.dataset)
+    if len(data["episode"].unique()) < options.judged + max(options.labels):
+        parser.error(f"{options.dataset} has fewer demonstrations than are judged and labelled")
+    done = set()
+    if options.table.exists():
+        with options.table.open(newline="", encoding="utf-8") as file:
+            done = {tuple(row[column] for column in COLUMNS[:6]) for row in csv.DictReader(file)}
+    else:
+        options.table.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
+    cells = [(method, labels) for method in options.methods for labels in options.labels]
+    with progress_bar(len(options.regimes) * len(options.seeds) * len(cells), "cells") as bar:
+        for regime in options.regimes:
+            for seed in options.seeds:
+                keys = {
+                    (method, labels): (
+                        source.name, regime, str(labels), str(seed), method, str(options.blend_decay)
+                    )
+                    for method, labels in cells
+                }  # fmt: skip
+                wanted = [cell for cell in cells if keys[cell] not in done]
+                bar.update(len(cells) - len(wanted))
+                if not wanted:
+                    continue
+                sensor = RegimeSensor(data, regime, seed=seed)
+                seen = data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
+                full, task = as_own_data(seen)
+                places = torch.unique(data["episode"], return_inverse=True)[1]  # as data of one's own are numbered
+                numbers = shuffled_trajectories(full, seed)
+                shown = seen.copy().set("observation", data["state"]).set("episode", places)
+                if sensor.distractors is not None:
+                    shown["distractors"] = sensor.distractors
+                for method, labels, controller, _, _ in controllers(full, task, numbers, seed, wanted):
+                    found = follow(controller, sensor, shown, source, numbers[-options.judged :], options.blend_decay)
+                    found["distance_mm"] = f"{found['distance_mm']:.2f}"
+                    with options.table.open("a", newline="", encoding="utf-8") as file:
+                        row = (*keys[method, labels], options.judged, *found.values())
+                        csv.writer(file, lineterminator="\n").writerow(row)
+                    bar.update()
+
+
+if __name__ == "__main__":
+    main()
