@@ -14,7 +14,7 @@ import json
 import statistics
 from pathlib import Path
 
-from torchrl_koap.evaluation.run import EvalConfig, evaluate
+from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import mode_entropy, wilson_interval
 from torchrl_koap.training import TrainConfig, train
 

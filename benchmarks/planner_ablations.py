@@ -17,8 +17,8 @@ from collections import defaultdict
 from pathlib import Path
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
+from torchrl_koap.evaluation.config import CONTROLLERS
 from torchrl_koap.evaluation.policy_files import BLEND_DECAY
-from torchrl_koap.evaluation.run import CONTROLLERS
 from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
 from torchrl_koap.files import replacing_file
 from torchrl_koap.tasks import get_task

@@ -18,7 +18,7 @@ from torchrl.envs.utils import step_mdp
 
 from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.envs.registry import make_env_of
-from torchrl_koap.evaluation.run import load_run
+from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.modules import blend_plan, policy_transforms
 from torchrl_koap.training.datasets import load_demonstrations
 

@@ -12,8 +12,9 @@ from typing import Any
 from pages import escape, heading, read_rows, table, toctree, write_page
 
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.config import TrainConfig, resolve
+from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.methods import METHODS, Method
+from torchrl_koap.training.resolved import resolve
 
 # of networks whose docstring has no equation; "paper" is that of the preset
 EQUATIONS = {

@@ -14,7 +14,7 @@ from tiny_runs import TINY, koap
 from torchrl_koap import Agent, EvalConfig, build_policy, fit_controller, fit_planner, load_policy, save_policy
 from torchrl_koap.data import make_demonstrations
 from torchrl_koap.evaluation.policy_files import PolicyDescription
-from torchrl_koap.evaluation.run import load_run
+from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.modules import ChunkedPolicy, PlanThenControl
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.checkpoints import CheckpointError, load_tensors, save_tensors

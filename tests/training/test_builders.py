@@ -23,10 +23,11 @@ from torchrl_koap.training.builders import (
     build_controller,
     set_up_torch,
 )
-from torchrl_koap.training.config import TrainConfig, resolve
+from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.diffusion_builders import DENOISERS, build_planner
 from torchrl_koap.training.methods import METHODS
+from torchrl_koap.training.resolved import resolve
 
 TASK = get_task("avoiding")
 PLANNER = {

@@ -15,7 +15,7 @@ from torchrl_koap.keys import LayoutError
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import Recipe, TrainConfig, fit_controller, fit_planner, train
 from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.config import resolve
+from torchrl_koap.training.resolved import resolve
 
 NAMES = ["q1", "q2", "goal_1", "goal_2"]
 SMALL = {"batch_size": 8, "channels": (8, 16)}

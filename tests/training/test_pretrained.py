@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_runs import TINY, koap, write_demonstrations
 
-from torchrl_koap.evaluation.run import load_run
+from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.training import pretrained
 from torchrl_koap.training.checkpoints import load_tensors
 from torchrl_koap.training.pretrained import copy_run, find_run, publish

@@ -15,9 +15,10 @@ from torchrl_koap.evaluation import load_run
 from torchrl_koap.modules import SupervisedInverseDynamics, WindowVariationalInverseDynamics
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.config import TrainConfig, resolve
+from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.resolved import resolve
 
 
 @pytest.fixture(scope="module")

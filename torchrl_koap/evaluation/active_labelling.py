@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation.latent_space import infer_steps
-from torchrl_koap.evaluation.run import load_run
+from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import KoopmanInverseDynamics

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_koap.evaluation.run import load_policy, load_run
+from torchrl_koap.evaluation.trained_run import load_policy, load_run
 from torchrl_koap.modules import Agent, AsynchronousAgent
 from torchrl_koap.training.builders import set_up_torch
 from torchrl_koap.training.plugins import Plugins, load_plugins

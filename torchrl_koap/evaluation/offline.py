@@ -20,7 +20,7 @@ from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.run_directory import RunDirectoryError
 
 if TYPE_CHECKING:
-    from torchrl_koap.evaluation.run import TrainedRun
+    from torchrl_koap.evaluation.trained_run import TrainedRun
 
 KIND = "offline"
 SPLITS = ("outside_budget", "left_out")

@@ -25,12 +25,13 @@ from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.tasks import Task
-from torchrl_koap.training.config import TrainConfig, resolve
+from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import progress_bar
 from torchrl_koap.training.released_settings import get_released
+from torchrl_koap.training.resolved import resolve
 from torchrl_koap.training.run import check_networks
 from torchrl_koap.training.run_directory import RunDirectory
 

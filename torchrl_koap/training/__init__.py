@@ -12,7 +12,7 @@ __getattr__ = exports(
         "Phase": "torchrl_koap.training.methods",
         "PluginError": "torchrl_koap.training.plugins",
         "Recipe": "torchrl_koap.training.fit",
-        "ResolvedConfig": "torchrl_koap.training.config",
+        "ResolvedConfig": "torchrl_koap.training.resolved",
         "RunDirectory": "torchrl_koap.training.run_directory",
         "RunDirectoryError": "torchrl_koap.training.run_directory",
         "TrainConfig": "torchrl_koap.training.config",
@@ -22,7 +22,7 @@ __getattr__ = exports(
         "load_demonstrations": "torchrl_koap.training.datasets",
         "load_plugins": "torchrl_koap.training.plugins",
         "register_method": "torchrl_koap.training.methods",
-        "resolve": "torchrl_koap.training.config",
+        "resolve": "torchrl_koap.training.resolved",
         "train": "torchrl_koap.training.run",
     },
 )

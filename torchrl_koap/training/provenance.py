@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.tasks.registry import is_adopted
-from torchrl_koap.training.config import ResolvedConfig
+from torchrl_koap.training.resolved import ResolvedConfig
 
 # what is derived from these may differ from version to version
 _RECORDED = ("observation", "action", "has_action", "episode", "step_count", ("next", "observation"), ("next", "done"))

@@ -16,7 +16,7 @@ from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training.action_errors import AFTER, BEFORE, error_entry, write_analysis
 from torchrl_koap.training.builders import build_controller, set_up_torch
 from torchrl_koap.training.checkpoints import load_weights
-from torchrl_koap.training.config import ResolvedConfig, TrainConfig, resolve
+from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.controller import train_controller
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.diffusion_builders import build_planner
@@ -26,6 +26,7 @@ from torchrl_koap.training.planner import train_planner
 from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.provenance import fingerprint, to_json
+from torchrl_koap.training.resolved import ResolvedConfig, resolve
 from torchrl_koap.training.resume import check_data, check_resume, started_with
 from torchrl_koap.training.run_directory import RunDirectory
 from torchrl_koap.training.validation import choose_validation, validation_of, without_validation
@@ -176,7 +177,7 @@ def check_networks(resolved: ResolvedConfig) -> None:
 
     Examples:
         >>> from pathlib import Path
-        >>> from torchrl_koap.training.config import TrainConfig, resolve
+        >>> from torchrl_koap.training import TrainConfig, resolve
         >>> from torchrl_koap.training.run import check_networks
         >>> check_networks(resolve(TrainConfig(out=Path("run"), task="sorting")))
     """

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_koap.training.config import TrainConfig, resolve
+from torchrl_koap.training.config import TrainConfig
+from torchrl_koap.training.resolved import resolve
 
 
 class TestTheTasksMethod:

@@ -1,0 +1,117 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What `koap eval` is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
+from torchrl_koap.training.plugins import Plugins
+
+CONTROLLERS = ("learned", "oracle")
+MOST_EPISODES = 100_000  # kept in memory
+
+
+@dataclass
+class EvalConfig:
+    """Rollouts of a trained run in closed loop; without an environment plans and actions on recorded data.
+
+    Attributes:
+        episodes: number of rollouts; tasks with contexts take the fixed ones of the evaluation table in turn.
+        rollouts_per_context: rollouts in each context; from 2 on the entropy of the modes per context is known.
+        seed: seed of the first rollout; the others count on from it.
+        controller: "learned", or "oracle": the simulator's own inverse map, which takes the tool where the plan says:
+            what fails then is the planner's.
+        execution: "feedback" (decode at every step) or "open_loop" (decode once per plan) (default: feedback, or the
+            task's).
+        solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
+        solver_steps: another number of solver steps.
+        replan_interval: control steps per plan (default: 4, or the task's).
+        blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are
+            (default: 0.8, or the task's).
+        candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
+            the one in force (default: as the run says, else 1).
+        choice: rule of that choice: "quarter", "typical" or "nearest".
+        out: folder to evaluate in instead of the run's own; what the run is made of is copied there.
+        batch_size: episodes at a time; results do not depend on it.
+        contexts_file: a context file of D3IL to take instead of the table.
+        env: id of a Gymnasium environment to roll out in instead of the task's own, such as "my_package:Reach-v0".
+        success_key: entry of its info that says whether the task is done (default: "is_success" or "success" where it
+            has one of them, else an episode that terminates with a positive reward).
+        task: refuse a run of another task than this.
+        dataset: for a task without an environment: where the data set of the training is now (default: where it was).
+        samples: for a task without an environment: plans that are sampled in each recorded situation.
+        threads: torch and simulator threads.
+        device: "cpu" or "cuda".
+        plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
+
+    Examples:
+        >>> from torchrl_koap.evaluation import EvalConfig, evaluate
+        >>> evaluate("runs/koap", EvalConfig(episodes=20, execution="open_loop"))["success_rate"]  # doctest: +SKIP
+    """
+
+    episodes: int = 60
+    rollouts_per_context: int = 1
+    seed: int = 100
+    controller: str = "learned"
+    execution: str | None = None
+    solver: str | None = None
+    solver_steps: int | None = None
+    replan_interval: int | None = None
+    blend_decay: float | None = None
+    candidates: int | None = None
+    choice: str = "quarter"
+    out: Path | None = None
+    batch_size: int | None = None
+    contexts_file: Path | None = None
+    env: str | None = None
+    success_key: str | None = None
+    task: str | None = None
+    dataset: str | None = None
+    samples: int = 16
+    threads: int = 2
+    device: str = "cpu"
+    plugins: Plugins = ()
+
+
+def check_ways(config: EvalConfig) -> None:
+    """Refuses ways to follow plans and controllers that there are not.
+
+    Args:
+        config (EvalConfig): what was asked for.
+
+    Raises:
+        ValueError: naming the option and the nearest one.
+    """
+    lookup(CONTROLLERS, config.controller, "controller")
+    if config.execution is not None:
+        lookup(EXECUTIONS, config.execution, "execution")
+
+
+def check_options(config: EvalConfig) -> None:
+    """Refuses what no run could be evaluated with, before any of it is loaded.
+
+    Args:
+        config (EvalConfig): what was asked for.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    for name in ("episodes", "batch_size", "rollouts_per_context", "samples"):
+        value = getattr(config, name)
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be >= 1, got {value}")
+    if config.episodes > MOST_EPISODES:
+        raise ValueError(
+            f"episodes must be at most {MOST_EPISODES:,}, which are kept in memory, got {config.episodes:,}"
+        )
+    if config.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {config.seed}")
+    if config.success_key is not None and config.env is None:
+        raise ValueError(
+            f"success_key was given, but no env that could report {config.success_key!r}: name an environment of"
+            " Gymnasium with --env"
+        )
+    check_ways(config)

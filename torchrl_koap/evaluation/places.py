@@ -1,0 +1,115 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Where a run is rolled out: environment, contexts, modes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchrl_koap.evaluation.config import EvalConfig
+from torchrl_koap.tasks import Task
+
+
+def choose_contexts(
+    task: Task, episodes: int, rollouts_per_context: int = 1, contexts_file: Path | None = None
+) -> tuple[list[int] | None, np.ndarray | None]:
+    """Number of the context of every rollout, and the contexts; None for a task in which all episodes start alike.
+
+    Args:
+        task (Task): the task.
+        episodes (int): number of rollouts.
+        rollouts_per_context (int): rollouts in each context.
+        contexts_file (Path, optional): a context file of D3IL instead of the evaluation table.
+
+    Raises:
+        ValueError: if there are too few contexts, or the task has none.
+    """
+    if not task.objects:
+        given = {"contexts_file": contexts_file is not None, "rollouts_per_context": rollouts_per_context != 1}
+        for name, unfit in given.items():
+            if unfit:
+                raise ValueError(f"{name} was given, but task {task.name!r} has no contexts")
+        return None, None
+    from torchrl_koap.envs.contexts import evaluation_contexts, load_contexts  # takes seconds
+
+    if contexts_file is None:
+        table = evaluation_contexts(task)
+    else:
+        table = load_contexts(contexts_file, task)
+    needed = (episodes - 1) // rollouts_per_context + 1
+    if needed > len(table):
+        raise ValueError(
+            f"{episodes} episodes with {rollouts_per_context} per context need {needed} contexts,"
+            f" there are {len(table)}"
+        )
+    numbers = [episode // rollouts_per_context for episode in range(episodes)]
+    return numbers, table[numbers]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a run is rolled out.
+
+    Args:
+        make_env (callable): an environment of a number of parallel episodes.
+        max_steps (int): control steps of an episode at most.
+        mode_index (callable): number of the mode, from the environment's leaf ``mode``.
+        num_modes (int): number of modes.
+        numbers (list of int, optional): number of the context of every rollout.
+        contexts (np.ndarray, optional): the contexts.
+
+    Examples:
+        >>> from torchrl_koap.evaluation import EvalConfig
+        >>> from torchrl_koap.evaluation.places import place_of
+        >>> from torchrl_koap.tasks import get_task
+        >>> place = place_of(get_task("avoiding"), EvalConfig(episodes=2))
+        >>> place.max_steps, place.num_modes, place.numbers
+        (250, 24, None)
+    """
+
+    make_env: Callable[[int], Any]
+    max_steps: int
+    mode_index: Callable[[torch.Tensor], torch.Tensor]
+    num_modes: int
+    numbers: list[int] | None = None
+    contexts: np.ndarray | None = None
+
+
+def place_of(task: Task, config: EvalConfig) -> Place:
+    """The task's own environment, or the one of Gymnasium that was asked for.
+
+    Args:
+        task (Task): the task.
+        config (EvalConfig): what was asked for.
+
+    Raises:
+        ValueError: if there are too few contexts, or contexts were asked for where there are none.
+    """
+    if config.env is None:
+        numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
+        from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
+
+        make_env = make_env_of(task, num_threads=config.threads)
+        return Place(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
+    for name, unfit in {
+        "contexts_file": config.contexts_file is not None,
+        "rollouts_per_context": config.rollouts_per_context != 1,
+    }.items():
+        if unfit:
+            raise ValueError(f"{name} was given, but an environment of Gymnasium has no contexts")
+    from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
+
+    make_env = partial(GymnasiumBatch, config.env, task, success_key=config.success_key)
+    probe = make_env(1)
+    probe.close()
+    return Place(make_env, probe.max_steps, _only_mode, 1)
+
+
+def _only_mode(mode: torch.Tensor) -> torch.Tensor:
+    return mode[..., 0]

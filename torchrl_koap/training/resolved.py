@@ -1,0 +1,286 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Options of a training with every name looked up and every default filled in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+from tensordict import TensorDictBase
+
+from torchrl_koap.data import LabelBudget, controller_view
+from torchrl_koap.data.label_budget import Unit
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import PRESETS
+from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
+from torchrl_koap.training.config import TrainConfig
+from torchrl_koap.training.datasets import find_task_of
+from torchrl_koap.training.loggers import check_logger
+from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
+from torchrl_koap.training.released_settings import POLICY, Released, get_released
+from torchrl_koap.training.response import tracked_columns
+from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.training.validation import default_fraction
+
+# defaults for data that lack labels or came without an environment, and for all others
+ALL_LABELS, LABEL_FRACTION = 1.0, 0.02
+
+
+@dataclass(frozen=True)
+class ResolvedConfig:
+    """A :class:`TrainConfig` that leaves nothing open: what planner and controller are trained by.
+
+    Args:
+        options (TrainConfig): with the task's defaults where nothing was asked for.
+        task (Task): the task.
+        method (Method): the method, with the decoder asked for.
+        teacher (Method, optional): the method that labels the rest of the data for it.
+        released (Released, optional): the settings of the first public code, if they were asked for.
+        budget (LabelBudget): which labels may be seen.
+        planner (dict): what :func:`~torchrl_koap.training.diffusion_builders.build_planner` takes.
+        controller (dict): what :func:`~torchrl_koap.training.builders.build_controller` takes.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training import TrainConfig, resolve
+        >>> resolved = resolve(TrainConfig(out=Path("runs/koap"), label_fraction=0.05))
+        >>> resolved.task.name, resolved.method.name, resolved.budget.amount, resolved.options.steps
+        ('avoiding', 'koap', 0.05, 5000)
+    """
+
+    options: TrainConfig
+    task: Task
+    method: Method
+    teacher: Method | None
+    released: Released | None
+    budget: LabelBudget
+    planner: dict[str, Any]
+    controller: dict[str, Any]
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """State columns that the controller reads."""
+        return self.task.controller_columns(self.options.controller_state)
+
+    def controller_view(self, data: TensorDictBase) -> TensorDictBase:
+        """Flat data ``[N]`` as the controller sees them: its columns, and actions as distances to their targets."""
+        return controller_view(data, self.columns, action_targets=self.task.action_targets)
+
+    def with_labels_of(self, data: TensorDictBase) -> ResolvedConfig:
+        """The same with the share of labels that is the default for these data, if none was asked for."""
+        if self.options.label_fraction is not None:
+            return self
+        every = self.task.env is None or not data["has_action"].all()
+        share = ALL_LABELS if every else LABEL_FRACTION
+        options = replace(self.options, label_fraction=share)
+        return replace(self, options=options, budget=_budget(options))
+
+
+def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
+    """Looks every name up and fills every default in, once; plugins must have been imported.
+
+    Args:
+        config (TrainConfig): what is asked for.
+        task (Task, optional): the task, registered or not. Default: the one of the data set.
+
+    Raises:
+        ValueError: for unknown names, numbers out of range, and options that exclude each other.
+        RunDirectoryError: if ``planner_from`` is no finished run.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.training import TrainConfig, resolve
+        >>> resolved = resolve(TrainConfig(out=Path("run"), task="avoiding", method="linear"))
+        >>> resolved.options.steps, resolved.method.closed_form, resolved.columns
+        (5000, True, (0, 1))
+    """
+    task = find_task_of(config.dataset, config.task) if task is None else task
+    options = replace(_with_task_defaults(config, task), task=task.name)
+    released = _released(options)
+    method = _method(options) if released is None else released.method
+    _check(options, method)
+    if not method.has_planner:
+        if config.forecast:
+            raise ValueError(f"method {options.method!r} is a policy of its own and has no plans to forecast")
+        options = replace(options, forecast=None)
+    if options.planner_from is not None:
+        planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
+    else:
+        planner = _planner_entry(options, task)
+    if released is not None and not method.has_planner:
+        planner |= POLICY
+    preset = "released" if options.released_settings else options.preset or method.presets[0]
+    controller: dict[str, Any] = {
+        "method": options.method,
+        "decoder": options.decoder,
+        "released": options.released_settings,
+        "preset": preset,
+        "state": options.controller_state if method.has_planner else "all",
+    }
+    if "lifting" in PRESETS[preset]:
+        controller["lifting"] = PRESETS[preset]["lifting"]
+    if method.earlier:
+        controller["revised"] = True
+    if method.tracks:
+        controller["tracking"] = tracked_columns(task)
+    if len(task.absolute_actions) == task.action_dim and not task.action_targets:
+        controller["absolute"] = True
+    return ResolvedConfig(
+        options=options,
+        task=task,
+        method=method,
+        teacher=get_method(method.teacher) if method.teacher else None,
+        released=released,
+        budget=_budget(options),
+        planner=planner,
+        controller=controller,
+    )
+
+
+_UNET = {"denoiser": "unet", "batch_size": 128, "planner_learning_rate": 3e-3}
+
+
+def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
+    # a network that is asked for by name, or that of the first public code, comes with its own sizes
+    own = task.defaults.planner if options.denoiser is None and not options.released_settings else {}
+    defaults: dict[str, Any] = (
+        _UNET
+        | dict(own)
+        | {
+            "method": "koap" if options.released_settings else task.defaults.method,
+            "steps": task.defaults.planner_steps,
+            "recovery_sigma": task.defaults.recovery_sigma,
+            "recovery_response": task.defaults.recovery_response,
+            "episodes": task.defaults.demonstrations,
+            "relative": task.defaults.relative,
+            "channels": task.defaults.channels,
+            "validation_fraction": default_fraction(task),
+            "forecast": True if task.env is None and not options.released_settings else None,
+        }
+    )
+    return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
+
+
+def _released(options: TrainConfig) -> Released | None:
+    if not options.released_settings:
+        if options.epochs is not None:
+            raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
+        return None
+    if options.decoder is not None or options.preset is not None:
+        raise ValueError("released settings come with their own decoder and preset: no --decoder, no --preset")
+    if options.epochs is not None and options.epochs < 1:
+        raise ValueError(f"epochs must be >= 1, got {options.epochs}")
+    return get_released(options.method)
+
+
+def _method(options: TrainConfig) -> Method:
+    method = get_method(options.method, options.decoder)
+    if options.preset is not None:
+        lookup(PRESETS, options.preset, "preset")
+        if options.preset not in method.presets:
+            has = list(method.presets)
+            raise ValueError(f"method {options.method!r} has no preset {options.preset!r}, it has {has}")
+    return method
+
+
+_LEAST = (
+    dict.fromkeys(("batch_size", "controller_batch_size", "checkpoint_every", "candidates"), 1)
+    | dict.fromkeys(("denoiser_width", "denoiser_depth"), 1)
+    | dict.fromkeys(("condition_octaves", "dropout", "planner_weight_decay", "first_steps_weight"), 0)
+    | dict.fromkeys(("recovery_sigma", "scene_shift", "scene_turn"), 0)
+)
+
+
+def _check(options: TrainConfig, method: Method) -> None:
+    check_logger(options.logger)
+    for name in COEFFICIENTS:
+        value = getattr(options, name)
+        if value is not None and name not in loss_coefficients(method):
+            raise ValueError(f"{name} was given, but no loss of method {options.method!r} has it")
+        if value is not None and value < 0:
+            raise ValueError(f"{name} must be >= 0, got {value}")
+    if not method.has_planner and options.planner_from is not None:
+        raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
+    for name in ("frame", "plan_steps", "observed_frames"):
+        if getattr(options, name) is not None and not method.has_planner:
+            raise ValueError(f"{name} is the planner's, which method {options.method!r} does not have")
+    if options.observed_frames not in (None, *range(1, HISTORY + 1)):
+        raise ValueError(f"observed_frames must be 1 to {HISTORY}, got {options.observed_frames}")
+    if options.plan_steps is not None and (not options.plan_steps or options.plan_steps[-1] < 4):
+        raise ValueError(f"plan_steps must end at 4 or more control steps, got {list(options.plan_steps)}")
+    if options.steps < 1 or options.controller_steps < 0:
+        raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
+    for name in ("planner_learning_rate", "controller_learning_rate"):
+        if not 0 < getattr(options, name) < math.inf:
+            raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
+    if options.label_fraction is not None and not 0 < options.label_fraction <= 1:
+        raise ValueError(f"label_fraction: a fraction must be in (0, 1], got {options.label_fraction}")
+    lookup(("float32", "bfloat16"), options.precision or "float32", "precision")
+    if options.seed < 0:
+        raise ValueError(f"seed must be >= 0, got {options.seed}")
+    if not 0 <= (options.validation_fraction or 0) < 1:
+        raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
+    for name, least in _LEAST.items():
+        value = getattr(options, name)
+        if value is not None and value < least:
+            raise ValueError(f"{name} must be >= {least}, got {value}")
+    if options.dropout is not None and options.dropout >= 1:
+        raise ValueError(f"dropout must be in [0, 1), got {options.dropout}")
+    if not 0 < options.observation_fraction <= 1:
+        raise ValueError(f"observation_fraction: a fraction must be in (0, 1], got {options.observation_fraction}")
+
+
+def _budget(options: TrainConfig) -> LabelBudget:
+    if options.label_episodes is not None:
+        if options.label_count is not None or options.label_unit != "trajectory":
+            raise ValueError("label_episodes are trajectories of their own choice: no label_count or label_unit")
+        return LabelBudget.of_episodes(options.label_episodes)
+    amount = options.label_fraction if options.label_count is None else options.label_count
+    amount = LABEL_FRACTION if amount is None else amount
+    unit = cast("Unit", options.label_unit)  # another one is refused there
+    return LabelBudget(amount, unit=unit, seed=options.seed, window=WINDOW, history=HISTORY)
+
+
+def _frame_of(task: Task, name: str) -> dict[str, list]:
+    """Columns of the frame of an object (:class:`~torchrl_koap.modules.diffusion.planar_frame.PlanarFrame`)."""
+    ends = ("_position", "_quaternion")
+    parts = [part.removesuffix(ends[0]) for part in task.planar_parts if part.endswith(ends[0])]
+    bodies = [body for body in parts if body + ends[1] in task.planar_parts]
+    if not bodies:
+        raise ValueError(f"frame was given, but in task {task.name!r} the place on the table matters")
+    lookup(bodies, name, "frame")
+    points, directions = task.planar_columns()
+    place, yaw = (task.state_slices[name + end].start for end in ends)
+    return {
+        "points": [list(pair) for pair in points],
+        "directions": [list(pair) for pair in directions],
+        "origin": [place, place + 1],
+        "heading": [yaw, yaw + 1],
+    }
+
+
+def _planner_entry(options: TrainConfig, task: Task) -> dict[str, Any]:
+    sizes = {
+        "width": options.denoiser_width,
+        "depth": options.denoiser_depth,
+        "frequencies": options.condition_octaves,
+        "dropout": options.dropout,
+        "forecast": options.forecast or None,
+        "frame": None if options.frame is None else _frame_of(task, options.frame),
+        "plan_steps": None if options.plan_steps is None else list(options.plan_steps),
+    }
+    # what was left out is left out here too, so that a run of before can be resumed
+    return {name: value for name, value in sizes.items() if value is not None} | {
+        "denoiser": options.denoiser,
+        "channels": list(options.channels),
+        "schedule": options.schedule,
+        "prediction": options.prediction,
+        "history": options.observed_frames or HISTORY,
+        "horizon": options.plan_steps[-1] if options.plan_steps else HORIZON,
+        "relative": options.relative,
+        "relations": options.relations,
+        "solver": options.solver,
+        "solver_steps": options.solver_steps,
+        "clip": 1.2 if options.prediction == "sample" else 1.0,
+    }
