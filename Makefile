@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/demo
 
-.PHONY: setup demo test slow faults test-matrix lock lint types docs tutorials dist clean
+.PHONY: setup demo test slow faults test-matrix lock lint types docs tutorials check-tutorials dist clean
 
 setup: $(VENV)/.ready
 
@@ -66,6 +66,10 @@ docs: setup
 # runs every tutorial and keeps output and pictures for the site
 tutorials: setup
 	$(BIN)/python docs/extensions/run_tutorials.py
+
+# runs them, or those named by TUTORIALS, and compares what they print with what the site shows; nothing is kept
+check-tutorials: setup
+	$(BIN)/python docs/extensions/run_tutorials.py --check --jobs 2 $(TUTORIALS)
 
 # wheel and sdist, tried in a fresh environment outside of the repository
 dist: setup

@@ -7,6 +7,7 @@ from pathlib import Path
 import torchrl_koap
 
 PACKAGE = Path(torchrl_koap.__file__).parent
+SILENT = {"NotImplementedError", "AttributeError"}  # of a subclass to come, and of names that are no attribute
 
 
 def public_definitions(kind):
@@ -36,3 +37,41 @@ def test_classes_have_an_example():
             found += 1
             assert ">>> " in text, f"{file}: class {name} has no example"
     assert found > 100
+
+
+def exported():
+    """Names that a room, or the package itself, has in its ``__all__``."""
+    names = set()
+    for file in (PACKAGE / "__init__.py", *PACKAGE.glob("*/__init__.py")):
+        for node in ast.parse(file.read_text()).body:
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+                names |= set(ast.literal_eval(node.value))
+    return names
+
+
+def raised(node):
+    """Names of the exceptions that a function raises itself."""
+    errors = [part.exc for part in ast.walk(node) if isinstance(part, ast.Raise) and part.exc is not None]
+    names = {ast.unparse(error.func if isinstance(error, ast.Call) else error) for error in errors}
+    return {name for name in names if name.endswith("Error")} - SILENT
+
+
+def test_exported_functions_have_an_example():
+    names, found = exported(), 0
+    for file, name, _, text in public_definitions(ast.FunctionDef):
+        if name in names:
+            found += 1
+            assert ">>> " in text, f"{file}: function {name} has no example"
+    assert found > 50
+
+
+def test_what_is_raised_is_told():
+    names, found = exported(), 0
+    for file, name, node, text in public_definitions((ast.FunctionDef, ast.ClassDef)):
+        makers = [node] if isinstance(node, ast.FunctionDef) else []
+        if isinstance(node, ast.ClassDef):
+            makers = [part for part in node.body if getattr(part, "name", "") in ("__init__", "__post_init__")]
+        if name in names and any(map(raised, makers)):
+            found += 1
+            assert "Raises:" in text, f"{file}: {name} raises {set().union(*map(raised, makers))}, and does not say so"
+    assert found > 30

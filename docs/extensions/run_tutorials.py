@@ -1,31 +1,48 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Runs tutorials and keeps what they print and draw for the site.
+"""Runs tutorials and keeps what they print and draw for the site, or checks that they still print it.
 
-python docs/extensions/run_tutorials.py              # all of them
-python docs/extensions/run_tutorials.py planners     # one
+python docs/extensions/run_tutorials.py                   # all of them
+python docs/extensions/run_tutorials.py planners          # one
+python docs/extensions/run_tutorials.py --check --jobs 2  # nothing is kept; two at a time
 """
 
 from __future__ import annotations
 
+import argparse
+import difflib
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tutorial_pages import DIGEST, FOLDER, ORDER, OUTPUTS, digest
 
+# a measured time with its unit: another one on every machine
+_TIME = re.compile(r"\d+(\.\d+)? (ms|s)\b")
+_FIGURE = re.compile(r"(?<![\w.])[+-]?\d+(?:[.,]\d+)*(?:e[+-]?\d+)?")
 
-def run(name: str) -> float:
-    """Runs a tutorial in an empty folder; returns the seconds it took.
+
+def run(name: str, *, check: bool = False) -> str:
+    """Runs a tutorial in an empty folder.
 
     Args:
         name (str): its file without the ending.
 
+    Keyword Args:
+        check (bool): what it prints is compared with what the site shows, instead of taking its place.
+
+    Returns:
+        str: the seconds it took and, with ``check``, the lines whose figures differ.
+
     Raises:
-        SystemExit: if it failed, with the end of what it said.
+        SystemExit: if it failed, with the end of what it said; with ``check`` also if it draws nothing, or prints
+            other words than the site shows.
     """
     script, began = FOLDER / f"{name}.py", time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
@@ -33,12 +50,48 @@ def run(name: str) -> float:
         done = subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True, env=env)
         if done.returncode:
             raise SystemExit(f"{script.name} failed:\n{done.stderr[-3000:]}")
+        said, printed, picture = f"{name}: {time.monotonic() - began:.0f} s", OUTPUTS / f"{name}.txt", f"{name}.png"
+        if not (Path(folder) / picture).exists():
+            raise SystemExit(f"{script.name} left no {picture}")
+        if check:
+            shown = printed.read_text(encoding="utf-8").splitlines()[1:]
+            words, figures = differences(shown, done.stdout.splitlines())
+            if words:
+                raise SystemExit("\n".join((f"{script.name} prints other words than {printed.name} shows:", *words)))
+            return "\n".join((said, *figures))
         OUTPUTS.mkdir(exist_ok=True)
-        (OUTPUTS / f"{name}.txt").write_text(f"{DIGEST}{digest(script)}\n{done.stdout}", encoding="utf-8")
-        shutil.copyfile(Path(folder) / f"{name}.png", OUTPUTS / f"{name}.png")
-    return time.monotonic() - began
+        printed.write_text(f"{DIGEST}{digest(script)}\n{done.stdout}", encoding="utf-8")
+        shutil.copyfile(Path(folder) / picture, OUTPUTS / picture)
+    return said
+
+
+def differences(shown: Iterable[str], printed: Iterable[str]) -> tuple[list[str], list[str]]:
+    """What differs between two outputs of a tutorial; measured times are not looked at.
+
+    Args:
+        shown (iterable of str): lines that the site shows.
+        printed (iterable of str): lines that were printed now.
+
+    Returns:
+        tuple: lines that differ in words, and those that differ in figures alone, as ``-shown`` and ``+printed``.
+    """
+    before, after = ([re.sub(" +", " ", _TIME.sub("TIME", line)) for line in lines] for lines in (shown, printed))
+    words = [[_FIGURE.sub("0", line) for line in lines] for lines in (before, after)]
+    if words[0] == words[1]:
+        pairs = zip(before, after, strict=True)
+        return [], [sign + line for pair in pairs if pair[0] != pair[1] for sign, line in zip("-+", pair, strict=True)]
+    return list(difflib.unified_diff(*words, "shown", "printed", lineterm="", n=0)), []
 
 
 if __name__ == "__main__":
-    for chosen in sys.argv[1:] or ORDER:
-        print(f"{chosen}: {run(chosen):.0f} s", flush=True)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="tutorial", help="default: all")
+    parser.add_argument("--check", action="store_true", help="keep nothing, compare with what the site shows")
+    parser.add_argument("--jobs", type=int, default=1, help="tutorials at a time")
+    options = parser.parse_args()
+    unknown = sorted(set(options.names) - set(ORDER))
+    if unknown:
+        parser.error(f"no such tutorial: {', '.join(unknown)}; there are {', '.join(ORDER)}")
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for line in pool.map(lambda name: run(name, check=options.check), options.names or ORDER):
+            print(line, flush=True)

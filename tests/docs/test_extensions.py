@@ -17,6 +17,7 @@ import api_pages  # noqa: E402
 import command_pages  # noqa: E402
 import design_page  # noqa: E402
 import pages  # noqa: E402
+import run_tutorials  # noqa: E402
 import time_picture  # noqa: E402
 import tutorial_pages  # noqa: E402
 
@@ -62,10 +63,43 @@ def test_the_digest_is_that_of_the_code_not_of_the_text(tmp_path):
     assert digests[0] == digests[1] != digests[2]
 
 
-def test_committed_output_says_of_which_code_it_is():
-    for file in tutorial_pages.OUTPUTS.glob("*.txt"):
-        assert file.stem in tutorial_pages.ORDER and file.with_suffix(".png").exists()
-        assert re.match(rf"{tutorial_pages.DIGEST}[0-9a-f]{{12}}\n", file.read_text())
+def test_every_tutorial_has_the_output_of_its_code():
+    assert {file.stem for file in tutorial_pages.OUTPUTS.glob("*.txt")} == set(tutorial_pages.ORDER)
+    for name in tutorial_pages.ORDER:
+        first, *printed = (tutorial_pages.OUTPUTS / f"{name}.txt").read_text().splitlines()
+        code = tutorial_pages.digest(ROOT / "tutorials" / f"{name}.py")
+        assert first == tutorial_pages.DIGEST + code, f"{name} has changed since: make tutorials"
+        assert printed and (tutorial_pages.OUTPUTS / f"{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("printed", "words", "figures"),
+    [
+        (["success 83.3 % (64-93)", "in 12 ms"], 0, 0),
+        (["success 83.3 % (64-93)", "in 7.5 s"], 0, 0),  # times are not compared
+        (["success  91.7 % (74-98)", "in 12 ms"], 0, 2),
+        (["failure 83.3 % (64-93)", "in 12 ms"], 5, 0),
+        (["success 83.3 % (64-93)"], 4, 0),
+    ],
+)
+def test_words_of_a_tutorial_are_compared_and_figures_that_moved_are_told(printed, words, figures):
+    found = run_tutorials.differences(["success 83.3 % (64-93)", "in 12 ms"], printed)
+    assert [len(lines) for lines in found] == [words, figures]
+
+
+def test_a_tutorial_that_prints_something_else_is_an_error(tmp_path, monkeypatch):
+    (tmp_path / "story.py").write_text("open('story.png', 'w')\nprint('all 3 of 4')\n")
+    (tmp_path / "story.txt").write_text("# code: 0\nall 4 of 4\n")
+    for name in ("FOLDER", "OUTPUTS"):
+        monkeypatch.setattr(run_tutorials, name, tmp_path)
+    assert run_tutorials.run("story", check=True).splitlines()[1:] == ["-all 4 of 4", "+all 3 of 4"]
+    (tmp_path / "story.txt").write_text("# code: 0\nnone of 4\n")
+    with pytest.raises(SystemExit, match="story.py prints other words than story.txt shows"):
+        run_tutorials.run("story", check=True)
+    (tmp_path / "story.py").write_text("print('none of 4')\n")
+    with pytest.raises(SystemExit, match="story.py left no story.png"):
+        run_tutorials.run("story", check=True)
+    assert not (tmp_path / "story.png").exists()  # nothing is kept
 
 
 def test_rooms_stand_on_what_they_import():

@@ -67,6 +67,9 @@ class RecoveryAugmentation(TensorDictModuleBase):
         action_key (NestedKey): actions ``[*B, T, act]``, replaced with ``moved_by``; NaN stays. Defaults to
             ``"action"``.
 
+    Raises:
+        ValueError: for a negative ``sigma``, a ``decay`` outside [0, 1), a ``tool`` without joints or kinematics.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

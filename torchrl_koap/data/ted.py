@@ -100,11 +100,24 @@ def save_ted(
 def read_about(folder: str | Path) -> dict[str, Any]:
     """Reads the description of a data set.
 
+    Args:
+        folder (str or Path): folder of the data set.
+
+    Returns:
+        dict: ``task``, ``trajectories``, ``steps``, ``lengths``, ``labelled_steps``, ``statistics``, ``notes``,
+            ``definition`` (of a task that came along) and ``sha256`` of its files.
+
     Raises:
         DamagedDataError: if the folder holds no data set, or one written by a newer version.
 
     Examples:
-        See :func:`save_ted`.
+        >>> import tempfile
+        >>> import torch
+        >>> from torchrl_koap.data import flatten_trajectories, read_about, save_ted
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     folder = save_ted(flatten_trajectories([torch.rand(5, 4)], [torch.rand(4, 2)]), root + "/ted")
+        ...     read_about(folder)["lengths"], read_about(folder)["labelled_steps"]
+        ([4], 4)
     """
     path = Path(folder) / _ABOUT
     try:
@@ -165,7 +178,13 @@ def load_ted(folder: str | Path, *, task: str | None = None, memmap: bool = True
         ValueError: if the data belong to another task.
 
     Examples:
-        See :func:`save_ted`.
+        >>> import tempfile
+        >>> import torch
+        >>> from torchrl_koap.data import flatten_trajectories, load_ted, save_ted
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     folder = save_ted(flatten_trajectories([torch.rand(5, 4)], [torch.rand(4, 2)]), root + "/ted")
+        ...     load_ted(folder, memmap=False)["action"].shape
+        torch.Size([4, 2])
     """
     folder = Path(folder)
     about = read_about(folder)

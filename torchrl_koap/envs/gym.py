@@ -134,6 +134,10 @@ class ManipulationGymEnv(gymnasium.Env):
 class AvoidingGymEnv(ManipulationGymEnv):
     """:class:`ManipulationGymEnv` of Avoiding.
 
+    Args:
+        render_mode (str, optional): ``"rgb_array"`` or None.
+        **options: as for :class:`ManipulationGymEnv`.
+
     Examples:
         >>> from torchrl_koap.envs import AvoidingGymEnv
         >>> observation, info = AvoidingGymEnv(max_steps=50).reset(seed=0)

@@ -39,6 +39,21 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     Raises:
         ValueError: for unknown options or fewer than one episode.
         RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap import EvalConfig, TrainConfig, evaluate, train
+        >>> from torchrl_koap.data import save_demonstrations
+        >>> states = [np.random.default_rng(i).normal(size=(30, 4)).cumsum(0) for i in range(6)]
+        >>> actions = [np.diff(frames[:, :2], axis=0) if i < 2 else None for i, frames in enumerate(states)]
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     arm = save_demonstrations(root + "/arm", states, actions, control_hz=30, robot=[0, 1])
+        ...     _ = train(TrainConfig(dataset=str(arm), out=Path(root) / "run", steps=2, controller_steps=2, threads=1))
+        ...     scores = evaluate(root + "/run", EvalConfig(samples=2, threads=1))
+        >>> scores["kind"], scores["relative_plan_error"] > 0  # without an environment: on recorded data
+        ('offline', True)
     """
     config = EvalConfig() if config is None else config
     check_options(config)

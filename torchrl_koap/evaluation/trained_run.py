@@ -81,6 +81,13 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
             not those that its training left.
         CheckpointError: if weights are damaged, of another task or without their statistics.
         PluginError: if a plugin of the run cannot be imported.
+
+    Examples:
+        >>> from torchrl_koap.evaluation import load_run
+        >>> from torchrl_koap.training.pretrained import find_run
+        >>> trained = load_run(find_run("pretrained:avoiding"))  # or the folder of a run of yours
+        >>> trained.task.name, trained.planner.horizon
+        ('avoiding', 14)
     """
     directory = RunDirectory(run)
     trained_on, planner_entry, entry = (
@@ -117,6 +124,15 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     Raises:
         ValueError: for an unknown execution or solver, or an interval out of range.
         RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`; a :class:`CheckpointError` names the file.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap import Agent, load_policy
+        >>> from torchrl_koap.training.pretrained import find_run
+        >>> agent = Agent(load_policy(find_run("pretrained:avoiding")), seed=0)
+        >>> agent.reset()
+        >>> agent.act(np.array([0.525, -0.28, 0.525, -0.28])).shape  # commanded and measured xy to a change of xy (m)
+        (2,)
     """
     given, config = config, EvalConfig() if config is None else config
     check_ways(config)

@@ -109,15 +109,15 @@ class InverseDynamics(TensorDictModuleBase):
         return self.reader.span(num_frames)
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """Raw states to the networks' units."""
+        """Raw states ``[*B, T, d]`` to the networks' units."""
         return state if self.state_normalizer is None else self.state_normalizer(state)
 
     def normalize_action(self, action: Tensor) -> Tensor:
-        """Raw actions to the networks' units."""
+        """Raw actions ``[*B, act]`` to the networks' units."""
         return action if self.action_normalizer is None else self.action_normalizer(action)
 
     def raw_action(self, action: Tensor) -> Tensor:
-        """Inverse of :meth:`normalize_action`."""
+        """Inverse of :meth:`normalize_action`: actions ``[*B, act]`` in raw units."""
         return action if self.action_normalizer is None else self.action_normalizer.inverse(action)
 
     @torch.no_grad()

@@ -118,6 +118,16 @@ def run_curve(config: CurveConfig) -> dict[str, Any]:
         RunDirectoryError: if the folder holds something else, a curve with other settings, or one that is being worked
             on.
         PluginError: if a plugin cannot be imported.
+
+    Examples:
+        >>> from torchrl_koap import CurveConfig, run_curve
+        >>> config = CurveConfig(out="curve", methods="koap,linear", fractions="0.01,0.1", seeds=2)
+        >>> run_curve(config)["done"]  # doctest: +SKIP
+        8
+        >>> run_curve(CurveConfig(out="curve", methods="kaop"))  # refused before anything is done
+        Traceback (most recent call last):
+        ...
+        ValueError: unknown method 'kaop'; did you mean 'koap'?
     """
     options, task, cells, root = check_curve(config)
     to_record = options.dataset == "scripted" and not (root.path / "demonstrations" / "ted").exists()

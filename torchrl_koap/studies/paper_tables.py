@@ -181,6 +181,15 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
             :func:`~torchrl_koap.studies.label_efficiency.check_curve` refuses; before any work on any task.
         RunDirectoryError: if the folder holds another comparison, or one of its curves cannot go on
             (:func:`~torchrl_koap.studies.label_efficiency.run_curve`).
+
+    Examples:
+        >>> from torchrl_koap.studies import BenchConfig, run_bench
+        >>> run_bench(BenchConfig(out="bench", table=1, tasks="avoiding", seeds=1))["done"]  # doctest: +SKIP
+        36
+        >>> run_bench(BenchConfig(out="bench", table=1, tasks="avoidign"))  # refused before anything is done
+        Traceback (most recent call last):
+        ...
+        ValueError: unknown task 'avoidign'; did you mean 'avoiding'?
     """
     if (config.table is None) == (config.study is None):
         raise ValueError("exactly one of --table and --study is needed")

@@ -64,6 +64,16 @@ def load_demonstrations(
 
     Raises:
         FileNotFoundError: if there is no such folder, or it holds no demonstrations.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from torchrl_koap.data import read_task, save_demonstrations
+        >>> from torchrl_koap.training import load_demonstrations
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     folder = save_demonstrations(root + "/arm", [np.random.rand(9, 3)], control_hz=30, action_dim=2)
+        ...     load_demonstrations(str(folder), read_task(folder / "ted"))["state"].shape
+        torch.Size([8, 3])
     """
     if dataset == "scripted":
         from torchrl_koap.envs.experts.demonstrations import record_demonstrations  # needs a simulator

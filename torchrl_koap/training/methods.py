@@ -75,6 +75,9 @@ class Phase:
         windows (str): ``"all"`` (labelled or not), ``"mixed"`` (a quarter of every batch has labels) or ``"labelled"``.
         share (float): of the updates that a controller may have.
 
+    Raises:
+        ValueError: for an unknown kind of windows, or a share outside (0, 1].
+
     Examples:
         >>> from torchrl_koap.objectives import InverseDynamicsLoss
         >>> from torchrl_koap.training.methods import Phase

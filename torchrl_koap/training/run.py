@@ -49,6 +49,21 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         RunDirectoryError: if the folder holds another run, one that was not asked to be resumed, or one that is being
             worked on.
         PluginError: if a plugin cannot be imported.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap import TrainConfig, train
+        >>> from torchrl_koap.data import save_demonstrations
+        >>> states = [np.random.default_rng(i).normal(size=(30, 4)).cumsum(0) for i in range(6)]
+        >>> actions = [np.diff(frames[:, :2], axis=0) if i < 2 else None for i, frames in enumerate(states)]
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     arm = save_demonstrations(root + "/arm", states, actions, control_hz=30, robot=[0, 1])
+        ...     config = TrainConfig(dataset=str(arm), out=Path(root) / "run", steps=2, controller_steps=2, threads=1)
+        ...     summary = train(config)
+        >>> summary["labels"]["labelled_transitions"], summary["labels"]["total_transitions"]
+        (58, 174)
     """
     run = RunDirectory(config.out)
     with ExitStack() as held:

@@ -66,7 +66,12 @@ class EmbeddingCache:
         return load_file(file)["features"].float() if file.is_file() else None
 
     def put(self, frames: Tensor, features: Tensor) -> None:
-        """Keeps features ``[N, F]`` of these frames, in half precision."""
+        """Keeps features in half precision.
+
+        Args:
+            frames (Tensor): uint8 ``[N, H, W, 3]``, by whose content they are found again.
+            features (Tensor): ``[N, F]``.
+        """
         from safetensors.torch import save_file
 
         file = self._file(frames)

@@ -68,6 +68,9 @@ class Projection(nn.Module):
         mean (Tensor): ``[F]``.
         components (Tensor): ``[F, d]``; scaled so that the first component has variance 1.
 
+    Raises:
+        ValueError: if mean and components have other shapes.
+
     Examples:
         >>> import torch
         >>> from torchrl_koap.vision import Projection
@@ -132,7 +135,12 @@ class Projection(nn.Module):
         return (features - self.mean) @ self.components
 
     def save(self, path: str | Path, about: dict[str, str]) -> Path:
-        """Writes it as safetensors, with a description."""
+        """Writes it as safetensors.
+
+        Args:
+            path (str or Path): file to write.
+            about (dict): what the file says of itself, text by name.
+        """
         from safetensors.torch import save_file
 
         save_file({"mean": self.mean.contiguous(), "components": self.components.half().contiguous()}, path, about)

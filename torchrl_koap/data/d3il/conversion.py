@@ -135,6 +135,18 @@ def find_raw_files(task: str, root: str | Path, *, split_file: str | Path | None
     Raises:
         FileNotFoundError: if nothing is there; the message lists the places looked at.
         ValueError: if the split file is no list of plain file names.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap.data import RawEpisode, find_raw_files, write_raw_episode
+        >>> path = np.linspace([0.5, -0.3, 0.12], [0.5, 0.4, 0.12], 40)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder) / "env_000_00.pkl"
+        ...     write_raw_episode(file, RawEpisode(robot={"des_c_pos": path, "c_pos": path}))
+        ...     [path.name for path in find_raw_files("avoiding", folder)[1]]
+        ['env_000_00.pkl']
     """
     root, inside = Path(root).expanduser(), PurePosixPath(get_converter(task).folder).parts
     ends = [Path(*inside[start:]) for start in range(len(inside) - 1, -1, -1)]
@@ -180,6 +192,20 @@ def convert_raw_files(
 
     Raises:
         RawFolderError: with the problems of all files.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap.data import RawEpisode, convert_raw_files, write_raw_episode
+        >>> from torchrl_koap.data.d3il.conversion import get_converter
+        >>> path = np.linspace([0.5, -0.3, 0.12], [0.5, 0.4, 0.12], 40)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = Path(folder) / "env_000_00.pkl"
+        ...     write_raw_episode(file, RawEpisode(robot={"des_c_pos": path, "c_pos": path}))
+        ...     data = convert_raw_files(get_converter("avoiding"), [file], Path(folder))
+        >>> data["observation"].shape, data["action"].shape
+        (torch.Size([39, 4]), torch.Size([39, 2]))
     """
     observations, actions = [], []
     for frames, steps in read_trajectories(converter, files, folder, progress=progress):

@@ -59,8 +59,8 @@ class RawEpisode:
     """One recorded demonstration of ``T`` control steps.
 
     Args:
-        robot (dict): arrays ``(T, ...)`` by name, see the module's table.
-        objects (dict): for each object of the scene its arrays ``(T, ...)`` by name.
+        robot (dict): arrays ``[T, ...]`` by name, see the module's table.
+        objects (dict): for each object of the scene its arrays ``[T, ...]`` by name.
         context (optional): what the scene was reset to, plain containers and arrays.
 
     Examples:
@@ -139,7 +139,15 @@ def write_raw_episode(path: str | Path, episode: RawEpisode) -> None:
         RawEpisodeError: with all problems of the demonstration.
 
     Examples:
-        See :func:`read_raw_episode`.
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap.data import RawEpisode, load_pickle, write_raw_episode
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "env_000_00.pkl"
+        ...     write_raw_episode(path, RawEpisode(robot={"c_pos": np.zeros((5, 3))}))
+        ...     load_pickle(path)["robot"]["c_pos"].shape
+        (5, 3)
     """
     problems = _problems(episode, robot=(), objects=(), min_length=1)
     if problems:

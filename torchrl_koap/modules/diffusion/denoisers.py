@@ -124,6 +124,9 @@ class MLPDenoiser(nn.Module):
         film (bool): also scale and shift the input of every residual layer by a linear function of step embedding and
             condition (Peebles and Xie 2023). Defaults to False: they enter once, beside the plan.
 
+    Raises:
+        ValueError: for a dropout outside [0, 1), or an ``embedding_dim`` that is odd or below 4.
+
     Examples:
         >>> import torch
         >>> from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser
@@ -210,6 +213,9 @@ class TransformerDenoiser(nn.Module):
         depth (int): number of layers. Defaults to 3.
         heads (int): attention heads; must divide ``width``. Defaults to 4.
         frequencies (int): octaves of the condition's Fourier features. Defaults to 4.
+
+    Raises:
+        ValueError: if ``heads`` does not divide ``width``, or ``width`` is odd.
 
     Examples:
         >>> import torch

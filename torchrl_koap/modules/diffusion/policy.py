@@ -131,7 +131,7 @@ class DiffusionPolicy(ConditionedDiffusion):
         return self.action_normalizer(actions)
 
     def decode_actions(self, sequence: Tensor) -> Tensor:
-        """Inverse of :meth:`encode_actions`."""
+        """Inverse of :meth:`encode_actions`: sequences ``[*B, H, act]`` in raw units."""
         return self.action_normalizer.inverse(sequence)
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:

@@ -130,7 +130,7 @@ class NoiseSchedule(nn.Module):
         return torch.randint(self.num_train_steps, shape, **options).to(like.dtype)
 
     def levels(self, time: Tensor) -> tuple[Tensor, Tensor]:
-        """Amplitudes of signal and noise at ``time``, in the shape of ``time``."""
+        """Amplitudes of signal and noise at ``time`` ``[*B]`` (training steps), each ``[*B]``."""
         if self.path == "flow":
             noise = time / self.num_train_steps
             return 1 - noise, noise
@@ -177,6 +177,12 @@ class NoiseSchedule(nn.Module):
         Args:
             num_steps (int): number of solver steps, at most ``num_train_steps`` on a diffusion path.
             times (sequence of float, optional): decreasing times to stop at instead; the clean plan is appended.
+
+        Returns:
+            list of Node: time in training steps, amplitudes of signal and noise.
+
+        Raises:
+            ValueError: if the number of steps is out of range.
         """
         if times is None:
             if num_steps < 1 or (self.path == "diffusion" and num_steps > self.num_train_steps):
