@@ -37,8 +37,8 @@ def write_command_pages() -> None:
     write_page(
         "commands/index",
         heading("Every command and option"),
-        "What ``koap COMMAND --help`` prints. Fields of a configuration in Python have the same names, with "
-        "underscores, as in :class:`~torchrl_koap.training.config.TrainConfig`.",
+        "What ``koap COMMAND --help`` prints, but for defaults that are ``None``. Fields of a configuration in Python "
+        "have the same names, with underscores, as in :class:`~torchrl_koap.training.config.TrainConfig`.",
         table(("command", "what it does"), [(f":doc:`{name}`", summary(kind)) for name, kind in commands.items()]),
         toctree(commands, hidden=True),
     )
@@ -57,4 +57,8 @@ def help_of(name: str) -> str:
     text = re.sub(r"\x1b\[[0-9;]*m", "", out.getvalue())
     lines = [line.strip("│").rstrip() for line in text.splitlines()]
     lines = [re.sub(r"^[╭╰]─+\s?|\s?─*[╮╯]$", "", line) for line in lines]
-    return "\n".join(line for line in lines if line.strip("─ ") or not line)
+    text = "\n".join(line for line in lines if line.strip("─ ") or not line)
+    text = re.sub(r"\{None\}\|(?:\{(\[.*?\])\}|(\S+))", r"\1\2", text)
+    # what stood beside a shorter name goes back to its column
+    text = re.sub(r"^(  --\S+ \S+) +(?=\S)", lambda found: f"{found[1]:<27}", text, flags=re.MULTILINE)
+    return re.sub(r"\s*\(default:\s+None\)", "", text)

@@ -9,7 +9,7 @@ import textwrap
 from functools import partial
 from typing import Any
 
-from pages import escape, heading, read_rows, table, toctree, write_page
+from pages import escape, execution, heading, planner_rows, read_rows, success, table, toctree, write_page
 
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.config import TrainConfig
@@ -139,12 +139,28 @@ def measured(method: Method) -> str:
     for row in read_rows("label_curves"):
         if row["method"] != method.name:
             continue
-        success = f"{100 * int(row['successes']) / int(row['n']):.1f} % of {row['n']}" if row["successes"] else ""
+        rate = success(row["successes"], row["n"])
         error = f"{row['action_error']} {row['unit']}" if row["action_error"] else ""
         data = f"{row['data']}, {row['demonstrations']}"
-        rows.append((row["task"], data, f"{100 * float(row['label_fraction']):g} %", success, row["entropy"], error))
-    head = ("task", "demonstrations", "labelled", "success", "entropy", "action error")
+        rows.append((row["task"], data, f"{100 * float(row['label_fraction']):g} %", rate, row["entropy"], error))
+    head = ("task", "demonstrations", "labelled", "success (95 %)", "entropy", "action error")
     earlier = getattr(method, "earlier", "")
     if rows and earlier:
         return f"The committed curves were measured when ``{method.name}`` was what is :doc:`{earlier}` now."
-    return table(head, rows) or "No curve of it is committed."
+    return table(head, rows) or planned(method) or "No figure of it is committed."
+
+
+def planned(method: Method) -> str:
+    """Rows of rollouts with several planners, for a method that is in no curve."""
+    rows = [
+        (
+            row["task"],
+            row["demonstrations"],
+            row["labels"],
+            execution(row),
+            success(row["successes"], row["n"]),
+            row["entropy"],
+        )
+        for row in planner_rows(method=method.name)
+    ]
+    return table(("task", "demonstrations", "labels", "planner", "success (95 %)", "entropy"), rows)

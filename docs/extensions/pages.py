@@ -7,6 +7,8 @@ import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from torchrl_koap.evaluation.statistics import wilson_interval
+
 ROOT = Path(__file__).resolve().parents[2]
 GENERATED = ROOT / "docs" / "generated"
 MARKS = "=-~"
@@ -66,6 +68,27 @@ def read_rows(name: str) -> list[dict[str, str]]:
     """Rows of a file of measured figures, ``benchmarks/results/NAME.csv``."""
     with (ROOT / "benchmarks" / "results" / f"{name}.csv").open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def success(successes: str | int, trials: str | int) -> str:
+    """A success rate with its 95 % interval and the number of rollouts, in percent; empty without successes."""
+    if successes == "":
+        return ""
+    low, high = wilson_interval(int(successes), int(trials))
+    return f"{100 * int(successes) / int(trials):.1f} % ({100 * low:.0f}-{100 * high:.0f}) of {trials}"
+
+
+def planner_rows(**wanted: str) -> list[dict[str, str]]:
+    """Rows of ``planner_ablations.csv`` with a learned controller, and with these values."""
+    rows = [row for row in read_rows("planner_ablations") if row["controller"] == "learned"]
+    return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+
+
+def execution(row: dict[str, str]) -> str:
+    """Denoiser, candidates, training seed and note of a row of ``planner_ablations.csv``."""
+    many = f"{row['candidates']} candidates" if row["candidates"] not in ("", "1") else ""
+    seed = f"training seed {row['training_seed']}"
+    return ", ".join(part for part in (row["denoiser"].split()[0], many, seed, row["note"]) if part)
 
 
 def escape(text: str) -> str:

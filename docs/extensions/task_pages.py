@@ -7,7 +7,19 @@ import inspect
 import math
 from typing import Any
 
-from pages import GENERATED, code, escape, heading, read_rows, table, toctree, write_page
+from pages import (
+    GENERATED,
+    code,
+    escape,
+    execution,
+    heading,
+    planner_rows,
+    read_rows,
+    success,
+    table,
+    toctree,
+    write_page,
+)
 
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.import_strings import resolve
@@ -168,24 +180,36 @@ def expert_blocks(expert: Any) -> list[str]:
 
 
 def measured_blocks(task: Task) -> list[str]:
-    """Success of KOAP and of the ridge, from the committed curves."""
+    """Success of KOAP and of the ridge, from the committed curves, and of plans followed by prediction."""
     rows = []
     for row in read_rows("label_curves"):
         if row["task"] == task.name and row["method"] in ("koap", "linear") and row.get("n"):
-            rate = 100 * int(row["successes"]) / int(row["n"]) if row["successes"] else None
             rows.append(
                 (
                     f"``{row['method']}``",
                     f"{row['data']}, {row['demonstrations']}",
                     f"{100 * float(row['label_fraction']):g} %",
-                    "" if rate is None else f"{rate:.1f} % of {row['n']}",
+                    success(row["successes"], row["n"]),
                     row["entropy"],
                 )
             )
-    if not rows:
+    head = ("method", "demonstrations", "labelled", "success (95 %)", "entropy")
+    followed = [
+        (row["demonstrations"], row["labels"], execution(row), success(row["successes"], row["n"]), row["entropy"])
+        for row in planner_rows(task=task.name, method="koap_mpc")
+    ]
+    if not rows and not followed:
         return [heading("Measured", 1), "See :doc:`/results/tasks`."]
-    head = ("method", "demonstrations", "labelled", "success", "entropy")
-    return [heading("Measured", 1), table(head, rows), "All methods, with intervals: :doc:`/results`."]
+    tracked = ("demonstrations", "labels", "planner", "success (95 %)", "entropy")
+    return [
+        heading("Measured", 1),
+        table(head, rows),
+        "Plans followed by predicting the robot's answer to its commands, :doc:`/generated/methods/koap_mpc`:"
+        if followed
+        else "",
+        table(tracked, followed),
+        "All methods: :doc:`/results`.",
+    ]
 
 
 def draw(task: Task) -> None:

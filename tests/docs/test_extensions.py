@@ -16,8 +16,10 @@ sys.path.append(str(ROOT / "docs" / "extensions"))
 import api_pages  # noqa: E402
 import command_pages  # noqa: E402
 import design_page  # noqa: E402
+import method_pages  # noqa: E402
 import pages  # noqa: E402
 import run_tutorials  # noqa: E402
+import task_pages  # noqa: E402
 import time_picture  # noqa: E402
 import tutorial_pages  # noqa: E402
 
@@ -129,8 +131,18 @@ def test_every_public_name_is_in_the_reference(generated):
 def test_every_command_is_a_page_of_its_options(generated):
     command_pages.write_command_pages()
     train = (generated / "commands" / "train.rst").read_text()
-    assert "--label-fraction" in train and "Train planner and controller" in train and "\x1b" not in train
+    assert "--label-fraction FLOAT" in train and "Train planner and controller" in train and "\x1b" not in train
+    assert "default: None" not in train and "{None}|" not in train
+    assert "\n     --task STR               name of the task" in train
     assert {path.stem for path in (generated / "commands").iterdir()} >= {"index", "convert", "curve", "doctor", "eval"}
+
+
+def test_success_never_stands_without_its_interval():
+    assert pages.success("164", "180") == "91.1 % (86-94) of 180" and pages.success("", "180") == ""
+    for name in ("koap", "koap_mpc"):
+        cells = [line for line in method_pages.measured(method_pages.METHODS[name]).splitlines() if " of 180" in line]
+        assert cells and all(re.search(r"\d % \(\d+-\d+\) of 180", cell) for cell in cells)
+    assert "koap_mpc" in "".join(task_pages.measured_blocks(task_pages.TASKS["avoiding"]))
 
 
 def test_tables_keep_several_lines_in_a_cell():
