@@ -51,6 +51,13 @@ def test_the_task_comes_with_the_data(run):
     assert summary["labels"]["labelled_transitions"] == 58 and summary["labels"]["selected_units"] == 2
 
 
+def test_data_of_an_own_task_are_validated_without_naming_it(run, capsys):
+    assert koap("validate", run.parent / "arm") == 0
+    assert "no problem found" in capsys.readouterr().out
+    assert koap("validate", run.parent / "arm", "--task", "sorting") == 1
+    assert "holds its own task 'arm'; --task sorting does not fit it" in capsys.readouterr().err
+
+
 def test_a_policy_acts_on_the_users_observations(run):
     agent = Agent(load_policy(run))
     agent.reset()

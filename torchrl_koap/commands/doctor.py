@@ -22,10 +22,10 @@ from torchrl_koap.data.doubts import find_doubts
 from torchrl_koap.data.lerobot.files import is_lerobot
 from torchrl_koap.evaluation import load_run
 from torchrl_koap.keys import validate
-from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks import Task
 from torchrl_koap.training import RunDirectory, RunDirectoryError
 from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.digests import DIGESTS
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
@@ -57,13 +57,14 @@ class Validate(Command):
     """Check a folder of demonstrations and report every problem found, and what is right in form but doubtful.
 
     Attributes:
-        dataset: folder of D3IL raw pickles, a LeRobot data set, or a folder written by `koap demos`.
-        task: name of the task.
+        dataset: folder of D3IL raw pickles, a LeRobot data set, or a folder written by `koap demos`, `koap convert` or
+            save_demonstrations.
+        task: name of the task (default: that of the data set, if it says so; else "avoiding").
         plugins: modules that register tasks; imported before anything else.
     """
 
     dataset: tyro.conf.Positional[str]
-    task: str = "avoiding"
+    task: str | None = None
     plugins: Plugins = ()
 
     def __call__(self) -> dict[str, str]:
@@ -73,7 +74,7 @@ class Validate(Command):
             LayoutError, RawFolderError: with all problems.
         """
         load_plugins(self.plugins)
-        task = get_task(self.task)
+        task = find_task_of(self.dataset, self.task)
         with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:
             data = validate(load_demonstrations(self.dataset, task, progress=count_up_to(bar)))
         units = task.observation_units or _position_units(task)
