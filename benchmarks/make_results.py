@@ -46,7 +46,16 @@ from result_rows import (
     training_rows,
     window_rows,
 )
-from scooping_rows import scooping_parts_table, scooping_probe_table, scooping_table
+from scooping_rows import (
+    scooping_cell,
+    scooping_cost_table,
+    scooping_minutes,
+    scooping_outlines,
+    scooping_parts_table,
+    scooping_plans_table,
+    scooping_probe_table,
+    scooping_table,
+)
 from unlabelled_picture import REGIMES, draw_errors
 from unlabelled_rows import (
     followed_rows,
@@ -111,6 +120,16 @@ _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env
 _PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size)
 _UNLABELLED = (followed_rows, unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
 _FAULTS = (ledger_rows, kill_rows, soak_rows, raw_rows, resume_rows, version_rows)
+_SCOOPING = (
+    scooping_cell,
+    scooping_cost_table,
+    scooping_minutes,
+    scooping_outlines,
+    scooping_parts_table,
+    scooping_plans_table,
+    scooping_probe_table,
+    scooping_table,
+)
 _HELPERS = (
     first,
     label_sizes,
@@ -122,9 +141,7 @@ _HELPERS = (
     *_PAPER,
     *_UNLABELLED,
     *_FAULTS,
-    scooping_parts_table,
-    scooping_probe_table,
-    scooping_table,
+    *_SCOOPING,
 )
 
 

@@ -103,7 +103,6 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     data = load_ted(options.folder / "data_both" / "ted")
-    data = data[0] if isinstance(data, tuple) else data
     states = [data["observation"][data["episode"] == e] for e in range(ROBOTS - options.episodes, ROBOTS)]
     sims, n = ScoopingSimulations("robot", 1), options.episodes
     taken, again = experts(sims, n)

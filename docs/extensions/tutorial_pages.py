@@ -26,6 +26,7 @@ ORDER = (
     "planners",
     "own_task",
     "label_next",
+    "scooping",
     "label_curve",
 )
 DIGEST = "# code: "

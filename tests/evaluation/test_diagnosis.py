@@ -6,18 +6,22 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tiny_runs import koap
 
+from torchrl_koap.data import flatten_trajectories
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.registry import make_env
+from torchrl_koap.evaluation import diagnosis, inspection
 from torchrl_koap.evaluation.diagnosis import (
     contexts_of,
     coverage,
     executed_success,
+    follow_recordings,
     imagine,
     imagined_success,
     rate,
@@ -25,6 +29,8 @@ from torchrl_koap.evaluation.diagnosis import (
     tracking_errors,
 )
 from torchrl_koap.evaluation.inspection import verdict
+from torchrl_koap.evaluation.run import load_run
+from torchrl_koap.reports.diagnosis_plot import plot_inspection
 from torchrl_koap.tasks import get_task
 
 AVOIDING = get_task("avoiding")
@@ -135,3 +141,47 @@ def test_inspect_from_the_shell(trained_run, tmp_path, capsys):
     assert written["closed_loop"]["episodes"] == 2 and (run / "plots" / "inspect.png").exists()
     assert koap("inspect", run, "--episodes", "0") == 1
     assert "episodes must be >= 1, got 0" in capsys.readouterr().err
+
+
+def test_plans_are_followed_as_the_task_says_and_no_planner_is_judged_without_a_goal(
+    trained_run, monkeypatch, tmp_path
+):
+    trained = load_run(trained_run)
+    plans = {"execution": "open_loop", "replan_interval": 8, "blend_decay": 0.0}
+    task = replace(trained.task, goal=None, defaults=replace(trained.task.defaults, execution=plans))
+    made, make_policy = [], inspection.make_policy
+
+    def noted(planner, controller, **options):
+        made.append(options)
+        return make_policy(planner, controller, **options)
+
+    monkeypatch.setattr(inspection, "load_run", lambda run: replace(trained, task=task))
+    for module in (inspection, diagnosis):
+        monkeypatch.setattr(module, "make_policy", noted)
+    config = inspection.InspectConfig(episodes=2, threads=1)
+    result = inspection.inspect(trained_run, config).result
+    assert [{name: options[name] for name in plans} for options in made] == [plans, plans]
+    assert "imagined" not in result and result["closed_loop"]["episodes"] == 2
+    assert result["plan_to_execution"] == {}  # actions are kept, not plans
+    assert plot_inspection(result, task, tmp_path / "inspect.png").exists()
+    inspection.inspect(trained_run, replace(config, replan_interval=4))
+    assert made[-1]["replan_interval"] == 4 and made[-1]["execution"] == "open_loop"
+
+
+@pytest.mark.parametrize(
+    ("followed", "words"), [(0.3, "the controller follows recorded states"), (1.0, "the controller works alone")]
+)
+def test_verdicts_without_a_judged_planner(followed, words):
+    result = {"followed": {"rate": followed}, "closed_loop": {"rate": 0.4}, "distance_to_demonstrations": {}}
+    assert verdict(result | {"recording_to_execution": {}}, get_task("scooping")).startswith(words)
+
+
+def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
+    states = [torch.full((20, 4), float(number)) for number in range(6)]
+    actions = [torch.full((19, 2), float("nan") if number < 4 else 0.1) for number in range(6)]
+    data = flatten_trajectories(states, actions)
+    data["state"] = data["observation"][:, :2].clone()
+    monkeypatch.setattr(diagnosis, "make_policy", lambda *_, **__: None)
+    monkeypatch.setattr(diagnosis, "roll_out", lambda *_, futures, **__: futures)
+    futures = follow_recordings(Straight(), None, AVOIDING, data, None, episodes=5)
+    assert futures[:, 0, 0, 0].tolist() == [4.0, 5.0]

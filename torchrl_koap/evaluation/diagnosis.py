@@ -20,7 +20,7 @@ from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.evaluation.rollouts import make_policy, roll_out
 from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.keys import OBSERVATION
+from torchrl_koap.keys import HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.policies.replay import RecordedPlanner
 from torchrl_koap.tasks import Task
@@ -109,7 +109,8 @@ def follow_recordings(
         planner (StatePlanner): for its history and horizon alone.
         controller (nn.Module): the controller under test.
         task (Task): the task.
-        data (TensorDictBase): flat demonstrations with ``state``.
+        data (TensorDictBase): flat demonstrations with ``state``. Where ``has_action`` says that some of them were
+            recorded without any action, by another embodiment, those are not followed.
         make_env (callable): makes an environment of a number of episodes.
 
     Keyword Args:
@@ -117,7 +118,11 @@ def follow_recordings(
         **options: of :func:`~torchrl_koap.evaluation.rollouts.make_policy`.
     """
     lengths = trajectory_lengths(data).tolist()
-    chosen = torch.linspace(0, len(lengths) - 1, min(episodes, len(lengths))).long().unique().tolist()
+    own = torch.arange(len(lengths))
+    if HAS_ACTION in data.keys():
+        recorded = torch.tensor([part.any().item() for part in data[HAS_ACTION].split(lengths)])
+        own = own[recorded] if recorded.any() else own
+    chosen = own[torch.linspace(0, len(own) - 1, min(episodes, len(own))).long().unique()].tolist()
     paths = data["state"].split(lengths)
     starts = torch.stack([data[OBSERVATION].split(lengths)[index][0] for index in chosen])
     policy = make_policy(RecordedPlanner(planner), controller, state_columns=task.state_of, **options)

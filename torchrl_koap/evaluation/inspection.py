@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import controller_view, trajectory_lengths
+from torchrl_koap.evaluation.config import EvalConfig
 from torchrl_koap.evaluation.diagnosis import (
     coverage,
     executed_success,
@@ -26,9 +27,9 @@ from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET, e
 from torchrl_koap.evaluation.offline import load_training_data
 from torchrl_koap.evaluation.places import choose_contexts
 from torchrl_koap.evaluation.rollouts import make_policy, roll_out
-from torchrl_koap.evaluation.trained_run import TrainedRun, load_run
+from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_run
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.tasks import REPLAN_INTERVAL, Task
+from torchrl_koap.tasks import Task
 from torchrl_koap.training.builders import set_up_torch
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import progress_bar
@@ -44,7 +45,7 @@ class InspectConfig:
         episodes: episodes of each of the three experiments.
         dataset: demonstrations to compare with (default: those the run was trained on).
         seed: seed of the planner's noise.
-        replan_interval: control steps per plan.
+        replan_interval: control steps per plan (default: as `koap eval` has it, and likewise the next).
         blend_decay: share of the distance between state and plan that is left after each step.
         latent_only: look into the latent space alone: seconds, without the experiments in the simulator.
         latent_steps: control steps that the latent dynamics predict (fewer where demonstrations are short).
@@ -60,8 +61,8 @@ class InspectConfig:
     episodes: int = 30
     dataset: str | None = None
     seed: int = 500
-    replan_interval: int = REPLAN_INTERVAL
-    blend_decay: float = 0.8
+    replan_interval: int | None = None
+    blend_decay: float | None = None
     latent_only: bool = False
     latent_steps: int = 10
     threads: int = 2
@@ -93,8 +94,9 @@ class Inspection:
 def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
     """Makes the three experiments and looks into the latent space.
 
-    ``imagined`` is the planner alone, ``followed`` the controller alone on recorded states (blind to where objects
-    went), ``closed_loop`` both. ``latent`` (:func:`~torchrl_koap.evaluation.latent_space.analyse_latent`) reads labels
+    ``imagined`` is the planner alone, which a task without a goal in its states cannot judge; ``followed`` the
+    controller alone on recorded states (blind to where objects went), ``closed_loop`` both. Plans are followed as
+    ``koap eval`` follows them. ``latent`` (:func:`~torchrl_koap.evaluation.latent_space.analyse_latent`) reads labels
     outside the budget, for analysis only.
 
     Args:
@@ -155,12 +157,10 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
 def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBase) -> dict[str, Any]:
     task = trained.task
     planner, controller = trained.planner.to(config.device), trained.controller.to(config.device)
-    settings: dict[str, Any] = {
-        "replan_interval": config.replan_interval,
-        "blend_decay": config.blend_decay,
-        "controller_columns": trained.columns,
-        "action_rule": task.action_rule,
-    }
+    asked = EvalConfig(replan_interval=config.replan_interval, blend_decay=config.blend_decay)
+    settings = execution_of(trained, asked)
+    interval = settings["replan_interval"]
+    settings |= {"controller_columns": trained.columns, "action_rule": task.action_rule}
     seeds = list(range(config.seed, config.seed + config.episodes))
     from torchrl_koap.envs.registry import make_env_of  # takes seconds
 
@@ -172,18 +172,18 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
         bar.update()
         followed = follow_recordings(planner, controller, task, data, make_env, episodes=config.episodes, **settings)
         bar.update()
-        start = torch.stack([task.state_of(episode["observation"][0]) for episode in closed])
-        steps = max(int(trajectory_lengths(data).max() * 1.5), 50)
-        imagined = imagine(
-            planner, start.to(config.device), interval=config.replan_interval, max_steps=steps, seed=config.seed
-        ).cpu()
+        judged = {}
+        if task.goal is not None:
+            start = torch.stack([task.state_of(episode["observation"][0]) for episode in closed]).to(config.device)
+            steps = max(int(trajectory_lengths(data).max() * 1.5), 50)
+            imagined = imagine(planner, start, interval=interval, max_steps=steps, seed=config.seed).cpu()
+            judged["imagined"] = rate(imagined_success(task, imagined))
         bar.update()
-    return {
-        "imagined": rate(imagined_success(task, imagined)),
+    return judged | {
         "followed": rate(executed_success(followed)),
         "closed_loop": rate(executed_success(closed)),
-        "plan_to_execution": tracking_errors(task, closed, config.replan_interval),
-        "recording_to_execution": tracking_errors(task, followed, config.replan_interval),
+        "plan_to_execution": tracking_errors(task, closed, interval),
+        "recording_to_execution": tracking_errors(task, followed, interval),
         "distance_to_demonstrations": coverage(task, closed, data),
     }
 
@@ -214,7 +214,7 @@ def verdict(result: dict[str, Any], task: Task) -> str:
         result (dict): of :func:`inspect`.
         task (Task): the task.
     """
-    sentences = [_experiments_say(result, task)] if "imagined" in result else []
+    sentences = [_experiments_say(result, task)] if "closed_loop" in result else []
     latent = result.get("latent", {})
     if "multi_step" in latent:
         sentences.append(_latent_says(latent, task))
@@ -258,15 +258,16 @@ def _experiments_say(result: dict[str, Any], task: Task) -> str:
     """What the three experiments say, in a sentence.
 
     Where things are pushed or grasped, recorded tool paths do not answer to where the objects went: there the
-    controller is judged by how near the tool stays to them.
+    controller is judged by how near the tool stays to them. A planner whose task has no goal is not judged.
     """
-    imagined, followed, closed = (result[name]["rate"] for name in ("imagined", "followed", "closed_loop"))
+    followed, closed = (result[name]["rate"] for name in ("followed", "closed_loop"))
+    imagined = result["imagined"]["rate"] if "imagined" in result else None
     if closed >= 0.9:
         return "nothing to find: the closed loop succeeds"
     parts = []
-    if imagined < 0.9:
+    if imagined is not None and imagined < 0.9:
         parts.append(f"the planner's own imagination reaches the goal in {imagined:.0%} of the episodes only")
-    if task.objects:
+    if task.objects and task.position in result["recording_to_execution"]:
         off = result["recording_to_execution"][task.position][-1]
         if off > _NEAR:
             parts.append(f"the controller leaves recorded tool paths by {1e3 * off:.0f} mm")
@@ -277,4 +278,6 @@ def _experiments_say(result: dict[str, Any], task: Task) -> str:
         parts.append("executed states lie far from every demonstration")
     if parts:
         return "; ".join(parts)
+    if imagined is None:
+        return "the controller works alone: the planner, or plans that start from executed states, are what is left"
     return "planner and controller work alone, not together: plans that start from executed states are worse"

@@ -102,7 +102,7 @@ def advice(numbers: Numbers) -> list[Advice]:
 def which_part(numbers: Numbers) -> Advice | None:
     """The closed loop fails and nobody has looked where."""
     success = numbers.of("success_rate")
-    if success is None or success >= GOOD or numbers.rate("imagined") is not None or _is_policy(numbers):
+    if success is None or success >= GOOD or numbers.rate("closed_loop") is not None or _is_policy(numbers):
         return None
     finding = f"success is {_percent(success)}; whether planner or controller fails is not known"
     return Advice(finding, "let each of them work alone", "koap inspect {run}")

@@ -54,12 +54,13 @@ def plot_inspection(result: Mapping[str, Any], task: Task, path: str | Path) -> 
     """
     figure = Figure(figsize=(9.8, 4.1), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
-    for index, name in enumerate(EXPERIMENTS):
+    made = {name: words for name, words in EXPERIMENTS.items() if name in result}
+    for index, name in enumerate(made):
         value = result[name]
         left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "closed_loop" else PALE_BLUE)
         left.vlines(index, 100 * value["low"], 100 * value["high"], color=INK, linewidth=1.4)
-    numbers = [f"{words}\nn = {result[name]['episodes']}" for name, words in EXPERIMENTS.items()]
-    left.set_xticks(range(3), numbers, fontsize=8)
+    numbers = [f"{words}\nn = {result[name]['episodes']}" for name, words in made.items()]
+    left.set_xticks(range(len(made)), numbers, fontsize=8)
     left.set_ylim(0, 105)
     left.set_ylabel("success (%)")
     set_title(left, "Who reaches the goal (95 % intervals)")

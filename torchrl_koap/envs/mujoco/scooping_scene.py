@@ -1,8 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scene of Scooping: table, bowl, free pieces, a camera, and what holds the spoon: a Panda of capsules, or a hand.
 
-Everything is a primitive shape. The arm's capsules have the links' places and thicknesses, so that its outline is that
-of the detailed meshes at a small part of their cost in software rendering.
+Everything is a primitive shape. The arm's capsules have the links' places and rough thicknesses, at a small part of the
+cost of detailed meshes in software rendering. Their outline is only roughly that of the meshes
+(``docs/results/scooping.md``).
 """
 
 from __future__ import annotations

@@ -1,0 +1,254 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The study of Scooping: options, rows, tables, probe, outlines and cost, with planted answers."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+import os
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def script(monkeypatch):
+    """Imports a script of ``benchmarks`` by its name."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--methods", "koap_untraind"], "unknown method 'koap_untraind'; did you mean 'koap_untrained'?"),
+        (["--labels", "0"], "--labels must be from 1 to the 100 demonstrations, got 0"),
+        (["--labels", "5", "--demonstrations", "3"], "--labels must be from 1 to the 3 demonstrations, got 5"),
+        (["--episodes", "0"], "--episodes must be at least 1, got 0"),
+        (["--controller-steps", "-1"], "--controller-steps must be at least 0, got -1"),
+        (["--blend-decay", "1"], "--blend-decay must be in [0, 1), got 1.0"),
+        (["--unlabelled", "foot"], "invalid choice: 'foot'"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_anything_is_recorded(script, words, said, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        script("scooping").main(["--folder", str(tmp_path / "none"), *words])
+    assert said in capsys.readouterr().err and not (tmp_path / "none").exists()
+
+
+@pytest.fixture
+def study(script, monkeypatch, tmp_path):
+    """The script with training and rollouts replaced by notes of what was asked for."""
+    module, asked = script("scooping"), []
+
+    def train(config):
+        asked.append(config)
+        config.out.mkdir(parents=True)
+        summary = {"planner": {"loss_planner": 0.25}, "action_error_mrad": {"controller": 12.34}}
+        (config.out / "summary.json").write_text(json.dumps(summary))
+
+    def evaluate(run, config):
+        asked.append((run, config))
+        starts = {"success_left": 1.0, "success_near": 0.5, "success_right": 0.0}
+        return {"success_rate": 6 / 15, "rim_rate": 9 / 15, **starts}
+
+    monkeypatch.setattr(module, "train", train)
+    monkeypatch.setattr(module, "evaluate", evaluate)
+    monkeypatch.setattr(module, "embed_demonstrations", lambda out, *_, **__: (out / "ted").mkdir(parents=True))
+    monkeypatch.setattr(module, "load_encoder", lambda cache: None)
+    monkeypatch.setattr(module, "TABLE", tmp_path / "table.csv")
+    for who in ("robot", "hand"):
+        (tmp_path / who).mkdir()
+    module.asked = asked
+    return module
+
+
+def run(study, tmp_path, *words):
+    study.main(["--folder", str(tmp_path), "--labels", "5", "--methods", "koap", *words])
+    with study.TABLE.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_cell_is_trained_rolled_out_and_written_once(study, tmp_path):
+    (row,) = run(study, tmp_path, "--unlabelled", "both")
+    assert (row["n"], row["successes"], row["rims"]) == ("15", "6", "9")
+    assert (row["left"], row["near"], row["right"]) == ("1.000", "0.500", "0.000")
+    assert (row["action_error_mrad"], row["planner_error"]) == ("12.3", "0.2500")
+    assert float(row["success_low"]) < 0.4 < float(row["success_high"])
+    planner, cell, (rolled, how) = study.asked
+    assert planner.method == "linear" and cell.planner_from == planner.out and rolled == cell.out
+    assert cell.label_episodes == (0, 1, 2, 3, 4) and (how.execution, how.blend_decay) == ("open_loop", 0.0)
+    assert run(study, tmp_path, "--unlabelled", "both") == [row] and len(study.asked) == 3  # it is there already
+    again = run(study, tmp_path, "--unlabelled", "both", "--execution", "feedback", "--blend-decay", "0.8")
+    assert [(r["execution"], r["blend_decay"]) for r in again] == [("open_loop", "0.0"), ("feedback", "0.8")]
+    assert len(study.asked) == 4 and study.asked[3][1].blend_decay == 0.8  # nothing is trained anew
+
+
+def test_hand_alone_has_a_planner_per_number_of_labels_and_no_analysis(study, tmp_path):
+    run(study, tmp_path, "--unlabelled", "hand", "both", "--labels", "5", "2")
+    names = [config.out.name for config in study.asked if not isinstance(config, tuple)]
+    assert [name for name in names if name.startswith("planner")] == [
+        "planner_hand_5_0",
+        "planner_hand_2_0",
+        "planner_both_0",
+    ]
+    assert {config.out.name: config.analysis for config in study.asked if not isinstance(config, tuple)}[
+        "koap_hand_5_0"
+    ] is False
+
+
+def test_cells_pool_seeds_and_take_the_longest_row_of_each(script):
+    base = {"labels": "5", "unlabelled": "both", "method": "koap", "execution": "open_loop", "blend_decay": "0.0"}
+    rates = {"left": "0.5", "near": "1.0", "right": "0.0", "action_error_mrad": "100.0"}
+    rows = [
+        base | rates | {"seed": seed, "n": n, "successes": successes, "rims": n}
+        for seed, n, successes in (("0", "15", "15"), ("0", "60", "30"), ("1", "60", "42"))
+    ]
+    rows.append(rows[0] | {"method": "dd", "action_error_mrad": ""})
+    cell, other = script("scooping_rows").scooping_cells(rows)
+    assert (cell["n"], cell["successes"], cell["seeds"]) == (120, 72, ["0", "1"])
+    assert cell["left"] == pytest.approx(0.5) and cell["action_error_mrad"] == [100.0, 100.0]
+    assert other["method"] == "dd" and other["action_error_mrad"] == []
+
+
+def test_a_place_that_the_embedding_holds_is_found_and_one_it_does_not_is_missed(script):
+    probe_error = script("scooping_probe").probe_error
+    generator = torch.Generator().manual_seed(0)
+    seen = [torch.randn(40, 6, generator=generator) for _ in range(8)]
+    mixing = torch.randn(6, 3, generator=generator).double()
+    assert probe_error(seen, [part.double() @ mixing + 0.4 for part in seen], 6) < 0.1  # mm
+    spoons = [torch.randn(40, 3, generator=generator).double() / 100 for _ in seen]
+    assert probe_error(seen, spoons, 6) > 10
+    # judged on those held out alone: what the others are like does not matter
+    broken = [part if index < 6 else part + 1 for index, part in enumerate(spoons)]
+    assert probe_error(seen, broken, 6) > 1000
+
+
+def test_outlines_overlap_by_hand(script):
+    overlap = script("scooping_silhouette").overlap
+    one, other = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    assert overlap(one, other) == 1.0
+    one[0], other[0, :2], other[1, :2] = True, True, True
+    assert overlap(one, other) == pytest.approx(2 / 6)
+
+
+def test_wall_time_is_read_off_the_files(script, tmp_path):
+    cost = script("scooping_cost")
+
+    def write(path, at, text="{}"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        os.utime(path, (at, at))
+
+    for who, pace in (("robot", 2), ("hand", 1)):
+        for number in range(5):
+            write(tmp_path / who / "data" / "chunk-000" / f"episode_{number}.parquet", 1000 + pace * number)
+    for number in range(3):
+        write(tmp_path / "cache" / f"{number}.safetensors", 2000 + 10 * number)
+    write(tmp_path / "planner_both_0" / "summary.json", 0, json.dumps({"train_seconds": {"planner": 7.0}}))
+    write(tmp_path / "cell" / "summary.json", 0, json.dumps({"train_seconds": {"planner": 0.1, "controller": 3.0}}))
+    write(tmp_path / "cell" / "digests.json", 3000)
+    write(tmp_path / "cell" / "eval.json", 3060, json.dumps({"episodes": 15}))
+    rows = cost.cost_rows(tmp_path, "cell", "planner_both_0")
+    assert [row["seconds"] for row in rows] == ["10", "5", "30", "7", "3", "60"]
+    with pytest.raises(ValueError, match="at least two files, got 1"):
+        cost.span([tmp_path / "cell" / "eval.json"])
+
+
+class Reads:
+    """A controller whose action is what the embedding's first seven columns hold ``shift`` frames later."""
+
+    in_keys, out_keys, num_past, num_window_frames = ("state",), ("action",), 2, 9
+
+    def __init__(self, change=lambda actions: actions):
+        self.change = change
+
+    def __call__(self, data):
+        return data.set("action", self.change(data["state"][..., :7]))
+
+
+@pytest.fixture(scope="module")
+def played():
+    """Joint targets that take a piece out of pieces that lie as the parts' experiments have them, and the start."""
+    sys.path.insert(0, str(BENCHMARKS))
+    parts = importlib.import_module("scooping_parts")
+    sys.path.remove(str(BENCHMARKS))
+    start, sims, rows = np.array([0.33, 0.0]), parts.ScoopingSimulations("robot", 1), np.zeros(1, dtype=np.int64)
+    context = np.array([[*start, parts.TURN]])
+    sims.reset(rows, parts.start_joints(context, "robot")[None], [parts.TURN])
+    expert, targets = parts.ScoopingExpert(sims, 0, 1, 0), []
+    while not sims.success[0] and len(targets) < parts.MOST_STEPS:
+        targets.append(expert.target())
+        sims.advance(rows, targets[-1][None])
+    return parts, sims, start, np.stack(targets)
+
+
+def test_targets_that_take_a_piece_do_and_those_that_stay_do_not(played):
+    parts, sims, start, targets = played
+    assert parts.play(sims, start, parts.TURN, targets)
+    assert not parts.play(sims, start, parts.TURN, targets[:1].repeat(40, 0))
+
+
+def test_a_controller_alone_is_judged_by_what_it_decodes(played):
+    parts, sims, start, targets = played
+    state = torch.zeros(len(targets), parts.EMBEDDING_DIM + 3)
+    state[:, :7] = torch.from_numpy(targets)
+    state[:, parts.EMBEDDING_DIM : parts.EMBEDDING_DIM + 2] = torch.from_numpy(start)
+    assert parts.decoded(sims, SimpleNamespace(controller=Reads()), [state]) == 1
+    still = Reads(lambda actions: actions[:, :1].expand_as(actions))
+    assert parts.decoded(sims, SimpleNamespace(controller=still), [state]) == 0
+
+
+def test_experts_that_do_nothing_take_nothing(played, monkeypatch):
+    parts, sims, *_ = played
+
+    class Idle:
+        finished = False
+
+        def __init__(self, sims, row, start, seed):
+            self.hold, self.left = sims.commands[row].copy(), 5
+
+        def target(self):
+            self.left -= 1
+            self.finished = self.left < 0
+            return self.hold
+
+    monkeypatch.setattr(parts, "ScoopingExpert", Idle)
+    assert parts.experts(sims, 3) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("steps", "lifted"),
+    [
+        ([-0.01] * 20 + [0.01] * 80, 2),  # into the bowl and out
+        ([-0.01] * 18 + [0.0] * 80, 0),  # in, and there it stays
+        ([0.01] * 98, 0),  # was never in
+    ],
+)
+def test_an_imagined_spoon_must_go_in_before_it_comes_out(played, steps, lifted):
+    parts = played[0]
+    generator = torch.Generator().manual_seed(0)
+    states = [torch.zeros(30, parts.EMBEDDING_DIM + 3) for _ in range(2)]
+    for state in states:  # the first column holds the height, in decimetres
+        height = torch.rand(30, generator=generator) * 0.3
+        height[0] = 0.2
+        state[:, 0], state[:, -1] = 10 * height, height
+
+    class Scripted:
+        history, made = 2, 0
+
+        def plan(self, history, generator=None):
+            ahead = torch.tensor(steps + [0.0] * 60)[self.made : self.made + 14].cumsum(0)
+            self.made += 8
+            plan = history[:, -1:].expand(-1, 14, -1).clone()
+            plan[..., 0] += 10 * ahead
+            return plan
+
+    assert parts.imagined(SimpleNamespace(planner=Scripted()), states, 8) == lifted
