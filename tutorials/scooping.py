@@ -7,7 +7,7 @@ From videos without actions to a scooping robot
 
 * how videos of a robot and of a hand become one data set of embeddings, by a network that nobody trained for it,
 * how a planner learns from all of them, and how five demonstrations with joint targets are enough to follow its plans,
-* what a small set like this one reaches, and which part of the policy falls short.
+* what a small set like this one reaches, and what it does not tell.
 
 Run it with ``python tutorials/scooping.py``; it needs the extra ``vision`` and an OpenGL library, and leaves
 ``scooping.png`` behind.
@@ -143,10 +143,9 @@ figure.savefig("scooping.png", dpi=90)
 # Conclusion
 # ----------
 # A network trained on other pictures, videos most of which have no actions, and five labelled demonstrations: the
-# spoon comes over the bowl, and often enough it leaves with a piece. That is all that a set of this size shows: the
-# intervals overlap, so it says nothing about which controller is best. The study with four times the videos, more
-# updates and every method is ``docs/results/scooping.md``; its first finding is that features which stay random do as
-# well there too.
+# spoon comes over the bowl, and it leaves with a piece in most trials. What a set of this size does not tell is which
+# controller is best: the intervals overlap, and features that stay random do as well as those that were trained, here
+# as in the study with four times the videos, ``docs/results/scooping.md``.
 #
 # From the shell: ``koap demos --task scooping --embodiment robot --out robot``, the same with ``hand``, then ``koap
 # embed robot hand --mixed --out data``, ``koap train --task scooping --dataset data --label-episodes 0 1 2 3 4`` and
