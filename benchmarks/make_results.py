@@ -53,6 +53,7 @@ from scooping_rows import (
     scooping_outlines,
     scooping_parts_table,
     scooping_plans_table,
+    scooping_probe_errors,
     scooping_probe_table,
     scooping_table,
 )
@@ -127,6 +128,7 @@ _SCOOPING = (
     scooping_outlines,
     scooping_parts_table,
     scooping_plans_table,
+    scooping_probe_errors,
     scooping_probe_table,
     scooping_table,
 )

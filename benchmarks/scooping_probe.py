@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -29,6 +29,7 @@ TABLE = Path(__file__).parent / "results" / "scooping_probe.csv"
 HELD_OUT = 0.25  # share of the demonstrations that the map is judged on
 MOST = 3000  # frames that components are fitted on
 RIDGE = 1e-3
+KEYS = ("pixels", "pooling", "columns", "embodiment")  # what tells rows apart
 
 
 def frames_of(folder: Path, embodiment: str, size: int, seed: int = 0) -> Iterable[ImageEpisode]:
@@ -73,6 +74,20 @@ def probe_error(seen: Sequence[Tensor], spoons: Sequence[Tensor], cut: int) -> f
     return 1000 * off.norm(dim=1).mean().item()
 
 
+def write(table: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    """Writes rows; those that the table has of other sizes, poolings, columns or embodiments stay."""
+    made = [{key: str(value) for key, value in row.items()} for row in rows]
+    if table.exists():
+        with table.open(newline="") as file:
+            there = list(csv.DictReader(file))
+        again = {tuple(row[key] for key in KEYS) for row in made}
+        made = [row for row in there if tuple(row.get(key) for key in KEYS) not in again] + made
+    with table.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(made)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, required=True, help="of benchmarks/scooping.py")
@@ -95,10 +110,7 @@ def main() -> None:
                     about |= {"embodiment": who, "demonstrations": cut, "held_out": len(spoons) - cut}
                     rows.append(about | {"error_mm": f"{error:.1f}"})
                     print(rows[-1], flush=True)
-    with TABLE.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write(TABLE, rows)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,8 @@ from typing import Any
 
 from result_rows import percent, rows_if_measured, table
 
+from torchrl_koap.tasks.scooping import EMBEDDING_DIM, IMAGE_SIZE
+
 STARTS = ("left", "near", "right")
 _CELL = ("labels", "unlabelled", "method", "execution", "blend_decay")
 _HOW = ("open_loop", "0.0")  # execution and blending of plans in the study itself
@@ -103,6 +105,13 @@ def scooping_probe_table() -> str:
     body = [[kind[0], f"`{kind[1]}`", *kind[2:], *(errors[who] for who in whose)] for kind, errors in found.items()]
     judged = {row["embodiment"]: f"{row['demonstrations']} + {row['held_out']} demonstrations" for row in rows}
     return table([*what, *(f"{who} (mm), {judged[who]}" for who in whose)], body)
+
+
+def scooping_probe_errors() -> dict[str, str]:
+    """What the task's own embedding keeps: its pooling and columns, and the errors by embodiment (mm)."""
+    task = {"pixels": str(IMAGE_SIZE), "pooling": "grid", "columns": str(EMBEDDING_DIM)}
+    own = [row for row in rows_if_measured("scooping_probe") if all(row[key] == task[key] for key in task)]
+    return task | {row["embodiment"]: row["error_mm"] for row in own}
 
 
 def scooping_parts_table() -> str:

@@ -131,6 +131,15 @@ def test_a_place_that_the_embedding_holds_is_found_and_one_it_does_not_is_missed
     assert probe_error(seen, broken, 6) > 1000
 
 
+def test_rows_of_other_probes_stay(script, tmp_path):
+    probe, table = script("scooping_probe"), tmp_path / "probe.csv"
+    row = {"pixels": 96, "pooling": "grid", "columns": 96, "embodiment": "hand", "error_mm": "12.0"}
+    probe.write(table, [row, row | {"pixels": 128}])
+    probe.write(table, [row | {"error_mm": "11.0"}])
+    with table.open(newline="") as file:
+        assert [(r["pixels"], r["error_mm"]) for r in csv.DictReader(file)] == [("128", "12.0"), ("96", "11.0")]
+
+
 def test_outlines_overlap_by_hand(script):
     overlap = script("scooping_silhouette").overlap
     one, other = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
