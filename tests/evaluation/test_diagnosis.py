@@ -29,7 +29,7 @@ from torchrl_koap.evaluation.diagnosis import (
     tracking_errors,
 )
 from torchrl_koap.evaluation.inspection import verdict
-from torchrl_koap.evaluation.run import load_run
+from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.reports.diagnosis_plot import plot_inspection
 from torchrl_koap.tasks import get_task
 
