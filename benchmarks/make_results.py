@@ -59,6 +59,7 @@ from scooping_rows import (
 )
 from unlabelled_picture import REGIMES, draw_errors
 from unlabelled_rows import (
+    followed,
     followed_rows,
     unlabelled_cells,
     unlabelled_gains,
@@ -119,7 +120,7 @@ def bench_size(name: str) -> str:
 
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
 _PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size)
-_UNLABELLED = (followed_rows, unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
+_UNLABELLED = (followed, followed_rows, unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
 _FAULTS = (ledger_rows, kill_rows, soak_rows, raw_rows, resume_rows, version_rows)
 _SCOOPING = (
     scooping_cell,

@@ -85,9 +85,21 @@ def followed_rows(against: Sequence[str]) -> list[list[str]]:
     return body
 
 
+def followed(regime: str, labels: int, method: str) -> str:
+    """How often demonstrations not seen before were followed to the end, over all seeds.
+
+    Args:
+        regime (str): the regime.
+        labels (int): labelled trajectories.
+        method (str): the method.
+    """
+    rows = read_rows("unlabelled_rollouts", regime=regime, labels=labels, method=method)
+    return _together({int(row["seed"]): row for row in rows})
+
+
 def _together(seeds: dict[int, dict]) -> str:
     counts = {key: str(sum(int(row[key]) for row in seeds.values())) for key in ("successes", "n")}
-    return f"{percent(counts, 0)}, {counts['n']}"
+    return f"{percent(counts, 0)} of {counts['n']}"
 
 
 def _successes(row: dict) -> float:
