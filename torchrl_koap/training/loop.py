@@ -15,6 +15,7 @@ from torch import nn
 from torchrl.objectives import SoftUpdate
 
 from torchrl_koap.training.checkpoints import CheckpointError, load_training_state, save_training_state
+from torchrl_koap.training.outlier_gradients import limit_outlier
 from torchrl_koap.training.run_directory import RunDirectory
 
 
@@ -74,6 +75,9 @@ def train_phase(
 ) -> dict[str, float]:
     """Minimises the sum of all ``loss_*`` entries with AdamW.
 
+    A gradient far longer than those before it is shortened
+    (:func:`~torchrl_koap.training.outlier_gradients.limit_outlier`).
+
     Args:
         phase (str): name in the log and of the checkpoint, ``"planner"`` or ``"controller"``.
         loss_module (nn.Module): a TorchRL ``LossModule``.
@@ -125,6 +129,7 @@ def train_phase(
         losses = loss_module(sample())
         terms = {key: losses.get(key) for key in losses.keys() if key.startswith("loss_")}
         sum(terms.values()).backward()
+        limit_outlier(optimizer)
         optimizer.step()
         optimizer.zero_grad()
         if target_update is not None:
