@@ -133,6 +133,14 @@ def test_empty_run_says_which_commands_make_the_sections(tmp_path):
     assert "img" not in page.tags and not (folder / "plots").exists()
 
 
+def test_a_picture_that_no_training_could_leave_says_why(tmp_path):
+    (tmp_path / "summary.json").write_text(json.dumps({"action_error": {"note": "no labels outside the budget"}}))
+    page = write_report(tmp_path).read_text()
+    assert "Predicted against recorded actions: not drawn, no labels outside the budget." in page
+    (tmp_path / "summary.json").write_text(json.dumps({"action_error": {"overall": 0.1}}))
+    assert "Predicted against recorded actions: not drawn" not in write_report(tmp_path).read_text()
+
+
 @pytest.mark.parametrize("name", ["config.json", "summary.json", "eval.json"])
 @pytest.mark.parametrize("content", ['{"task": ', "[1, 2]", ""])
 def test_damaged_json_is_named_and_the_rest_is_shown(name, content, tmp_path):

@@ -69,7 +69,9 @@ def write_report(
     facts = run_facts(run_dir)
     offline = facts["columns"] is not None
     notes += evaluation.get("faults") or []
-    figures, missing = _figures(run_dir, problems, facts["task"], offline=offline)
+    note = _action_errors(summary)[0].get("note")  # why the training left no actions to draw
+    reasons = {"actions.safetensors": note} if isinstance(note, str) else {}
+    figures, missing = _figures(run_dir, problems, facts["task"], reasons, offline=offline)
     return write_page(
         "run.html",
         run_dir / "index.html",
@@ -248,7 +250,7 @@ def _share(labels: Mapping[str, Any]) -> str:
 
 
 def _figures(
-    run_dir: Path, problems: Mapping[str, str], task: str | None, *, offline: bool
+    run_dir: Path, problems: Mapping[str, str], task: str | None, reasons: Mapping[str, str], *, offline: bool
 ) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
     """What is to be shown, and for each command the titles of the pictures whose source it would leave."""
     figures: list[dict[str, Any]] = []
@@ -263,6 +265,8 @@ def _figures(
             figures.append(figure | {"source": f"{FOLDER}/{file}", "beside": moving})
         elif (item.source in _SIMULATED) if offline else item.recorded:
             continue  # no command makes it for this task
+        elif not (run_dir / item.source).exists() and item.source in reasons:
+            figures.append(figure | {"empty": reasons[item.source]})  # no command would make it
         elif not (run_dir / item.source).exists():
             missing.setdefault(_filled(item.command, run_dir), []).append(item.title)
         elif item.empty:
