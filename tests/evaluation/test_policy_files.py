@@ -16,7 +16,7 @@ from torchrl_koap.data import make_demonstrations
 from torchrl_koap.evaluation.policy_files import PolicyDescription
 from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.modules import ChunkedPolicy, PlanThenControl
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import REPLAN_INTERVAL, get_task
 from torchrl_koap.training.checkpoints import CheckpointError, load_tensors, save_tensors
 
 PATH = np.random.default_rng(0).normal(size=(9, 4)) / 100 + np.array([0.5, -0.2, 0.5, -0.2])
@@ -54,6 +54,15 @@ def test_a_run_as_one_file(trained_run, tmp_path):
     np.testing.assert_array_equal(actions(loaded), expected)
     other = load_policy(str(path), EvalConfig(replan_interval=4))
     assert (other.execution, other.replan_interval, other.planner.solver) == ("open_loop", 4, "ddim")
+
+
+def test_a_policy_that_is_built_follows_plans_as_its_task_says(own_policy):
+    planner, controller, task = own_policy.planner, own_policy.controller, own_policy.description.task
+    task = replace(task, defaults=replace(task.defaults, execution={"execution": "open_loop", "blend_decay": 0.0}))
+    built = build_policy(planner, controller, task)
+    assert (built.execution, built.replan_interval, built.blend_decay) == ("open_loop", REPLAN_INTERVAL, 0.0)
+    asked = build_policy(planner, controller, task, execution="feedback", replan_interval=2)
+    assert (asked.execution, asked.replan_interval, asked.blend_decay) == ("feedback", 2, 0.0)
 
 
 def test_a_task_says_how_plans_are_followed_where_nobody_else_does(trained_run):

@@ -145,7 +145,7 @@ def build_policy(planner: StatePlanner, controller: nn.Module, task: Task | None
         controller (InverseDynamics): from :func:`~torchrl_koap.training.fit_controller`.
         task (Task, optional): the task. Default: the one they were fitted for.
         **options: ``execution``, ``replan_interval`` and ``blend_decay``, see
-            :class:`~torchrl_koap.modules.PlanThenControl`.
+            :class:`~torchrl_koap.modules.PlanThenControl`. Default: the task's.
 
     Returns:
         PlanThenControl: for an :class:`~torchrl_koap.modules.Agent`, an environment with
@@ -180,7 +180,8 @@ def build_policy(planner: StatePlanner, controller: nn.Module, task: Task | None
             raise ValueError(f"the {name} was fitted for other columns than those of task {task.name!r}")
     entries = {name: recipe.entry for name, recipe in made.items()}
     columns = task.controller_columns(entries["controller"]["state"])
-    return assemble_policy(planner, controller, PolicyDescription(task, columns=columns, **entries), **options)
+    description = PolicyDescription(task, columns=columns, **entries)
+    return assemble_policy(planner, controller, description, **dict(task.defaults.execution) | options)
 
 
 def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
