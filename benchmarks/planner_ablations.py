@@ -67,7 +67,8 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
             groups[row["context"]] += [row["mode"]] * (row["outcome"] == "success" and row["mode"] >= 0)
         unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
         entropy = conditional_entropy(list(groups.values()), task.num_modes, unsolved=unsolved)
-    seconds = summary["train_seconds"]
+    trained_by = RunDirectory(source).read_json("summary.json") if source else summary
+    seconds = trained_by["train_seconds"]
     return {
         "task": config["task"],
         "demonstrations": summary["labels"].get("trajectories", summary["trajectories_used"]),

@@ -41,6 +41,17 @@ def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
     return replace(config, **kept)
 
 
+def begun_by(run: RunDirectory, command: str | None) -> str | None:
+    """The command that a run was begun with, which says what it is; the one that goes on with it leaves options out.
+
+    Args:
+        run (RunDirectory): the run, which may be new.
+        command (str, optional): how the training was called now, where it was called from a shell.
+    """
+    earlier = run.read_json("config.json") if (run.path / "config.json").exists() else {}
+    return earlier.get("command") or command
+
+
 def check_resume(run: RunDirectory, content: Mapping[str, Any], *, resume: bool) -> None:
     """Refuses a folder that holds another run, or one that was not asked to be resumed.
 

@@ -27,7 +27,7 @@ from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.provenance import fingerprint, to_json
 from torchrl_koap.training.resolved import ResolvedConfig, resolve
-from torchrl_koap.training.resume import check_data, check_resume, started_with
+from torchrl_koap.training.resume import begun_by, check_data, check_resume, started_with
 from torchrl_koap.training.run_directory import RunDirectory
 from torchrl_koap.training.validation import choose_validation, validation_of, without_validation
 
@@ -75,7 +75,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         resolved = resolve(config)
         options, task = resolved.options, resolved.task
         set_up_torch(options.threads, options.device)
-        content = to_json(resolved, command)
+        content = to_json(resolved, begun_by(run, command))
         check_resume(run, content, resume=options.resume)
         check_networks(resolved)
 
