@@ -1,0 +1,100 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Controllers that follow demonstrations in a regime: who reads the plan arrives, who stands still does not."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tiny_runs import koap
+from torch import nn
+
+from torchrl_koap.data.regimes import RegimeSensor
+from torchrl_koap.tasks import get_task
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def script():
+    sys.path.insert(0, str(BENCHMARKS))
+    try:
+        yield importlib.import_module("unlabelled_rollouts")
+    finally:
+        sys.path.remove(str(BENCHMARKS))
+
+
+@pytest.fixture(scope="module")
+def demonstrations(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demonstrations") / "demos"
+    assert koap("demos", "--out", folder, "--episodes", 6, "--threads", 1, "--quiet") == 0
+    return folder
+
+
+class Next(nn.Module):
+    """Commands a multiple of the step that is planned some frames ahead, when the arm will have answered."""
+
+    num_past = 1
+
+    def __init__(self, gain):
+        super().__init__()
+        self.gain = gain
+
+    def forward(self, window):
+        state = window["state"]
+        action = torch.zeros_like(state)
+        action[:, 1] = self.gain * (state[:, 4] - state[:, 3])
+        return TensorDict({"action": action}, window.batch_size)
+
+
+def shown(script, demonstrations, regime):
+    data, _ = script.load_positions(str(demonstrations), 100)
+    sensor = RegimeSensor(data, regime)
+    seen = data.copy().set("state", sensor.noisy(sensor.recorded)).set("observation", data["state"])
+    return sensor, seen.set("episode", torch.unique(data["episode"], return_inverse=True)[1])
+
+
+def test_who_follows_arrives_and_who_stands_still_does_not(script, demonstrations):
+    sensor, seen = shown(script, demonstrations, "plain")
+    episodes, task = torch.arange(6), get_task("avoiding")
+    moved, stood = (script.follow(Next(gain), sensor, seen, task, episodes, 0.0) for gain in (1.0, 0.0))
+    assert moved["successes"] >= 4 and moved["successes"] + moved["collisions"] <= 6
+    assert (stood["successes"], stood["collisions"]) == (0, 0)
+    assert moved["distance_mm"] < 40 < stood["distance_mm"]
+
+
+def test_noise_reaches_the_controller(script, demonstrations):
+    task, episodes = get_task("avoiding"), torch.arange(2)
+    results = []
+    for regime in ("plain", "noise"):
+        sensor, seen = shown(script, demonstrations, regime)
+        results.append(script.follow(Next(1.0), sensor, seen, task, episodes, 0.0)["distance_mm"])
+    assert results[0] < results[1]
+
+
+def test_rows_are_not_run_again(script, demonstrations, tmp_path, monkeypatch):
+    table = tmp_path / "rows.csv"
+    arguments = [
+        *("--dataset", str(demonstrations), "--regimes", "wide_64", "--methods", "linear_steps", "--labels", "1"),
+        *("--seeds", "0", "--judged", "2", "--table", str(table)),
+    ]
+    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", *arguments])
+    script.main()
+    with table.open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["regime"], row["method"], row["n"]) == ("wide_64", "linear_steps", "2")
+    monkeypatch.setattr(script, "follow", None)
+    script.main()
+    assert len(table.read_text().splitlines()) == 2
+
+
+def test_too_few_demonstrations_are_named(script, demonstrations, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", "--dataset", str(demonstrations)])
+    with pytest.raises(SystemExit):
+        script.main()
+    assert "fewer demonstrations than are judged and labelled" in capsys.readouterr().err
