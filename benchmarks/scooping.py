@@ -82,6 +82,8 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
         settings |= {"controller_steps": options.controller_steps, "analysis": unlabelled != "hand"}
         train(_config(run, folder, unlabelled, labels, **settings))
     ways = {name: getattr(options, name) for name in ("execution", "replan_interval", "blend_decay")}
+    if method.startswith("dp"):  # it has no plans to follow: its chunks of actions are executed as they are
+        ways["execution"] = None
     result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1, **ways))
     summary = json.loads((run / "summary.json").read_text())
     n = options.episodes

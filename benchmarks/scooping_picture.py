@@ -25,8 +25,13 @@ from torchrl_koap.tasks.scooping import FRAME_HZ
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "pictures" / "scooping.png"
 SHOWN = 5  # frames of each film
 LABELS = ("2", "5")
-COLORS = {"koap": BLUE, "koap_untrained": PALE_BLUE, "linear": ORANGE}
-NAMES = {"koap": "KOAP", "koap_untrained": "KOAP, features untrained", "linear": "ridge, raw frames"}
+COLORS = {"koap": BLUE, "koap_untrained": PALE_BLUE, "dp": MUTED, "linear": ORANGE}
+NAMES = {
+    "koap": "KOAP",
+    "koap_untrained": "KOAP, features untrained",
+    "dp": "Diffusion Policy",
+    "linear": "ridge, raw frames",
+}
 
 
 def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], path: Path) -> Path:
@@ -52,17 +57,15 @@ def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], pa
         for cell in cells
         if (cell["unlabelled"], cell["execution"], cell["blend_decay"]) == ("both", "open_loop", "0.0")
     }
-    others = sorted({method for _, method in shown} - set(COLORS))
     for group, labels in enumerate(LABELS):
-        own = [*COLORS, max(others, key=lambda name: _rate(shown.get((labels, name))))] if others else [*COLORS]
-        for place, method in enumerate(own):
+        for place, method in enumerate(NAMES):
             cell = shown.get((labels, method))
             if cell is None:
                 continue
             x = group + (place - 1.5) * 0.21
             low, high = (100 * end for end in wilson_interval(cell["successes"], cell["n"]))
-            label = NAMES.get(method, "best of the others") if not group else None
-            axes.bar(x, 100 * _rate(cell), width=0.19, color=COLORS.get(method, MUTED), label=label)
+            label = NAMES[method] if not group else None
+            axes.bar(x, 100 * cell["successes"] / cell["n"], width=0.19, color=COLORS[method], label=label)
             axes.vlines(x, low, high, color=INK, linewidth=1)
     axes.set(xticks=range(len(LABELS)), ylim=(0, 102), ylabel="success (%)")
     axes.set_xticklabels([f"{labels} labels" for labels in LABELS], fontsize=9)
@@ -71,10 +74,6 @@ def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], pa
     tidy(axes)
     figure.savefig(path, dpi=100, facecolor="white", metadata={"Software": None})
     return path
-
-
-def _rate(cell: Mapping[str, Any] | None) -> float:
-    return -1.0 if cell is None else cell["successes"] / cell["n"]
 
 
 def main() -> None:
