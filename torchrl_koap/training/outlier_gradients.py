@@ -1,11 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Gradients far longer than those before them, by which a long training can undo itself within a few updates.
 
-Where gradients have become short, so has the second moment that AdamW divides by. One that is several times as long then
-moves every parameter by several learning rates, the next one is longer still, and within twenty updates the loss is what
-it was at the beginning. Such jumps are known from large models (Wortsman et al. 2023, which limits the update by the same
-comparison, tensor by tensor). Here the length of the whole gradient is compared, so that a training without outliers is
-not touched.
+Where gradients have become short, so has the second moment that AdamW divides by. One that is several times as long
+then moves every parameter by several learning rates, the next one is longer still, and within twenty updates the loss
+is what it was at the beginning. Such jumps are known from large models (Wortsman et al. 2023, which limits the update by
+the same comparison, tensor by tensor). Here the length of the whole gradient is compared, so that a training without
+outliers is not touched.
 """
 
 from __future__ import annotations
