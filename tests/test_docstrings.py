@@ -75,3 +75,12 @@ def test_what_is_raised_is_told():
             found += 1
             assert "Raises:" in text, f"{file}: {name} raises {set().union(*map(raised, makers))}, and does not say so"
     assert found > 30
+
+
+def test_exported_functions_tell_what_they_return():
+    names, found = exported(), 0
+    for file, name, node, text in public_definitions(ast.FunctionDef):
+        if name in names and node.returns is not None and ast.unparse(node.returns) != "None":
+            found += 1
+            assert "Returns:" in text or "Yields:" in text, f"{file}: function {name} does not say what it returns"
+    assert found > 50

@@ -43,6 +43,9 @@ def read_recordings(
             ``action...``.
         action_dim (int, optional): number of action columns of tables without actions.
 
+    Returns:
+        Recordings: trajectories with the names and units that the format has.
+
     Raises:
         RecordingsError: with all faults, named (:mod:`torchrl_koap.data.recordings`).
         FileNotFoundError: if there is no such source.

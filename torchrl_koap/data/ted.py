@@ -140,6 +140,9 @@ def read_task(folder: str | Path) -> Task | None:
     Args:
         folder (str or Path): folder of the data set.
 
+    Returns:
+        Task or None: None if the data set only names its task.
+
     Raises:
         DamagedDataError: if the folder holds no data set, or its task is damaged or names code.
 

@@ -196,6 +196,9 @@ def controller_view(
         action_targets (sequence of int): for actions that are targets, the state column of each: what is left of an
             action is the distance to it. Default: actions stay as they are.
 
+    Returns:
+        TensorDictBase: a copy ``[N]`` with another ``state`` and, with targets, another ``action``.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

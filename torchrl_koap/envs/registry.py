@@ -39,6 +39,9 @@ def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
         **options: further arguments of the environment, such as ``num_threads``, ``max_steps`` and ``dtype``. They
             join, and go before, ``Task.env_options``.
 
+    Returns:
+        EnvBase: the batched environment.
+
     Raises:
         ValueError: if the task is unknown, or has no environment.
 

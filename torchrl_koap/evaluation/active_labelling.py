@@ -235,6 +235,9 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
         run (str or Path): a run directory.
         config (SuggestConfig, optional): how many, and by which criterion.
 
+    Returns:
+        SuggestedLabels: the trajectories to label next, in order.
+
     Raises:
         ValueError: for an unknown criterion, a count out of range, a run without latent actions or whose decoder was
             not fitted in closed form, or demonstrations that are not those of the training any more.

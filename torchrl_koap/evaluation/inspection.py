@@ -103,6 +103,9 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
         run (str or Path): a run directory.
         config (InspectConfig, optional): how many episodes, and how.
 
+    Returns:
+        Inspection: errors and successes of the parts, and which one fails.
+
     Raises:
         ValueError: for fewer than one episode or step, or a run without a planner.
         RunDirectoryError: if the folder is no finished run.

@@ -76,6 +76,9 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
     Keyword Args:
         task (str, optional): refuse a run of another task.
 
+    Returns:
+        TrainedRun: networks with their weights, in evaluation mode.
+
     Raises:
         RunDirectoryError: if the folder is no finished run, one of another task than asked for, or one whose files are
             not those that its training left.
@@ -120,6 +123,9 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
         run (str, Path or TrainedRun): a run directory, what :func:`load_run` made of one, or a file.
         config (EvalConfig, optional): execution, solver, interval between plans, device and plugins; the rest is not
             used. What is not asked for is as ``koap eval`` has it, for a file as it was saved.
+
+    Returns:
+        RecedingHorizonPolicy: in evaluation mode, on the device asked for.
 
     Raises:
         ValueError: for an unknown execution or solver, or an interval out of range.

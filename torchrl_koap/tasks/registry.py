@@ -59,6 +59,9 @@ def get_task(name: str) -> Task:
     Args:
         name (str): the name.
 
+    Returns:
+        Task: the registered task.
+
     Raises:
         ValueError: if the name is unknown; the message suggests the nearest one.
 
@@ -94,6 +97,9 @@ def adopt_task(task: Task) -> Task:
     Args:
         task (Task): the task.
 
+    Returns:
+        Task: the task, which its name finds from now on.
+
     Raises:
         ValueError: if a package has registered another task of that name.
 
@@ -124,6 +130,9 @@ def task_of(config: Mapping[str, Any]) -> Task:
 
     Args:
         config (mapping): content of ``config.json``.
+
+    Returns:
+        Task: the registered task of that name, or the one that the mapping defines.
 
     Raises:
         ValueError: if the task it brings along is damaged or names code, or nobody has registered it.

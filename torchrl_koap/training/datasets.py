@@ -62,6 +62,9 @@ def load_demonstrations(
         progress (callable, optional): called with the number of demonstrations that were recorded, or read from raw
             files, and that of all.
 
+    Returns:
+        TensorDictBase: flat data ``[N]`` with ``state`` and every recorded label.
+
     Raises:
         FileNotFoundError: if there is no such folder, or it holds no demonstrations.
 

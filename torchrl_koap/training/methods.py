@@ -380,6 +380,9 @@ def get_method(name: str, decoder: str | None = None) -> Method:
         decoder (str, optional): ``"ridge"`` (closed form, fitted at the end) or ``"sgd"`` (trained with the rest), for
             methods that exist with both. Default: the method's own.
 
+    Returns:
+        Method: the entry of :data:`METHODS`.
+
     Raises:
         ValueError: if there is no such method, or not with that decoder; the message suggests the nearest name.
 

@@ -3,8 +3,8 @@
 
 Where gradients have become short, so has the second moment that AdamW divides by. One that is several times as long
 then moves every parameter by several learning rates, the next one is longer still, and within twenty updates the loss
-is what it was at the beginning. Such jumps are known from large models (Wortsman et al. 2023, which limits the update by
-the same comparison, tensor by tensor). Here the length of the whole gradient is compared, so that a training without
+is what it was at the beginning. Such jumps are known from large models (Wortsman et al. 2023, which limits the update
+by the same comparison, tensor by tensor). Here the length of the whole gradient is compared, so that a training without
 outliers is not touched.
 """
 

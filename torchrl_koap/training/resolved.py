@@ -84,6 +84,9 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         config (TrainConfig): what is asked for.
         task (Task, optional): the task, registered or not. Default: the one of the data set.
 
+    Returns:
+        ResolvedConfig: nothing in it is left open.
+
     Raises:
         ValueError: for unknown names, numbers out of range, and options that exclude each other.
         RunDirectoryError: if ``planner_from`` is no finished run.

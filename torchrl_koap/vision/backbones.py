@@ -102,6 +102,9 @@ def load_backbone(weights: str | Path | None = None, *, stride: int = 8) -> Back
     Keyword Args:
         stride (int): pixels per place of the feature maps: 8, 16 or 32.
 
+    Returns:
+        Backbone: frozen, in evaluation mode.
+
     Raises:
         WeightsError: if the file is missing, no file of weights, or holds those of another network.
         ValueError: for another stride.

@@ -190,6 +190,9 @@ def convert_raw_files(
         dtype (torch.dtype): floating type of the entries.
         progress (callable, optional): called with the number of files read and that of all.
 
+    Returns:
+        TensorDictBase: flat data ``[N]``, one trajectory per file.
+
     Raises:
         RawFolderError: with the problems of all files.
 

@@ -90,6 +90,9 @@ def read_raw_episode(
         objects (sequence of str): objects that must be there, with ``pos`` and ``quat``.
         min_length (int): least number of rows.
 
+    Returns:
+        RawEpisode: its arrays, a row per control step.
+
     Raises:
         RawEpisodeError: with all problems: unsafe or damaged file, missing keys, wrong shapes, unequal lengths, NaN or
             infinite values, too few rows. Each names file and key.

@@ -66,6 +66,9 @@ def load_pickle(path: str | Path) -> Any:
     Args:
         path (str or Path): the file.
 
+    Returns:
+        object: what the file holds: dicts, lists, strings, numbers and NumPy arrays.
+
     Raises:
         UnsafePickleError: if the file holds anything else. The message names the file and the class or function.
         DamagedPickleError: if the file is empty, truncated or no pickle.
@@ -103,6 +106,9 @@ def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
     Args:
         content (bytes): the pickle.
         name (str): what to call it in error messages.
+
+    Returns:
+        object: what the bytes hold: dicts, lists, strings, numbers and NumPy arrays.
 
     Raises:
         UnsafePickleError: see :func:`load_pickle`.

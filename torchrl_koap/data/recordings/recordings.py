@@ -89,6 +89,9 @@ def make_recordings(
         skipped (sequence of str): entries that the caller left out.
         source (str): what messages call the whole.
 
+    Returns:
+        Recordings: checked, with names and units.
+
     Raises:
         RecordingsError: with all faults: no trajectories, other widths than in the first, fewer than two frames,
             integers where floating-point numbers are wanted, states that are not finite, infinite actions, a number of

@@ -120,6 +120,9 @@ def make_koopman_inverse_dynamics(
         action_normalizer (nn.Module, optional): see :class:`KoopmanInverseDynamics`.
         **overrides: any entry of ``PRESETS[preset]``, and of ``NETWORK_OPTIONS`` for the network chosen.
 
+    Returns:
+        KoopmanInverseDynamics: with fresh weights, drawn from torch's global generator.
+
     Raises:
         ValueError: for an unknown preset or option; the message suggests the nearest.
 

@@ -213,6 +213,9 @@ def blend_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
         plan (Tensor): planned states ``[*B, H, d]``; one shorter than three states is returned as it is.
         decay (float): ``rho``.
 
+    Returns:
+        Tensor: the bent plan ``[*B, H, d]``.
+
     Examples:
         >>> import torch
         >>> from torchrl_koap.modules import blend_plan

@@ -31,6 +31,9 @@ def policy_transforms(history: int, *, observation_key: NestedKey = OBSERVATION)
     Keyword Args:
         observation_key (NestedKey): entry of the observation ``[*B, obs]``. Defaults to ``"observation"``.
 
+    Returns:
+        Compose: transforms for a ``TransformedEnv``.
+
     Examples:
         >>> from torchrl_koap.modules import policy_transforms
         >>> len(policy_transforms(5))
