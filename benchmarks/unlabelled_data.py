@@ -18,11 +18,11 @@ from __future__ import annotations
 
 import argparse
 import copy
-import csv
 import warnings
 from pathlib import Path
 
 import torch
+from resumable_table import open_table
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import controller_view, make_demonstrations, select_state
@@ -156,18 +156,7 @@ def main() -> None:
     name = find_task_of(options.dataset).name
     if options.trajectories < JUDGED + max(options.labels):
         parser.error(f"--trajectories must be at least {JUDGED} judged ones and those with labels")
-    done = set()
-    if options.table.exists():
-        with options.table.open(newline="", encoding="utf-8") as file:
-            done = {tuple(row[column] for column in COLUMNS[:5]) for row in csv.DictReader(file)}
-    else:
-        options.table.parent.mkdir(parents=True, exist_ok=True)
-        options.table.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
-
-    def write(row) -> None:
-        with options.table.open("a", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerow(row)
-
+    done, write = open_table(options.table, COLUMNS, COLUMNS[:5])
     cells = len(options.regimes) * len(options.seeds) * len(options.methods) * len(options.labels)
     with progress_bar(cells, "cells") as bar:
         for regime in options.regimes:

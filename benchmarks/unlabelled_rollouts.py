@@ -7,17 +7,19 @@
 The planner takes no part: at every step the plan is what the demonstration did next, as the sensor of the regime showed
 it (with its noise), bent towards the present observation as the library's policies do. The robot's own motion is
 simulated, and what the controller sees of it goes through the same sensor, with fresh noise. Training, labels and seeds
-are those of ``unlabelled_data.py``; judged are the last trajectories of a seed's order. Success is that of the task.
+are those of ``unlabelled_data.py``; noise goes on from one cell of a seed to the next, so that a row that is run by itself
+differs by what other noise does; judged are the last trajectories of a seed's order. Success is that of the task.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import warnings
+from itertools import product
 from pathlib import Path
 
 import torch
+from resumable_table import open_table
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import step_mdp
 from unlabelled_data import METHODS, as_own_data, controllers, load_positions, shuffled_trajectories
@@ -26,6 +28,7 @@ from torchrl_koap.data.regimes import REGIMES, RegimeSensor
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.policy_files import BLEND_DECAY
 from torchrl_koap.modules import InverseDynamics, blend_plan
+from torchrl_koap.tasks import Task
 from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.progress import progress_bar
 
@@ -53,7 +56,12 @@ def padded(paths: list[torch.Tensor], length: int) -> torch.Tensor:
 
 @torch.no_grad()
 def follow(
-    controller: InverseDynamics, sensor: RegimeSensor, shown: TensorDictBase, task, episodes: torch.Tensor, decay: float
+    controller: InverseDynamics,
+    sensor: RegimeSensor,
+    shown: TensorDictBase,
+    task: Task,
+    episodes: torch.Tensor,
+    decay: float,
 ) -> dict[str, float]:
     """Rolls out one episode per demonstration.
 
@@ -102,6 +110,32 @@ def follow(
     }
 
 
+def run_seed(data: TensorDictBase, source: Task, regime: str, seed: int, wanted: list[tuple[str, int]], options):
+    """Rolls out the controllers of one regime and seed.
+
+    Yields:
+        tuple: method and number of labelled trajectories, and what :func:`follow` found.
+    """
+    if not wanted:
+        return
+    sensor = RegimeSensor(data, regime, seed=seed)
+    seen = data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
+    full, task = as_own_data(seen)
+    places = torch.unique(data["episode"], return_inverse=True)[1]  # as data of one's own are numbered
+    numbers = shuffled_trajectories(full, seed)
+    shown = seen.copy().set("observation", data["state"]).set("episode", places)
+    if sensor.distractors is not None:
+        shown["distractors"] = sensor.distractors
+    for method, labels, controller, _, _ in controllers(full, task, numbers, seed, wanted):
+        found = follow(controller, sensor, shown, source, numbers[-options.judged :], options.blend_decay)
+        yield (method, labels), found | {"distance_mm": f"{found['distance_mm']:.2f}"}
+
+
+def _key(source: Task, regime: str, seed: int, cell: tuple[str, int], decay: float) -> tuple[str, ...]:
+    method, labels = cell
+    return source.name, regime, str(labels), str(seed), method, str(decay)
+
+
 def main() -> None:
     """Runs what the table lacks."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -121,41 +155,16 @@ def main() -> None:
     source = find_task_of(options.dataset)
     if len(data["episode"].unique()) < options.judged + max(options.labels):
         parser.error(f"{options.dataset} has fewer demonstrations than are judged and labelled")
-    done = set()
-    if options.table.exists():
-        with options.table.open(newline="", encoding="utf-8") as file:
-            done = {tuple(row[column] for column in COLUMNS[:6]) for row in csv.DictReader(file)}
-    else:
-        options.table.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
-    cells = [(method, labels) for method in options.methods for labels in options.labels]
+    done, write = open_table(options.table, COLUMNS, COLUMNS[:6])
+    cells = list(product(options.methods, options.labels))
     with progress_bar(len(options.regimes) * len(options.seeds) * len(cells), "cells") as bar:
-        for regime in options.regimes:
-            for seed in options.seeds:
-                keys = {
-                    (method, labels): (
-                        source.name, regime, str(labels), str(seed), method, str(options.blend_decay)
-                    )
-                    for method, labels in cells
-                }  # fmt: skip
-                wanted = [cell for cell in cells if keys[cell] not in done]
-                bar.update(len(cells) - len(wanted))
-                if not wanted:
-                    continue
-                sensor = RegimeSensor(data, regime, seed=seed)
-                seen = data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
-                full, task = as_own_data(seen)
-                places = torch.unique(data["episode"], return_inverse=True)[1]  # as data of one's own are numbered
-                numbers = shuffled_trajectories(full, seed)
-                shown = seen.copy().set("observation", data["state"]).set("episode", places)
-                if sensor.distractors is not None:
-                    shown["distractors"] = sensor.distractors
-                for method, labels, controller, _, _ in controllers(full, task, numbers, seed, wanted):
-                    found = follow(controller, sensor, shown, source, numbers[-options.judged :], options.blend_decay)
-                    found["distance_mm"] = f"{found['distance_mm']:.2f}"
-                    with options.table.open("a", newline="", encoding="utf-8") as file:
-                        row = (*keys[method, labels], options.judged, *found.values())
-                        csv.writer(file, lineterminator="\n").writerow(row)
-                    bar.update()
+        for regime, seed in product(options.regimes, options.seeds):
+            keys = {cell: _key(source, regime, seed, cell, options.blend_decay) for cell in cells}
+            wanted = [cell for cell in cells if keys[cell] not in done]
+            bar.update(len(cells) - len(wanted))
+            for cell, found in run_seed(data, source, regime, seed, wanted, options):
+                write((*keys[cell], options.judged, *found.values()))
+                bar.update()
 
 
 if __name__ == "__main__":

@@ -169,9 +169,10 @@ def test_a_run_killed_in_the_middle_ends_bit_for_bit_like_one_that_was_not(
     )
 
 
-def test_a_finished_run_may_be_resumed_and_stays_what_it_is(copied_run):
+def test_a_finished_run_may_be_resumed_and_stays_what_it_is(copied_run, monkeypatch):
     before = contents(copied_run)
     began = RunDirectory(copied_run).read_json("config.json")["command"]
+    monkeypatch.setattr(sys, "argv", ["koap", "train", "--resume"])
     assert koap("train", "--out", copied_run, "--resume") == 0
     assert RunDirectory(copied_run).read_json("config.json")["command"] == began  # which says what the run is
     after = contents(copied_run)
