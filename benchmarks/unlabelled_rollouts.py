@@ -8,7 +8,7 @@ The planner takes no part: at every step the plan is what the demonstration did 
 it (with its noise), bent towards the present observation as the library's policies do. The robot's own motion is
 simulated, and what the controller sees of it goes through the same sensor, with fresh noise. Training, labels and seeds
 are those of ``unlabelled_data.py``. Noise goes on from one cell of a seed to the next, so that a row that is run by
-itself differs by what other noise does. Judged are the last trajectories of a seed's order. Success is that of the task.
+itself differs by what other noise does. Judged are the last trajectories of a seed's order. Success is the task's.
 """
 
 from __future__ import annotations
