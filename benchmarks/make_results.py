@@ -17,6 +17,7 @@ from pathlib import Path
 
 from fault_rows import kill_rows, ledger_rows, raw_rows, resume_rows, soak_rows, version_rows
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from planner_rows import amounts, draw_amounts, planner_options, planner_table, short_trainings
 from readme_pictures import draw_label_curves, draw_pipeline
 from result_rows import (
     SOURCE,
@@ -33,7 +34,6 @@ from result_rows import (
     own_robot_rows,
     percent,
     pivot,
-    planner_table,
     pooled,
     preset_rows,
     read_rows,
@@ -168,7 +168,10 @@ def pages() -> dict[Path, str]:
         share,
         table,
         pivot,
+        amounts,
+        planner_options,
         planner_table,
+        short_trainings,
         difference,
         fact,
         commands,
@@ -221,6 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     (ROOT / PICTURES).mkdir(parents=True, exist_ok=True)
     drawn = [draw_label_curves(curves(), ROOT / PICTURES / "success_and_entropy.png")]
     drawn += [draw_pipeline(ROOT / PICTURES / f"pipeline.{kind}") for kind in ("svg", "png")]
+    drawn.append(draw_amounts(ROOT / PICTURES / "demonstrations.png"))
     drawn.append(draw_errors({regime: unlabelled_cells(regime) for regime in REGIMES}, ROOT / PICTURES))
     print("\n".join(f"wrote {path}" for path in [*stale, *(path.relative_to(ROOT) for path in drawn)]))
     return 0

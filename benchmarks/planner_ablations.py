@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 import statistics
 from collections import defaultdict
 from pathlib import Path
@@ -27,15 +28,27 @@ from torchrl_koap.training.run_directory import RunDirectory
 TABLE = Path(__file__).parent / "results" / "planner_ablations.csv"
 SIZES = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay")
 UNITS = {"trajectory": "trajectories", "window": "windows", "transition": "transitions"}
-OLDER = {"controller": "learned", "stacked": ""}  # in rows that were written before the column
+OLDER = {"controller": "learned", "stacked": "", "disturbed": "0.0"}  # in rows that were written before the column
 OTHERS = ("first_steps_weight", "precision", "recovery_sigma", "planner_learning_rate")
+PLANS = ("frame", "plan_steps", "observed_frames")
 
 
 def planner_of(config: dict) -> str:
     """The denoiser and its options in words."""
-    sizes = [f"{name}={config[name]}" for name in (*SIZES, *OTHERS) if config.get(name) is not None]
-    channels = [f"channels={tuple(config['channels'])}"] if config["denoiser"] == "unet" else []
-    return " ".join([config["denoiser"], *channels, *sizes])
+    given = {name: config[name] for name in (*SIZES, *OTHERS, *PLANS) if config.get(name) is not None}
+    if config["denoiser"] == "unet":
+        given = {"channels": tuple(config["channels"])} | given
+    words = {name: ",".join(map(str, value)) if isinstance(value, list) else value for name, value in given.items()}
+    return " ".join([config["denoiser"], *(f"{name}={value}" for name, value in words.items())])
+
+
+def disturbed_share(dataset: str) -> float:
+    """Share of the demonstrations of a data set that were recorded with a disturbed operator, as `koap demos` notes."""
+    for folder in (Path(dataset), Path(dataset) / "ted"):
+        if (folder / "about.json").is_file():
+            notes = json.loads((folder / "about.json").read_text(encoding="utf-8")).get("notes") or {}
+            return float(notes.get("disturbance", {}).get("share", 0.0))
+    return 0.0
 
 
 def labels_of(config: dict) -> str:
@@ -94,6 +107,7 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
         "command": config["command"],
         "controller": controller,
         "stacked": stacked_of(results),
+        "disturbed": disturbed_share(trained["dataset"]),
     }
 
 

@@ -90,46 +90,6 @@ def pivot(rows: Sequence[Mapping[str, str]], cell: Any, *, by: str = "label_frac
     return table([head, *map(share, places)], body)
 
 
-def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
-    """A row per trained planner and way to run it."""
-    head = [
-        "labels",
-        "method",
-        "planner",
-        "demonstrations",
-        "updates x batch",
-        "seed",
-        "candidates",
-        "success in % (95 %), entropy",
-        "steps",
-        "",
-    ]
-    body = [
-        [
-            row["labels"],
-            "*oracle*" if row.get("controller") == "oracle" else f"`{row['method']}`",
-            row["denoiser"],
-            row["demonstrations"],
-            f"{row['updates']} x {row['batch']}",
-            row["training_seed"],
-            row["candidates"] if row["candidates"] == "1" else f"{row['candidates']}, {row['choice']}",
-            success(row),
-            row["mean_steps"],
-            row["note"] or boxes(row),
-        ]
-        for row in rows
-    ]
-    return table(head, body)
-
-
-def boxes(row: Mapping[str, str]) -> str:
-    """How often the first box of Stacking reached its zone, and two did, empty for other tasks."""
-    if not row.get("stacked"):
-        return ""
-    first, two, _ = (100 * int(count) / int(row["n"]) for count in row["stacked"].split())
-    return f"first box {first:.1f} %, two {two:.1f} %"
-
-
 def difference(row: Mapping[str, str]) -> str:
     """A difference in percentage points with its interval."""
     return f"{float(row['difference']):+.1f} ({int(row['low']):+d} to {int(row['high']):+d})"

@@ -6,9 +6,9 @@
 
 The planner takes no part: at every step the plan is what the demonstration did next, as the sensor of the regime showed
 it (with its noise), bent towards the present observation as the library's policies do. The robot's own motion is
-simulated, and what the controller sees of it goes through the same sensor, with fresh noise. Training, labels and seeds
-are those of ``unlabelled_data.py``. Noise goes on from one cell of a seed to the next, so that a row that is run by
-itself differs by what other noise does. Judged are the last trajectories of a seed's order. Success is the task's.
+simulated, and what the controller sees of it goes through the same sensor, with fresh noise: the same noise for every
+controller of a seed, whichever rows are run. Training, labels and seeds are those of ``unlabelled_data.py``. Judged are
+the last trajectories of a seed's order. Success is the task's.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ COLUMNS = (
     "distance_mm",
 )
 HORIZON = 14
+NOISE_SEED = 2000  # plus the seed: noise of the rollouts, apart from that of the demonstrations
 SPARE = 40  # control steps that a rollout may take longer than its demonstration
 
 
@@ -62,6 +63,7 @@ def follow(
     task: Task,
     episodes: torch.Tensor,
     decay: float,
+    seed: int,
 ) -> dict[str, float]:
     """Rolls out one episode per demonstration.
 
@@ -73,6 +75,7 @@ def follow(
         task (Task): has the environment; the robot's position is what the sensor is asked for.
         episodes (Tensor): numbers of the demonstrations.
         decay (float): with which plans are bent towards the present observation.
+        seed (int): of the noise on what is observed.
 
     Returns:
         dict: successes, collisions, mean distance to the demonstration over the steps of running episodes (mm).
@@ -86,9 +89,10 @@ def follow(
     td, history = env.reset(), []
     running, distances = torch.ones(len(parts), dtype=torch.bool), []
     outcome = torch.zeros(2, len(parts), dtype=torch.bool)
+    noise = torch.Generator().manual_seed(seed)
     for step in range(steps):
         beside = None if moving is None else moving[:, max(step - 1, 0)]
-        seen = sensor.noisy(sensor.show(td["observation"][:, columns].to(paths), beside)).to(plans)
+        seen = sensor.noisy(sensor.show(td["observation"][:, columns].to(paths), beside), noise).to(plans)
         history = ([seen] * (controller.num_past + 1) if not history else [*history, seen])[-controller.num_past - 1 :]
         observed = torch.stack(history, 1)
         plan = blend_plan(observed, plans[:, step : step + HORIZON], decay)
@@ -127,7 +131,8 @@ def run_seed(data: TensorDictBase, source: Task, regime: str, seed: int, wanted:
     if sensor.distractors is not None:
         shown["distractors"] = sensor.distractors
     for method, labels, controller, _, _ in controllers(full, task, numbers, seed, wanted):
-        found = follow(controller, sensor, shown, source, numbers[-options.judged :], options.blend_decay)
+        judged = numbers[-options.judged :]
+        found = follow(controller, sensor, shown, source, judged, options.blend_decay, NOISE_SEED + seed)
         yield (method, labels), found | {"distance_mm": f"{found['distance_mm']:.2f}"}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import json
 from pathlib import Path
 
 import pytest
@@ -42,3 +43,13 @@ def test_no_column_is_lost(script, tmp_path):
     with pytest.raises(ValueError, match="has columns that no row gets any more: by_hand"):
         script.append({"task": "aligning"}, table)
     assert table.read_bytes() == before
+
+
+def test_disturbed_demonstrations_are_told_by_their_notes(script, tmp_path):
+    place = tmp_path / "demos" / "ted"
+    place.mkdir(parents=True)
+    about = place / "about.json"
+    for notes, share in (({"disturbance": {"share": 0.5}}, 0.5), ({"seed": 0}, 0.0), (None, 0.0)):
+        about.write_text(json.dumps({"notes": notes}))
+        assert script.disturbed_share(str(tmp_path / "demos")) == script.disturbed_share(str(place)) == share
+    assert script.disturbed_share("scripted") == 0.0

@@ -62,7 +62,7 @@ def shown(script, demonstrations, regime):
 def test_who_follows_arrives_and_who_stands_still_does_not(script, demonstrations):
     sensor, seen = shown(script, demonstrations, "plain")
     episodes, task = torch.arange(6), get_task("avoiding")
-    moved, stood = (script.follow(Next(gain), sensor, seen, task, episodes, 0.0) for gain in (1.0, 0.0))
+    moved, stood = (script.follow(Next(gain), sensor, seen, task, episodes, 0.0, 0) for gain in (1.0, 0.0))
     assert moved["successes"] >= 4 and moved["successes"] + moved["collisions"] <= 6
     assert (stood["successes"], stood["collisions"]) == (0, 0)
     assert moved["distance_mm"] < 40 < stood["distance_mm"]
@@ -73,8 +73,15 @@ def test_noise_reaches_the_controller(script, demonstrations):
     results = []
     for regime in ("plain", "noise"):
         sensor, seen = shown(script, demonstrations, regime)
-        results.append(script.follow(Next(1.0), sensor, seen, task, episodes, 0.0)["distance_mm"])
+        results.append(script.follow(Next(1.0), sensor, seen, task, episodes, 0.0, 0)["distance_mm"])
     assert results[0] < results[1]
+
+
+def test_noise_is_that_of_the_seed_whatever_ran_before(script, demonstrations):
+    task, episodes = get_task("avoiding"), torch.arange(2)
+    sensor, seen = shown(script, demonstrations, "noise")
+    first, second, other = (script.follow(Next(1.0), sensor, seen, task, episodes, 0.8, seed) for seed in (3, 3, 4))
+    assert first == second != other
 
 
 def test_rows_are_not_run_again(script, demonstrations, tmp_path, monkeypatch):

@@ -148,15 +148,17 @@ class RegimeSensor:
         seen = (seen - self._mean) / self._spread
         return self.regime.embed(seen if distractors is None else torch.cat([seen, distractors], -1))
 
-    def noisy(self, shown: Tensor) -> Tensor:
+    def noisy(self, shown: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The same with noise, other noise at every call.
 
         Args:
             shown (Tensor): from :meth:`show` ``[N, c]``.
+            generator (torch.Generator, optional): that the noise is drawn from, for noise that does not depend on what
+                was drawn before. Default: the sensor's own.
         """
         if not self.regime.noise:
             return shown
-        noise = torch.randn(shown.shape, generator=self._generator).to(shown)
+        noise = torch.randn(shown.shape, generator=generator or self._generator).to(shown)
         return shown + self.regime.noise * self.step * noise
 
 

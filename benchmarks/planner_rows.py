@@ -1,0 +1,130 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The planners that were tried as rows of docs/results/planners.md, and the picture of success against demonstrations."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from result_rows import read_rows, success, table
+
+from torchrl_koap.evaluation.statistics import wilson_interval
+
+PLANNERS = {  # the two that most rows have, and their options
+    "U-Net": "unet channels=(32, 64) recovery_sigma=0.004 planner_learning_rate=0.003",
+    "wide MLP": "mlp denoiser_width=512 denoiser_depth=4 condition_octaves=1 precision=bfloat16 recovery_sigma=0.004"
+    " planner_learning_rate=0.001",
+}
+SHORT = "8000"  # updates of the trainings that are compared with each other, a third of the default's
+_OPTION = re.compile(r"[^\s(]+\([^)]*\)|\S+")
+
+
+def planner_words(denoiser: str) -> str:
+    """A planner as one of :data:`PLANNERS` and what it has besides, or in full where it is neither."""
+    options = _OPTION.findall(denoiser)
+    for name, known in PLANNERS.items():
+        common = _OPTION.findall(known)
+        if set(common) <= set(options):
+            return ", ".join([name, *(f"`{option}`" for option in options if option not in common)])
+    return f"`{denoiser}`"
+
+
+def boxes(row: Mapping[str, str]) -> str:
+    """How often the first box of Stacking reached its zone, and two did, empty for other tasks."""
+    if not row.get("stacked"):
+        return ""
+    first, two, _ = (100 * int(count) / int(row["n"]) for count in row["stacked"].split())
+    return f"first box {first:.1f} %, two {two:.1f} %"
+
+
+def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
+    """A row per trained planner and way to run it."""
+    head = [
+        "labels",
+        "method",
+        "planner",
+        "demonstrations",
+        "updates x batch",
+        "seed",
+        "candidates",
+        "success in % (95 %), entropy",
+        "steps",
+        "",
+    ]
+    body = [
+        [
+            row["labels"],
+            "*oracle*" if row["controller"] == "oracle" else f"`{row['method']}`",
+            planner_words(row["denoiser"]),
+            row["demonstrations"] + (" disturbed" if disturbed(row) else ""),
+            f"{row['updates']} x {row['batch']}",
+            row["training_seed"],
+            row["candidates"] if row["candidates"] == "1" else f"{row['candidates']}, {row['choice']}",
+            success(row),
+            row["mean_steps"],
+            "; ".join(filter(None, [row["note"], boxes(row)])),
+        ]
+        for row in rows
+    ]
+    return table(head, body)
+
+
+def planner_options() -> str:
+    """The definitions of the short names in the tables."""
+    return "\n".join(f"* *{name}*: `{options}`" for name, options in PLANNERS.items())
+
+
+def disturbed(row: Mapping[str, str]) -> bool:
+    """Whether operators were disturbed while the demonstrations were recorded."""
+    return float(row["disturbed"] or 0) > 0
+
+
+def short_trainings(task: str = "aligning") -> list[dict[str, str]]:
+    """Rows of the short trainings of a task, which differ in one thing each."""
+    rows = read_rows("planner_ablations", task=task, updates=SHORT, controller="learned")
+    return [row for row in rows if row["candidates"] == "1"]
+
+
+def amounts(task: str = "aligning") -> list[dict[str, str]]:
+    """Those that differ in the demonstrations alone, by their number."""
+    rows = [row for row in short_trainings(task) if planner_words(row["denoiser"]) == "wide MLP"]
+    return sorted(rows, key=lambda row: (disturbed(row), int(row["demonstrations"]), row["training_seed"]))
+
+
+def draw_amounts(path: Path) -> Path:
+    """Draws success against demonstrations, with undisturbed and with disturbed operators.
+
+    Args:
+        path (Path): the picture.
+
+    Returns:
+        Path: the same.
+    """
+    figure, axis = plt.subplots(figsize=(4.6, 3.2))
+    series = defaultdict(list)
+    for row in amounts():
+        series[disturbed(row)].append((int(row["demonstrations"]), int(row["successes"]), int(row["n"])))
+    looks = {False: ("#0b6e4f", "o", "operators undisturbed"), True: ("#c1440e", "D", "half of them disturbed")}
+    for kind, points in series.items():
+        color, marker, label = looks[kind]
+        numbers, rates = [n for n, _, _ in points], [100 * won / of for _, won, of in points]
+        low, high = zip(*(wilson_interval(won, of) for _, won, of in points), strict=True)
+        below = [rate - 100 * end for rate, end in zip(rates, low, strict=True)]
+        above = [100 * end - rate for rate, end in zip(rates, high, strict=True)]
+        axis.errorbar(numbers, rates, [below, above], color=color, marker=marker, ms=5, capsize=3, label=label)
+    axis.set_xscale("log")
+    ticks = sorted({number for points in series.values() for number, _, _ in points})
+    axis.set_xticks(ticks, [str(tick) for tick in ticks])
+    axis.minorticks_off()
+    axis.set_ylim(0, 100)
+    axis.set_xlabel("demonstrations")
+    axis.set_ylabel("success (%)")
+    axis.legend(frameon=False, loc="lower right")
+    axis.spines[["top", "right"]].set_visible(False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=130, metadata={"Software": None})
+    plt.close(figure)
+    return path
