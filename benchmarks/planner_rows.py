@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The planners that were tried as rows of docs/results/planners.md, and the picture of success against demonstrations."""
+"""The planners that were tried as rows of docs/results/planners.md; the picture of success against demonstrations."""
 
 from __future__ import annotations
 
