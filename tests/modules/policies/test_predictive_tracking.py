@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Plans that are followed by prediction: on a robot whose response is known, and as a policy."""
 
+import copy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -135,3 +137,23 @@ def test_actions_minimise_what_is_documented():
     assert best.shape == (3, 2)
     (slope,) = torch.autograd.grad(cost(best), best)
     torch.testing.assert_close(slope, torch.zeros_like(slope), atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["of the policy", "of the response alone"])
+def test_weights_that_are_loaded_later_count(whole):
+    policy, other = policy_of(), sluggish()
+    other.weight[[0, 1], [0, 1], 2] *= 3
+    wanted = policy_of(other)
+    copied = copy.deepcopy(policy)
+    before = [gain.clone() for gain in policy.gains()]
+    if whole:
+        policy.load_state_dict(wanted.state_dict())
+    else:
+        policy.response.load_state_dict(other.state_dict())
+    for now, expected, earlier in zip(policy.gains(), wanted.gains(), before, strict=True):
+        torch.testing.assert_close(now, expected)
+        assert not torch.allclose(now, earlier)
+    for mine, earlier in zip(copied.gains(), before, strict=True):  # a copy goes on with weights of its own
+        torch.testing.assert_close(mine, earlier)
+    copied.load_state_dict(wanted.state_dict())
+    torch.testing.assert_close(copied.gains()[0], wanted.gains()[0])

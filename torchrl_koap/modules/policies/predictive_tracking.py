@@ -96,6 +96,11 @@ class PredictiveTracking(PlanThenControl):
         self.response, self.look_ahead = response, look_ahead
         self.smoothness, self.end_speed = smoothness, end_speed
         self._gains: tuple[Tensor, Tensor] | None = None
+        response.register_load_state_dict_post_hook(self._forget_gains)
+
+    def _forget_gains(self, *_: Any) -> None:
+        """The gains are those of a response that has got other weights."""
+        self._gains = None
 
     def track(self, observed: Tensor, states: Tensor, plan: Tensor) -> Tensor:
         """The next actions of the tracked entries.
