@@ -94,6 +94,18 @@ def amounts(task: str = "aligning") -> list[dict[str, str]]:
     return sorted(rows, key=lambda row: (disturbed(row), int(row["demonstrations"]), row["training_seed"]))
 
 
+def options_table(task: str = "aligning") -> str:
+    """Success of short trainings that differ from the wide MLP in one option, and of the wide MLP itself."""
+    rows = [row for row in short_trainings(task) if not disturbed(row)]
+    most = max(int(row["demonstrations"]) for row in rows)
+    body = []
+    for row in rows:
+        words = planner_words(row["denoiser"])
+        if int(row["demonstrations"]) == most and not words.startswith("`"):
+            body.append([words.removeprefix("wide MLP, "), success(row), row["mean_steps"], row["mean_steps_won"]])
+    return table(["planner", "success in % (95 %), entropy", "steps", "steps of successes"], body)
+
+
 def draw_amounts(path: Path) -> Path:
     """Draws success against demonstrations, with undisturbed and with disturbed operators.
 

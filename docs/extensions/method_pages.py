@@ -13,7 +13,8 @@ from pages import escape, execution, heading, planner_rows, read_rows, success, 
 
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.config import TrainConfig
-from torchrl_koap.training.methods import METHODS, Method
+from torchrl_koap.training.method import Method
+from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.resolved import resolve
 
 # of networks whose docstring has no equation; "paper" is that of the preset

@@ -17,7 +17,8 @@ from tiny_runs import TINY
 
 from torchrl_koap.studies.table import read_cells
 from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.methods import METHODS, Method, Phase, register_method
+from torchrl_koap.training.method import Method, Phase
+from torchrl_koap.training.methods import METHODS, register_method
 from torchrl_koap.training.plugins import PluginError, load_plugins
 from torchrl_koap.training.run_directory import RunDirectory
 

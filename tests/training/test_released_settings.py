@@ -9,7 +9,7 @@ import pytest
 from tiny_runs import TINY, koap, write_demonstrations
 
 from torchrl_koap.data import D3ILExperienceReplay, LabelBudget, WindowTable
-from torchrl_koap.training.methods import Phase
+from torchrl_koap.training.method import Phase
 from torchrl_koap.training.released_settings import RELEASED, get_released
 
 

@@ -23,7 +23,7 @@ from torchrl_koap.training.builders import build_controller, method_named
 from torchrl_koap.training.checkpoints import CheckpointError, check_weights, load_tensors, save_tensors
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.fit import Recipe
-from torchrl_koap.training.methods import Method
+from torchrl_koap.training.method import Method
 from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.provenance import versions
 

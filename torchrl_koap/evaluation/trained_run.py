@@ -23,7 +23,7 @@ from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
 from torchrl_koap.training.builders import method_named
 from torchrl_koap.training.checkpoints import CheckpointError, load_weights
 from torchrl_koap.training.digests import check_digests
-from torchrl_koap.training.methods import Method
+from torchrl_koap.training.method import Method
 from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 

@@ -12,7 +12,8 @@ from typing import Any
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
-from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
+from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
+from torchrl_koap.training.methods import get_method
 
 # how a method is measured where no option says otherwise; what is not named is as for any other method
 PUBLISHED = {"koap_paper": {"controller_state": "all", "execution": "open_loop", "joining": 0.0, "candidates": 1}}

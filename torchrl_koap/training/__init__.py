@@ -8,8 +8,8 @@ __getattr__ = exports(
     __name__,
     {
         "METHODS": "torchrl_koap.training.methods",
-        "Method": "torchrl_koap.training.methods",
-        "Phase": "torchrl_koap.training.methods",
+        "Method": "torchrl_koap.training.method",
+        "Phase": "torchrl_koap.training.method",
         "PluginError": "torchrl_koap.training.plugins",
         "Recipe": "torchrl_koap.training.fit",
         "ResolvedConfig": "torchrl_koap.training.resolved",

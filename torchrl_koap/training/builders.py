@@ -12,7 +12,8 @@ from torch import nn
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import Normalizer
-from torchrl_koap.training.methods import Method, get_method, normalizers_of
+from torchrl_koap.training.method import Method, normalizers_of
+from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.released_settings import get_released
 
 _MOST_THREADS = 1024

@@ -23,7 +23,7 @@ from torchrl_koap.training.checkpoints import save_tensors, save_weights
 from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
 from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.loop import moving_average, train_phase
-from torchrl_koap.training.methods import COEFFICIENTS, LABELLED_SHARES, Method, Phase
+from torchrl_koap.training.method import COEFFICIENTS, LABELLED_SHARES, Method, Phase
 from torchrl_koap.training.planner import augmentation, planner_weight_decay, training_dtype
 from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.resolved import ResolvedConfig

@@ -19,14 +19,9 @@ none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action re
 
 from __future__ import annotations
 
-import inspect
-import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
-from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.objectives import LossModule
 
@@ -53,121 +48,11 @@ from torchrl_koap.objectives import (
     VariationalLoss,
 )
 from torchrl_koap.training.diffusion_builders import build_diffusion_policy
+from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.plugins import load_entry_points
 
 LOOK_AHEAD = (1, 2, 3, 4, 5)
-
-
-KINDS = ("controller", "policy")
-# share of every batch that has labels; None: as it comes
-LABELLED_SHARES = {"all": None, "mixed": 0.25, "labelled": 1.0}
-COEFFICIENTS = ("koopman_coeff", "action_coeff")  # of losses, that a training may be given
 GROUP = "torchrl_koap.methods"  # of entry points
-
-
-@dataclass(frozen=True)
-class Phase:
-    """A stretch of training.
-
-    Args:
-        name (str): its name in the log.
-        loss (callable): the loss of a network, a ``LossModule`` whose ``loss_*`` entries are minimised and logged.
-        windows (str): ``"all"`` (labelled or not), ``"mixed"`` (a quarter of every batch has labels) or ``"labelled"``.
-        share (float): of the updates that a controller may have.
-
-    Raises:
-        ValueError: for an unknown kind of windows, or a share outside (0, 1].
-
-    Examples:
-        >>> from torchrl_koap.objectives import InverseDynamicsLoss
-        >>> from torchrl_koap.training.methods import Phase
-        >>> Phase("controller", InverseDynamicsLoss, "labelled").share
-        1.0
-    """
-
-    name: str
-    loss: Callable[[Any], LossModule]
-    windows: str = "all"
-    share: float = 1.0
-
-    def __post_init__(self):
-        lookup(LABELLED_SHARES, self.windows, "kind of windows")
-        if not 0 < self.share <= 1:
-            raise ValueError(f"the share of phase {self.name!r} must be in (0, 1], got {self.share}")
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way to get from few labels to a policy.
-
-    A ``"controller"`` maps windows of states ``[*B, T, d]`` to actions ``[*B, T, act]`` and follows the plans of the
-    planner that all controllers share: a :class:`~torchrl_koap.modules.InverseDynamics`, whose docstring lists what is
-    asked of one. With ``closed_form`` it also has ``fit_decoder(windows, mask, groups=)``, called once after all
-    updates with windows of which frame ``num_past`` counts where ``mask`` is True; it returns numbers for the summary,
-    or a :class:`~torchrl_koap.modules.RidgeFit`.
-
-    A ``"policy"`` has no planner beside it: see :class:`~torchrl_koap.modules.DiffusionPolicy` for what it offers.
-
-    Args:
-        name (str): what ``--method`` calls it.
-        title (str): what tables and legends call it.
-        build (callable): for a controller ``build(state_dim, action_dim, normalizers, options)`` with the keyword
-            arguments ``state_normalizer`` and ``action_normalizer`` in ``normalizers`` and the ``controller`` entry of
-            ``config.json`` as ``options``; for a policy ``build(state_dim, action_dim, features, options)`` with the
-            task's relative positions, or None, and the ``planner`` entry.
-        phases (tuple of Phase): how it is trained.
-        kind (str): ``"controller"``, or ``"policy"``, which has the planner's updates instead of a planner.
-        closed_form (bool): its decoder is fitted in closed form at the end.
-        labelled_only (bool): it sees labelled windows and nothing else, statistics of the states included.
-        teacher (str): the method whose controller labels the rest of the data first.
-        other_decoder (str): the same method with the other way to get a decoder.
-        presets (tuple of str): values of ``--preset`` that it can be built with; the first is its own.
-        tracks (bool): its controller has a ``response`` (:class:`~torchrl_koap.modules.CommandResponse`), which is
-            fitted to the labelled steps; plans are followed by it (:class:`~torchrl_koap.modules.PredictiveTracking`);
-            ``build`` finds its columns under ``"tracking"`` of the options.
-        earlier (str): the method that runs hold which name this one but were trained before it was what it is now:
-            those whose ``controller`` entry does not say ``"revised"``.
-
-    Raises:
-        ValueError: for an unknown kind, a name that cannot be a folder's, or two phases of one name.
-
-    Examples:
-        >>> from torchrl_koap.modules import LinearInverseDynamics
-        >>> from torchrl_koap.training.methods import Method
-        >>> def build(state_dim, action_dim, normalizers, options):
-        ...     return LinearInverseDynamics(state_dim, action_dim)
-        >>> Method("my_ridge", "a ridge of mine", build, closed_form=True).has_planner
-        True
-    """
-
-    name: str
-    title: str
-    build: Callable[..., TensorDictModuleBase]
-    phases: tuple[Phase, ...] = ()
-    kind: str = "controller"
-    closed_form: bool = False
-    labelled_only: bool = False
-    teacher: str = ""
-    other_decoder: str = ""
-    presets: tuple[str, ...] = ("default",)
-    earlier: str = ""
-    tracks: bool = False
-
-    def __post_init__(self):
-        lookup(KINDS, self.kind, "kind of method")
-        if not re.fullmatch(r"[A-Za-z0-9_.]+", self.name):
-            raise ValueError(f"the name of a method must be letters, digits, '_' and '.', got {self.name!r}")
-        names = [phase.name for phase in self.phases]
-        if len(set(names)) < len(names):
-            raise ValueError(f"phases of method {self.name!r} need names of their own, got {names}")
-        if self.kind == "policy" and len(names) != 1:
-            raise ValueError(f"a policy is trained in one phase, method {self.name!r} has {len(names)}")
-
-    @property
-    def has_planner(self) -> bool:
-        """Whether a planner is trained beside it."""
-        return self.kind != "policy"
-
 
 # where actions say where the robot is to be, what is read off the present frame counts more than the steps around it
 PLACE = {"place": 1.0, "curvature": 10.0, "position_scale": 2.0, "motion_scale": 3.0, "num_features": 1024}
@@ -213,22 +98,6 @@ def without_actions(network: nn.Module, *, koopman_coeff: float = 1.0) -> LossMo
         koopman_coeff (float): weight of its Koopman term. Defaults to ``1``.
     """
     return KOAPLoss(network, action_coeff=0.0, koopman_coeff=koopman_coeff)
-
-
-def loss_coefficients(method: Method) -> set[str]:
-    """Names of the coefficients that the losses of a method take, such as ``"koopman_coeff"``.
-
-    Args:
-        method (Method): the method.
-
-    Examples:
-        >>> from torchrl_koap.training.methods import get_method, loss_coefficients
-        >>> sorted(loss_coefficients(get_method("koap_paper"))), loss_coefficients(get_method("dd"))
-        (['action_coeff', 'koopman_coeff'], set())
-    """
-    return {
-        name for phase in method.phases for name in inspect.signature(phase.loss).parameters if name in COEFFICIENTS
-    }
 
 
 _LABELS = (Phase("controller", InverseDynamicsLoss, "labelled"),)
@@ -404,16 +273,3 @@ def get_method(name: str, decoder: str | None = None) -> Method:
         own = "a closed form" if method.closed_form else "trained by gradients"
         raise ValueError(f"the decoder of method {name!r} is {own}: it has no decoder {decoder!r}")
     return lookup(METHODS, method.other_decoder, "method")
-
-
-def normalizers_of(state: nn.Module, action: nn.Module) -> Mapping[str, nn.Module]:
-    """The two normalisers as the keyword arguments that every network takes.
-
-    Args:
-        state (nn.Module): maps raw states ``[*B, d]`` to the network's units.
-        action (nn.Module): maps raw actions ``[*B, act]`` to them.
-
-    Returns:
-        dict: ``state_normalizer`` and ``action_normalizer``.
-    """
-    return {"state_normalizer": state, "action_normalizer": action}

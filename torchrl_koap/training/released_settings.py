@@ -19,7 +19,8 @@ from torchrl_koap.data import WindowTable
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import RecurrentInverseDynamics, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import InverseDynamicsLoss, KOAPLoss
-from torchrl_koap.training.methods import METHODS, Method, Phase, get_method, without_actions
+from torchrl_koap.training.method import Method, Phase
+from torchrl_koap.training.methods import METHODS, get_method, without_actions
 
 BATCH_SIZE, WEIGHT_DECAY, WARMUP = 256, 0.01, 200
 POLICY_EPOCHS = 200

@@ -17,7 +17,8 @@ from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.loggers import check_logger
-from torchrl_koap.training.methods import COEFFICIENTS, Method, get_method, loss_coefficients
+from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
+from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.response import tracked_columns
 from torchrl_koap.training.run_directory import RunDirectory
