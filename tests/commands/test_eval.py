@@ -1,0 +1,57 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap eval``: what it writes, and what its options change."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from tiny_runs import koap
+
+from torchrl_koap.training.checkpoints import load_tensors
+
+
+def test_what_an_evaluation_writes(copied_run, capsys):
+    """The contract of eval.json, a report with pictures, and numbers that depend on the seeds alone."""
+    assert koap("eval", copied_run, "--episodes", 3, "--seed", 100, "--threads", 1, "--no-animate") == 0
+    result = json.loads((copied_run / "eval.json").read_text())
+    rows = result["episode"]
+    assert [row["seed"] for row in rows] == [100, 101, 102]
+    assert {row["outcome"] for row in rows} <= {"success", "collision", "timeout"}
+    won = sum(row["outcome"] == "success" for row in rows)
+    assert result["success_rate"] == won / 3 and result["episodes"] == 3
+    assert 0 <= result["success_low"] <= result["success_rate"] <= result["success_high"] <= 1
+    assert result["collisions"] == sum(row["outcome"] == "collision" for row in rows)
+    assert result["mean_steps"] == pytest.approx(sum(row["steps"] for row in rows) / 3)
+    assert all(-1 <= row["mode"] < 24 for row in rows) and 0 <= result["mode_entropy"] <= 1
+    assert result["control_hz"] > 0 and result["plan_ms"] >= 0 and result["control_ms"] > 0
+    assert (result["execution"], result["replan_interval"]) == ("feedback", 4)
+    tensors, about = load_tensors(copied_run / "rollouts.safetensors")
+    assert tensors["length"].tolist() == [row["steps"] for row in rows] and about["task"] == "avoiding"
+    assert (copied_run / "index.html").stat().st_size > 1000
+    assert "success_rate" in capsys.readouterr().out
+
+
+def test_an_evaluation_does_not_depend_on_the_batch_size(copied_run, no_report):
+    found = []
+    for size in (8, 3):
+        assert koap("eval", copied_run, "--episodes", 8, "--seed", 7, "--threads", 1, "--batch-size", size) == 0
+        result = json.loads((copied_run / "eval.json").read_text())
+        found.append((result["episode"], load_tensors(copied_run / "rollouts.safetensors")[0]["position"]))
+    assert found[0][0] == found[1][0]
+    torch.testing.assert_close(found[0][1], found[1][1], atol=1e-4, rtol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        (("--execution", "open_loop"), {"execution": "open_loop"}),
+        (("--solver", "ddpm", "--solver-steps", "4"), {"solver": "ddpm", "solver_steps": 4}),
+        (("--replan-interval", "2"), {"replan_interval": 2}),
+    ],
+)
+def test_options_of_an_evaluation(copied_run, no_report, options, wanted):
+    assert koap("eval", copied_run, "--episodes", 1, "--threads", 1, *options) == 0
+    result = json.loads((copied_run / "eval.json").read_text())
+    assert {key: result[key] for key in wanted} == wanted and result["episodes"] == 1
