@@ -8,9 +8,10 @@ from torchrl_koap.data.augmentation import (
     extrapolate_ends,
 )
 from torchrl_koap.data.d3il.conversion import Converter, RawFolderError, convert_raw_files, find_raw_files
+from torchrl_koap.data.d3il.pickle_scan import DamagedPickleError, UnsafePickleError
 from torchrl_koap.data.d3il.raw import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
 from torchrl_koap.data.d3il.replay import D3ILExperienceReplay
-from torchrl_koap.data.d3il.unpickling import DamagedPickleError, UnsafePickleError, load_pickle, loads_pickle
+from torchrl_koap.data.d3il.unpickling import load_pickle, loads_pickle
 from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstrations
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands, subsample_trajectories
 from torchrl_koap.data.lerobot.reader import read_lerobot

@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from torchrl_koap.data.d3il.unpickling import DamagedPickleError, UnsafePickleError, load_pickle, loads_pickle
+from torchrl_koap.data.d3il.pickle_scan import DamagedPickleError, UnsafePickleError
+from torchrl_koap.data.d3il.unpickling import load_pickle, loads_pickle
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 

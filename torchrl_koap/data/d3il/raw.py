@@ -24,7 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.d3il.unpickling import DamagedPickleError, UnsafePickleError, load_pickle
+from torchrl_koap.data.d3il.pickle_scan import DamagedPickleError, UnsafePickleError
+from torchrl_koap.data.d3il.unpickling import load_pickle
 from torchrl_koap.files import replacing_file
 
 ROBOT_COLUMNS = {

@@ -16,45 +16,25 @@ import functools
 import io
 import math
 import pickle
-import pickletools
 import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from torchrl_koap.data.d3il.pickle_scan import (
+    MOST_ODD_KEYS,
+    DamagedPickleError,
+    UnsafePickleError,
+    refusal,
+    scan,
+    spell,
+)
 from torchrl_koap.files import read_bytes
 
 _MAX_DEPTH = 64
-_MOST_VALUES = 1_000_000  # values that a tuple unfolds to: so much is gone through when it is hashed
-_MOST_ODD_KEYS = 10_000  # keys other than text can be chosen to collide, which takes the square of their number
 _ELEMENT_TYPES = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,5}")
 _PLAIN = (str, bytes, bool, int, float, type(None))
-
-_STRINGS = frozenset("STRING BINSTRING SHORT_BINSTRING UNICODE SHORT_BINUNICODE BINUNICODE BINUNICODE8".split())
-_REMEMBER = frozenset("PUT BINPUT LONG_BINPUT MEMOIZE".split())
-_RECALL = frozenset("GET BINGET LONG_BINGET".split())
-_TUPLES = frozenset("TUPLE TUPLE1 TUPLE2 TUPLE3".split())
-_KEYED = frozenset("DICT SETITEM SETITEMS".split())
-_PLAIN_OPCODES = (
-    frozenset(
-        "PROTO FRAME STOP MARK NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT"
-        " BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 EMPTY_LIST APPEND APPENDS LIST EMPTY_TUPLE TUPLE TUPLE1 TUPLE2"
-        " TUPLE3 EMPTY_DICT DICT SETITEM SETITEMS GLOBAL STACK_GLOBAL REDUCE BUILD".split()
-    )
-    | _STRINGS
-    | _REMEMBER
-    | _RECALL
-)
-
-
-class UnsafePickleError(ValueError):
-    """The file asks for something other than arrays and plain containers; nothing of it was run."""
-
-
-class DamagedPickleError(ValueError):
-    """The file is empty, truncated, or not a pickle at all."""
 
 
 def load_pickle(path: str | Path) -> Any:
@@ -78,7 +58,7 @@ def load_pickle(path: str | Path) -> Any:
     Examples:
         >>> import os, pickle, tempfile
         >>> import numpy as np
-        >>> from torchrl_koap.data.d3il.unpickling import UnsafePickleError, load_pickle
+        >>> from torchrl_koap.data import UnsafePickleError, load_pickle
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = os.path.join(folder, "episode.pkl")
         ...     with open(path, "wb") as file:
@@ -122,7 +102,7 @@ def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
     """
     if not content:
         raise DamagedPickleError(f"{name}: the file is empty")
-    _scan(content, name)
+    scan(content, name, _STAND_INS)
     try:
         loaded = _RestrictedUnpickler(content, name).load()
         return _finish(loaded, name, depth=0, finished={}, open_containers=set())
@@ -135,104 +115,18 @@ def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
         raise DamagedPickleError(f"{name}: not a complete pickle ({type(error).__name__}: {error})") from error
 
 
-class _Sketch(NamedTuple):
-    """What the scan knows of a value without building it: its text, if it is one, and how many values it unfolds to."""
-
-    text: str | None = None
-    size: int = 1
-
-
-def _scan(content: bytes, name: str) -> None:
-    """Refuses, without running anything, instructions, names and amounts of work that plain data do not need."""
-    refused: dict[str, None] = {}  # in the order they are met
-    stack: list[_Sketch | None] = []  # None is a mark
-    remembered: dict[int, _Sketch] = {}
-    position, damage, odd_keys = 0, None, 0
-    try:
-        for opcode, argument, position in pickletools.genops(content):
-            instruction, asked = opcode.name, None
-            if instruction in _REMEMBER:
-                slot = len(remembered) if instruction == "MEMOIZE" else argument
-                if slot > position:  # the C unpickler allocates up to the largest slot at once
-                    refused[f"memory slot {slot}"] = None
-                remembered[slot] = stack[-1] or _Sketch()
-            taken = [] if instruction in _REMEMBER else _take(stack, opcode.stack_before)
-            if instruction in ("GLOBAL", "INST"):
-                asked = tuple(argument.split(" ", 1))
-            elif instruction == "STACK_GLOBAL":
-                asked = tuple(value.text for value in taken)
-            if asked is not None and not _permitted(*asked):
-                refused["a disguised name" if None in asked else _spell(*asked)] = None
-            elif instruction not in _PLAIN_OPCODES:
-                refused[f"pickle instruction {instruction}"] = None
-            if instruction in _KEYED:
-                keys = taken if instruction == "DICT" else taken[1:]
-                odd_keys += sum(key.text is None for key in keys[::2])
-            if instruction in _REMEMBER:
-                continue
-            if instruction == "MARK":
-                stack.append(None)
-            elif opcode.stack_after:
-                sketch = remembered.get(argument, _Sketch()) if instruction in _RECALL else _Sketch()
-                if instruction in _STRINGS:
-                    sketch = _Sketch(argument)
-                elif instruction in _TUPLES:
-                    sketch = _Sketch(size=1 + sum(value.size for value in taken))
-                if sketch.size > _MOST_VALUES:  # shared parts: a short file can unfold without end
-                    refused[f"a tuple of more than {_MOST_VALUES:,} values"] = None
-                    sketch = _Sketch()
-                stack.append(sketch)
-    except Exception as error:  # genops reports damage by several kinds of errors
-        damage = f"{name}: not a complete pickle ({error or type(error).__name__}, after byte {position})"
-    if odd_keys > _MOST_ODD_KEYS:
-        refused[f"{odd_keys:,} dictionary keys that are no text (more than {_MOST_ODD_KEYS:,})"] = None
-    if refused:
-        raise _refusal(name, ", ".join(list(refused)[:6]))
-    if damage:
-        raise DamagedPickleError(damage)
-    if position + 1 != len(content):
-        raise DamagedPickleError(f"{name}: {len(content) - position - 1} bytes follow the end of the pickle")
-
-
-def _take(stack: list[_Sketch | None], before: Sequence[Any]) -> list[_Sketch]:
-    """Takes from the sketched stack what an instruction uses up; first comes what was pushed first."""
-    taken = []
-    if pickletools.markobject in before:
-        while (value := stack.pop()) is not None:
-            taken.append(value)
-        before = before[: before.index(pickletools.markobject)]
-    for _ in before:
-        value = stack.pop()
-        if value is None:
-            raise ValueError("a mark where a value was wanted")
-        taken.append(value)
-    return taken[::-1]
-
-
-def _refusal(name: str, asked: str) -> UnsafePickleError:
-    return UnsafePickleError(f"{name}: asks for {asked}: refused, only numpy arrays and plain containers are read")
-
-
-def _spell(module: str, attribute: str) -> str:
-    return f"{module.replace('__builtin__', 'builtins')}.{attribute}"  # Python 2 called it __builtin__
-
-
-def _permitted(module: str | None, attribute: str | None) -> bool:
-    return (module, attribute) in _STAND_INS
-
-
 class _RestrictedUnpickler(pickle.Unpickler):
     def __init__(self, content: bytes, name: str):
         super().__init__(io.BytesIO(content), encoding="latin1")  # numpy data pickled by Python 2 are latin1 text
         self._name = name
 
     def find_class(self, module, attribute):
-        if not _permitted(module, attribute):
-            raise _refusal(self._name, _spell(module, attribute))
+        if (module, attribute) not in _STAND_INS:
+            raise refusal(self._name, spell(module, attribute))
         return _StandIn(f"{module}.{attribute}", _STAND_INS[module, attribute], self._name)
 
     def persistent_load(self, pid):
-        raise _refusal(self._name, f"data outside the file (persistent id {pid!r})")
+        raise refusal(self._name, f"data outside the file (persistent id {pid!r})")
 
 
 class _StandIn:
@@ -332,8 +226,8 @@ def _encode(text, encoding):
 
 
 def _ordered_dict(*pairs):
-    if pairs and len(pairs[0]) > _MOST_ODD_KEYS:
-        raise UnsafePickleError(f"a dictionary is made of {len(pairs[0]):,} pairs, more than {_MOST_ODD_KEYS:,}")
+    if pairs and len(pairs[0]) > MOST_ODD_KEYS:
+        raise UnsafePickleError(f"a dictionary is made of {len(pairs[0]):,} pairs, more than {MOST_ODD_KEYS:,}")
     return dict(*pairs)
 
 
@@ -390,7 +284,7 @@ def _finish(value, name: str, *, depth: int, finished: dict, open_containers: se
         result = bytes(value)
     else:
         kind = value.name if isinstance(value, _StandIn) else type(value).__name__
-        raise _refusal(name, f"{kind} as a value")
+        raise refusal(name, f"{kind} as a value")
     open_containers.discard(id(value))
     finished[id(value)] = result
     return result
