@@ -13,7 +13,7 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from matplotlib.ticker import FixedLocator, NullLocator
 
 from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, set_title, tidy
-from torchrl_koap.studies.plots import method_styles
+from torchrl_koap.studies.lines import method_styles
 
 _NAMES = {
     "koap": "KOAP",

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from torchrl_koap.studies.plots import _spread, method_styles, plot_action_error, plot_entropy, plot_success
+from torchrl_koap.studies.lines import _spread, method_styles
+from torchrl_koap.studies.plots import plot_action_error, plot_entropy, plot_success
 from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.studies.summary import summarise
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchrl_koap.envs import StackingEnv
-from torchrl_koap.envs.mujoco.controller import Q_MAX, Q_MIN, forward_kinematics
+from torchrl_koap.envs.mujoco.kinematics import Q_MAX, Q_MIN, forward_kinematics
 from torchrl_koap.tasks.panda_kinematics import tool_position
 
 

@@ -13,11 +13,12 @@ from torchrl_koap.data.d3il.raw import RawEpisode, RawEpisodeError, read_raw_epi
 from torchrl_koap.data.d3il.replay import D3ILExperienceReplay
 from torchrl_koap.data.d3il.unpickling import load_pickle, loads_pickle
 from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstrations
-from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands, subsample_trajectories
+from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands
 from torchrl_koap.data.lerobot.reader import read_lerobot
 from torchrl_koap.data.recorded_replay import RecordedExperienceReplay
 from torchrl_koap.data.recordings import Recordings, RecordingsError, make_recordings
 from torchrl_koap.data.sources import read_recordings
+from torchrl_koap.data.subsampling import subsample_trajectories
 from torchrl_koap.data.ted import DamagedDataError, load_ted, read_about, read_task, save_ted
 from torchrl_koap.data.trajectories import (
     controller_view,
@@ -27,7 +28,8 @@ from torchrl_koap.data.trajectories import (
     trajectory_lengths,
 )
 from torchrl_koap.data.window_buffer import cut_windows, make_window_buffer
-from torchrl_koap.data.window_sampler import WindowSampler, WindowSamplerWithoutReplacement, WindowUnit
+from torchrl_koap.data.window_sampler import WindowSampler, WindowUnit
+from torchrl_koap.data.window_sampler_without_replacement import WindowSamplerWithoutReplacement
 from torchrl_koap.data.window_table import WindowTable
 
 __all__ = [

@@ -10,7 +10,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorDictReplayBuffer, TensorStorage
 
-from torchrl_koap.data.window_sampler import WindowSampler, WindowSamplerWithoutReplacement
+from torchrl_koap.data.window_sampler import WindowSampler
+from torchrl_koap.data.window_sampler_without_replacement import WindowSamplerWithoutReplacement
 from torchrl_koap.data.window_table import WindowTable
 
 

@@ -9,7 +9,7 @@ import pytest
 from shared_data import SHARED
 
 from torchrl_koap.envs.avoiding import START_JOINTS
-from torchrl_koap.envs.mujoco import controller
+from torchrl_koap.envs.mujoco import controller, kinematics
 from torchrl_koap.envs.mujoco.linear_algebra import solve_clipped
 from torchrl_koap.envs.mujoco.scene import compile_scene, scene
 from torchrl_koap.envs.mujoco.simulation import SimulationBatch
@@ -27,9 +27,9 @@ def generator():
     return np.random.default_rng(0)
 
 
-def kinematics(q):
+def pose_of(q):
     axes, origins, tcp, quat = np.empty((8, 3, 3)), np.empty((8, 3)), np.empty(3), np.empty(4)
-    controller.forward_kinematics(q, axes, origins, tcp, quat)
+    kinematics.forward_kinematics(q, axes, origins, tcp, quat)
     return axes, origins, tcp, quat
 
 
@@ -37,7 +37,7 @@ def numpy_inverse_kinematics(target, q):
     """Inverse kinematics of the controller in plain NumPy, with an explicit singular value decomposition."""
     q = q.copy()
     for _ in range(3):
-        axes, origins, tcp, r = kinematics(q)
+        axes, origins, tcp, r = pose_of(q)
         t = target[3:] if target[3:] @ r >= 0 else -target[3:]
         e_p = np.clip(target[:3] - tcp, -0.01, 0.01)
         e_o = np.clip(r[0] * t[1:] - t[0] * r[1:] + np.cross(r[1:], t[1:]), -0.1, 0.1)
@@ -46,27 +46,27 @@ def numpy_inverse_kinematics(target, q):
         jacobian = np.concatenate([np.cross(z, tcp - origins[1:]), z], axis=1).T
         left, values, right = np.linalg.svd(jacobian @ jacobian.T + 1e-12 * np.eye(6))
         inverse = right.T @ np.diag(1 / np.clip(values, 0.01, 100)) @ left.T
-        null = 40 * np.clip(controller.Q_REST - q, -0.2, 0.2)
+        null = 40 * np.clip(kinematics.Q_REST - q, -0.2, 0.2)
         v = jacobian.T @ inverse @ (u - jacobian @ null) + null
         v *= min(1.0, 3 / np.linalg.norm(v))
-        q = np.clip(q + 0.001 * v, controller.Q_MIN, controller.Q_MAX)
+        q = np.clip(q + 0.001 * v, kinematics.Q_MIN, kinematics.Q_MAX)
     return q
 
 
 def compiled_inverse_kinematics(target, q):
     q = q.copy()
     shapes = [(8, 3, 3), (8, 3), (3,), (4,), (6, 7), (6, 6), (6,), (7,), (6, 6), (6, 6)]
-    controller.inverse_kinematics(target, q, *[np.empty(shape) for shape in shapes])
+    kinematics.inverse_kinematics(target, q, *[np.empty(shape) for shape in shapes])
     return q
 
 
 def test_forward_kinematics_agree_with_mujoco(model, generator):
     data, tcp_body = mujoco.MjData(model), model.body("panda/tcp").id
     for _ in range(50):
-        q = generator.uniform(controller.Q_MIN, controller.Q_MAX)
+        q = generator.uniform(kinematics.Q_MIN, kinematics.Q_MAX)
         data.qpos[:7] = q
         mujoco.mj_kinematics(model, data)
-        _, origins, tcp, quat = kinematics(q)
+        _, origins, tcp, quat = pose_of(q)
         np.testing.assert_allclose(tcp, data.xpos[tcp_body], atol=1e-12)
         np.testing.assert_allclose(origins[1:], data.xanchor[:7], atol=1e-12)
         # the physics model's hand is turned by a rounded -45 deg, 1.2e-6 rad off
@@ -89,10 +89,10 @@ def test_clipped_solve_equals_svd(generator, smallest, largest):
 
 def test_inverse_kinematics_equal_the_numpy_version(generator):
     start = np.array(START_JOINTS)
-    pose = np.concatenate([kinematics(start)[2], [0, 1, 0, 0]])
+    pose = np.concatenate([pose_of(start)[2], [0, 1, 0, 0]])
     for index in range(60):
         # far commands, both signs of the quaternion, and postures near singularities and joint limits
-        q = start if index < 20 else generator.uniform(controller.Q_MIN, controller.Q_MAX)
+        q = start if index < 20 else generator.uniform(kinematics.Q_MIN, kinematics.Q_MAX)
         target = pose.copy()
         target[:3] += generator.normal(0, 0.05, 3)
         target[3:] *= 1 if index % 2 else -1
@@ -103,10 +103,10 @@ def test_inverse_kinematics_equal_the_numpy_version(generator):
 
 def test_inverse_kinematics_converge_and_respect_the_bound_of_joint_3():
     q = np.array(START_JOINTS)
-    target = np.concatenate([kinematics(q)[2] + [0.05, 0.1, 0.02], [0, 1, 0, 0]])
+    target = np.concatenate([pose_of(q)[2] + [0.05, 0.1, 0.02], [0, 1, 0, 0]])
     for _ in range(1000):
         q = compiled_inverse_kinematics(target, q)
-    _, _, tcp, quat = kinematics(q)
+    _, _, tcp, quat = pose_of(q)
     np.testing.assert_allclose(tcp, target[:3], atol=1e-6)
     assert abs(quat[1]) > 1 - 1e-10
     assert compiled_inverse_kinematics(target, np.array([0, 0.5, 2.8, -2, 0, 2, 0.0]))[2] == 2.0

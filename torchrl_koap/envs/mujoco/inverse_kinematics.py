@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from torchrl_koap.envs.mujoco.controller import forward_kinematics, inverse_kinematics
+from torchrl_koap.envs.mujoco.kinematics import forward_kinematics, inverse_kinematics
 
 
 @njit(cache=True)

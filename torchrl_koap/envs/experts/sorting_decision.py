@@ -1,0 +1,225 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What Sorting's scripted expert decides in a control step: from where to push a box, and the way of the rod there.
+
+Ways are paths of least cost by the eikonal equation (:mod:`torchrl_koap.envs.experts.path_planning`): for the box with
+the others as obstacles, for the rod with all boxes as obstacles. All functions are compiled.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from torchrl_koap.envs.experts.path_planning import (
+    FAR,
+    ORIGIN,
+    SHAPE,
+    STEP,
+    descent,
+    solve_eikonal,
+    square_distance,
+    value_at,
+)
+from torchrl_koap.tasks.sorting import BOX_HALF
+
+ROD_RADIUS = 0.01
+_LANE_HALF = 0.058  # m; a box is led to within this of the middle of its bin
+_PUSH, _FREE = 0.0130, 0.0145  # m per control step
+_REACH = 0.30  # m from the base; nearer, the arm may flip over
+_DIRECTIONS = 32
+_HOLD = 0.006  # a direction is given up for a very different one if that is better by this much (m of way)
+
+
+@njit(cache=True)
+def _squares(boxes, yaws):
+    """Centres, cosines and sines of the yaw [n, 4]."""
+    squares = np.empty((len(boxes), 4))
+    squares[:, :2] = boxes
+    squares[:, 2], squares[:, 3] = np.cos(yaws), np.sin(yaws)
+    return squares
+
+
+@njit(cache=True)
+def _box_field(boxes, yaws, obstacle, lane):
+    """Cost of the rest of a box's way into its bin, everywhere [X, Y]; ``lane`` is the middle of the bin (x)."""
+    slowness, cost, squares = np.ones(SHAPE), np.full(SHAPE, FAR), _squares(boxes, yaws)
+    for i in range(SHAPE[0]):
+        x = ORIGIN[0] + i * STEP
+        off = abs(x - lane)
+        for j in range(SHAPE[1]):
+            y = ORIGIN[1] + j * STEP
+            if y > 0.236 and off < _LANE_HALF:
+                cost[i, j] = 0.25 * max(off - 0.02, 0.0)
+            s = 1.0
+            if y > 0.15 and off > _LANE_HALF:
+                s += 6.0 * min((y - 0.15) / 0.03, 1.0)
+            border = max(_REACH + 0.05 - np.hypot(x, y), x - 0.75, -0.34 - y)
+            if border > 0:
+                s += 10.0 * min(border / 0.02, 1.0)
+            for k in range(len(boxes)):
+                if obstacle[k]:
+                    gap = square_distance(x, y, squares[k], BOX_HALF)
+                    s += 12.0 * min(max((0.048 - gap) / 0.02, 0.0), 1.0)
+            slowness[i, j] = s
+    return solve_eikonal(slowness, cost)
+
+
+@njit(cache=True)
+def _rod_slowness(boxes, yaws, solid, target):
+    slowness, squares = np.ones(SHAPE), _squares(boxes, yaws)
+    for i in range(SHAPE[0]):
+        x = ORIGIN[0] + i * STEP
+        for j in range(SHAPE[1]):
+            y = ORIGIN[1] + j * STEP
+            border = max(_REACH - np.hypot(x, y), x - 0.82, y - 0.28)
+            s = 1.0 + (10.0 * min(border / 0.02, 1.0) if border > 0 else 0.0)
+            for k in range(len(boxes)):
+                if solid[k]:
+                    gap = square_distance(x, y, squares[k], BOX_HALF)
+                    margin = 0.016 if k == target else 0.022
+                    s += 25.0 * min(max((margin - gap) / 0.012, 0.0), 1.0)
+            slowness[i, j] = s
+    return slowness
+
+
+@njit(cache=True)
+def _cost_from(slowness, x, y):
+    """Cost of the rod's way from a place to everywhere [X, Y]."""
+    cost = np.full(SHAPE, FAR)
+    i = int(min(max((x - ORIGIN[0]) / STEP, 0.0), SHAPE[0] - 2.0))
+    j = int(min(max((y - ORIGIN[1]) / STEP, 0.0), SHAPE[1] - 2.0))
+    for a in (i, i + 1):
+        for b in (j, j + 1):
+            cost[a, b] = np.hypot(x - ORIGIN[0] - a * STEP, y - ORIGIN[1] - b * STEP)
+    return solve_eikonal(slowness, cost)
+
+
+@njit(cache=True)
+def _behind(box, yaw, angle, clearance):
+    """Place of the rod from which it pushes a box along ``angle``."""
+    turned = angle - yaw
+    support = BOX_HALF * (abs(np.cos(turned)) + abs(np.sin(turned)))
+    # the middle of a face is nearer than the corners that the support counts
+    reach = min(support, BOX_HALF / max(abs(np.cos(turned)), abs(np.sin(turned)))) + ROD_RADIUS + clearance
+    return box[0] - reach * np.cos(angle), box[1] - reach * np.sin(angle)
+
+
+@njit(cache=True)
+def _carried(box, yaw, rod, ahead):
+    """Where a box will be once the rod has come from where it is to the place ``ahead``."""
+    box = box.copy()
+    square = np.array([0.0, 0.0, np.cos(yaw), np.sin(yaw)])
+    for k in range(1, 5):
+        x, y = rod + (ahead - rod) * k / 4
+        square[:2] = box
+        overlap = ROD_RADIUS - square_distance(x, y, square, BOX_HALF)
+        away = box - np.array([x, y])
+        size = np.sqrt(away[0] ** 2 + away[1] ** 2)
+        if overlap > 0 and size > 1e-6:
+            box += away / size * overlap
+    return box
+
+
+@njit(cache=True)
+def _direction_cost(box, yaw, angle, to_go, way, slowness):
+    """What is left to go after pushing along ``angle``, plus the rod's way to the place behind the box."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    left = 0.5 * (
+        value_at(to_go, box[0] + 0.02 * cos, box[1] + 0.02 * sin)
+        + value_at(to_go, box[0] + 0.045 * cos, box[1] + 0.045 * sin)
+    )
+    x, y = _behind(box, yaw, angle, 0.007)
+    return left + 0.2 * max(value_at(way, x, y) - 0.03, 0.0) + 0.004 * (value_at(slowness, x, y) - 1)
+
+
+@njit(cache=True)
+def _choose_direction(box, yaw, to_go, way, slowness):
+    """Angle along which to push, and its cost."""
+    best, best_cost = 0.0, np.inf
+    for k in range(_DIRECTIONS):
+        angle = 2 * np.pi * k / _DIRECTIONS
+        cost = _direction_cost(box, yaw, angle, to_go, way, slowness)
+        if cost < best_cost:
+            best, best_cost = angle, cost
+    return best, best_cost
+
+
+@njit(cache=True)
+def _wrapped(angle):
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+@njit(cache=True)
+def decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
+    """Decides on the step of the rod.
+
+    Args:
+        boxes (np.ndarray): positions [B, 2] (m).
+        yaws (np.ndarray): their yaws [B] (rad).
+        present (np.ndarray): boxes that are on the platform, bool [B].
+        target (int): the box that is led to its bin.
+        lane (float): x (m) of the middle of that bin.
+        rod (np.ndarray): position of the rod [2] (m).
+        ahead (np.ndarray): where it will be when an action begins to show [2] (m).
+        pushing (bool): whether it pushed in the last control step.
+        held (float): direction (rad) in which it did, or NaN.
+
+    Returns:
+        tuple: step in x and y (m), whether it pushes, and the direction (rad) in which.
+    """
+    boxes = boxes.copy()
+    boxes[target] = _carried(boxes[target], yaws[target], rod, ahead)
+    box, yaw = boxes[target], yaws[target]
+    others = present.copy()
+    others[target] = False
+    to_go = _box_field(boxes, yaws, others, lane)
+    slowness = _rod_slowness(boxes, yaws, present, target)
+    way = _cost_from(slowness, ahead[0], ahead[1])
+    angle, cost = _choose_direction(box, yaw, to_go, way, slowness)
+    change = 0.0 if np.isnan(held) else _wrapped(angle - held)
+    if 0.0 < abs(change) <= 0.5:
+        angle = held + 0.4 * change
+    elif change != 0.0 and _direction_cost(box, yaw, held, to_go, way, slowness) < cost + _HOLD:
+        angle = held
+
+    towards = box - ahead
+    distance = np.sqrt(towards[0] ** 2 + towards[1] ** 2)
+    off = _wrapped(np.arctan2(towards[1], towards[0]) - angle)
+    near_x, near_y = _behind(box, yaw, angle, 0.0)
+    contact = np.hypot(box[0] - near_x, box[1] - near_y)
+    if pushing:
+        pushing = abs(off) < 0.8 and distance < contact + 0.04
+    else:
+        pushing = abs(off) < 0.35 and distance < contact + 0.04
+    if pushing:
+        heading = angle + min(max(1.4 * off, -1.2), 1.2)
+        speed = _PUSH * (1.0 - 0.5 * min(abs(off) / 0.6, 1.0))
+        return speed * np.cos(heading), speed * np.sin(heading), True, angle
+    x, y = _behind(box, yaw, angle, 0.008)
+    gap = np.hypot(x - ahead[0], y - ahead[1])
+    if gap < 0.02:
+        direction = np.array([x - ahead[0], y - ahead[1]]) / max(gap, 1e-6)
+    else:
+        direction = descent(_cost_from(slowness, x, y), ahead[0], ahead[1])
+    speed = min(_FREE, max(0.45 * gap, 0.005))
+    return speed * direction[0], speed * direction[1], False, angle
+
+
+@njit(cache=True)
+def pushing_cost(boxes, yaws, present, target, lane, rod):
+    """Cost (m of way) of leading a box to its bin, the rod's own way to it included.
+
+    Args:
+        boxes (np.ndarray): positions [B, 2] (m).
+        yaws (np.ndarray): their yaws [B] (rad).
+        present (np.ndarray): boxes that are on the platform, bool [B].
+        target (int): the box.
+        lane (float): x (m) of the middle of its bin.
+        rod (np.ndarray): position of the rod [2] (m).
+    """
+    others = present.copy()
+    others[target] = False
+    to_go = _box_field(boxes, yaws, others, lane)
+    slowness = _rod_slowness(boxes, yaws, present, target)
+    way = _cost_from(slowness, rod[0], rod[1])
+    return _choose_direction(boxes[target], yaws[target], to_go, way, slowness)[1]

@@ -1,0 +1,174 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Compiled kinematics of the Panda arm: the pose of the tool, and the damped steps towards a pose of the original.
+
+Plain float64 arithmetic in a fixed order (docs/d3il.md, Controller).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from torchrl_koap.envs.mujoco.linear_algebra import clip, solve_clipped
+
+TIMESTEP = 0.001
+# Joint 3's upper bound is 2.0 in the original although the joint reaches 2.8973.
+Q_MIN = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
+Q_MAX = np.array([2.8973, 1.7628, 2.0, -0.0698, 2.8973, 3.7525, 2.8973])
+Q_REST = np.array([0.0, 0.174, 0.0, -0.872, 0.0, 1.222, 0.785])
+
+IK_ITERATIONS = 3
+
+_COS45 = 0.5**0.5
+
+
+@njit(cache=True)
+def _next_frame(axes, index, turn):
+    """Writes frame ``index`` of the chain into ``axes`` (columns x, y, z) up to the joint's own rotation.
+
+    ``turn`` is +1, -1 or 0: the fixed rotation about x by +90, -90 or 0 deg.
+    """
+    for k in range(3):
+        x, y, z = axes[index - 1, 0, k], axes[index - 1, 1, k], axes[index - 1, 2, k]
+        axes[index, 0, k] = x
+        if turn > 0:
+            axes[index, 1, k], axes[index, 2, k] = z, -y
+        elif turn < 0:
+            axes[index, 1, k], axes[index, 2, k] = -z, y
+        else:
+            axes[index, 1, k], axes[index, 2, k] = y, z
+
+
+@njit(cache=True)
+def _rotate(axes, index, angle):
+    c, s = np.cos(angle), np.sin(angle)
+    for k in range(3):
+        x, y = axes[index, 0, k], axes[index, 1, k]
+        axes[index, 0, k] = c * x + s * y
+        axes[index, 1, k] = c * y - s * x
+
+
+@njit(cache=True)
+def forward_kinematics(q, axes, origins, tcp, quat):
+    """Forward kinematics of the arm: frames of its joints and pose of the TCP, in the frame of its base.
+
+    Args:
+        q (np.ndarray): joint angles [7] (rad).
+        axes (np.ndarray): receives the axes x, y, z of the joints' frames in rows 1-7 [8, 3, 3]; row 0 ends as the
+            hand's.
+        origins (np.ndarray): receives their origins [8, 3] (m).
+        tcp (np.ndarray): receives the position of the TCP [3] (m).
+        quat (np.ndarray): receives its quaternion [4] (w, x, y, z).
+    """
+    for i in range(3):
+        for k in range(3):
+            axes[0, i, k] = 1.0 if i == k else 0.0
+    origins[0, 0], origins[0, 1], origins[0, 2] = 0.0, 0.0, 0.0
+    for index in range(1, 8):
+        along_x, along_y, along_z, turn = 0.0, 0.0, 0.0, 1
+        if index == 1:
+            along_z, turn = 0.333, 0
+        elif index == 2:
+            turn = -1
+        elif index == 3:
+            along_y = -0.316
+        elif index == 4:
+            along_x = 0.0825
+        elif index == 5:
+            along_x, along_y, turn = -0.0825, 0.384, -1
+        elif index == 7:
+            along_x = 0.088
+        for k in range(3):
+            origins[index, k] = (
+                origins[index - 1, k]
+                + axes[index - 1, 0, k] * along_x
+                + axes[index - 1, 1, k] * along_y
+                + axes[index - 1, 2, k] * along_z
+            )
+        _next_frame(axes, index, turn)
+        _rotate(axes, index, q[index - 1])
+    for k in range(3):
+        tcp[k] = origins[7, k] + 0.212 * axes[7, 2, k]
+        # the hand is turned by exactly -45 deg about z
+        axes[0, 0, k] = _COS45 * (axes[7, 0, k] - axes[7, 1, k])
+        axes[0, 1, k] = _COS45 * (axes[7, 0, k] + axes[7, 1, k])
+        axes[0, 2, k] = axes[7, 2, k]
+    _quaternion(axes[0], quat)
+
+
+@njit(cache=True)
+def _quaternion(axes, quat):
+    """Quaternion (w, x, y, z) of a rotation whose columns are the rows of ``axes``."""
+    xx, yy, zz = axes[0, 0], axes[1, 1], axes[2, 2]
+    xy, yx, xz, zx, yz, zy = axes[1, 0], axes[0, 1], axes[2, 0], axes[0, 2], axes[2, 1], axes[1, 2]
+    if xx + yy + zz > 0.0:
+        s = 2.0 * np.sqrt(1.0 + xx + yy + zz)
+        quat[0], quat[1], quat[2], quat[3] = 0.25 * s, (zy - yz) / s, (xz - zx) / s, (yx - xy) / s
+    elif xx >= yy and xx >= zz:
+        s = 2.0 * np.sqrt(1.0 + xx - yy - zz)
+        quat[0], quat[1], quat[2], quat[3] = (zy - yz) / s, 0.25 * s, (xy + yx) / s, (xz + zx) / s
+    elif yy >= zz:
+        s = 2.0 * np.sqrt(1.0 + yy - xx - zz)
+        quat[0], quat[1], quat[2], quat[3] = (xz - zx) / s, (xy + yx) / s, 0.25 * s, (yz + zy) / s
+    else:
+        s = 2.0 * np.sqrt(1.0 + zz - xx - yy)
+        quat[0], quat[1], quat[2], quat[3] = (yx - xy) / s, (xz + zx) / s, (yz + zy) / s, 0.25 * s
+
+
+@njit(cache=True)
+def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors):
+    """Inverse kinematics: moves joint angles in place, by three damped steps, towards a pose of the TCP.
+
+    Args:
+        target (np.ndarray): position (m) and unit quaternion (w, x, y, z) [7].
+        q (np.ndarray): joint angles [7] (rad), overwritten.
+        axes (np.ndarray): scratch space [8, 3, 3].
+        origins (np.ndarray): scratch space [8, 3].
+        tcp (np.ndarray): scratch space [3].
+        quat (np.ndarray): scratch space [4].
+        jacobian (np.ndarray): scratch space [6, 7].
+        matrix (np.ndarray): scratch space [6, 6].
+        task (np.ndarray): scratch space [6].
+        null (np.ndarray): scratch space [7].
+        factor (np.ndarray): scratch space [6, 6].
+        vectors (np.ndarray): scratch space [6, 6].
+    """
+    for _ in range(IK_ITERATIONS):
+        forward_kinematics(q, axes, origins, tcp, quat)
+        near = 0.0
+        for k in range(4):
+            near += quat[k] * target[3 + k]
+        sign = -1.0 if near < 0.0 else 1.0
+        tw, tx, ty, tz = sign * target[3], sign * target[4], sign * target[5], sign * target[6]
+        w, x, y, z = quat[0], quat[1], quat[2], quat[3]
+        for k in range(3):
+            task[k] = (800.0 if k == 2 else 200.0) * clip(target[k] - tcp[k], -0.01, 0.01)
+        task[3] = 30.0 * clip(w * tx - tw * x + (y * tz - z * ty), -0.1, 0.1)
+        task[4] = 30.0 * clip(w * ty - tw * y + (z * tx - x * tz), -0.1, 0.1)
+        task[5] = 30.0 * clip(w * tz - tw * z + (x * ty - y * tx), -0.1, 0.1)
+
+        for j in range(7):
+            zx, zy, zz = axes[j + 1, 2, 0], axes[j + 1, 2, 1], axes[j + 1, 2, 2]
+            rx, ry, rz = tcp[0] - origins[j + 1, 0], tcp[1] - origins[j + 1, 1], tcp[2] - origins[j + 1, 2]
+            jacobian[0, j], jacobian[1, j], jacobian[2, j] = zy * rz - zz * ry, zz * rx - zx * rz, zx * ry - zy * rx
+            jacobian[3, j], jacobian[4, j], jacobian[5, j] = zx, zy, zz
+            null[j] = 40.0 * clip(Q_REST[j] - q[j], -0.2, 0.2)
+        for i in range(6):
+            for k in range(7):
+                task[i] -= jacobian[i, k] * null[k]
+            for j in range(i + 1):
+                total = 0.0
+                for k in range(7):
+                    total += jacobian[i, k] * jacobian[j, k]
+                matrix[i, j] = matrix[j, i] = total
+            matrix[i, i] += 1e-12
+        solve_clipped(matrix, task, factor, vectors)
+
+        square = 0.0
+        for j in range(7):
+            for i in range(6):
+                null[j] += jacobian[i, j] * task[i]
+            square += null[j] * null[j]
+        scale = 3.0 / np.sqrt(square) if square > 9.0 else 1.0
+        for j in range(7):
+            q[j] = clip(q[j] + TIMESTEP * scale * null[j], Q_MIN[j], Q_MAX[j])
