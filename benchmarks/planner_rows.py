@@ -13,11 +13,14 @@ from result_rows import read_rows, success, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 
-PLANNERS = {  # the two that most rows have, and their options
+PLANNERS = {  # those that most rows have, and their options; the first one that fits gives the name
     "U-Net": "unet channels=(32, 64) recovery_sigma=0.004 planner_learning_rate=0.003",
     "wide MLP": "mlp denoiser_width=512 denoiser_depth=4 condition_octaves=1 precision=bfloat16 recovery_sigma=0.004"
     " planner_learning_rate=0.001",
+    "wide MLP of 4 octaves": "mlp denoiser_width=512 denoiser_depth=4 precision=bfloat16 recovery_sigma=0.004"
+    " planner_learning_rate=0.001",
 }
+LEAST = 180  # rollouts of a row that others are compared with
 SHORT = "8000"  # updates of the trainings that are compared with each other, a third of the default's
 _OPTION = re.compile(r"[^\s(]+\([^)]*\)|\S+")
 
@@ -104,6 +107,25 @@ def options_table(task: str = "aligning") -> str:
         if int(row["demonstrations"]) == most and not words.startswith("`"):
             body.append([words.removeprefix("wide MLP, "), success(row), row["mean_steps"], row["mean_steps_won"]])
     return table(["planner", "success in % (95 %), entropy", "steps", "steps of successes"], body)
+
+
+def ceiling_table() -> str:
+    """Tasks with a planner that the simulator's inverse map followed: the same planner with learned controllers.
+
+    Diffusion Policy, which has no planner, stands beside where it was trained with all labels, as many updates and the
+    same demonstrations.
+    """
+    rows = [row for row in read_rows("planner_ablations") if row["candidates"] == "1" and int(row["n"]) >= LEAST]
+    same = ("task", "denoiser", "updates", "batch", "demonstrations", "disturbed", "training_seed")
+    body = []
+    for oracle in (row for row in rows if row["controller"] == "oracle"):
+        beside = [row for row in rows if all(row[name] == oracle[name] for name in same)]
+        for row in sorted(beside, key=lambda row: (row["controller"] == "oracle", row["method"], row["labels"])):
+            told = "*oracle*" if row["controller"] == "oracle" else f"`{row['method']}`, {row['labels']}"
+            cell = [row["task"], f"{planner_words(row['denoiser'])}, {row['updates']}", told, success(row)]
+            if row["blend_decay"] == oracle["blend_decay"] and cell not in body:
+                body.append([*cell, row["note"] or boxes(row)])
+    return table(["task", "planner, updates", "controller, labels", "success in % (95 %), entropy", ""], body)
 
 
 def draw_amounts(path: Path) -> Path:
