@@ -67,8 +67,10 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
     run = RunDirectory(path)
     config, summary = run.read_json("config.json"), run.read_json("summary.json")
     task = get_task(config["task"])
-    source = config.get("planner_from")  # a planner that was taken over is described by the run that trained it
-    trained = RunDirectory(source).read_json("config.json") if source else config
+    source, trained = None, config
+    while trained.get("planner_from"):  # a planner that was taken over is described by the run that trained it
+        source = trained["planner_from"]
+        trained = RunDirectory(source).read_json("config.json")
     rows = [row for result in results for row in result["episode"]]
     won = [row for row in rows if row["outcome"] == "success"]
     low, high = wilson_interval(len(won), len(rows))

@@ -94,12 +94,13 @@ def short_trainings(task: str = "aligning") -> list[dict[str, str]]:
 def amounts(task: str = "aligning") -> list[dict[str, str]]:
     """Those that differ in the demonstrations alone, by their number."""
     rows = [row for row in short_trainings(task) if planner_words(row["denoiser"]) == "wide MLP"]
+    rows = [row for row in rows if row["labels"] != "all" and row["method"] == "koap"]
     return sorted(rows, key=lambda row: (disturbed(row), int(row["demonstrations"]), row["training_seed"]))
 
 
 def options_table(task: str = "aligning") -> str:
     """Success of short trainings that differ from the wide MLP in one option, and of the wide MLP itself."""
-    rows = [row for row in short_trainings(task) if not disturbed(row)]
+    rows = [row for row in short_trainings(task) if not disturbed(row) and row["labels"] != "all"]
     most = max(int(row["demonstrations"]) for row in rows)
     body = []
     for row in rows:
