@@ -53,3 +53,19 @@ def test_disturbed_demonstrations_are_told_by_their_notes(script, tmp_path):
         about.write_text(json.dumps({"notes": notes}))
         assert script.disturbed_share(str(tmp_path / "demos")) == script.disturbed_share(str(place)) == share
     assert script.disturbed_share("scripted") == 0.0
+
+
+def test_a_planner_that_was_handed_on_is_described_by_the_run_that_trained_it(script, tmp_path):
+    given = {"task": "avoiding", "method": "koap", "seed": 0, "label_fraction": 1, "denoiser": "mlp", "command": "koap"}
+    given |= {"dataset": "scripted", "batch_size": 64}
+    summary = {"labels": {}, "trajectories_used": 5, "train_seconds": {"planner": 1.0, "controller": 1.0}}
+    source = None
+    for name, steps in (("trained", 700), ("taken", 5000), ("again", 5000)):
+        (tmp_path / name).mkdir()
+        config = given | {"steps": steps, "planner_from": source}
+        for file, content in (("config.json", config), ("summary.json", summary)):
+            (tmp_path / name / file).write_text(json.dumps(content))
+        source = str(tmp_path / name)
+    episode = {"outcome": "success", "mode": 1, "steps": 50}
+    row = script.row_of(tmp_path / "again", [{"episode": [episode]}], {}, "")
+    assert (row["updates"], row["successes"], row["labels"]) == (700, 1, "all")
