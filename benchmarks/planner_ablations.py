@@ -2,7 +2,7 @@
 """Adds one row to the table of planners that were tried: success in closed loop over several noise seeds.
 
     python benchmarks/planner_ablations.py RUN --seeds 100 1100 2100 --candidates 4 --note "wider"
-    python benchmarks/planner_ablations.py RUN --controller oracle        # a ceiling: the simulator's own inverse map
+    python benchmarks/planner_ablations.py RUN --controller oracle        # the simulator's own inverse map
 
 Every seed is one rollout in each of the fixed contexts (60 episodes on Avoiding, which has none). Sixty rollouts tell
 88 from 96 % by luck alone, so the table holds the sum.

@@ -32,8 +32,8 @@ _PUSH = {"m": 0.004, "rad": 0.01}  # change of a command by which its effect is 
 class OracleControl(PlanThenControl):
     """Plans states, and executes the commands that take the simulated robot there.
 
-    It reads the simulation, not the observation: nothing that a robot could have, but a ceiling for every controller
-    under the same planner.
+    It reads the simulation, not the observation: nothing that a robot could have. How exactly the tool follows
+    its plan is beyond any learned controller; whether the task succeeds is not, where the tool pushes something.
 
     Args:
         planner (StatePlanner): plans states from the last observed ones.
