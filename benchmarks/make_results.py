@@ -17,7 +17,7 @@ from pathlib import Path
 
 from fault_rows import kill_rows, ledger_rows, raw_rows, resume_rows, soak_rows, version_rows
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from planner_rows import amounts, same_planner_table, draw_amounts, planner_options, planner_table
+from planner_rows import amounts, draw_amounts, planner_options, planner_table, same_planner_table
 from readme_pictures import draw_label_curves, draw_pipeline
 from result_rows import (
     SOURCE,

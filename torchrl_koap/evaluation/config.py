@@ -23,7 +23,7 @@ class EvalConfig:
         rollouts_per_context: rollouts in each context; from 2 on the entropy of the modes per context is known.
         seed: seed of the first rollout; the others count on from it.
         controller: "learned", or "oracle": the simulator's own inverse map, which takes the tool where the plan says:
-            what fails then is the planner's.
+            what fails then is not a question of labels.
         execution: "feedback" (decode at every step) or "open_loop" (decode once per plan) (default: feedback, or the
             task's).
         solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
