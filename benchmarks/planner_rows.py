@@ -128,7 +128,8 @@ def draw_amounts(path: Path) -> Path:
         low, high = zip(*(wilson_interval(won, of) for _, won, of in points), strict=True)
         below = [rate - 100 * end for rate, end in zip(rates, low, strict=True)]
         above = [100 * end - rate for rate, end in zip(rates, high, strict=True)]
-        axis.errorbar(numbers, rates, [below, above], color=color, marker=marker, ms=5, capsize=3, label=label)
+        places = [number * (1.07 if kind else 1.0) for number in numbers]  # beside each other
+        axis.errorbar(places, rates, [below, above], color=color, marker=marker, ms=5, capsize=3, label=label)
     axis.set_xscale("log")
     ticks = sorted({number for points in series.values() for number, _, _ in points})
     axis.set_xticks(ticks, [str(tick) for tick in ticks])
