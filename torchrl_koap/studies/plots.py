@@ -56,8 +56,7 @@ def plot_success(
     Examples:
         >>> import tempfile
         >>> from torchrl_koap.studies.plots import plot_success
-        >>> from torchrl_koap.studies.lines import DASHES, MARKERS, Line, draw_lines, method_styles, name_lines
-    from torchrl_koap.studies.summary import summarise
+        >>> from torchrl_koap.studies.summary import summarise
         >>> cell = {"task": "avoiding", "method": "koap", "seed": 0, "status": "done", "episodes": 9, "successes": 5}
         >>> rows = [cell | {"fraction": fraction} for fraction in (0.01, 0.1)]
         >>> with tempfile.TemporaryDirectory() as folder:

@@ -57,8 +57,7 @@ class SortingExpert:
         >>> import torch
         >>> from torchrl_koap.envs import SortingEnv
         >>> from torchrl_koap.envs.contexts import evaluation_contexts
-        >>> from torchrl_koap.envs.experts.sorting_decision import decide, pushing_cost
-    from torchrl_koap.envs.sorting import mode_index
+        >>> from torchrl_koap.envs.sorting import mode_index
         >>> from torchrl_koap.envs.experts.sorting import SortingExpert
         >>> contexts = evaluation_contexts("sorting_2", 2)
         >>> env = SortingEnv(2, num_boxes=2, contexts=contexts, dtype=torch.float64)
