@@ -102,9 +102,10 @@ def same_planner_table() -> str:
         beside = [row for row in rows if all(row[name] == oracle[name] for name in same)]
         for row in sorted(beside, key=lambda row: (row["controller"] == "oracle", row["method"], row["labels"])):
             told = "*oracle*" if row["controller"] == "oracle" else f"`{row['method']}`, {row['labels']}"
-            cell = [row["task"], f"{planner_words(row['denoiser'])}, {row['updates']}", told, success(row)]
-            if row["blend_decay"] == oracle["blend_decay"] and cell not in body:
-                body.append([*cell, row["note"] or boxes(row)])
+            planner = f"{planner_words(row['denoiser'])}, {row['updates']}"
+            cells = [row["task"], planner, told, success(row), row["note"] or boxes(row)]
+            if row["blend_decay"] == oracle["blend_decay"] and cells not in body:
+                body.append(cells)
     return table(["task", "planner, updates", "controller, labels", "success in % (95 %), entropy", ""], body)
 
 
