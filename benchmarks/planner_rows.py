@@ -26,7 +26,7 @@ _OPTION = re.compile(r"[^\s(]+\([^)]*\)|\S+")
 
 
 def planner_words(denoiser: str) -> str:
-    """A planner as one of :data:`PLANNERS` and what it has besides, or in full where it is neither."""
+    """A planner as one of :data:`PLANNERS` and what it has besides, or in full where it is none of them."""
     options = _OPTION.findall(denoiser)
     for name, known in PLANNERS.items():
         common = _OPTION.findall(known)

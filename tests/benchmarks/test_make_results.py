@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,13 +14,8 @@ SOURCE = ROOT / "benchmarks" / "results"
 
 
 @pytest.fixture(scope="module")
-def results():
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    spec = importlib.util.spec_from_file_location("make_results", ROOT / "benchmarks" / "make_results.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    yield module
-    sys.path.remove(str(ROOT / "benchmarks"))
+def results(benchmark_script):
+    return benchmark_script("make_results")
 
 
 def test_pages_are_those_of_the_figures(results):

@@ -3,22 +3,12 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-from pathlib import Path
-
 import pytest
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
-def rows():
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        yield importlib.import_module("planner_rows")
-    finally:
-        sys.path.remove(str(BENCHMARKS))
+def rows(benchmark_script):
+    return benchmark_script("planner_rows")
 
 
 def test_a_known_planner_has_its_short_name(rows):

@@ -4,25 +4,13 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import json
 import os
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-
-
-@pytest.fixture
-def script(monkeypatch):
-    """Imports a script of ``benchmarks`` by its name."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return importlib.import_module
 
 
 @pytest.mark.parametrize(
@@ -37,16 +25,16 @@ def script(monkeypatch):
         (["--unlabelled", "foot"], "invalid choice: 'foot'"),
     ],
 )
-def test_what_cannot_be_run_is_refused_before_anything_is_recorded(script, words, said, tmp_path, capsys):
+def test_what_cannot_be_run_is_refused_before_anything_is_recorded(benchmark_script, words, said, tmp_path, capsys):
     with pytest.raises(SystemExit):
-        script("scooping").main(["--folder", str(tmp_path / "none"), *words])
+        benchmark_script("scooping").main(["--folder", str(tmp_path / "none"), *words])
     assert said in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 
 @pytest.fixture
-def study(script, monkeypatch, tmp_path):
+def study(benchmark_script, monkeypatch, tmp_path):
     """The script with training and rollouts replaced by notes of what was asked for."""
-    module, asked = script("scooping"), []
+    module, asked = benchmark_script("scooping"), []
 
     def train(config):
         asked.append(config)
@@ -104,7 +92,7 @@ def test_hand_alone_has_a_planner_per_number_of_labels_and_no_analysis(study, tm
     ] is False
 
 
-def test_cells_pool_seeds_and_take_the_longest_row_of_each(script):
+def test_cells_pool_seeds_and_take_the_longest_row_of_each(benchmark_script):
     base = {"labels": "5", "unlabelled": "both", "method": "koap", "execution": "open_loop", "blend_decay": "0.0"}
     rates = {"left": "0.5", "near": "1.0", "right": "0.0", "action_error_mrad": "100.0"}
     rows = [
@@ -112,14 +100,14 @@ def test_cells_pool_seeds_and_take_the_longest_row_of_each(script):
         for seed, n, successes in (("0", "15", "15"), ("0", "60", "30"), ("1", "60", "42"))
     ]
     rows.append(rows[0] | {"method": "dd", "action_error_mrad": ""})
-    cell, other = script("scooping_rows").scooping_cells(rows)
+    cell, other = benchmark_script("scooping_rows").scooping_cells(rows)
     assert (cell["n"], cell["successes"], cell["seeds"]) == (120, 72, ["0", "1"])
     assert cell["left"] == pytest.approx(0.5) and cell["action_error_mrad"] == [100.0, 100.0]
     assert other["method"] == "dd" and other["action_error_mrad"] == []
 
 
-def test_a_place_that_the_embedding_holds_is_found_and_one_it_does_not_is_missed(script):
-    probe_error = script("scooping_probe").probe_error
+def test_a_place_that_the_embedding_holds_is_found_and_one_it_does_not_is_missed(benchmark_script):
+    probe_error = benchmark_script("scooping_probe").probe_error
     generator = torch.Generator().manual_seed(0)
     seen = [torch.randn(40, 6, generator=generator) for _ in range(8)]
     mixing = torch.randn(6, 3, generator=generator).double()
@@ -131,8 +119,8 @@ def test_a_place_that_the_embedding_holds_is_found_and_one_it_does_not_is_missed
     assert probe_error(seen, broken, 6) > 1000
 
 
-def test_rows_of_other_probes_stay(script, tmp_path):
-    probe, table = script("scooping_probe"), tmp_path / "probe.csv"
+def test_rows_of_other_probes_stay(benchmark_script, tmp_path):
+    probe, table = benchmark_script("scooping_probe"), tmp_path / "probe.csv"
     row = {"pixels": 96, "pooling": "grid", "columns": 96, "embodiment": "hand", "error_mm": "12.0"}
     probe.write(table, [row, row | {"pixels": 128}])
     probe.write(table, [row | {"error_mm": "11.0"}])
@@ -140,16 +128,16 @@ def test_rows_of_other_probes_stay(script, tmp_path):
         assert [(r["pixels"], r["error_mm"]) for r in csv.DictReader(file)] == [("128", "12.0"), ("96", "11.0")]
 
 
-def test_outlines_overlap_by_hand(script):
-    overlap = script("scooping_silhouette").overlap
+def test_outlines_overlap_by_hand(benchmark_script):
+    overlap = benchmark_script("scooping_silhouette").overlap
     one, other = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
     assert overlap(one, other) == 1.0
     one[0], other[0, :2], other[1, :2] = True, True, True
     assert overlap(one, other) == pytest.approx(2 / 6)
 
 
-def test_wall_time_is_read_off_the_files(script, tmp_path):
-    cost = script("scooping_cost")
+def test_wall_time_is_read_off_the_files(benchmark_script, tmp_path):
+    cost = benchmark_script("scooping_cost")
 
     def write(path, at, text="{}"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -184,11 +172,9 @@ class Reads:
 
 
 @pytest.fixture(scope="module")
-def played():
+def played(benchmark_script):
     """Joint targets that take a piece out of pieces that lie as the parts' experiments have them, and the start."""
-    sys.path.insert(0, str(BENCHMARKS))
-    parts = importlib.import_module("scooping_parts")
-    sys.path.remove(str(BENCHMARKS))
+    parts = benchmark_script("scooping_parts")
     start, sims, rows = np.array([0.33, 0.0]), parts.ScoopingSimulations("robot", 1), np.zeros(1, dtype=np.int64)
     context = np.array([[*start, parts.TURN]])
     sims.reset(rows, parts.start_joints(context, "robot")[None], [parts.TURN])

@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,16 +15,10 @@ from torch import nn
 from torchrl_koap.data.regimes import RegimeSensor
 from torchrl_koap.tasks import get_task
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-
 
 @pytest.fixture(scope="module")
-def script():
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        yield importlib.import_module("unlabelled_rollouts")
-    finally:
-        sys.path.remove(str(BENCHMARKS))
+def script(benchmark_script):
+    return benchmark_script("unlabelled_rollouts")
 
 
 @pytest.fixture(scope="module")
