@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
-from torchrl_koap.modules import KoopmanInverseDynamics, LatentActionFourier, RidgeFit
-from torchrl_koap.modules.koopman.smoothed_action import RAW, LatentActionSmoothed
+from torchrl_koap.modules import KoopmanInverseDynamics, RidgeFit
+from torchrl_koap.modules.koopman.smoothed_action import RAW
 from torchrl_koap.tasks import Task
 
 # one or two labelled trajectories cannot be left out to choose the penalty
@@ -53,18 +53,16 @@ def fit_closed_form(
     groups = windows["episode"][:, -1]
     if not isinstance(controller, KoopmanInverseDynamics):
         fit = controller.fit_decoder(windows, mask, groups=groups)
-    elif isinstance(controller.latent_action, LatentActionSmoothed):
+    elif controller.latent_action.choices:
         fit = _best_block(controller, windows, mask, groups, shared_axes, guessed_axes)
     else:
-        has_axes = isinstance(controller.latent_action, LatentActionFourier)
-        axes = (shared_axes, guessed_axes) if has_axes else ((), ())
-        fit = _fit_koopman(controller, windows, mask, groups, *axes)
+        fit = _fit_koopman(controller, windows, mask, groups, shared_axes, guessed_axes)
     if not isinstance(fit, RidgeFit):
         return dict(fit or {})
     # LAPACK's last digits depend on where memory lies: keep those that two equal runs share
     held_out = float(f"{fit.errors[fit.penalty]:.6g}")
     found = {"penalty": fit.penalty, "labels_used": fit.num_labels, "held_out_error": held_out}
-    if isinstance(getattr(controller, "latent_action", None), LatentActionSmoothed):
+    if isinstance(controller, KoopmanInverseDynamics) and controller.latent_action.choices:
         found["block"] = controller.latent_action.chosen
     return found
 
@@ -81,7 +79,7 @@ def _fit_koopman(
     through_zero = not controller.action_normalizer.offset.any()
     penalty = PLACE_PENALTY if getattr(controller.latent_action, "place", 0.0) else DEFAULT_PENALTY
     options: dict[str, Any] = {"groups": groups, "default_penalty": penalty, "bias": not through_zero}
-    if not (shared_axes or guessed_axes):
+    if not (shared_axes or guessed_axes) or not controller.latent_action.holds_steps:
         return controller.fit_decoder(windows, mask, **options)
     options["tied_axes"] = shared_axes or guessed_axes
     fit = controller.fit_decoder(windows, mask, **options)
@@ -101,9 +99,7 @@ def _best_block(
     kept: tuple[float, str, RidgeFit, dict[str, Tensor]] | None = None
     for block in chooser.choices:
         chooser.choose(block)
-        own_columns = chooser.identity or block == RAW
-        axes = (shared_axes, guessed_axes) if own_columns else ((), ())
-        fit = _fit_koopman(controller, windows, mask, groups, *axes)
+        fit = _fit_koopman(controller, windows, mask, groups, shared_axes, guessed_axes)
         error = fit.errors[fit.penalty] / (RAW_SHARE if block == RAW else 1.0)
         if kept is None or error < kept[0]:
             weights = {name: value.clone() for name, value in controller.action_decoder.state_dict().items()}

@@ -13,10 +13,8 @@ from torch import Tensor, nn
 from torchrl_koap.keys import ACTION, STATE
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
-from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
-from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionModule
+from torchrl_koap.modules.koopman.latent_action import LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
-from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
 NORMALIZED_STATE = "normalized_state"
 NORMALIZED_ACTION = "normalized_action"
@@ -184,10 +182,9 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
         Args:
             windows (Tensor): raw states ``[*B, T, d]``; no label is read.
         """
-        if isinstance(self.lifting, CompactLifting):
-            self.lifting.choose_size(self.normalize_state(windows))
-        if isinstance(self.latent_action, LatentActionSmoothed):
-            self.latent_action.fit_unlabelled(self.normalize_state(windows))
+        windows = self.normalize_state(windows)
+        self.lifting.choose_size(windows)
+        self.latent_action.fit_unlabelled(windows)
 
     @torch.no_grad()
     def fit_decoder(
@@ -209,7 +206,7 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
             groups (Tensor, optional): trajectory of every window, int64 ``[*B]``, to be left out together.
             tied_axes (sequence of int, optional): the state column that each action entry moves. The decoder is then
                 shrunk towards one filter of the steps that all axes share, instead of towards 0; needs a
-                :class:`LatentActionFourier`.
+                latent action that holds them (:attr:`LatentActionModule.holds_steps`).
             batch_size (int): windows per forward pass.
             **kwargs: options of :meth:`LinearActionDecoder.fit_ridge`.
 
@@ -247,13 +244,11 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
 
     def _tied_axis_prior(self, latent: Tensor, action: Tensor, axes: Sequence[int]) -> Tensor:
         """The decoder ``[act, m]`` that applies one and the same filter to the steps of every axis."""
-        if (
-            not isinstance(self.latent_action, (LatentActionFourier, LatentActionSmoothed))
-            or len(axes) != action.shape[-1]
-        ):
+        if not self.latent_action.holds_steps or len(axes) != action.shape[-1]:
             raise ValueError(
-                f"tied_axes need a LatentActionFourier or LatentActionSmoothed and one state column per action entry"
-                f" ({action.shape[-1]}), got {type(self.latent_action).__name__} and {list(axes)}"
+                "tied_axes need a latent action that holds steps, such as LatentActionFourier, and one state"
+                f" column per action entry ({action.shape[-1]}), got {type(self.latent_action).__name__} and"
+                f" {list(axes)}"
             )
         entries, factors = self.latent_action.steps(axes)  # [S, act]
         size = _unit(self.state_normalizer, self.latent_action.state_dim, factors)[list(axes)]

@@ -68,6 +68,34 @@ class LatentActionModule(FrameGatherer, TensorDictModuleBase):
         """Latent actions ``[*B, T, m]`` from frames ``[*B, T, F, d]``."""
         raise NotImplementedError
 
+    @property
+    def holds_steps(self) -> bool:
+        """Whether :meth:`steps` can say where the steps along state columns are."""
+        return False
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """Blocks among which the held-out labelled error may choose; none where there is nothing to choose."""
+        return ()
+
+    def steps(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Where a latent action holds the steps along some state columns, and their size per unit of it.
+
+        Args:
+            axes (sequence of int): state columns.
+
+        Returns:
+            tuple of Tensor: entries of the latent action, int64 ``[S, len(axes)]``, and factors ``[S, len(axes)]`` that
+            turn them into steps in the networks' units; ``S = num_past + len(look_ahead)``.
+
+        Raises:
+            ValueError: if it does not hold them.
+        """
+        raise ValueError(f"{type(self).__name__} does not hold the steps along state columns")
+
+    def fit_unlabelled(self, windows: Tensor) -> None:
+        """Fits what is fitted in closed form after the training to windows ``[*B, T, d]``; most have nothing."""
+
     # reads and writes entries, where a gatherer alone takes states
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:  # type: ignore[override]
         """Writes the latent action of every frame of the window."""
@@ -216,16 +244,13 @@ class LatentActionFourier(LatentActionModule):
         curved = self.amplitude * torch.cos(where @ self.frequency + self.phase)
         return torch.cat([motion, curved, *((self.place * frames[..., n, :],) if self.place else ())], -1)
 
+    @property
+    def holds_steps(self) -> bool:
+        """Its first entries are the steps."""
+        return True
+
     def steps(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Where a latent action holds the steps along some state columns, and their size per unit of it.
-
-        Args:
-            axes (sequence of int): state columns.
-
-        Returns:
-            tuple of Tensor: entries of the latent action, int64 ``[S, len(axes)]``, and factors ``[S, len(axes)]`` that
-            turn them into steps in the networks' units; ``S = num_past + len(look_ahead)``.
-        """
+        """Where a latent action holds the steps along some state columns (:meth:`LatentActionModule.steps`)."""
         scales = torch.cat([self.scales[: self.num_past], self.scales[self.num_past + 1 :]])[:, list(axes)]
         first = torch.arange(len(scales), device=scales.device)[:, None] * self.state_dim
         return first + torch.tensor(list(axes), device=scales.device), scales * math.sqrt(self.motion_dim)

@@ -99,6 +99,10 @@ class KoopmanLifting(TensorDictModuleBase):
         if self.encoder_skip is not None:
             self.fit_linear(windows)
 
+    def choose_size(self, windows: Tensor) -> int:
+        """Number of coordinates kept after training, chosen on unlabelled windows ``[*B, T, d]``: here all."""
+        return self.latent_dim
+
     @torch.no_grad()
     def fit_linear(self, states: Tensor) -> None:
         """Sets the linear maps to the principal components of states ``[*B, d]``, at unit spread; no label is read.

@@ -104,6 +104,11 @@ class LatentActionSmoothed(LatentActionModule):
         """Blocks among which the held-out labelled error may choose."""
         return BLOCKS
 
+    @property
+    def holds_steps(self) -> bool:
+        """The raw block does, and the lifted one where the state is its own lifting."""
+        return self.identity or self.chosen == RAW
+
     @torch.no_grad()
     def choose(self, block: str) -> None:
         """Reads one block; the other is 0.
@@ -186,7 +191,7 @@ class LatentActionSmoothed(LatentActionModule):
         self.raw.fit_scales(windows)
 
     def steps(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Where the chosen block holds the steps along state columns, see :meth:`LatentActionFourier.steps`.
+        """Where the chosen block holds the steps along state columns, see :meth:`LatentActionModule.steps`.
 
         Raises:
             ValueError: if the chosen block does not hold the state's own columns.
