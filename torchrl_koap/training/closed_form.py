@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
 from torchrl_koap.modules import KoopmanInverseDynamics, RidgeFit
+from torchrl_koap.modules.koopman.action_decoder import INPUT_NOISE
 from torchrl_koap.modules.koopman.smoothed_action import RAW
 from torchrl_koap.tasks import Task
 
@@ -78,7 +79,8 @@ def _fit_koopman(
     """One fit, with tied axes where there are any: known ones, or likely ones if they help."""
     through_zero = not controller.action_normalizer.offset.any()
     penalty = PLACE_PENALTY if getattr(controller.latent_action, "place", 0.0) else DEFAULT_PENALTY
-    options: dict[str, Any] = {"groups": groups, "default_penalty": penalty, "bias": not through_zero}
+    options: dict[str, Any] = {"groups": groups, "default_penalty": penalty, "input_noise": INPUT_NOISE}
+    options["bias"] = not through_zero
     if not (shared_axes or guessed_axes) or not controller.latent_action.holds_steps:
         return controller.fit_decoder(windows, mask, **options)
     options["tied_axes"] = shared_axes or guessed_axes

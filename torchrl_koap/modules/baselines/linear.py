@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_koap.keys import ACTION, STATE
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
-from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.koopman.action_decoder import INPUT_NOISE, LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.time_alignment import check_offsets, frame_index, frame_span
 
 
@@ -108,5 +108,9 @@ class LinearInverseDynamics(InverseDynamics):
             self.scale.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
         groups = None if groups is None else groups.unsqueeze(-1).expand_as(mask)
         return self.decoder.fit_ridge(
-            self._frames(windows.get(self.in_key)), windows.get(self.out_key), mask, groups=groups
+            self._frames(windows.get(self.in_key)),
+            windows.get(self.out_key),
+            mask,
+            groups=groups,
+            input_noise=INPUT_NOISE,
         )

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
-from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.koopman.action_decoder import INPUT_NOISE, LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.time_alignment import FrameGatherer
 
 COUNTS = (2, 4, 8, 16, 32, 64)
@@ -125,7 +125,7 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         def fit(count: int) -> RidgeFit:
             self.gate.copy_(torch.arange(len(self.gate), device=self.gate.device) < count)
             options = {"groups": groups, "default_penalty": self.default_penalty, "bias": False}
-            return self.action_decoder.fit_ridge(latent * self.gate, action, mask, **options)
+            return self.action_decoder.fit_ridge(latent * self.gate, action, mask, input_noise=INPUT_NOISE, **options)
 
         fits = {count: fit(count) for count in self._counts}
         return fit(min(fits, key=lambda count: fits[count].errors[fits[count].penalty]))

@@ -15,6 +15,9 @@ from torchrl_koap.keys import ACTION, LATENT_ACTION
 
 # latent actions larger than this keep so many directions of their covariance: a square root of it would be gigabytes
 WIDE, DIRECTIONS = 2048, 256
+# variance of the errors of plans that recorded steps do not show, in units of a latent action's mean square norm: where
+# tens of thousands of steps are labelled the choice of the penalty would follow them closer than plans can be trusted
+INPUT_NOISE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ class LinearActionDecoder(TensorDictModuleBase):
         groups: Tensor | None = None,
         penalties: Sequence[float] = tuple(10.0 ** (p / 2) for p in range(-12, 3)),
         default_penalty: float | None = None,
+        input_noise: float = 0.0,
         bias: bool = True,
         prior: Tensor | None = None,
     ) -> RidgeFit:
@@ -109,6 +113,12 @@ class LinearActionDecoder(TensorDictModuleBase):
         leverage ``h_i``, which is exact for least squares. With ``groups`` all steps of a group are left out together
         (exact as well): steps of one trajectory resemble each other so much that leaving out one says little.
 
+        Steps that are left out are recorded ones too. Latent actions of *plans* have errors besides, which many labels
+        do not show: the more there are, the smaller the penalty that is chosen, and the more a direction counts in
+        which recorded steps hardly differ. Noise of variance :math:`s^2` on every entry acts as a penalty of
+        :math:`n s^2` (Bishop 1995, "Training with noise is equivalent to Tikhonov regularization"), so no smaller one
+        is chosen.
+
         Args:
             latent (Tensor): latent actions ``[*B, m]``.
             action (Tensor): actions ``[*B, act]``; anything, NaN included, where ``mask`` is False.
@@ -117,6 +127,8 @@ class LinearActionDecoder(TensorDictModuleBase):
             penalties (sequence of float): candidates, in units of the mean square norm of the latent actions: the ratio
                 of noise to signal variance that the fit assumes.
             default_penalty (float, optional): used instead of the choice where there are fewer than three groups.
+            input_noise (float): variance :math:`s^2` of the errors of every entry of latent actions to come, in units
+                of their mean square norm. Defaults to 0.
             bias (bool): fit ``b``; otherwise it is 0 and a latent action of 0 decodes to 0. Defaults to ``True``.
             prior (Tensor, optional): ``[act, m]``, what ``D`` is shrunk towards. Defaults to 0.
 
@@ -140,6 +152,8 @@ class LinearActionDecoder(TensorDictModuleBase):
         candidates = tuple(penalties) if default_penalty is None else (*penalties, default_penalty)
         if not candidates or not all(0 < penalty < float("inf") for penalty in candidates):
             raise ValueError(f"penalties must be positive and finite, got {candidates}")
+        if not 0 <= input_noise < float("inf"):
+            raise ValueError(f"input_noise must be finite and not negative, got {input_noise}")
         if not mask.any():
             raise ValueError("fit_ridge needs at least one labelled step, the mask selects none")
         x, y = latent[mask].double(), action[mask].double()
@@ -171,7 +185,9 @@ class LinearActionDecoder(TensorDictModuleBase):
             shrink = singular.square() / (singular.square() + penalty * unit)
             return _held_out(left, shrink, projected, target, groups, centred=bias)
 
-        errors = {float(penalty): held_out(penalty).square().mean().sqrt().item() for penalty in penalties}
+        least = input_noise * len(x)
+        tried = sorted({max(float(penalty), least) for penalty in penalties})
+        errors = {penalty: held_out(penalty).square().mean().sqrt().item() for penalty in tried}
         best = min(errors, key=errors.get)
         scaled = singular.square() + best * unit
         weight = (right.mT * (singular / scaled)) @ projected  # [m, act]
