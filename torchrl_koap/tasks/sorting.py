@@ -147,7 +147,13 @@ def _sorting(num_boxes: int) -> Task:
         converter=f"torchrl_koap.data.d3il.conversion:SORTING_{num_boxes}",
         scene=Scene(shapes=(platform, *_walls()), x=(0.17, 0.83), y=(-0.43, 0.45), caption=_CAPTION, camera="cage"),
         in_paper=num_boxes == 4,
-        defaults=Defaults(demonstrations=1000, planner_steps=18000, planner=WIDE_MLP, released_epochs=400),
+        defaults=Defaults(
+            demonstrations=1000,
+            planner_steps=24000,
+            planner=WIDE_MLP,
+            view={"observed_frames": 1},
+            released_epochs=400,
+        ),
     )
 
 

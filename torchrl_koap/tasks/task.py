@@ -82,6 +82,8 @@ class Defaults:
         planner (dict): options of `koap train` for the planner's network and its training that are used together where
             no denoiser is asked for: ``denoiser``, its sizes, ``batch_size``, ``planner_learning_rate``.
         recovery_response (str): how that augmentation leads back, ``"first_order"`` or ``"second_order"``.
+        view (dict): options of `koap train` for what the planner sees, whichever its network: ``observed_frames``,
+            ``frame``, ``plan_steps``.
         released_epochs (int): epochs of a controller in KOAP's first public code.
         execution (dict): how plans are followed where a command does not say: ``execution``, ``replan_interval``,
             ``blend_decay`` of :class:`~torchrl_koap.evaluation.EvalConfig`. Policies without a planner take the
@@ -101,6 +103,7 @@ class Defaults:
     recovery_sigma: float = 0.004
     recovery_response: str = "first_order"
     planner: Mapping[str, Any] = field(default_factory=dict)
+    view: Mapping[str, Any] = field(default_factory=dict)
     released_epochs: int = 400
     execution: Mapping[str, Any] = field(default_factory=dict)
 

@@ -60,10 +60,10 @@ class TrainConfig:
         forecast: plan deviations from a linear forecast, which carries over to goals not demonstrated (default: for a
             task without an environment).
         frame: object from which the planner sees everything, such as "target": tasks whose place on the table does not
-            matter (default: the world).
+            matter; "world" for none (default: the task's).
         plan_steps: frames of the plan that are modelled, counted from 1, such as 1 2 3 4 6 8 11 14; those in between
             lie on straight lines, and the last one is the horizon (default: all of 14).
-        observed_frames: frames that the planner sees, 1 or 2 (default: 2).
+        observed_frames: frames that the planner sees, 1 or 2 (default: the task's).
         relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.

@@ -108,6 +108,9 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         if config.forecast:
             raise ValueError(f"method {options.method!r} is a policy of its own and has no plans to forecast")
         options = replace(options, forecast=None)
+    elif options.planner_from is None and released is None:
+        view = {name: value for name, value in task.defaults.view.items() if getattr(options, name) is None}
+        options = replace(options, **view)
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:
@@ -142,6 +145,7 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     )
 
 
+WORLD = "world"  # no object's frame, where a task has one by default
 _UNET = {"denoiser": "unet", "batch_size": 128, "planner_learning_rate": 3e-3}
 
 
@@ -253,7 +257,7 @@ def _frame_of(task: Task, name: str) -> dict[str, list]:
     bodies = [body for body in parts if body + ends[1] in task.planar_parts]
     if not bodies:
         raise ValueError(f"frame was given, but in task {task.name!r} the place on the table matters")
-    lookup(bodies, name, "frame")
+    lookup((WORLD, *bodies), name, "frame")
     points, directions = task.planar_columns()
     place, yaw = (task.state_slices[name + end].start for end in ends)
     return {
@@ -271,7 +275,7 @@ def _planner_entry(options: TrainConfig, task: Task) -> dict[str, Any]:
         "frequencies": options.condition_octaves,
         "dropout": options.dropout,
         "forecast": options.forecast or None,
-        "frame": None if options.frame is None else _frame_of(task, options.frame),
+        "frame": None if options.frame in (None, WORLD) else _frame_of(task, options.frame),
         "plan_steps": None if options.plan_steps is None else list(options.plan_steps),
     }
     # what was left out is left out here too, so that a run of before can be resumed
