@@ -17,7 +17,15 @@ from pathlib import Path
 
 from fault_rows import kill_rows, ledger_rows, raw_rows, resume_rows, soak_rows, version_rows
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from planner_rows import amounts, draw_amounts, planner_options, planner_table, same_planner_table
+from planner_rows import (
+    PLANNERS,
+    amounts,
+    draw_amounts,
+    planner_options,
+    planner_table,
+    planner_variants,
+    same_planner_table,
+)
 from readme_pictures import draw_label_curves, draw_pipeline
 from result_rows import (
     SOURCE,
@@ -171,13 +179,16 @@ def pages() -> dict[Path, str]:
         amounts,
         same_planner_table,
         planner_options,
+        planner_variants,
         planner_table,
         difference,
         fact,
         commands,
         *_HELPERS,
     )
-    environment.globals.update({helper.__name__: helper for helper in helpers} | {"int": int, "float": float})
+    environment.globals.update(
+        {helper.__name__: helper for helper in helpers} | {"int": int, "float": float, "planner_names": PLANNERS}
+    )
     made = {}
     for template in sorted(SOURCE.glob("*.md.jinja")):
         name = template.name.removesuffix(".jinja")

@@ -92,6 +92,13 @@ def amounts(task: str = "aligning") -> list[dict[str, str]]:
     return sorted(rows, key=lambda row: (disturbed(row), int(row["demonstrations"]), row["training_seed"]))
 
 
+def planner_variants(task: str = "aligning", amount: str = "1000") -> list[dict[str, str]]:
+    """Short trainings on all demonstrations of a task that differ in the planner's options, the plain one first."""
+    rows = read_rows("planner_ablations", task=task, updates=SHORT, controller="learned", method="koap", candidates=1)
+    rows = [row for row in rows if row["demonstrations"] == amount and row["labels"] != "all"]
+    return sorted(rows, key=lambda row: (row["denoiser"] not in PLANNERS.values(), int(row["successes"])))
+
+
 def same_planner_table() -> str:
     """Tasks with a planner that the simulator's inverse map followed: the same planner with learned controllers."""
     rows = [row for row in read_rows("planner_ablations") if row["candidates"] == "1" and int(row["n"]) >= LEAST]

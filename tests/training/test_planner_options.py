@@ -43,9 +43,9 @@ def test_the_frame_of_an_object(name):
 @pytest.mark.parametrize(
     ("options", "shape"),
     [
-        ({"frame": "target"}, (1, 14, 14)),
-        ({"plan_steps": (1, 2, 4, 8, 20), "observed_frames": 2}, (2, 20, 5)),
-        ({"frame": "world"}, (1, 14, 14)),
+        ({"frame": "target"}, (2, 14, 14)),
+        ({"plan_steps": (1, 2, 4, 8, 20)}, (2, 20, 5)),
+        ({"frame": "world", "observed_frames": 1}, (1, 14, 14)),
         ({"frame": "box", "plan_steps": (2, 9), "observed_frames": 1}, (1, 9, 2)),
     ],
 )
@@ -58,17 +58,15 @@ def test_a_planner_learns_with_them(options, shape):
 
 
 def test_a_task_brings_its_own_view_unless_another_is_named():
-    resolved, planner = planner_of()  # names its denoiser
-    assert (resolved.options.observed_frames, resolved.options.frame) == (1, None)
-    assert planner.history == 1 and planner.frame is None
-    assert planner_of(observed_frames=2)[1].history == 2
-    for asked in ({"method": "dp"}, {"released_settings": True}, {"task": "avoiding"}):
-        options = resolve(TrainConfig(out=Path("run"), **({"task": "aligning"} | asked))).options
-        assert (options.observed_frames, options.frame) == (None, None)
+    resolved, planner = planner_of("sorting")  # names its denoiser
+    assert resolved.options.observed_frames == planner.history == 1
+    assert planner_of("sorting", observed_frames=2)[1].history == planner_of("avoiding")[1].history == 2
+    for asked in ({"method": "dp"}, {"released_settings": True}, {"task": "aligning"}):
+        assert resolve(TrainConfig(out=Path("run"), **({"task": "sorting"} | asked))).options.observed_frames is None
 
 
 def test_without_them_the_entry_is_as_before():
-    resolved, _ = planner_of(observed_frames=2)
+    resolved, _ = planner_of()
     assert not {"frame", "plan_steps"} & set(resolved.planner)
     assert (resolved.planner["history"], resolved.planner["horizon"]) == (2, 14)
 

@@ -128,12 +128,6 @@ register_task(
         ),
         label_levels=(0.02, 0.05, 0.1, 0.25, 0.5),
         in_paper=True,
-        defaults=Defaults(
-            demonstrations=1000,
-            planner_steps=24000,
-            planner=WIDE_MLP,
-            view={"observed_frames": 1},
-            released_epochs=200,
-        ),
+        defaults=Defaults(demonstrations=1000, planner_steps=24000, planner=WIDE_MLP, released_epochs=200),
     )
 )
