@@ -29,6 +29,7 @@ def fit_closed_form(
     *,
     shared_axes: Sequence[int] = (),
     guessed_axes: Sequence[int] = (),
+    input_noise: float = INPUT_NOISE,
 ) -> dict[str, Any]:
     """Fits a controller's linear decoder on every labelled step that sees its whole look-ahead, each used once.
 
@@ -42,6 +43,8 @@ def fit_closed_form(
             Fourier latent actions (:meth:`KoopmanInverseDynamics.fit_decoder`).
         guessed_axes (sequence of int): the same where it is only likely; used if labels left out are predicted better
             by it. On a robot of seven joints with five labelled trajectories that is a fifth of the error.
+        input_noise (float): errors of plans that a Koopman model's decoder allows for
+            (:meth:`~torchrl_koap.modules.LinearActionDecoder.fit_ridge`).
 
     Returns:
         dict: penalty, number of labels and held-out error of the fit, or what another controller's fit returns.
@@ -55,9 +58,9 @@ def fit_closed_form(
     if not isinstance(controller, KoopmanInverseDynamics):
         fit = controller.fit_decoder(windows, mask, groups=groups)
     elif controller.latent_action.choices:
-        fit = _best_block(controller, windows, mask, groups, shared_axes, guessed_axes)
+        fit = _best_block(controller, windows, mask, groups, shared_axes, guessed_axes, input_noise)
     else:
-        fit = _fit_koopman(controller, windows, mask, groups, shared_axes, guessed_axes)
+        fit = _fit_koopman(controller, windows, mask, groups, shared_axes, guessed_axes, input_noise)
     if not isinstance(fit, RidgeFit):
         return dict(fit or {})
     # LAPACK's last digits depend on where memory lies: keep those that two equal runs share
@@ -75,11 +78,12 @@ def _fit_koopman(
     groups: Tensor,
     shared_axes: Sequence[int],
     guessed_axes: Sequence[int],
+    input_noise: float,
 ) -> RidgeFit:
     """One fit, with tied axes where there are any: known ones, or likely ones if they help."""
     through_zero = not controller.action_normalizer.offset.any()
     penalty = PLACE_PENALTY if getattr(controller.latent_action, "place", 0.0) else DEFAULT_PENALTY
-    options: dict[str, Any] = {"groups": groups, "default_penalty": penalty, "input_noise": INPUT_NOISE}
+    options: dict[str, Any] = {"groups": groups, "default_penalty": penalty, "input_noise": input_noise}
     options["bias"] = not through_zero
     if not (shared_axes or guessed_axes) or not controller.latent_action.holds_steps:
         return controller.fit_decoder(windows, mask, **options)
@@ -95,13 +99,14 @@ def _best_block(
     groups: Tensor,
     shared_axes: Sequence[int],
     guessed_axes: Sequence[int],
+    input_noise: float,
 ) -> RidgeFit:
     """Fits each block of a smoothed latent action; keeps the lifted one unless the other's held-out error says no."""
     chooser = controller.latent_action
     kept: tuple[float, str, RidgeFit, dict[str, Tensor]] | None = None
     for block in chooser.choices:
         chooser.choose(block)
-        fit = _fit_koopman(controller, windows, mask, groups, shared_axes, guessed_axes)
+        fit = _fit_koopman(controller, windows, mask, groups, shared_axes, guessed_axes, input_noise)
         error = fit.errors[fit.penalty] / (RAW_SHARE if block == RAW else 1.0)
         if kept is None or error < kept[0]:
             weights = {name: value.clone() for name, value in controller.action_decoder.state_dict().items()}
