@@ -86,8 +86,15 @@ def test_steps_of_the_state_are_where_they_are_said_to_be():
         entries, factors = infer.steps([0, 1])
         steps = latent[:, entries] * factors
         torch.testing.assert_close(steps[:, past - 1], windows[:, 8] - windows[:, 7])
+    assert infer.holds_steps
+    wide = make_infer(columns=20)
     with pytest.raises(ValueError, match="no columns of the state"):
-        make_infer(columns=20).steps([0])
+        wide.steps([0])
+    held = []
+    for block in wide.choices:
+        wide.choose(block)
+        held.append((block, wide.holds_steps))
+    assert held == [(LIFTED, False), (RAW, True)]
 
 
 @pytest.mark.parametrize("columns", [2, 12])
