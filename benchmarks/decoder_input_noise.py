@@ -19,6 +19,7 @@ from resumable_table import open_table
 from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation import EvalConfig, evaluate, load_run
 from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.training.checkpoints import save_weights
 from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
 from torchrl_koap.training.datasets import load_demonstrations
@@ -32,6 +33,8 @@ def refitted(source: Path, folder: Path, noise: float) -> dict:
     """Copies a run and fits its decoder on the labels it was trained with; returns what the fit found."""
     shutil.copytree(source, folder)
     trained = load_run(folder)
+    if not isinstance(trained.controller, KoopmanInverseDynamics):
+        raise SystemExit(f"{source}: method {trained.method.name!r} has no Koopman decoder to fit with other noise")
     task = trained.task
     data = load_demonstrations(trained.config["dataset"], task, episodes=trained.config["episodes"])
     labelled, _ = trained.budget.apply(data, command=task.command_columns)

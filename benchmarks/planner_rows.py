@@ -92,10 +92,10 @@ def amounts(task: str = "aligning") -> list[dict[str, str]]:
     return sorted(rows, key=lambda row: (disturbed(row), int(row["demonstrations"]), row["training_seed"]))
 
 
-def planner_variants(task: str = "aligning", amount: str = "1000") -> list[dict[str, str]]:
-    """Short trainings on all demonstrations of a task that differ in the planner's options, the plain one first."""
-    rows = read_rows("planner_ablations", task=task, updates=SHORT, controller="learned", method="koap", candidates=1)
-    rows = [row for row in rows if row["demonstrations"] == amount and row["labels"] != "all"]
+def planner_variants() -> list[dict[str, str]]:
+    """Short trainings on all demonstrations of Aligning that differ in the planner's options, the plain one first."""
+    same = {"task": "aligning", "demonstrations": 1000, "updates": SHORT, "controller": "learned", "method": "koap"}
+    rows = [row for row in read_rows("planner_ablations", candidates=1, **same) if row["labels"] != "all"]
     return sorted(rows, key=lambda row: (row["denoiser"] not in PLANNERS.values(), int(row["successes"])))
 
 

@@ -67,25 +67,24 @@ def test_few_trajectories_take_the_default_penalty_many_choose():
 
 
 @pytest.mark.parametrize("method", ["koap", "linear", "pca"])
-def test_no_penalty_is_below_that_of_the_errors_of_plans(method):
+def test_no_penalty_is_below_that_of_the_errors_of_plans(monkeypatch, method):
     generator = torch.Generator().manual_seed(0)
     frames = [torch.randn(91, 2, generator=generator).cumsum(0) * 0.01 for _ in range(6)]
     data = select_state(flatten_trajectories(frames, [frame[1:] - frame[:-1] for frame in frames]), (0, 1))
     torch.manual_seed(0)
     controller = build_controller({"method": method, "preset": "default"}, 2, 2, data)
     seen = []
-    controller_fit = LinearActionDecoder.fit_ridge
+    fit_ridge = LinearActionDecoder.fit_ridge
 
     def spy(self, *args, **options):
-        seen.append(controller_fit(self, *args, **options))
+        seen.append(fit_ridge(self, *args, **options))
         return seen[-1]
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LinearActionDecoder, "fit_ridge", spy)
-        if hasattr(controller, "fit_unlabelled"):
-            windows = cut_windows(data, controller.num_window_frames, pad_before=controller.num_past)["state"]
-            controller.fit_scales(windows), controller.fit_unlabelled(windows)
-        report = fit_closed_form(controller, data)
+    monkeypatch.setattr(LinearActionDecoder, "fit_ridge", spy)
+    if hasattr(controller, "fit_unlabelled"):
+        windows = cut_windows(data, controller.num_window_frames, pad_before=controller.num_past)["state"]
+        controller.fit_scales(windows), controller.fit_unlabelled(windows)
+    report = fit_closed_form(controller, data)
     assert report["labels_used"] > 400
     assert all(min(fit.errors) == pytest.approx(INPUT_NOISE * report["labels_used"]) for fit in seen)
     if method == "koap":

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -63,6 +64,13 @@ def test_a_task_brings_its_own_view_unless_another_is_named():
     assert planner_of("sorting", observed_frames=2)[1].history == planner_of("avoiding")[1].history == 2
     for asked in ({"method": "dp"}, {"released_settings": True}, {"task": "aligning"}):
         assert resolve(TrainConfig(out=Path("run"), **({"task": "sorting"} | asked))).options.observed_frames is None
+
+
+def test_the_view_of_a_task_is_checked_as_an_option_is():
+    task = get_task("sorting")
+    odd = replace(task, defaults=replace(task.defaults, view={"observed_frames": 3}))
+    with pytest.raises(ValueError, match="observed_frames must be 1 to 2, got 3"):
+        resolve(TrainConfig(out=Path("run"), task="sorting"), odd)
 
 
 def test_without_them_the_entry_is_as_before():

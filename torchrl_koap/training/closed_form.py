@@ -83,8 +83,12 @@ def _fit_koopman(
     """One fit, with tied axes where there are any: known ones, or likely ones if they help."""
     through_zero = not controller.action_normalizer.offset.any()
     penalty = PLACE_PENALTY if getattr(controller.latent_action, "place", 0.0) else DEFAULT_PENALTY
-    options: dict[str, Any] = {"groups": groups, "default_penalty": penalty, "input_noise": input_noise}
-    options["bias"] = not through_zero
+    options: dict[str, Any] = {
+        "groups": groups,
+        "default_penalty": penalty,
+        "input_noise": input_noise,
+        "bias": not through_zero,
+    }
     if not (shared_axes or guessed_axes) or not controller.latent_action.holds_steps:
         return controller.fit_decoder(windows, mask, **options)
     options["tied_axes"] = shared_axes or guessed_axes

@@ -103,14 +103,14 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     options = replace(_with_task_defaults(config, task), task=task.name)
     released = _released(options)
     method = _method(options) if released is None else released.method
+    if method.has_planner and options.planner_from is None and released is None:
+        view = {name: value for name, value in task.defaults.view.items() if getattr(options, name) is None}
+        options = replace(options, **view)
     _check(options, method)
     if not method.has_planner:
         if config.forecast:
             raise ValueError(f"method {options.method!r} is a policy of its own and has no plans to forecast")
         options = replace(options, forecast=None)
-    elif options.planner_from is None and released is None:
-        view = {name: value for name, value in task.defaults.view.items() if getattr(options, name) is None}
-        options = replace(options, **view)
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:

@@ -16,7 +16,7 @@ from torchrl_koap.keys import ACTION, LATENT_ACTION
 # latent actions larger than this keep so many directions of their covariance: a square root of it would be gigabytes
 WIDE, DIRECTIONS = 2048, 256
 # variance of the errors of plans that recorded steps do not show, in units of a latent action's mean square norm: where
-# tens of thousands of steps are labelled the choice of the penalty would follow them closer than plans can be trusted
+# thousands of steps are labelled, a penalty chosen by them alone was followed by fewer successes in closed loop
 INPUT_NOISE = 1e-8
 
 
