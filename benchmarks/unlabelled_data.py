@@ -3,12 +3,14 @@
 
     koap demos --out runs/avoiding96
     python benchmarks/unlabelled_data.py --dataset runs/avoiding96 --regimes plain noise wide_64
+    python benchmarks/unlabelled_data.py --dataset runs/avoiding96 --regimes wide_64 --labels-from play
     python benchmarks/unlabelled_data.py --dataset runs/stacking --regimes joints_hidden
 
 Every method sees the same observations (with noise in training and in the trajectories it is judged on) and the same
 labelled trajectories, and all other trajectories without labels. The error is that of one decoded action on 24
-other trajectories, whose actions are read for it alone. Rows are appended to the table as they are known;
-what is there already is not run again.
+other trajectories, whose actions are read for it alone. With ``--labels-from play`` no demonstration has labels: they
+come from random play of the same robot (:mod:`torchrl_koap.envs.experts.random_play`). Rows are appended to the table
+as they are known; what is there already is not run again.
 
 What is trained without labels is trained once for all numbers of labelled trajectories of a seed: the weights are those
 that separate trainings would give, for no label is read before the closed form at the end.
@@ -27,6 +29,7 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.data import controller_view, make_demonstrations, select_state
 from torchrl_koap.data.regimes import REGIMES, Regime, apply_regime
+from torchrl_koap.envs.experts.random_play import record_random_play
 from torchrl_koap.modules import InverseDynamics, Normalizer
 from torchrl_koap.tasks import Task
 from torchrl_koap.training import fit_controller
@@ -52,6 +55,10 @@ METHODS = {
     "dd_lookahead": ("dd_lookahead", None, 500, True, {}),
 }
 JUDGED = 24  # trajectories, the last of a seed's order, that controllers are judged on
+PLAY_PUSH = 0.008  # m, about the demonstrations' own steps
+PLAY_BOUNDS = ((0.25, 0.75), (-0.25, 0.33))  # m
+PLAYED = 16  # motions of random play
+PLAY_SUFFIX = ", play"  # of what the table calls a regime
 HIDDEN = Regime("joints_hidden", "Stacking, joints hidden", hidden=tuple(range(7)))
 
 
@@ -64,6 +71,15 @@ def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:
     else:
         data = controller_view(data, task.controller_columns("robot"), action_targets=task.action_targets)
     return data[torch.isin(data["episode"], data["episode"].unique()[:most])], task.action_unit
+
+
+def add_play(data: TensorDictBase, dataset: str) -> TensorDictBase:
+    """The data and, with the highest numbers, motions of random play of the same robot."""
+    task = find_task_of(dataset)
+    play = select_state(record_random_play(task, PLAYED, push=PLAY_PUSH, bounds=PLAY_BOUNDS), task.state_of)
+    play = controller_view(play, task.controller_columns("robot"), action_targets=task.action_targets)
+    play["episode"] += 1 + data["episode"].max()
+    return torch.cat([data.select(*play.keys(include_nested=True, leaves_only=True)), play])
 
 
 def as_own_data(data: TensorDictBase) -> tuple[TensorDictBase, Task]:
@@ -118,23 +134,32 @@ def controllers(full: TensorDictBase, task: Task, numbers: torch.Tensor, seed: i
         yield method, labels, controller, fit, updates
 
 
-def shuffled_trajectories(data: TensorDictBase, seed: int) -> torch.Tensor:
-    """Numbers of the trajectories in the order of a seed: the first ones get labels, the last ones are judged."""
-    numbers = data["episode"].unique()
-    return numbers[torch.randperm(len(numbers), generator=torch.Generator().manual_seed(seed))]
+def shuffled_trajectories(data: TensorDictBase, seed: int, played: int = 0) -> torch.Tensor:
+    """Numbers of the trajectories in the order of a seed: the first ones get labels, the last ones are judged.
+
+    Args:
+        data (TensorDictBase): flat data.
+        seed (int): of the order.
+        played (int): how many of the highest numbers are random play, which comes first.
+    """
+    numbers, generator = data["episode"].unique(), torch.Generator().manual_seed(seed)
+    count = len(numbers) - played
+    shuffled = [torch.randperm(played, generator=generator) + count] if played else []
+    return numbers[torch.cat([*shuffled, torch.randperm(count, generator=generator)])]
 
 
 def run_regime(data, unit, name, regime, options, write, done, bar) -> None:
     """All cells of one regime."""
     for seed in options.seeds:
         full, task = as_own_data(apply_regime(data, regime, seed=seed))
-        numbers = shuffled_trajectories(full, seed)
+        numbers = shuffled_trajectories(full, seed, PLAYED if options.labels_from == "play" else 0)
         cells = [(method, labels) for method in options.methods for labels in options.labels]
-        wanted = [cell for cell in cells if (str(name), regime.name, str(cell[1]), str(seed), cell[0]) not in done]
+        label = regime.name + PLAY_SUFFIX * (options.labels_from == "play")
+        wanted = [cell for cell in cells if (str(name), label, str(cell[1]), str(seed), cell[0]) not in done]
         bar.update(len(cells) - len(wanted))
         for method, labels, controller, fit, updates in controllers(full, task, numbers, seed, wanted):
             predicted, true, _ = first_actions(controller, full, numbers[-JUDGED:])
-            row = (str(name), regime.name, str(labels), str(seed), method, f"{rmse(predicted, true, unit):.4f}")
+            row = (str(name), label, str(labels), str(seed), method, f"{rmse(predicted, true, unit):.4f}")
             write((*row, {"m": "mm", "rad": "mrad"}[unit], choice_of(controller, fit), updates))
             bar.update()
 
@@ -147,6 +172,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--labels", nargs="+", type=int, default=[1, 2, 4, 8, 16])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--labels-from", default="demonstrations", choices=["demonstrations", "play"])
     parser.add_argument("--trajectories", type=int, default=96, help="demonstrations used at most")
     parser.add_argument("--table", type=Path, default=TABLE)
     options = parser.parse_args()
@@ -156,6 +182,8 @@ def main() -> None:
     name = find_task_of(options.dataset).name
     if options.trajectories < JUDGED + max(options.labels):
         parser.error(f"--trajectories must be at least {JUDGED} judged ones and those with labels")
+    if options.labels_from == "play":
+        data = add_play(data, options.dataset)
     done, write = open_table(options.table, COLUMNS, COLUMNS[:5])
     cells = len(options.regimes) * len(options.seeds) * len(options.methods) * len(options.labels)
     with progress_bar(cells, "cells") as bar:

@@ -8,7 +8,7 @@ The planner takes no part: at every step the plan is what the demonstration did 
 it (with its noise), bent towards the present observation as the library's policies do. The robot's own motion is
 simulated, and what the controller sees of it goes through the same sensor, with fresh noise: the same noise for every
 controller of a seed, whichever rows are run. Training, labels and seeds are those of ``unlabelled_data.py``. Judged are
-the last trajectories of a seed's order. Success is the task's.
+the last trajectories of a seed's order. Success is the task's. ``--labels-from play``: as there.
 """
 
 from __future__ import annotations
@@ -22,7 +22,16 @@ import torch
 from resumable_table import open_table
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import step_mdp
-from unlabelled_data import METHODS, as_own_data, controllers, load_positions, shuffled_trajectories
+from unlabelled_data import (
+    METHODS,
+    PLAY_SUFFIX,
+    PLAYED,
+    add_play,
+    as_own_data,
+    controllers,
+    load_positions,
+    shuffled_trajectories,
+)
 
 from torchrl_koap.data.regimes import REGIMES, RegimeSensor
 from torchrl_koap.envs.registry import make_env
@@ -114,8 +123,10 @@ def follow(
     }
 
 
-def run_seed(data: TensorDictBase, source: Task, regime: str, seed: int, wanted: list[tuple[str, int]], options):
-    """Rolls out the controllers of one regime and seed.
+def run_seed(
+    data: TensorDictBase, source: Task, regime: str, seed: int, wanted: list[tuple[str, int]], played: int, options
+):
+    """Rolls out the controllers of one regime and seed; the last ``played`` trajectories are random play.
 
     Yields:
         tuple: method and number of labelled trajectories, and what :func:`follow` found.
@@ -126,7 +137,7 @@ def run_seed(data: TensorDictBase, source: Task, regime: str, seed: int, wanted:
     seen = data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
     full, task = as_own_data(seen)
     places = torch.unique(data["episode"], return_inverse=True)[1]  # as data of one's own are numbered
-    numbers = shuffled_trajectories(full, seed)
+    numbers = shuffled_trajectories(full, seed, played)
     shown = seen.copy().set("observation", data["state"]).set("episode", places)
     if sensor.distractors is not None:
         shown["distractors"] = sensor.distractors
@@ -149,6 +160,7 @@ def main() -> None:
     methods = ["semi_supervised", "koap_untrained", "koap_labelled_only", "pca", "linear_steps"]
     parser.add_argument("--methods", nargs="+", default=methods, choices=list(METHODS))
     parser.add_argument("--labels", nargs="+", type=int, default=[1, 2, 4])
+    parser.add_argument("--labels-from", default="demonstrations", choices=["demonstrations", "play"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--judged", type=int, default=60, help="demonstrations followed per seed")
     parser.add_argument("--blend-decay", type=float, default=BLEND_DECAY)
@@ -160,14 +172,18 @@ def main() -> None:
     source = find_task_of(options.dataset)
     if len(data["episode"].unique()) < options.judged + max(options.labels):
         parser.error(f"{options.dataset} has fewer demonstrations than are judged and labelled")
+    played = PLAYED if options.labels_from == "play" else 0
+    if played:
+        data = add_play(data, options.dataset)
+    suffix = PLAY_SUFFIX if played else ""
     done, write = open_table(options.table, COLUMNS, COLUMNS[:6])
     cells = list(product(options.methods, options.labels))
     with progress_bar(len(options.regimes) * len(options.seeds) * len(cells), "cells") as bar:
         for regime, seed in product(options.regimes, options.seeds):
-            keys = {cell: _key(source, regime, seed, cell, options.blend_decay) for cell in cells}
+            keys = {cell: _key(source, regime + suffix, seed, cell, options.blend_decay) for cell in cells}
             wanted = [cell for cell in cells if keys[cell] not in done]
             bar.update(len(cells) - len(wanted))
-            for cell, found in run_seed(data, source, regime, seed, wanted, options):
+            for cell, found in run_seed(data, source, regime, seed, wanted, played, options):
                 write((*keys[cell], options.judged, *found.values()))
                 bar.update()
 
