@@ -28,9 +28,14 @@ from torchrl_koap.training.run_directory import RunDirectory
 TABLE = Path(__file__).parent / "results" / "planner_ablations.csv"
 SIZES = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay")
 UNITS = {"trajectory": "trajectories", "window": "windows", "transition": "transitions"}
-OLDER = {"controller": "learned", "stacked": "", "disturbed": "0.0"}  # in rows that were written before the column
+OLDER = {
+    "controller": "learned",
+    "stacked": "",
+    "disturbed": "0.0",
+    "command_lead": "0.0",
+}  # in rows that were written before the column
 OTHERS = ("first_steps_weight", "precision", "recovery_sigma", "planner_learning_rate")
-PLANS = ("frame", "plan_steps", "observed_frames")
+PLANS = ("frame", "plan_steps", "observed_frames", "gripper_recovery")
 
 
 def planner_of(config: dict) -> str:
@@ -110,6 +115,7 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
         "controller": controller,
         "stacked": stacked_of(results),
         "disturbed": disturbed_share(trained["dataset"]),
+        "command_lead": results[0]["command_lead"],
     }
 
 
@@ -152,6 +158,7 @@ def main() -> None:
     parser.add_argument("--choice", default="quarter")
     parser.add_argument("--replan-interval", type=int, default=4)
     parser.add_argument("--blend-decay", type=float, default=BLEND_DECAY)
+    parser.add_argument("--command-lead", type=float, help="default: the task's; 0: any distance")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--note", default="")
     parser.add_argument("--table", type=Path, default=TABLE)
@@ -165,6 +172,7 @@ def main() -> None:
     results = []
     for seed in options.seeds:
         settings = {**choices, "choice": options.choice, "controller": options.controller}
+        settings["command_lead"] = options.command_lead
         config = EvalConfig(episodes=options.episodes, seed=seed, threads=options.threads, **settings)
         results.append(evaluate(options.run, config))
     row = row_of(options.run, results, choices, options.note, options.controller)

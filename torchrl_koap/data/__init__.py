@@ -13,6 +13,7 @@ from torchrl_koap.data.d3il.raw import RawEpisode, RawEpisodeError, read_raw_epi
 from torchrl_koap.data.d3il.replay import D3ILExperienceReplay
 from torchrl_koap.data.d3il.unpickling import load_pickle, loads_pickle
 from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstrations
+from torchrl_koap.data.gripper_recovery import GripperRecovery
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands
 from torchrl_koap.data.lerobot.reader import read_lerobot
 from torchrl_koap.data.recorded_replay import RecordedExperienceReplay
@@ -37,6 +38,7 @@ __all__ = [
     "D3ILExperienceReplay",
     "DamagedDataError",
     "DamagedPickleError",
+    "GripperRecovery",
     "LabelBudget",
     "LabelReport",
     "ObjectPermutation",

@@ -31,6 +31,8 @@ class EvalConfig:
         replan_interval: control steps per plan (default: 4, or the task's).
         blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are
             (default: 0.8, or the task's).
+        command_lead: farthest that the command may be ahead of the robot along each axis, in the units of the
+            actions; 0: any distance (default: the task's, else 0).
         candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
             the one in force (default: as the run says, else 1).
         choice: rule of that choice: "quarter", "typical" or "nearest".
@@ -61,6 +63,7 @@ class EvalConfig:
     solver_steps: int | None = None
     replan_interval: int | None = None
     blend_decay: float | None = None
+    command_lead: float | None = None
     candidates: int | None = None
     choice: str = "quarter"
     out: Path | None = None

@@ -16,6 +16,7 @@ from torchrl_koap.evaluation.policy_files import (
     PolicyDescription,
     assemble_policy,
     build_networks,
+    make_leash,
     read_policy,
 )
 from torchrl_koap.modules import RecedingHorizonPolicy, StatePlanner
@@ -142,7 +143,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     """
     given, config = config, EvalConfig() if config is None else config
     check_ways(config)
-    names = ("execution", "replan_interval", "blend_decay", "choice", "candidates")
+    names = ("execution", "replan_interval", "blend_decay", "choice", "candidates", "command_lead")
     options = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
     if config.controller == "oracle":
         trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
@@ -184,7 +185,12 @@ def execution_of(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:
         trained (TrainedRun): the run.
         config (EvalConfig): what was asked for.
     """
-    options: dict[str, Any] = {"execution": "feedback", "replan_interval": REPLAN_INTERVAL, "blend_decay": BLEND_DECAY}
+    options: dict[str, Any] = {
+        "execution": "feedback",
+        "replan_interval": REPLAN_INTERVAL,
+        "blend_decay": BLEND_DECAY,
+        "command_lead": 0.0,
+    }
     own = dict(trained.task.defaults.execution)
     if trained.planner is None or config.controller == "oracle":  # chunks are executed as they are; an oracle looks
         own.pop("execution", None)
@@ -206,4 +212,7 @@ def _oracle(trained: TrainedRun, options: dict[str, Any]) -> RecedingHorizonPoli
     kept = {"candidates": trained.config.get("candidates") or 1}
     history = max(trained.planner.history, getattr(trained.controller, "num_past", 0) + 1)
     rule = trained.task.action_rule if trained.task.gripper is not None else None
-    return OracleControl(trained.planner, trained.task, history=history, action_rule=rule, **kept | options)
+    leash = make_leash(trained.task, options.pop("command_lead"))
+    policy = OracleControl(trained.planner, trained.task, history=history, action_rule=rule, **kept | options)
+    policy.leash = leash
+    return policy

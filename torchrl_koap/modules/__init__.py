@@ -30,6 +30,7 @@ from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.policies.action_chunks import ChunkedPolicy
 from torchrl_koap.modules.policies.agent import Agent
 from torchrl_koap.modules.policies.asynchronous import AsynchronousAgent
+from torchrl_koap.modules.policies.command_leash import CommandLeash
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
 from torchrl_koap.modules.policies.policy_env import PolicyEnv, SeededNoise
 from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
@@ -42,6 +43,7 @@ __all__ = [
     "Agent",
     "AsynchronousAgent",
     "ChunkedPolicy",
+    "CommandLeash",
     "CommandResponse",
     "DiffusionPolicy",
     "EpisodeNoise",

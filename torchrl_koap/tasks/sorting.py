@@ -33,6 +33,7 @@ BIN_WALLS = (
 )
 BOX_HALF = 0.03  # half width of a box (m)
 PLATFORM_X, PLATFORM_Y = (0.2, 0.8), (-0.4, 0.2)  # m
+COMMAND_LEAD = 0.1  # m; scripted demonstrations keep the command within 0.097 of the robot
 PO_NOISE = 0.002  # m; of PO-Sorting, in demonstrations as well as in evaluation; the paper states no figure
 # six regions (x range, y range in m) that are dealt out to the boxes at random
 REGIONS = tuple((x, y) for x in ((0.4, 0.5), (0.55, 0.65)) for y in ((-0.15, -0.1), (-0.05, 0.0), (0.05, 0.1)))
@@ -153,6 +154,7 @@ def _sorting(num_boxes: int) -> Task:
             planner=WIDE_MLP,
             view={"observed_frames": 1},
             released_epochs=400,
+            execution={"command_lead": COMMAND_LEAD},
         ),
     )
 
@@ -167,7 +169,13 @@ register_task(
         noise=PO_NOISE,
         data="sorting",
         gym_id="",
-        defaults=Defaults(demonstrations=1000, planner_steps=18000, planner=WIDE_MLP, released_epochs=200),
+        defaults=Defaults(
+            demonstrations=1000,
+            planner_steps=18000,
+            planner=WIDE_MLP,
+            released_epochs=200,
+            execution={"command_lead": COMMAND_LEAD},
+        ),
     )
 )
 

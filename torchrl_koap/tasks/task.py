@@ -86,8 +86,8 @@ class Defaults:
             ``frame``, ``plan_steps``.
         released_epochs (int): epochs of a controller in KOAP's first public code.
         execution (dict): how plans are followed where a command does not say: ``execution``, ``replan_interval``,
-            ``blend_decay`` of :class:`~torchrl_koap.evaluation.EvalConfig`. Policies without a planner take the
-            interval alone.
+            ``blend_decay``, ``command_lead`` of :class:`~torchrl_koap.evaluation.EvalConfig`. Policies without a
+            planner take the interval and the lead alone.
 
     Examples:
         >>> from torchrl_koap.tasks.task import Defaults

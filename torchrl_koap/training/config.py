@@ -69,6 +69,8 @@ class TrainConfig:
         recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
         recovery_response: how the augmentation leads back, "first_order" at once or "second_order" from rest, which
             robots that follow their commands late can do (default: the task's).
+        gripper_recovery: share of the windows with open fingers that are shown with fingers closed on nothing, which
+            open again; for tasks with a gripper (default: 0.1); 0 turns it off.
         scene_shift: typical displacement (m) of whole scenes, for tasks whose place on the table does not matter.
         scene_turn: typical angle (rad) by which such scenes are turned.
         exchange: exchange objects that are alike.
@@ -138,6 +140,7 @@ class TrainConfig:
     controller_state: str = "robot"
     recovery_sigma: float | None = None
     recovery_response: str | None = None
+    gripper_recovery: float | None = None
     scene_shift: float = 0.05
     scene_turn: float = 0.3
     exchange: bool = True

@@ -34,6 +34,7 @@ PLANNER_OPTIONS = (
         "relations",
         "recovery_sigma",
         "recovery_response",
+        "gripper_recovery",
         "scene_shift",
         "scene_turn",
         "exchange",

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
 from torchrl_koap.data import (
+    GripperRecovery,
     ObjectPermutation,
     RandomPlanarTransform,
     RecoveryAugmentation,
@@ -160,4 +161,6 @@ def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> 
         tool: dict[str, Any] = {"tool": task.tool_columns, "kinematics": task.tool_position}
         way: dict[str, Any] = {"response": options.recovery_response, "columns": arm, "moved_by": moved_by}
         steps.append(RecoveryAugmentation(options.recovery_sigma, history=HISTORY, **way, **tool))
+    if task.gripper is not None and options.gripper_recovery and not actions:
+        steps.append(GripperRecovery(task.gripper[1], share=options.gripper_recovery, history=HISTORY))
     return TensorDictSequential(*steps)

@@ -107,6 +107,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         view = {name: value for name, value in task.defaults.view.items() if getattr(options, name) is None}
         options = replace(options, **view)
     _check(options, method)
+    if options.gripper_recovery and task.gripper is None:
+        raise ValueError(f"gripper_recovery was given, but task {task.name!r} has no gripper (Task.gripper)")
     if not method.has_planner:
         if config.forecast:
             raise ValueError(f"method {options.method!r} is a policy of its own and has no plans to forecast")
@@ -146,6 +148,7 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
 
 
 WORLD = "world"  # no object's frame, where a task has one by default
+GRIPPER_RECOVERY = 0.1  # share of windows
 _UNET = {"denoiser": "unet", "batch_size": 128, "planner_learning_rate": 3e-3}
 
 
@@ -160,6 +163,7 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
             "steps": task.defaults.planner_steps,
             "recovery_sigma": task.defaults.recovery_sigma,
             "recovery_response": task.defaults.recovery_response,
+            "gripper_recovery": None if task.gripper is None else GRIPPER_RECOVERY,
             "episodes": task.defaults.demonstrations,
             "relative": task.defaults.relative,
             "channels": task.defaults.channels,
@@ -235,6 +239,8 @@ def _check(options: TrainConfig, method: Method) -> None:
             raise ValueError(f"{name} must be >= {least}, got {value}")
     if options.dropout is not None and options.dropout >= 1:
         raise ValueError(f"dropout must be in [0, 1), got {options.dropout}")
+    if options.gripper_recovery is not None and not 0 <= options.gripper_recovery <= 1:
+        raise ValueError(f"gripper_recovery must be a share in [0, 1], got {options.gripper_recovery}")
     if not 0 < options.observation_fraction <= 1:
         raise ValueError(f"observation_fraction: a fraction must be in (0, 1], got {options.observation_fraction}")
 

@@ -75,6 +75,9 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         choice (str): the rule by which it is taken.
         kept_steps (int, optional): entries of a chunk that are kept. Default: those that are executed.
 
+    Attributes:
+        leash (CommandLeash, optional): has the last word on actions; None, unless set.
+
     Raises:
         ValueError: for a history shorter than the planner's, or an interval longer than the horizon. At the first call
             for a history of another length.
@@ -122,6 +125,7 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self.history, self.replan_interval = history, replan_interval
         self.planner, self.candidates, self.choice = planner, candidates, choice
+        self.leash: TensorDictModuleBase | None = None
         self._written: TensorDictBase | None = None
         self.receding = MultiStepActorWrapper(
             _Chunk(self.make_chunk, planner.noise_key, chunk_key),
@@ -196,7 +200,7 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
                 tensordict.update(self._written)
         tensordict = self._any_batch(tensordict, [*kept, cached])
         self._written = tensordict.select(*kept)
-        return tensordict
+        return tensordict if self.leash is None else self.leash(tensordict)
 
     def _any_batch(self, tensordict: TensorDictBase, kept: list[NestedKey]) -> TensorDictBase:
         """One step of a batch of any shape."""
