@@ -83,5 +83,9 @@ class CommandLeash(TensorDictModuleBase):
         observed, action = tensordict.get(self.in_keys[0])[..., -1, :], tensordict.get(self.in_keys[1]).clone()
         state = observed if self.state_of is None else self.state_of(observed)
         ahead = (observed[..., self.commands] - state[..., self.positions]).to(action.dtype)
-        action[..., self.actions] = (ahead + action[..., self.actions]).clamp(-self.lead, self.lead) - ahead
+        wanted = action[..., self.actions]
+        reach = ahead + wanted
+        held = reach.clamp(-self.lead, self.lead)
+        # what is within the lead keeps its bits: episodes with contacts turn out otherwise for a rounding error
+        action[..., self.actions] = torch.where(held == reach, wanted, held - ahead)
         return tensordict.set(self.out_keys[0], action)
