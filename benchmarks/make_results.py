@@ -24,7 +24,9 @@ from planner_rows import (
     planner_options,
     planner_table,
     planner_variants,
+    pooled_boxes,
     same_planner_table,
+    stuck_table,
 )
 from readme_pictures import draw_label_curves, draw_pipeline
 from result_rows import (
@@ -178,8 +180,10 @@ def pages() -> dict[Path, str]:
         pivot,
         amounts,
         same_planner_table,
+        stuck_table,
         planner_options,
         planner_variants,
+        pooled_boxes,
         planner_table,
         difference,
         fact,

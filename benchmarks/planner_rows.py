@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-from result_rows import read_rows, success, table
+from result_rows import percent, read_rows, success, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 
@@ -43,6 +43,20 @@ def boxes(row: Mapping[str, str]) -> str:
     return f"first box {first:.1f} %, two {two:.1f} %"
 
 
+def pooled_boxes(rows: Sequence[Mapping[str, str]]) -> str:
+    """How many boxes of Stacking several rows together brought to the zone, with Wilson intervals."""
+    n = sum(int(row["n"]) for row in rows)
+    counts = [sum(int(row["stacked"].split()[place]) for row in rows) for place in range(3)]
+    first, two, three = (percent({"successes": str(count), "n": str(n)}) for count in counts)
+    return f"the first box in {first} of {n} rollouts, two in {two}, all three in {three}"
+
+
+def leashed(row: Mapping[str, str]) -> str:
+    """How far ahead of the robot its command may be, empty where it may run away."""
+    lead = float(row["command_lead"])
+    return f"command at most {lead:g} ahead" if lead else ""
+
+
 def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
     """A row per trained planner and way to run it."""
     head = [
@@ -68,7 +82,7 @@ def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
             row["candidates"] if row["candidates"] == "1" else f"{row['candidates']}, {row['choice']}",
             success(row),
             row["mean_steps"],
-            "; ".join(filter(None, [row["note"], boxes(row)])),
+            "; ".join(filter(None, [row["note"], boxes(row), leashed(row)])),
         ]
         for row in rows
     ]
@@ -88,6 +102,7 @@ def disturbed(row: Mapping[str, str]) -> bool:
 def amounts(task: str = "aligning") -> list[dict[str, str]]:
     """Short trainings of a task that differ in the demonstrations alone, by their number."""
     rows = read_rows("planner_ablations", task=task, updates=SHORT, controller="learned", method="koap", candidates=1)
+    rows = [row for row in rows if not leashed(row)]  # all trainings of the comparison are of before
     rows = [row for row in rows if planner_words(row["denoiser"]) == "wide MLP" and row["labels"] != "all"]
     return sorted(rows, key=lambda row: (disturbed(row), int(row["demonstrations"]), row["training_seed"]))
 
@@ -96,6 +111,7 @@ def planner_variants() -> list[dict[str, str]]:
     """Short trainings on all demonstrations of Aligning that differ in the planner's options, the plain one first."""
     same = {"task": "aligning", "demonstrations": 1000, "updates": SHORT, "controller": "learned", "method": "koap"}
     rows = [row for row in read_rows("planner_ablations", candidates=1, **same) if row["labels"] != "all"]
+    rows = [row for row in rows if not leashed(row)]  # as in amounts()
     return sorted(rows, key=lambda row: (row["denoiser"] not in PLANNERS.values(), int(row["successes"])))
 
 
@@ -103,7 +119,7 @@ def same_planner_table() -> str:
     """Tasks with a planner that the simulator's inverse map followed: the same planner with learned controllers."""
     rows = [row for row in read_rows("planner_ablations") if row["candidates"] == "1" and int(row["n"]) >= LEAST]
     rows = [row for row in rows if "ran away" not in row["note"]]  # of a planner of its own
-    same = ("task", "denoiser", "updates", "batch", "demonstrations", "disturbed", "training_seed")
+    same = ("task", "denoiser", "updates", "batch", "demonstrations", "disturbed", "training_seed", "command_lead")
     body = []
     for oracle in (row for row in rows if row["controller"] == "oracle"):
         beside = [row for row in rows if all(row[name] == oracle[name] for name in same)]
@@ -114,6 +130,21 @@ def same_planner_table() -> str:
             if row["blend_decay"] == oracle["blend_decay"] and cells not in body:
                 body.append(cells)
     return table(["task", "planner, updates", "controller, labels", "success in % (95 %), entropy", ""], body)
+
+
+def stuck_table() -> str:
+    """How episodes ran out of time, by task and by what was done against it."""
+    groups = defaultdict(list)
+    for row in read_rows("stuck_episodes"):
+        groups[row["task"], float(row["command_lead"]), float(row["gripper_recovery"])].append(row)
+    counted = ("n", "out_of_time", "runaway", "fingers", "one place", "moving")
+    body = []
+    for (task, lead, share), rows in sorted(groups.items()):
+        kept = [f"command at most {lead:g} ahead" if lead else "", f"`--gripper-recovery {share:g}`" if share else ""]
+        sums = [str(sum(int(row[name]) for row in rows)) for name in counted]
+        body.append([f"`{task}`", ", ".join(filter(None, kept)) or "nothing", str(len(rows)), *sums])
+    head = ["task", "done against it", "evaluations", "rollouts", "out of time", "command ran away"]
+    return table([*head, "fingers closed on nothing", "in one place", "still moving"], body)
 
 
 def draw_amounts(path: Path) -> Path:
