@@ -18,6 +18,8 @@ REGIMES = {
     "distractors": "64 columns, 2 distractors",
     "joints_hidden": "Stacking, joints hidden",
 }
+# the same with labels from random play alone, as the table calls them; not in the picture
+PLAYED = {f"{name}, play": f"{title}; labels from random play" for name, title in REGIMES.items()}
 CONTROLS = (
     *("semi_supervised", "semi_supervised, untrained", "semi_supervised, labelled only", "koap", "koap_untrained"),
     *("koap_labelled_only", "koap_paper", "pca", "linear_steps", "dd_lookahead"),

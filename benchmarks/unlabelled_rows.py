@@ -8,7 +8,9 @@ from collections.abc import Sequence
 
 from result_rows import percent, read_rows
 from scipy.stats import t as student
-from unlabelled_picture import CONTROLS, REGIMES
+from unlabelled_picture import CONTROLS, PLAYED, REGIMES
+
+TITLES = REGIMES | PLAYED
 
 
 def unlabelled_cells(regime: str) -> dict[tuple[str, int], dict[int, float]]:
@@ -53,7 +55,7 @@ def unlabelled_gains(regimes: Sequence[str], against: Sequence[str]) -> list[lis
     for regime in regimes:
         cells = unlabelled_cells(regime)
         for number in sorted({number for _, number in cells}):
-            row = [REGIMES[regime], str(number)]
+            row = [TITLES[regime], str(number)]
             for method in against:
                 own, other = (cells.get((name, number), {}) for name in ("semi_supervised", method))
                 row.append(paired_gain([100 * (1 - own[seed] / other[seed]) for seed in own.keys() & other.keys()]))
@@ -73,10 +75,10 @@ def followed_rows(against: Sequence[str]) -> list[list[str]]:
         cell.setdefault(row["method"], {})[int(row["seed"])] = row
     body = []
     for (regime, labels), methods in sorted(
-        found.items(), key=lambda item: (list(REGIMES).index(item[0][0]), item[0][1])
+        found.items(), key=lambda item: (list(TITLES).index(item[0][0]), item[0][1])
     ):
         own = methods["semi_supervised"]
-        row = [REGIMES[regime], str(labels), _together(own)]
+        row = [TITLES[regime], str(labels), _together(own)]
         for method in against:
             other = methods.get(method, {})
             ahead = [100 * (_successes(own[seed]) - _successes(other[seed])) for seed in own.keys() & other.keys()]

@@ -26,8 +26,7 @@ from torchrl_koap.evaluation.latent_space import analyse_latent
 from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET, error_unit, judge_latent_model
 from torchrl_koap.evaluation.offline import load_training_data
 from torchrl_koap.evaluation.places import choose_contexts
-from torchrl_koap.evaluation.policy_files import make_leash
-from torchrl_koap.evaluation.rollouts import make_policy, roll_out
+from torchrl_koap.evaluation.rollouts import make_leash, make_policy, roll_out
 from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_run
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.tasks import Task

@@ -6,7 +6,6 @@ The file is safetensors with a JSON header; reading one runs no code that it bri
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,9 +13,9 @@ from typing import Any
 
 from torch import nn
 
-from torchrl_koap.evaluation.rollouts import make_policy
+from torchrl_koap.evaluation.rollouts import make_leash, make_policy
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import ChunkedPolicy, CommandLeash, RecedingHorizonPolicy, StatePlanner
+from torchrl_koap.modules import ChunkedPolicy, RecedingHorizonPolicy, StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task, get_task
 from torchrl_koap.tasks.json_format import import_strings_of, plain_task_from_json
@@ -27,7 +26,6 @@ from torchrl_koap.training.fit import Recipe
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.provenance import versions
-from torchrl_koap.training.response import tracked_columns
 
 FORMAT, VERSION = "torchrl_koap policy", 1
 BLEND_DECAY = 0.8
@@ -142,41 +140,6 @@ def assemble_policy(
     policy.description = description
     policy.leash = make_leash(task, command_lead)
     return policy.eval()
-
-
-def make_leash(task: Task, lead: float) -> CommandLeash | None:
-    """The leash on a task's commands, None for a lead of 0.
-
-    Args:
-        task (Task): the task.
-        lead (float): farthest that the command may be ahead of the robot, in the units of the actions.
-
-    Raises:
-        ValueError: if the lead is negative, or the task's actions are no changes of a command that it observes.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.policy_files import make_leash
-        >>> from torchrl_koap.tasks import get_task
-        >>> make_leash(get_task("aligning"), 0.1).commands.tolist()
-        [0, 1, 2]
-    """
-    if not lead:
-        return None
-    if task.command is None or task.action_targets:
-        raise ValueError(
-            f"command_lead was given, but the actions of task {task.name!r} are no changes of a command that it"
-            " observes (Task.command)"
-        )
-    if not 0 < lead < math.inf:
-        raise ValueError(f"command_lead must be a number >= 0, got {lead}")
-    columns = tracked_columns(task)
-    return CommandLeash(
-        lead,
-        commands=columns["commands"],
-        positions=columns["states"],
-        actions=columns["actions"],
-        state_of=task.state_of,
-    )
 
 
 def build_policy(planner: StatePlanner, controller: nn.Module, task: Task | None = None, **options: Any):

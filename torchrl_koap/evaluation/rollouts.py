@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -19,10 +20,13 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_koap.evaluation.scores import OUTCOMES, outcome_of
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion.planner import StatePlanner
+from torchrl_koap.modules.policies.command_leash import CommandLeash
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
 from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
 from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
 from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
+from torchrl_koap.tasks import Task
+from torchrl_koap.training.response import tracked_columns
 
 AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
 
@@ -74,6 +78,41 @@ def make_policy(
         action_rule=action_rule,
         candidates=candidates,
         choice=choice,
+    )
+
+
+def make_leash(task: Task, lead: float) -> CommandLeash | None:
+    """The leash on a task's commands, None for a lead of 0.
+
+    Args:
+        task (Task): the task.
+        lead (float): farthest that the command may be ahead of the robot, in the units of the actions.
+
+    Raises:
+        ValueError: if the lead is negative, or the task's actions are no changes of a command that it observes.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.rollouts import make_leash
+        >>> from torchrl_koap.tasks import get_task
+        >>> make_leash(get_task("aligning"), 0.1).commands.tolist()
+        [0, 1, 2]
+    """
+    if not lead:
+        return None
+    if task.command is None or task.action_targets:
+        raise ValueError(
+            f"command_lead was given, but the actions of task {task.name!r} are no changes of a command that it"
+            " observes (Task.command)"
+        )
+    if not 0 < lead < math.inf:
+        raise ValueError(f"command_lead must be a number >= 0, got {lead}")
+    columns = tracked_columns(task)
+    return CommandLeash(
+        lead,
+        commands=columns["commands"],
+        positions=columns["states"],
+        actions=columns["actions"],
+        state_of=task.state_of,
     )
 
 

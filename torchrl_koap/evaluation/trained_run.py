@@ -16,9 +16,9 @@ from torchrl_koap.evaluation.policy_files import (
     PolicyDescription,
     assemble_policy,
     build_networks,
-    make_leash,
     read_policy,
 )
+from torchrl_koap.evaluation.rollouts import make_leash
 from torchrl_koap.modules import RecedingHorizonPolicy, StatePlanner
 from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
 from torchrl_koap.training.builders import method_named

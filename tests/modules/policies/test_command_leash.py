@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
-from torchrl_koap.evaluation.policy_files import make_leash
+from torchrl_koap.evaluation.rollouts import make_leash
 from torchrl_koap.modules import CommandLeash
 from torchrl_koap.tasks import get_task
 
