@@ -10,7 +10,7 @@ import pytest
 import torch
 from toy_policies import CountingPlanner, EchoController
 
-from torchrl_koap.modules import Agent, AsynchronousAgent, PlanThenControl, StatePlanner, TemporalUnet
+from torchrl_koap.modules import Agent, AsynchronousAgent, CommandLeash, PlanThenControl, StatePlanner, TemporalUnet
 
 
 class HeldPlanner(CountingPlanner):
@@ -94,6 +94,16 @@ def test_a_plan_has_the_states_that_are_known(prediction):
     assert not torch.allclose(free[:, 2:], bound[:, 2:])
     with pytest.raises(ValueError, match=r"known states must be \[\*B, 1..13, 2\]"):
         planner.plan(history, noise, known=torch.zeros(3, 14, 2))
+
+
+def test_the_command_is_held_back_as_in_the_policy_itself():
+    agent = make_agent()
+    agent.policy.leash = CommandLeash(0.1, commands=[0], positions=[1], actions=[0])
+    agent.reset()
+    for step in range(4):
+        action = agent.act(np.array([step / 20, 0.0]))  # a command ahead of a robot that stands still
+        assert abs(step / 20 + action[0]) <= 0.1 + 1e-6
+    agent.close()
 
 
 def test_refusals():

@@ -115,7 +115,7 @@ class AsynchronousAgent(Agent):
         action = self.policy.act(history, self._remaining())
         self._age += 1
         self._begun += 1
-        return action
+        return action if self.policy.leash is None else self.policy.leash.hold(self._frames, action)
 
     def _remaining(self) -> Tensor:
         """What is left of the plan in force, its last state repeated."""

@@ -26,7 +26,8 @@ class CommandLeash(TensorDictModuleBase):
     is decided from then on hardly moves it. With the leash the robot answers as soon as plans turn back.
 
     It goes behind any policy in a ``TensorDictSequential``;
-    :class:`~torchrl_koap.modules.RecedingHorizonPolicy` applies the one that is its attribute ``leash``.
+    :class:`~torchrl_koap.modules.RecedingHorizonPolicy` applies the one that is its attribute ``leash``. Exported
+    policies have none: whoever calls them holds the command back.
 
     Args:
         lead (float): ``l``, farthest that the command may be ahead along every axis, in the units of the action.
@@ -80,12 +81,25 @@ class CommandLeash(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replaces the action."""
-        observed, action = tensordict.get(self.in_keys[0])[..., -1, :], tensordict.get(self.in_keys[1]).clone()
-        state = observed if self.state_of is None else self.state_of(observed)
-        ahead = (observed[..., self.commands] - state[..., self.positions]).to(action.dtype)
+        observed, action = (tensordict.get(key) for key in self.in_keys)
+        return tensordict.set(self.out_keys[0], self.hold(observed, action))
+
+    def hold(self, observed: Tensor, action: Tensor) -> Tensor:
+        """The action that is left of one.
+
+        Args:
+            observed (Tensor): observations ``[*B, history, obs]``, the present one last.
+            action (Tensor): ``[*B, act]``; not changed.
+
+        Returns:
+            Tensor: ``[*B, act]``; what is within the lead keeps its bits, for episodes with contacts turn out otherwise
+            for a rounding error.
+        """
+        frame, action = observed[..., -1, :], action.clone()
+        state = frame if self.state_of is None else self.state_of(frame)
+        ahead = (frame[..., self.commands] - state[..., self.positions]).to(action.dtype)
         wanted = action[..., self.actions]
         reach = ahead + wanted
         held = reach.clamp(-self.lead, self.lead)
-        # what is within the lead keeps its bits: episodes with contacts turn out otherwise for a rounding error
         action[..., self.actions] = torch.where(held == reach, wanted, held - ahead)
-        return tensordict.set(self.out_keys[0], action)
+        return action

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -14,6 +15,9 @@ from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_koap.keys import ACTION, OBSERVATION
 from torchrl_koap.modules.policies.candidates import check_candidates
+
+if TYPE_CHECKING:
+    from torchrl_koap.modules.policies.command_leash import CommandLeash
 
 OBSERVATION_HISTORY = "observation_history"
 STATE_HISTORY = "state_history"
@@ -125,7 +129,7 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self.history, self.replan_interval = history, replan_interval
         self.planner, self.candidates, self.choice = planner, candidates, choice
-        self.leash: TensorDictModuleBase | None = None
+        self.leash: CommandLeash | None = None
         self._written: TensorDictBase | None = None
         self.receding = MultiStepActorWrapper(
             _Chunk(self.make_chunk, planner.noise_key, chunk_key),
