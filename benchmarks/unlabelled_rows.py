@@ -63,14 +63,19 @@ def unlabelled_gains(regimes: Sequence[str], against: Sequence[str]) -> list[lis
     return body
 
 
-def followed_rows(against: Sequence[str]) -> list[list[str]]:
+def followed_rows(against: Sequence[str], *, played: bool = False) -> list[list[str]]:
     """Successes of controllers that follow demonstrations not seen before, and how much ``semi_supervised`` is ahead.
 
     Args:
         against (sequence of str): methods that it is compared with.
+
+    Keyword Args:
+        played (bool): where the labels are from random play, instead of from demonstrations.
     """
     found: dict[tuple[str, int], dict[str, dict[int, dict]]] = {}
     for row in read_rows("unlabelled_rollouts"):
+        if (row["regime"] in PLAYED) != played:
+            continue
         cell = found.setdefault((row["regime"], int(row["labels"])), {})
         cell.setdefault(row["method"], {})[int(row["seed"])] = row
     body = []

@@ -97,3 +97,26 @@ def test_too_few_demonstrations_are_named(script, demonstrations, monkeypatch, c
     with pytest.raises(SystemExit):
         script.main()
     assert "fewer demonstrations than are judged and labelled" in capsys.readouterr().err
+
+
+def test_labels_from_play_are_of_no_demonstration(script, demonstrations):
+    study = sys.modules["unlabelled_data"]
+    data, _ = script.load_positions(str(demonstrations), 100)
+    both = study.add_play(data, str(demonstrations))
+    assert len(both["episode"].unique()) == 6 + study.PLAYED
+    torch.testing.assert_close(both["state"][: len(data)], data["state"])
+    full, _ = script.as_own_data(both)
+    for seed in range(3):
+        numbers = script.shuffled_trajectories(full, seed, study.PLAYED)
+        assert numbers[: study.PLAYED].min() >= 6 > numbers[study.PLAYED :].max()
+        assert numbers.unique().numel() == 6 + study.PLAYED
+        labelled = study.with_labels(full, numbers[:2])
+        known = labelled["episode"][labelled["has_action"].squeeze(-1)].unique()
+        assert known.tolist() == sorted(numbers[:2].tolist())
+
+
+def test_tables_keep_labels_from_play_apart(benchmark_script):
+    rows = benchmark_script("unlabelled_rows")
+    for played in (False, True):
+        regimes = {row[0] for row in rows.followed_rows(["pca"], played=played)}
+        assert regimes and all(("random play" in regime) == played for regime in regimes)
