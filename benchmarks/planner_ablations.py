@@ -115,7 +115,7 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
         "controller": controller,
         "stacked": stacked_of(results),
         "disturbed": disturbed_share(trained["dataset"]),
-        "command_lead": results[0]["command_lead"],
+        "command_lead": results[0].get("command_lead", 0.0),  # evaluations of before have none
     }
 
 
