@@ -12,6 +12,8 @@ from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.gripper import PLANNED_OPEN_ABOVE, gripper_number
 from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.planner import augmentation
+from torchrl_koap.training.resume import started_with
+from torchrl_koap.training.run_directory import RunDirectory
 
 OPEN, HELD = 0.08, 0.0617
 
@@ -68,6 +70,21 @@ def test_tasks_with_a_gripper_have_it_by_default(task, share):
     assert [step.share for step in steps if isinstance(step, GripperRecovery)] == ([share] if share else [])
     off = resolve(TrainConfig(out="run", task=task, gripper_recovery=0.0)).options
     assert not any(isinstance(step, GripperRecovery) for step in augmentation(off, get_task(task)).module)
+
+
+def test_a_policy_without_plans_has_none():
+    assert resolve(TrainConfig(out="run", task="stacking", method="dp")).options.gripper_recovery is None
+    with pytest.raises(ValueError, match="gripper_recovery is the planner's, which method 'dp' does not have"):
+        resolve(TrainConfig(out="run", task="stacking", method="dp", gripper_recovery=0.1))
+
+
+def test_a_run_of_before_goes_on_without(tmp_path):
+    config = TrainConfig(out=tmp_path, task="stacking", resume=True)
+    (tmp_path / "config.json").write_text('{"task": "stacking", "seed": 3}')
+    options = resolve(started_with(RunDirectory(tmp_path), config)).options
+    assert (options.seed, options.gripper_recovery) == (3, 0.0)
+    (tmp_path / "config.json").write_text('{"task": "stacking", "gripper_recovery": 0.3}')
+    assert resolve(started_with(RunDirectory(tmp_path), config)).options.gripper_recovery == 0.3
 
 
 @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])

@@ -112,7 +112,9 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     if not method.has_planner:
         if config.forecast:
             raise ValueError(f"method {options.method!r} is a policy of its own and has no plans to forecast")
-        options = replace(options, forecast=None)
+        if config.gripper_recovery:
+            raise ValueError(f"gripper_recovery is the planner's, which method {options.method!r} does not have")
+        options = replace(options, forecast=None, gripper_recovery=None)
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:
