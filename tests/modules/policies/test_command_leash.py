@@ -7,10 +7,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from toy_policies import CountingPlanner, EchoController
 
+from torchrl_koap import load_policy, save_policy
+from torchrl_koap.evaluation import EvalConfig
 from torchrl_koap.evaluation.rollouts import make_leash
-from torchrl_koap.modules import CommandLeash
+from torchrl_koap.modules import CommandLeash, PlanThenControl
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training.pretrained import find_run
 
 COLUMNS = {"commands": [0, 1], "positions": [2, 3], "actions": [0, 1]}
 
@@ -62,6 +66,27 @@ def test_a_task_says_which_columns_they_are():
     td = TensorDict({"observation_history": observation, "action": torch.zeros(2)}, [])
     torch.testing.assert_close(leash(td)["action"], torch.tensor([-0.9, -0.9]))
     assert make_leash(get_task("sorting"), 0.0) is None
+
+
+def test_a_policy_applies_its_own():
+    policy = PlanThenControl(
+        CountingPlanner(), EchoController(), state_columns=(0, 1), history=2, replan_interval=2, blend_decay=0.0
+    )
+    td = TensorDict({"observation_history": torch.ones(3, 2, 2), "is_init": torch.ones(3, 1, dtype=torch.bool)}, [3])
+    free = policy(td.clone())["action"]
+    policy.leash = CommandLeash(0.25, commands=[0], positions=[1], actions=[2])
+    held = policy(td.clone())["action"]
+    assert (free[:, 2].abs() > 0.25).all() and (held[:, 2].abs() == 0.25).all()
+    assert torch.equal(free[:, :2], held[:, :2])
+
+
+def test_a_trained_policy_has_that_of_its_task_unless_told_otherwise(tmp_path):
+    run = find_run("pretrained:sorting")
+    policy = load_policy(run)
+    assert policy.leash.lead == 0.1
+    assert load_policy(run, EvalConfig(command_lead=0.0)).leash is None
+    saved = load_policy(save_policy(policy, tmp_path / "policy.safetensors"))
+    assert saved.leash.lead == 0.1
 
 
 @pytest.mark.parametrize(
