@@ -28,12 +28,8 @@ from torchrl_koap.training.run_directory import RunDirectory
 TABLE = Path(__file__).parent / "results" / "planner_ablations.csv"
 SIZES = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay")
 UNITS = {"trajectory": "trajectories", "window": "windows", "transition": "transitions"}
-OLDER = {
-    "controller": "learned",
-    "stacked": "",
-    "disturbed": "0.0",
-    "command_lead": "0.0",
-}  # in rows that were written before the column
+# in rows that were written before the column
+OLDER = {"controller": "learned", "stacked": "", "disturbed": "0.0", "command_lead": "0.0"}
 OTHERS = ("first_steps_weight", "precision", "recovery_sigma", "planner_learning_rate")
 PLANS = ("frame", "plan_steps", "observed_frames", "gripper_recovery")
 
@@ -67,15 +63,21 @@ def labels_of(config: dict) -> str:
     return f"{config['label_fraction']:g} of {UNITS[config['label_unit']]}"
 
 
+def planner_source(config: dict) -> tuple[str | None, dict]:
+    """The run that trained the planner of a run, None for the run itself, and its ``config.json``."""
+    source = None
+    while config.get("planner_from"):  # a planner that was taken over is described by the run that trained it
+        source = config["planner_from"]
+        config = RunDirectory(source).read_json("config.json")
+    return source, config
+
+
 def row_of(path: Path, results: list[dict], choices: dict, note: str, controller: str = "learned") -> dict:
     """One row of the table from a run directory and its evaluations."""
     run = RunDirectory(path)
     config, summary = run.read_json("config.json"), run.read_json("summary.json")
     task = get_task(config["task"])
-    source, trained = None, config
-    while trained.get("planner_from"):  # a planner that was taken over is described by the run that trained it
-        source = trained["planner_from"]
-        trained = RunDirectory(source).read_json("config.json")
+    source, trained = planner_source(config)
     rows = [row for result in results for row in result["episode"]]
     won = [row for row in rows if row["outcome"] == "success"]
     low, high = wilson_interval(len(won), len(rows))

@@ -22,6 +22,8 @@ PLANNERS = {  # those that most rows have, and their options; the first one that
 }
 LEAST = 180  # rollouts of a row that others are compared with
 SHORT = "8000"  # updates of the trainings that are compared with each other, a third of the default's
+# what the short trainings that are compared have in common; all of them are of before commands were held back
+_COMPARED = {"updates": SHORT, "controller": "learned", "method": "koap", "candidates": 1, "command_lead": 0.0}
 _OPTION = re.compile(r"[^\s(]+\([^)]*\)|\S+")
 
 
@@ -101,17 +103,15 @@ def disturbed(row: Mapping[str, str]) -> bool:
 
 def amounts(task: str = "aligning") -> list[dict[str, str]]:
     """Short trainings of a task that differ in the demonstrations alone, by their number."""
-    rows = read_rows("planner_ablations", task=task, updates=SHORT, controller="learned", method="koap", candidates=1)
-    rows = [row for row in rows if not leashed(row)]  # all trainings of the comparison are of before
+    rows = read_rows("planner_ablations", task=task, **_COMPARED)
     rows = [row for row in rows if planner_words(row["denoiser"]) == "wide MLP" and row["labels"] != "all"]
     return sorted(rows, key=lambda row: (disturbed(row), int(row["demonstrations"]), row["training_seed"]))
 
 
 def planner_variants() -> list[dict[str, str]]:
     """Short trainings on all demonstrations of Aligning that differ in the planner's options, the plain one first."""
-    same = {"task": "aligning", "demonstrations": 1000, "updates": SHORT, "controller": "learned", "method": "koap"}
-    rows = [row for row in read_rows("planner_ablations", candidates=1, **same) if row["labels"] != "all"]
-    rows = [row for row in rows if not leashed(row)]  # as in amounts()
+    rows = read_rows("planner_ablations", task="aligning", demonstrations=1000, **_COMPARED)
+    rows = [row for row in rows if row["labels"] != "all"]
     return sorted(rows, key=lambda row: (row["denoiser"] not in PLANNERS.values(), int(row["successes"])))
 
 

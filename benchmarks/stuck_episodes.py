@@ -20,6 +20,7 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
+from planner_ablations import planner_source
 from resumable_table import open_table
 from torch import Tensor
 
@@ -65,7 +66,8 @@ def way_out(task: Task, action: Tensor, tool: Tensor, objects: Tensor) -> str:
 def row_of(path: Path) -> tuple[str, ...]:
     """The row of the last evaluation of a run."""
     run = RunDirectory(path)
-    result, task = run.read_json("eval.json"), get_task(run.read_json("config.json")["task"])
+    result, config = run.read_json("eval.json"), run.read_json("config.json")
+    task = get_task(config["task"])
     rollouts, _ = load_tensors(run.path / "rollouts.safetensors")
     found: Counter[str] = Counter()
     for number, episode in enumerate(result["episode"]):
@@ -73,9 +75,7 @@ def row_of(path: Path) -> tuple[str, ...]:
             steps = int(rollouts["length"][number])
             tool, objects = (rollouts[name][number, : steps + 1] for name in ("position", "object_position"))
             found[way_out(task, rollouts["action"][number, :steps], tool, objects)] += 1
-    trained = run.read_json("config.json")
-    while trained.get("planner_from"):
-        trained = RunDirectory(trained["planner_from"]).read_json("config.json")
+    _, trained = planner_source(config)
     options = (result["episode"][0]["seed"], result.get("command_lead", 0.0), trained.get("gripper_recovery") or 0.0)
     numbers = (*options, len(result["episode"]), found.total(), *(found[way] for way in WAYS))
     return task.name, path.name, *map(str, numbers)

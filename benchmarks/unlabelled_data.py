@@ -62,6 +62,11 @@ PLAY_SUFFIX = ", play"  # of what the table calls a regime
 HIDDEN = Regime("joints_hidden", "Stacking, joints hidden", hidden=tuple(range(7)))
 
 
+def robot_view(data: TensorDictBase, task: Task) -> TensorDictBase:
+    """Flat data with the robot's own columns as ``state``."""
+    return controller_view(data, task.controller_columns("robot"), action_targets=task.action_targets)
+
+
 def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:
     """Flat data with what the robot's controller could read as ``state``, and the unit of its actions."""
     task = find_task_of(dataset)
@@ -69,15 +74,15 @@ def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:
     if task.source == "stacking":  # joints, gripper, tool; the gripper's action has no unit and is left out
         data = data.copy().set("state", data["state"][:, :11]).set("action", data["action"][:, :7])
     else:
-        data = controller_view(data, task.controller_columns("robot"), action_targets=task.action_targets)
+        data = robot_view(data, task)
     return data[torch.isin(data["episode"], data["episode"].unique()[:most])], task.action_unit
 
 
 def add_play(data: TensorDictBase, dataset: str) -> TensorDictBase:
     """The data and, with the highest numbers, motions of random play of the same robot."""
     task = find_task_of(dataset)
-    play = select_state(record_random_play(task, PLAYED, push=PLAY_PUSH, bounds=PLAY_BOUNDS), task.state_of)
-    play = controller_view(play, task.controller_columns("robot"), action_targets=task.action_targets)
+    play = record_random_play(task, PLAYED, push=PLAY_PUSH, bounds=PLAY_BOUNDS)
+    play = robot_view(select_state(play, task.state_of), task)
     play["episode"] += 1 + data["episode"].max()
     return torch.cat([data.select(*play.keys(include_nested=True, leaves_only=True)), play])
 

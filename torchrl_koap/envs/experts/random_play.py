@@ -93,14 +93,13 @@ def record_random_play(
 
 def _tool_columns(task: Task) -> slice:
     """Columns of the observation that hold the position which actions change."""
-    starts = dict(zip(task.observation_parts, np.cumsum([0, *task.observation_parts.values()]), strict=False))
-    width = task.observation_parts.get(task.position, 0)
-    if task.env is None or task.action_targets or width != task.action_dim:
+    columns = task.observation[task.position]
+    if task.env is None or task.action_targets or columns.stop - columns.start != task.action_dim:
         raise ValueError(
             f"random play pushes a tool about; task {task.name!r} has no environment in which {task.action_dim} actions"
             " change the position of one"
         )
-    return slice(int(starts[task.position]), int(starts[task.position]) + width)
+    return columns
 
 
 def _check_bounds(task: Task, bounds: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
