@@ -44,8 +44,8 @@ def test_the_frame_of_an_object(name):
 @pytest.mark.parametrize(
     ("options", "shape"),
     [
-        ({"frame": "target"}, (2, 14, 14)),
-        ({"plan_steps": (1, 2, 4, 8, 20)}, (2, 20, 5)),
+        ({"frame": "target", "observed_frames": 2}, (2, 14, 14)),
+        ({"plan_steps": (1, 2, 4, 8, 20)}, (1, 20, 5)),
         ({"frame": "world", "observed_frames": 1}, (1, 14, 14)),
         ({"frame": "box", "plan_steps": (2, 9), "observed_frames": 1}, (1, 9, 2)),
     ],
@@ -62,7 +62,7 @@ def test_a_task_brings_its_own_view_unless_another_is_named():
     resolved, planner = planner_of("sorting")  # names its denoiser
     assert resolved.options.observed_frames == planner.history == 1
     assert planner_of("sorting", observed_frames=2)[1].history == planner_of("avoiding")[1].history == 2
-    for asked in ({"method": "dp"}, {"released_settings": True}, {"task": "aligning"}):
+    for asked in ({"method": "dp"}, {"released_settings": True}, {"task": "stacking"}):
         assert resolve(TrainConfig(out=Path("run"), **({"task": "sorting"} | asked))).options.observed_frames is None
 
 
@@ -74,7 +74,7 @@ def test_the_view_of_a_task_is_checked_as_an_option_is():
 
 
 def test_without_them_the_entry_is_as_before():
-    resolved, _ = planner_of()
+    resolved, _ = planner_of("avoiding")
     assert not {"frame", "plan_steps"} & set(resolved.planner)
     assert (resolved.planner["history"], resolved.planner["horizon"]) == (2, 14)
 

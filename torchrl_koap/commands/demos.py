@@ -33,7 +33,8 @@ class Demos(Command):
         threads: simulator threads.
         batch_size: episodes played at once; the demonstrations do not depend on it.
         disturbance: share of the demonstrations in which the operator is disturbed now and then (pushes, slips, late
-            turns); those from which it recovers are kept, and OUT/ted/about.json says how often it did.
+            turns, a height that drifts); those from which it recovers are kept, and OUT/ted/about.json says how often
+            it did (default: that of the task).
         embodiment: of a task that is recorded by a camera, "robot" (with actions) or "hand" (frames alone); OUT is then
             a LeRobot data set with pictures, for `koap embed`.
         plugins: modules that register tasks; imported before anything else.
@@ -45,7 +46,7 @@ class Demos(Command):
     seed: int = 0
     threads: int = 2
     batch_size: int = BATCH_SIZE
-    disturbance: float = 0.0
+    disturbance: float | None = None
     embodiment: str | None = None
     plugins: Plugins = ()
 

@@ -131,8 +131,10 @@ register_task(
         in_paper=True,
         defaults=Defaults(
             demonstrations=1000,
-            planner_steps=24000,
+            disturbance=0.5,
+            planner_steps=8000,
             planner=WIDE_MLP,
+            view={"observed_frames": 1},
             released_epochs=200,
             execution={"command_lead": COMMAND_LEAD},
         ),

@@ -75,6 +75,7 @@ class Defaults:
     Args:
         method (str): what `koap train` trains.
         demonstrations (int): number of scripted demonstrations to record.
+        disturbance (float): share of them in which the operator is disturbed.
         planner_steps (int): planner updates.
         channels (tuple of int): widths of the planner's U-Net.
         relative (bool): plans are displacements from the present state.
@@ -86,8 +87,8 @@ class Defaults:
             ``frame``, ``plan_steps``.
         released_epochs (int): epochs of a controller in KOAP's first public code.
         execution (dict): how plans are followed where a command does not say: ``execution``, ``replan_interval``,
-            ``blend_decay``, ``command_lead`` of :class:`~torchrl_koap.evaluation.EvalConfig`. Policies without a
-            planner take the interval and the lead alone.
+            ``blend_decay``, ``command_lead``, ``action_gain`` of :class:`~torchrl_koap.evaluation.EvalConfig`. Policies
+            without a planner take the interval, the lead and the gain alone.
 
     Examples:
         >>> from torchrl_koap.tasks.task import Defaults
@@ -97,6 +98,7 @@ class Defaults:
 
     method: str = "koap"
     demonstrations: int = 200
+    disturbance: float = 0.0
     planner_steps: int = 12000
     channels: tuple[int, ...] = (64, 128)
     relative: bool = True

@@ -9,7 +9,13 @@ import torch
 
 from torchrl_koap.envs.experts import demonstrations
 from torchrl_koap.envs.experts.demonstrations import episodes_to_ted, record_episodes
-from torchrl_koap.envs.experts.disturbances import KINDS, Disturbances, choose_disturbed, disturbed_columns
+from torchrl_koap.envs.experts.disturbances import (
+    KINDS,
+    Disturbances,
+    choose_disturbed,
+    disturbed_columns,
+    height_column,
+)
 from torchrl_koap.tasks import get_task
 
 WANTED = np.array([[0.003, 0.01]])
@@ -27,7 +33,7 @@ def test_actions_change_within_the_spells_and_nowhere_else():
     for begin, end, kind in hand.spells[0]:
         inside[begin:end] = kind != "late_turn"  # to go on as before changes nothing of a constant action
     assert np.array_equal(changed, inside)
-    assert {kind for _, _, kind in hand.spells[0]} == set(KINDS)
+    assert {kind for _, _, kind in hand.spells[0]} == set(KINDS) - {"drift"}
     assert all(second[0] - first[1] >= 12 for first, second in zip(hand.spells[0], hand.spells[0][1:], strict=False))
 
 
@@ -68,8 +74,39 @@ def test_episodes_are_disturbed_by_their_own_seed_alone():
     assert not choose_disturbed(9, 0, seed=0).any() and choose_disturbed(9, 1, seed=0).all()
 
 
-def test_grippers_and_heights_are_left_alone():
+def test_the_height_of_a_tool_drifts_up_and_down_and_nothing_else_does_at_once():
+    wanted = np.array([[0.006, 0.008, 0.0]])
+    hand = Disturbances(get_task("aligning"), [(1, 0, 0)], [True])
+    done = np.stack([hand.disturb(wanted)[0] for _ in range(900)])
+    inside = np.zeros(len(done), dtype=bool)
+    spells = [spell for spell in hand.spells[0] if spell[2] == "drift"]
+    for begin, end, _ in spells:
+        inside[begin:end] = True
+        assert len(set(done[begin:end, 2])) == 1 and 4 <= end - begin <= 11
+    height = done[:, 2]
+    assert np.array_equal(height != 0, inside) and height.min() < 0 < height.max()
+    assert (np.abs(height[inside]) >= 0.1 * 0.01).all() and (np.abs(height) <= 0.35 * 0.01).all()
+    assert hand.spells[0] == sorted(hand.spells[0]) and {kind for _, _, kind in hand.spells[0]} == set(KINDS)
+    flat = Disturbances(get_task("avoiding"), [(1, 0, 0)], [True])  # the same draws sideways
+    assert np.array_equal(np.stack([flat.disturb(wanted[:, :2])[0] for _ in range(900)]), done[:, :2])
+
+
+def test_an_operator_brings_the_tool_back_to_its_height():
+    raw, report = record_episodes("aligning", 2, seed=2, num_threads=1, disturbance=1.0)
+    restored = []
+    for spells, episode in zip(report.spells, raw, strict=True):
+        drifts = [spell for spell in spells if spell[2] == "drift"]
+        command = episode.robot["des_c_pos"][:, 2]
+        for (begin, end, _), (later, _, _) in zip(drifts, [*drifts[1:], (len(command), 0, "")], strict=True):
+            if begin > 60 and end + 15 < later:  # after the descent
+                assert np.ptp(command[begin - 1 : end + 1]) > 0.004
+                restored.append(abs(command[end + 15] - command[begin - 1]))
+    assert restored and max(restored) < 0.004
+
+
+def test_grippers_are_left_alone():
     assert disturbed_columns(get_task("stacking")).tolist() == [*range(7)]
+    assert [height_column(get_task(name)) for name in ("stacking", "sorting", "scooping")] == [None] * 3
     assert disturbed_columns(get_task("aligning")).tolist() == [0, 1]
 
 
@@ -121,3 +158,14 @@ def test_recorded_actions_are_those_that_were_executed(disturbed, monkeypatch):
     recorded = episodes_to_ted(raw, "avoiding", dtype=torch.float64)["action"].numpy()
     last = np.array(done[-len(recorded) - 1 :])[1:]  # the first action is the state that the log begins with
     assert report.attempts[0] >= 1 and np.allclose(recorded, last, atol=1e-12)
+
+
+def test_a_task_brings_its_share_of_disturbed_demonstrations_unless_another_is_asked_for():
+    assert get_task("aligning").defaults.disturbance == 0.5 and get_task("avoiding").defaults.disturbance == 0
+    own, report = record_episodes("aligning", 2, seed=2, num_threads=1)
+    assert report.notes["disturbance"]["share"] == 0.5 and report.disturbed == list(choose_disturbed(2, 0.5, 2))
+    assert "disturbance" not in record_episodes("avoiding", 1, num_threads=1)[1].notes
+    quiet, without = record_episodes("aligning", 2, seed=2, num_threads=1, disturbance=0.0)
+    assert "disturbance" not in without.notes
+    same = [np.array_equal(a.robot["des_c_pos"], b.robot["des_c_pos"]) for a, b in zip(own, quiet, strict=True)]
+    assert same == [not spells for spells in report.spells]

@@ -27,7 +27,7 @@ import torch
 
 from torchrl_koap.data import RawEpisode, flatten_trajectories, read_raw_episode, save_ted, write_raw_episode
 from torchrl_koap.data.d3il.conversion import get_converter
-from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, iterate_takes
+from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, share_of_disturbed, iterate_takes
 from torchrl_koap.envs.experts.recording import PlainEpisode
 from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.files import one_at_a_time, replacing_file
@@ -45,7 +45,7 @@ def record_to_folder(
     progress: Callable[[int, int], None] | None = None,
     *,
     batch_size: int = BATCH_SIZE,
-    disturbance: float = 0.0,
+    disturbance: float | None = None,
 ) -> RecordingReport:
     """Records demonstrations into a folder; called again with the same arguments, it goes on where it was interrupted.
 
@@ -59,7 +59,8 @@ def record_to_folder(
 
     Keyword Args:
         batch_size (int): episodes played at once. The demonstrations do not depend on it.
-        disturbance (float): share of the demonstrations in which the operator is disturbed.
+        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
+            the task.
 
     Raises:
         FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.
@@ -77,7 +78,8 @@ def record_to_folder(
         ...     sorted(path.name for path in Path(folder).iterdir()), len(report.rows)
         (['raw', 'ted'], 2)
     """
-    start, task = time.perf_counter(), get_task(task.source)
+    start, disturbance = time.perf_counter(), share_of_disturbed(task, disturbance)
+    task = get_task(task.source)
     request = {"task": task.name, "episodes": episodes, "seed": seed, "disturbance": disturbance}
     iterating = functools.partial(
         iterate_takes, task, episodes, seed, num_threads, batch_size=batch_size, disturbance=disturbance

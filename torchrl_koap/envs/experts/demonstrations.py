@@ -53,7 +53,7 @@ def record_demonstrations(
     *,
     dtype: torch.dtype = torch.float32,
     batch_size: int = BATCH_SIZE,
-    disturbance: float = 0.0,
+    disturbance: float | None = None,
 ) -> tuple[TensorDict, RecordingReport]:
     """Records demonstrations of a scripted expert as flat TED data, every action labelled.
 
@@ -68,7 +68,8 @@ def record_demonstrations(
         progress (callable, optional): called with the number of demonstrations recorded and wanted.
         dtype (torch.dtype): floating type of the entries; everything is computed in float64.
         batch_size (int): episodes played at once. The demonstrations do not depend on it.
-        disturbance (float): share of the demonstrations in which the operator is disturbed.
+        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
+            the task.
 
     Returns:
         tuple: flat data ``[N]`` in the storage layout of :mod:`torchrl_koap.keys`, and the :class:`RecordingReport`.
@@ -97,7 +98,7 @@ def record_episodes(
     progress: Callable[[int, int], None] | None = None,
     *,
     batch_size: int = BATCH_SIZE,
-    disturbance: float = 0.0,
+    disturbance: float | None = None,
 ) -> tuple[list[Episode], RecordingReport]:
     """Records demonstrations with everything D3IL's recorder logs.
 
@@ -110,7 +111,8 @@ def record_episodes(
 
     Keyword Args:
         batch_size (int): episodes played at once. The demonstrations do not depend on it.
-        disturbance (float): share of the demonstrations in which the operator is disturbed.
+        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
+            the task.
 
     Returns:
         tuple: the episodes, for :func:`episodes_to_ted` and, of a task of D3IL, :func:`write_raw_episodes`, and the
@@ -121,6 +123,7 @@ def record_episodes(
         RecordingError: if an episode fails again and again.
     """
     start, facts = time.perf_counter(), get_task(get_task(task).source)
+    disturbance = share_of_disturbed(get_task(task), disturbance)
     takes = list(
         iterate_takes(facts, episodes, seed, num_threads, progress, batch_size=batch_size, disturbance=disturbance)
     )
@@ -136,7 +139,7 @@ def iterate_takes(
     progress: Callable[[int, int], None] | None = None,
     *,
     batch_size: int = BATCH_SIZE,
-    disturbance: float = 0.0,
+    disturbance: float | None = None,
     done: Collection[int] = (),
 ) -> Iterator[Take]:
     """Demonstrations one after the other, in their order; no more than a batch of them is held in memory.
@@ -150,7 +153,8 @@ def iterate_takes(
 
     Keyword Args:
         batch_size (int): episodes played at once: what memory holds. The demonstrations do not depend on it.
-        disturbance (float): share of the demonstrations in which the operator is disturbed.
+        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
+            the task.
         done (collection of int): numbers of demonstrations that are there already and left out.
 
     Yields:
@@ -165,7 +169,8 @@ def iterate_takes(
         >>> [take.index for take in iterate_takes("avoiding", 4, done=[0, 2])]
         [1, 3]
     """
-    task = get_task(task if isinstance(task, str) else task.source)
+    task = get_task(task) if isinstance(task, str) else task
+    disturbance = share_of_disturbed(task, disturbance)
     task = get_task(task.source)
     expert_of(task)
     limits = (
@@ -181,6 +186,16 @@ def iterate_takes(
     if disturbance:
         disturbed_columns(task)
     return _play_batches(task, episodes, seed, num_threads, progress, batch_size, disturbed, frozenset(done))
+
+
+def share_of_disturbed(task: Task, share: float | None) -> float:
+    """The share of the demonstrations in which the operator is disturbed.
+
+    Args:
+        task (Task): the task, whose own share (``Defaults.disturbance``) is taken where none was asked for.
+        share (float, optional): what was asked for.
+    """
+    return task.defaults.disturbance if share is None else share
 
 
 def episodes_to_ted(raw: Sequence[Episode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:

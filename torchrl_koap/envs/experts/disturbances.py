@@ -9,6 +9,8 @@ a state is always the action that was done in it::
     impulse      for a few control steps the command is pushed in a direction of its own
     slip         for a while the command runs off to the side of the way that the operator wants
     late_turn    for a while the operator goes on as it did before
+    drift        for a while the height of a tool that is pushed about sinks or rises unnoticed, where an action
+                 commands it
 
 All draws come from the seed of the attempt, so an episode does not depend on the others in the batch.
 """
@@ -22,11 +24,18 @@ import numpy as np
 
 from torchrl_koap.tasks import Task
 
-KINDS = ("impulse", "slip", "late_turn")
-_STREAM, _CHOICE_STREAM = 2, 3  # keep these draws apart from those of players and contexts
+KINDS = ("impulse", "slip", "late_turn", "drift")
+_SIDEWAYS = KINDS[:3]
+_STREAM, _CHOICE_STREAM, _HEIGHT_STREAM = 2, 3, 4  # keep these draws apart from those of players and contexts
 _QUIET, _MEAN_GAP = 12, 45  # control steps from one disturbance to the next: at least, and on average beyond that
-_STEPS = {"impulse": (2, 6), "slip": (4, 11), "late_turn": (4, 11)}  # control steps that one lasts, low and high end
+_STEPS = {
+    "impulse": (2, 6),
+    "slip": (4, 11),
+    "late_turn": (4, 11),
+    "drift": (4, 11),
+}  # control steps that one lasts, low and high end
 _SLIP = (0.6, 1.4)  # rad
+_DRIFT = (0.1, 0.35)  # of the size of the operator's own steps
 _MEMORY = 0.98  # of the size of the operator's own steps
 
 
@@ -58,7 +67,8 @@ class Disturbances:
     """Disturbs the actions of a batch of operators.
 
     How far an action is changed follows from the operator's own steps so far, so one class serves every task. Entries
-    that are no change of a command (the gripper) are left alone, and so is the height of a tool that is pushed about.
+    that are no change of a command (the gripper) are left alone. The height of a tool that is pushed about only drifts:
+    where demonstrations never lift it, nothing tells a controller how that is done.
 
     Args:
         task (Task): tells which actions are changes of commands.
@@ -77,10 +87,15 @@ class Disturbances:
     """
 
     def __init__(self, task: Task, seeds: Sequence, disturbed: Sequence[bool]):
-        self._columns = disturbed_columns(task)
+        self._columns, self._height = disturbed_columns(task), height_column(task)
+        chosen = [tuple(seed) if each else None for seed, each in zip(seeds, disturbed, strict=True)]
         self._hands = [
-            _Hand(np.random.default_rng((*seed, _STREAM)), len(self._columns)) if chosen else None
-            for seed, chosen in zip(seeds, disturbed, strict=True)
+            None if seed is None else _Hand(np.random.default_rng((*seed, _STREAM)), len(self._columns))
+            for seed in chosen
+        ]
+        self._lifts = [
+            None if seed is None or self._height is None else _Lift(np.random.default_rng((*seed, _HEIGHT_STREAM)))
+            for seed in chosen
         ]
 
     def disturb(self, action: np.ndarray) -> np.ndarray:
@@ -96,12 +111,18 @@ class Disturbances:
         for row, hand in enumerate(self._hands):
             if hand is not None:
                 done[row, self._columns] = hand.disturb(action[row, self._columns])
+            lift = self._lifts[row]
+            if hand is not None and lift is not None:
+                done[row, self._height] = lift.drift(float(done[row, self._height]), hand.pace)
         return done
 
     @property
     def spells(self) -> list[list[tuple[int, int, str]]]:
         """Of every episode so far the disturbances: first control step, the one after the last, kind."""
-        return [[] if hand is None else list(hand.spells) for hand in self._hands]
+        return [
+            [] if hand is None else sorted(hand.spells + ([] if lift is None else lift.spells))
+            for hand, lift in zip(self._hands, self._lifts, strict=True)
+        ]
 
 
 def disturbed_columns(task: Task) -> np.ndarray:
@@ -127,6 +148,22 @@ def disturbed_columns(task: Task) -> np.ndarray:
     return np.array([names.index(name) for name in joints or list(changes)[:2]])
 
 
+def height_column(task: Task) -> int | None:
+    """Column of the action that changes the height of a tool on the table, None where no action does.
+
+    Args:
+        task (Task): the task.
+
+    Examples:
+        >>> from torchrl_koap.envs.experts.disturbances import height_column
+        >>> from torchrl_koap.tasks import get_task
+        >>> [height_column(get_task(name)) for name in ("avoiding", "aligning", "stacking")]
+        [None, 2, None]
+    """
+    lengths = [index for index, unit in enumerate(task.actions.values()) if unit == "m"]
+    return lengths[2] if len(lengths) == 3 and list(disturbed_columns(task)) == lengths[:2] else None
+
+
 def count_spells(spells: Sequence[Sequence[tuple[int, int, str]]]) -> dict[str, int]:
     """How often each kind of disturbance happened.
 
@@ -136,7 +173,7 @@ def count_spells(spells: Sequence[Sequence[tuple[int, int, str]]]) -> dict[str, 
     Examples:
         >>> from torchrl_koap.envs.experts.disturbances import count_spells
         >>> count_spells([[(20, 23, "slip")], []])
-        {'impulse': 0, 'slip': 1, 'late_turn': 0}
+        {'impulse': 0, 'slip': 1, 'late_turn': 0, 'drift': 0}
     """
     counts = Counter(kind for episode in spells for _, _, kind in episode)
     return {kind: counts[kind] for kind in KINDS}
@@ -147,7 +184,7 @@ class _Hand:
 
     def __init__(self, generator: np.random.Generator, width: int):
         self._generator, self._width = generator, width
-        self._time, self._pace = 0, 0.0
+        self._time, self.pace = 0, 0.0
         self._held, self._last = np.zeros(width), np.zeros(width)
         self._plan(0)
         self.spells: list[tuple[int, int, str]] = []
@@ -155,7 +192,7 @@ class _Hand:
     def _plan(self, now: int) -> None:
         draw = self._generator
         self._start = now + _QUIET + int(draw.exponential(_MEAN_GAP))
-        self._kind = KINDS[draw.integers(len(KINDS))]
+        self._kind = _SIDEWAYS[draw.integers(len(_SIDEWAYS))]
         self._end = self._start + int(draw.integers(*_STEPS[self._kind]))
         direction = draw.normal(size=self._width)
         self._push = draw.uniform(0.7, 1.4) * direction / np.linalg.norm(direction)
@@ -163,7 +200,7 @@ class _Hand:
         self._share = draw.uniform(-1.0, 1.0, self._width)
 
     def disturb(self, wanted: np.ndarray) -> np.ndarray:
-        self._pace = max(float(np.linalg.norm(wanted)), _MEMORY * self._pace)
+        self.pace = max(float(np.linalg.norm(wanted)), _MEMORY * self.pace)
         done = wanted
         if self._time >= self._start:
             if self._time == self._start:
@@ -177,7 +214,7 @@ class _Hand:
         return done
 
     def _impulse(self, wanted: np.ndarray) -> np.ndarray:
-        return wanted + self._pace * self._push
+        return wanted + self.pace * self._push
 
     def _slip(self, wanted: np.ndarray) -> np.ndarray:
         if self._width != 2:  # no one side to run off to: a push that grows with the speed
@@ -187,3 +224,27 @@ class _Hand:
 
     def _late_turn(self, wanted: np.ndarray) -> np.ndarray:
         return self._held
+
+
+class _Lift:
+    """The height in one episode: when it drifts next, how quickly and for how long."""
+
+    def __init__(self, generator: np.random.Generator):
+        self._generator, self._time = generator, 0
+        self._plan()
+        self.spells: list[tuple[int, int, str]] = []
+
+    def _plan(self) -> None:
+        draw = self._generator
+        self._start = self._time + _QUIET + int(draw.exponential(_MEAN_GAP))
+        self._end = self._start + int(draw.integers(*_STEPS["drift"]))
+        self._rate = draw.uniform(*_DRIFT) * draw.choice((-1.0, 1.0))
+
+    def drift(self, wanted: float, pace: float) -> float:
+        if self._time == self._start:
+            self.spells.append((self._start, self._end, "drift"))
+        done = pace * self._rate if self._time >= self._start else wanted
+        self._time += 1
+        if self._time >= self._end:
+            self._plan()
+        return done
