@@ -29,7 +29,7 @@ TABLE = Path(__file__).parent / "results" / "planner_ablations.csv"
 SIZES = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay")
 UNITS = {"trajectory": "trajectories", "window": "windows", "transition": "transitions"}
 # in rows that were written before the column
-OLDER = {"controller": "learned", "stacked": "", "disturbed": "0.0", "command_lead": "0.0"}
+OLDER = {"controller": "learned", "stacked": "", "disturbed": "0.0", "command_lead": "0.0", "action_gain": "1.0"}
 OTHERS = ("first_steps_weight", "precision", "recovery_sigma", "planner_learning_rate")
 PLANS = ("frame", "plan_steps", "observed_frames", "gripper_recovery")
 
@@ -118,6 +118,7 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
         "stacked": stacked_of(results),
         "disturbed": disturbed_share(trained["dataset"]),
         "command_lead": results[0].get("command_lead", 0.0),  # evaluations of before have none
+        "action_gain": results[0].get("action_gain", 1.0),
     }
 
 
@@ -161,6 +162,7 @@ def main() -> None:
     parser.add_argument("--replan-interval", type=int, default=4)
     parser.add_argument("--blend-decay", type=float, default=BLEND_DECAY)
     parser.add_argument("--command-lead", type=float, help="default: the task's; 0: any distance")
+    parser.add_argument("--action-gain", type=float, help="default: the task's")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--note", default="")
     parser.add_argument("--table", type=Path, default=TABLE)
@@ -174,7 +176,7 @@ def main() -> None:
     results = []
     for seed in options.seeds:
         settings = {**choices, "choice": options.choice, "controller": options.controller}
-        settings["command_lead"] = options.command_lead
+        settings |= {"command_lead": options.command_lead, "action_gain": options.action_gain}
         config = EvalConfig(episodes=options.episodes, seed=seed, threads=options.threads, **settings)
         results.append(evaluate(options.run, config))
     row = row_of(options.run, results, choices, options.note, options.controller)

@@ -59,6 +59,11 @@ def leashed(row: Mapping[str, str]) -> str:
     return f"command at most {lead:g} ahead" if lead else ""
 
 
+def paced(row: Mapping[str, str]) -> str:
+    """What the actions were multiplied by, empty where by nothing."""
+    return "" if float(row["action_gain"]) == 1 else f"actions times {float(row['action_gain']):g}"
+
+
 def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
     """A row per trained planner and way to run it."""
     head = [
@@ -84,7 +89,7 @@ def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
             row["candidates"] if row["candidates"] == "1" else f"{row['candidates']}, {row['choice']}",
             success(row),
             row["mean_steps"],
-            "; ".join(filter(None, [row["note"], boxes(row), leashed(row)])),
+            "; ".join(filter(None, [row["note"], boxes(row), leashed(row), paced(row)])),
         ]
         for row in rows
     ]
@@ -115,11 +120,51 @@ def planner_variants() -> list[dict[str, str]]:
     return sorted(rows, key=lambda row: (row["denoiser"] not in PLANNERS.values(), int(row["successes"])))
 
 
+def disturbances() -> list[dict[str, str]]:
+    """Short trainings of Aligning with one observed frame, by what was disturbed while its operators played."""
+    rows = read_rows("planner_ablations", task="aligning", updates=SHORT, demonstrations=1000, candidates=1)
+    rows = [row for row in rows if row["denoiser"] == PLANNERS["wide MLP"] + " observed_frames=1"]
+    return sorted(rows, key=lambda row: (disturbed(row), not row["note"], row["labels"], row["training_seed"]))
+
+
+def gains(rows: Sequence[Mapping[str, str]]) -> str:
+    """Successes of one trained run by the gain of its actions."""
+    rows = sorted({float(row["action_gain"]): row for row in rows}.items())
+    return ", ".join(f"`{gain:g}`: {row['successes']} of {row['n']}" for gain, row in rows)
+
+
+def decoded_sizes(task: str) -> str:
+    """Decoded size of actions over the recorded one, over the trained runs."""
+    shares = sorted({row["share"] for row in read_rows("decoded_sizes", task=task)})
+    return f"`{shares[0]}`" if len(shares) == 1 else f"`{shares[0]}` to `{shares[-1]}`"
+
+
+def directions_table() -> str:
+    """Decoded share of a planned motion by direction, a row per trained run."""
+    runs: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
+    for row in read_rows("decoded_directions"):
+        share = f"{float(row['share']):.2f} ({float(row['low']):.2f} to {float(row['high']):.2f})"
+        runs[row["run"], row["disturbed"]][row["planned"]] = share
+    directions = list(next(iter(runs.values())))
+    body = [[how, *(cells[direction] for direction in directions)] for (_, how), cells in runs.items()]
+    return table(["operators disturbed", *(f"`{direction}`" for direction in directions)], body)
+
+
 def same_planner_table() -> str:
     """Tasks with a planner that the simulator's inverse map followed: the same planner with learned controllers."""
     rows = [row for row in read_rows("planner_ablations") if row["candidates"] == "1" and int(row["n"]) >= LEAST]
     rows = [row for row in rows if "ran away" not in row["note"]]  # of a planner of its own
-    same = ("task", "denoiser", "updates", "batch", "demonstrations", "disturbed", "training_seed", "command_lead")
+    same = (
+        "task",
+        "denoiser",
+        "updates",
+        "batch",
+        "demonstrations",
+        "disturbed",
+        "training_seed",
+        "command_lead",
+        "action_gain",
+    )
     body = []
     for oracle in (row for row in rows if row["controller"] == "oracle"):
         beside = [row for row in rows if all(row[name] == oracle[name] for name in same)]

@@ -30,7 +30,7 @@ A policy for the task `{task}` in this library's own simulation, trained on **sc
 | entropy of the modes | {entropy} |
 | mean steps | {mean_steps} ({mean_steps_won} where successful) |
 | evaluated | these compact weights, {contexts}, {candidates} candidate plan(s) |
-| data | {demonstrations} scripted demonstrations (`koap demos --task {task} --episodes {demonstrations} --seed 0`) |
+| data | {demonstrations} scripted demonstrations (`{recorded}`) |
 | labels | {labels}, method `{method}` |
 | planner | {denoiser}, {updates} updates of {batch} windows, training seed {training_seed} |
 | training time | {train_seconds} s of one shared CPU core |
@@ -70,6 +70,9 @@ def main() -> None:
     source = RunDirectory(options.run).read_json("config.json").get("planner_from")
     if source:  # the planner was trained by another command
         row["command"] = f"{RunDirectory(source).read_json('config.json')['command']}\n    {row['command']}"
+    row["recorded"] = "koap demos --task {task} --episodes {demonstrations} --seed 0".format(**row)
+    if row["disturbed"]:
+        row["recorded"] += f" --disturbance {row['disturbed']:g}"
     row["contexts"] = "the 60 fixed contexts with every seed" if "contexts" in results[0] else "all from the same start"
     (folder / "README.md").write_text(CARD.format(**row))
     size = sum(file.stat().st_size for file in folder.iterdir())

@@ -33,6 +33,8 @@ class EvalConfig:
             (default: 0.8, or the task's).
         command_lead: farthest that the command may be ahead of the robot along each axis, in the units of the
             actions; 0: any distance (default: the task's, else 0).
+        action_gain: what actions that are changes of a command are multiplied by: above 1 the robot is quicker than
+            planned (default: the task's, else 1).
         candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
             the one in force (default: as the run says, else 1).
         choice: rule of that choice: "quarter", "typical" or "nearest".
@@ -64,6 +66,7 @@ class EvalConfig:
     replan_interval: int | None = None
     blend_decay: float | None = None
     command_lead: float | None = None
+    action_gain: float | None = None
     candidates: int | None = None
     choice: str = "quarter"
     out: Path | None = None

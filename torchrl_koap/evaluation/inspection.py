@@ -26,7 +26,7 @@ from torchrl_koap.evaluation.latent_space import analyse_latent
 from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET, error_unit, judge_latent_model
 from torchrl_koap.evaluation.offline import load_training_data
 from torchrl_koap.evaluation.places import choose_contexts
-from torchrl_koap.evaluation.rollouts import make_leash, make_policy, roll_out
+from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy, roll_out
 from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_run
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.tasks import Task
@@ -163,6 +163,7 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
     asked = EvalConfig(replan_interval=config.replan_interval, blend_decay=config.blend_decay)
     settings = execution_of(trained, asked)
     interval, leash = settings["replan_interval"], make_leash(task, settings.pop("command_lead"))
+    gain = make_gain(task, settings.pop("action_gain"))
     settings |= {"controller_columns": trained.columns, "action_rule": task.action_rule}
     seeds = list(range(config.seed, config.seed + config.episodes))
     from torchrl_koap.envs.registry import make_env_of  # takes seconds
@@ -171,7 +172,7 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
     _, contexts = choose_contexts(task, config.episodes)
     with progress_bar(3, "experiments", unit="experiment") as bar:
         policy = make_policy(planner, controller, state_columns=task.state_of, **settings)
-        policy.leash = leash
+        policy.leash, policy.action_gain = leash, gain
         closed = roll_out(policy, make_env, seeds, max_steps=task.max_steps, contexts=contexts)
         bar.update()
         followed = follow_recordings(planner, controller, task, data, make_env, episodes=config.episodes, **settings)

@@ -13,7 +13,7 @@ from typing import Any
 
 from torch import nn
 
-from torchrl_koap.evaluation.rollouts import make_leash, make_policy
+from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ChunkedPolicy, RecedingHorizonPolicy, StatePlanner
 from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
@@ -29,7 +29,7 @@ from torchrl_koap.training.provenance import versions
 
 FORMAT, VERSION = "torchrl_koap policy", 1
 BLEND_DECAY = 0.8
-_OPTIONS = ("execution", "replan_interval", "blend_decay", "candidates", "choice", "command_lead")
+_OPTIONS = ("execution", "replan_interval", "blend_decay", "candidates", "choice", "command_lead", "action_gain")
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,7 @@ def assemble_policy(
     candidates: int = 1,
     choice: str = "quarter",
     command_lead: float = 0.0,
+    action_gain: float = 1.0,
 ) -> RecedingHorizonPolicy:
     """Networks as a policy that knows how it was built.
 
@@ -108,10 +109,11 @@ def assemble_policy(
         choice (str): the rule by which one of them is taken.
         command_lead (float): farthest that the command may be ahead of the robot
             (:class:`~torchrl_koap.modules.CommandLeash`); 0: any distance.
+        action_gain (float): what actions that are changes of a command are multiplied by.
 
     Raises:
-        ValueError: for an unknown execution or rule, a number out of range, or a lead in a task whose actions are no
-            changes of a command that it observes.
+        ValueError: for an unknown execution or rule, a number out of range, or a lead or gain in a task whose actions
+            are no changes of a command (that it observes).
     """
     lookup(EXECUTIONS, execution, "execution")
     task = description.task
@@ -138,7 +140,7 @@ def assemble_policy(
             choice=choice,
         )
     policy.description = description
-    policy.leash = make_leash(task, command_lead)
+    policy.leash, policy.action_gain = make_leash(task, command_lead), make_gain(task, action_gain)
     return policy.eval()
 
 
@@ -244,6 +246,8 @@ def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
     }
     if policy.leash is not None:
         about["command_lead"] = policy.leash.lead
+    if policy.action_gain is not None:
+        about["action_gain"] = next(factor for factor in policy.action_gain.tolist() if factor != 1)
     if planned:
         about |= {"execution": policy.execution, "blend_decay": policy.blend_decay}
     save_tensors(path, tensors, about)

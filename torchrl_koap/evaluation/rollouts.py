@@ -81,6 +81,32 @@ def make_policy(
     )
 
 
+def make_gain(task: Task, gain: float) -> Tensor | None:
+    """What every entry of a task's actions is multiplied by, None for a gain of 1.
+
+    Args:
+        task (Task): the task.
+        gain (float): factor of the entries that are changes of a command; others are left as they are.
+
+    Raises:
+        ValueError: if the gain is no number above 0, or no action of the task is a change of a command.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.rollouts import make_gain
+        >>> from torchrl_koap.tasks import get_task
+        >>> make_gain(get_task("sorting"), 1.5).tolist(), make_gain(get_task("stacking"), 2.0).tolist()
+        ([1.5, 1.5], [2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0])
+    """
+    if not 0 < gain < math.inf:
+        raise ValueError(f"action_gain must be a number above 0, got {gain}")
+    if gain == 1:
+        return None
+    changes = [name not in task.absolute_actions for name in task.actions]
+    if task.action_targets or not any(changes):
+        raise ValueError(f"action_gain was given, but no action of task {task.name!r} is a change of a command")
+    return torch.tensor([gain if change else 1.0 for change in changes])
+
+
 def make_leash(task: Task, lead: float) -> CommandLeash | None:
     """The leash on a task's commands, None for a lead of 0.
 

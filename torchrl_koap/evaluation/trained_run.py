@@ -18,7 +18,7 @@ from torchrl_koap.evaluation.policy_files import (
     build_networks,
     read_policy,
 )
-from torchrl_koap.evaluation.rollouts import make_leash
+from torchrl_koap.evaluation.rollouts import make_gain, make_leash
 from torchrl_koap.modules import RecedingHorizonPolicy, StatePlanner
 from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
 from torchrl_koap.training.builders import method_named
@@ -143,7 +143,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     """
     given, config = config, EvalConfig() if config is None else config
     check_ways(config)
-    names = ("execution", "replan_interval", "blend_decay", "choice", "candidates", "command_lead")
+    names = ("execution", "replan_interval", "blend_decay", "choice", "candidates", "command_lead", "action_gain")
     options = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
     if config.controller == "oracle":
         trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
@@ -190,10 +190,13 @@ def execution_of(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:
         "replan_interval": REPLAN_INTERVAL,
         "blend_decay": BLEND_DECAY,
         "command_lead": 0.0,
+        "action_gain": 1.0,
     }
     own = dict(trained.task.defaults.execution)
     if trained.planner is None or config.controller == "oracle":  # chunks are executed as they are; an oracle looks
         own.pop("execution", None)
+    if config.controller == "oracle" or trained.method.tracks:  # they know what they commanded, and how it is answered
+        own.pop("action_gain", None)
     asked = {name: getattr(config, name) for name in options if getattr(config, name) is not None}
     return options | own | asked
 
@@ -213,6 +216,7 @@ def _oracle(trained: TrainedRun, options: dict[str, Any]) -> RecedingHorizonPoli
     history = max(trained.planner.history, getattr(trained.controller, "num_past", 0) + 1)
     rule = trained.task.action_rule if trained.task.gripper is not None else None
     leash = make_leash(trained.task, options.pop("command_lead"))
+    gain = make_gain(trained.task, options.pop("action_gain"))
     policy = OracleControl(trained.planner, trained.task, history=history, action_rule=rule, **kept | options)
-    policy.leash = leash
+    policy.leash, policy.action_gain = leash, gain
     return policy

@@ -102,7 +102,8 @@ class ChunkedPolicy(RecedingHorizonPolicy):
         Returns:
             Tensor: ``[*B, replan_interval, act]``.
         """
-        return self.planner.sample(self._read(self.state_of(observations)), noise)[..., : self.replan_interval, :]
+        actions = self.planner.sample(self._read(self.state_of(observations)), noise)
+        return self.scaled(actions[..., : self.replan_interval, :])
 
     def make_chunk(
         self, history: Tensor, noise: Tensor | None, in_force: Tensor | None = None, fresh: Tensor | None = None

@@ -112,7 +112,7 @@ class AsynchronousAgent(Agent):
             bound = self._remaining()[..., : min(self._delay, self.policy.planner.horizon - 1), :]
             self._pending = self._thread.submit(self._make, history, self._noise_for(len(history)), bound)
             self._begun = 0
-        action = self.policy.act(history, self._remaining())
+        action = self.policy.scaled(self.policy.act(history, self._remaining()))
         self._age += 1
         self._begun += 1
         return action if self.policy.leash is None else self.policy.leash.hold(self._frames, action)

@@ -161,7 +161,9 @@ class PlanThenControl(RecedingHorizonPolicy):
             Tensor: ``[*B, replan_interval, act]``.
         """
         history = self.state_of(observations)
-        return self._decode_chunk(history, self.planner.plan(history[..., -self.planner.history :, :], noise))
+        return self.scaled(
+            self._decode_chunk(history, self.planner.plan(history[..., -self.planner.history :, :], noise))
+        )
 
     def act(self, history: Tensor, cached: Tensor) -> Tensor:
         """Decodes the action from what remains of the plan, or hands out the one decoded before.

@@ -80,6 +80,8 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         kept_steps (int, optional): entries of a chunk that are kept. Default: those that are executed.
 
     Attributes:
+        action_gain (Tensor, optional): what every entry of an action is multiplied by ``[act]``: above 1 a robot whose
+            actions are changes of a command is quicker than planned. None, unless set.
         leash (CommandLeash, optional): has the last word on actions; None, unless set.
 
     Raises:
@@ -95,6 +97,8 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         >>> policy.plan_and_decode(torch.zeros(5, 2, 4), torch.randn(5, *sampler.noise_shape)).shape
         torch.Size([5, 4, 3])
     """
+
+    action_gain: Tensor | None
 
     def __init__(
         self,
@@ -129,6 +133,7 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self.history, self.replan_interval = history, replan_interval
         self.planner, self.candidates, self.choice = planner, candidates, choice
+        self.register_buffer("action_gain", None, persistent=False)
         self.leash: CommandLeash | None = None
         self._written: TensorDictBase | None = None
         self.receding = MultiStepActorWrapper(
@@ -175,6 +180,10 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         """
         raise NotImplementedError
 
+    def scaled(self, action: Tensor) -> Tensor:
+        """Actions ``[*B, act]`` times :attr:`action_gain`, where there is one."""
+        return action if self.action_gain is None else action * self.action_gain
+
     def act(self, history: Tensor, cached: Tensor) -> Tensor:
         """The action under the entry of the chunk that is in force; by default that entry itself.
 
@@ -204,6 +213,8 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
                 tensordict.update(self._written)
         tensordict = self._any_batch(tensordict, [*kept, cached])
         self._written = tensordict.select(*kept)
+        if self.action_gain is not None:
+            tensordict.set(self.out_keys[0], self.scaled(tensordict.get(self.out_keys[0])))
         return tensordict if self.leash is None else self.leash(tensordict)
 
     def _any_batch(self, tensordict: TensorDictBase, kept: list[NestedKey]) -> TensorDictBase:
