@@ -27,7 +27,7 @@ import torch
 
 from torchrl_koap.data import RawEpisode, flatten_trajectories, read_raw_episode, save_ted, write_raw_episode
 from torchrl_koap.data.d3il.conversion import get_converter
-from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, share_of_disturbed, iterate_takes
+from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, iterate_takes, share_of_disturbed
 from torchrl_koap.envs.experts.recording import PlainEpisode
 from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.files import one_at_a_time, replacing_file
