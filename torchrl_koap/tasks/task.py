@@ -88,7 +88,7 @@ class Defaults:
         released_epochs (int): epochs of a controller in KOAP's first public code.
         execution (dict): how plans are followed where a command does not say: ``execution``, ``replan_interval``,
             ``blend_decay``, ``command_lead``, ``action_gain`` of :class:`~torchrl_koap.evaluation.EvalConfig`. Policies
-            without a planner take the interval, the lead and the gain alone.
+            without a planner take no blend and no execution.
 
     Examples:
         >>> from torchrl_koap.tasks.task import Defaults

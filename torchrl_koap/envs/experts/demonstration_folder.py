@@ -27,7 +27,8 @@ import torch
 
 from torchrl_koap.data import RawEpisode, flatten_trajectories, read_raw_episode, save_ted, write_raw_episode
 from torchrl_koap.data.d3il.conversion import get_converter
-from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, iterate_takes, share_of_disturbed
+from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, iterate_takes
+from torchrl_koap.envs.experts.disturbances import share_disturbed
 from torchrl_koap.envs.experts.recording import PlainEpisode
 from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.files import one_at_a_time, replacing_file
@@ -78,7 +79,7 @@ def record_to_folder(
         ...     sorted(path.name for path in Path(folder).iterdir()), len(report.rows)
         (['raw', 'ted'], 2)
     """
-    start, disturbance = time.perf_counter(), share_of_disturbed(task, disturbance)
+    start, disturbance = time.perf_counter(), share_disturbed(task, disturbance)
     task = get_task(task.source)
     request = {"task": task.name, "episodes": episodes, "seed": seed, "disturbance": disturbance}
     iterating = functools.partial(

@@ -21,7 +21,7 @@ from tensordict import TensorDict
 from torchrl_koap.data import RawEpisode, flatten_trajectories, write_raw_episode
 from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.experts.disturbances import Disturbances, choose_disturbed, disturbed_columns
+from torchrl_koap.envs.experts.disturbances import Disturbances, choose_disturbed, disturbed_columns, share_disturbed
 from torchrl_koap.envs.experts.recording import FAULTS, Episode, PlainEpisode, expert_of, play
 from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.envs.registry import make_env
@@ -123,7 +123,7 @@ def record_episodes(
         RecordingError: if an episode fails again and again.
     """
     start, facts = time.perf_counter(), get_task(get_task(task).source)
-    disturbance = share_of_disturbed(get_task(task), disturbance)
+    disturbance = share_disturbed(get_task(task), disturbance)
     takes = list(
         iterate_takes(facts, episodes, seed, num_threads, progress, batch_size=batch_size, disturbance=disturbance)
     )
@@ -170,7 +170,7 @@ def iterate_takes(
         [1, 3]
     """
     task = get_task(task) if isinstance(task, str) else task
-    disturbance = share_of_disturbed(task, disturbance)
+    disturbance = share_disturbed(task, disturbance)
     task = get_task(task.source)
     expert_of(task)
     limits = (
@@ -186,16 +186,6 @@ def iterate_takes(
     if disturbance:
         disturbed_columns(task)
     return _play_batches(task, episodes, seed, num_threads, progress, batch_size, disturbed, frozenset(done))
-
-
-def share_of_disturbed(task: Task, share: float | None) -> float:
-    """The share of the demonstrations in which the operator is disturbed.
-
-    Args:
-        task (Task): the task, whose own share (``Defaults.disturbance``) is taken where none was asked for.
-        share (float, optional): what was asked for.
-    """
-    return task.defaults.disturbance if share is None else share
 
 
 def episodes_to_ted(raw: Sequence[Episode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:

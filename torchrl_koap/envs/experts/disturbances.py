@@ -28,15 +28,21 @@ KINDS = ("impulse", "slip", "late_turn", "drift")
 _SIDEWAYS = KINDS[:3]
 _STREAM, _CHOICE_STREAM, _HEIGHT_STREAM = 2, 3, 4  # keep these draws apart from those of players and contexts
 _QUIET, _MEAN_GAP = 12, 45  # control steps from one disturbance to the next: at least, and on average beyond that
-_STEPS = {
-    "impulse": (2, 6),
-    "slip": (4, 11),
-    "late_turn": (4, 11),
-    "drift": (4, 11),
-}  # control steps that one lasts, low and high end
+# control steps that one lasts, low and high end
+_STEPS = {"impulse": (2, 6), "slip": (4, 11), "late_turn": (4, 11), "drift": (4, 11)}
 _SLIP = (0.6, 1.4)  # rad
 _DRIFT = (0.1, 0.35)  # of the size of the operator's own steps
 _MEMORY = 0.98  # of the size of the operator's own steps
+
+
+def share_disturbed(task: Task, share: float | None) -> float:
+    """The share of the demonstrations in which the operator is disturbed.
+
+    Args:
+        task (Task): the task, whose own share (``Defaults.disturbance``) is taken where none was asked for.
+        share (float, optional): what was asked for.
+    """
+    return task.defaults.disturbance if share is None else share
 
 
 def choose_disturbed(episodes: int, share: float, seed: int) -> np.ndarray:
