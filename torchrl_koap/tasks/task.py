@@ -87,8 +87,7 @@ class Defaults:
             ``frame``, ``plan_steps``.
         released_epochs (int): epochs of a controller in KOAP's first public code.
         execution (dict): how plans are followed where a command does not say: ``execution``, ``replan_interval``,
-            ``blend_decay``, ``command_lead``, ``action_gain`` of :class:`~torchrl_koap.evaluation.EvalConfig`. Policies
-            without a planner take no blend and no execution.
+            ``blend_decay``, ``command_lead``, ``action_gain`` (:class:`~torchrl_koap.evaluation.EvalConfig`).
 
     Examples:
         >>> from torchrl_koap.tasks.task import Defaults
