@@ -15,7 +15,7 @@ from torchrl_koap import load_policy, save_policy
 from torchrl_koap.evaluation import EvalConfig
 from torchrl_koap.evaluation.rollouts import make_gain
 from torchrl_koap.evaluation.trained_run import execution_of
-from torchrl_koap.modules import CommandLeash, PlanThenControl
+from torchrl_koap.modules import ChunkedPolicy, CommandLeash, DiffusionPolicy, PlanThenControl, TemporalUnet
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.pretrained import find_run
 
@@ -48,6 +48,19 @@ def test_actions_are_multiplied_and_plans_are_not(execution, batch):
     decoded = policy.plan_and_decode(td["observation_history"], noise)
     policy.action_gain = None
     torch.testing.assert_close(decoded, policy.plan_and_decode(td["observation_history"], noise) * GAINS)
+
+
+def test_chunks_of_actions_have_it_too():
+    torch.manual_seed(0)
+    sampler = DiffusionPolicy(TemporalUnet(3, 4, channels=(8, 16)), state_dim=2, action_dim=3)
+    policy = ChunkedPolicy(sampler, state_columns=(0, 1), history=2, replan_interval=2)
+    td, noise = observed([3]), torch.randn(3, *policy.noise_shape)
+    td[sampler.noise_key] = noise
+    plain, decoded = policy(td.clone())["action"], policy.plan_and_decode(td["observation_history"], noise)
+    policy.action_gain = torch.tensor([2.0, 1.0, 3.0])
+    torch.testing.assert_close(policy(td.clone())["action"], plain * policy.action_gain)
+    again = policy.plan_and_decode(td["observation_history"], noise)
+    torch.testing.assert_close(again, decoded * policy.action_gain)
 
 
 def test_a_command_is_held_back_with_its_gain():

@@ -106,6 +106,17 @@ def test_the_command_is_held_back_as_in_the_policy_itself():
     agent.close()
 
 
+def test_actions_have_the_gain_of_the_policy():
+    plain, gained = make_agent(), make_agent()
+    gained.policy.action_gain = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    for agent in (plain, gained):
+        agent.reset()
+    first, second = (agent.act(np.array([7.0, 1.0])) for agent in (plain, gained))
+    assert np.any(first) and np.allclose(second, first * [1.0, 2.0, 3.0, 4.0])
+    for agent in (plain, gained):
+        agent.close()
+
+
 def test_refusals():
     policy = make_agent().policy
     with pytest.raises(ValueError, match="control_hz must be a positive number"):
