@@ -13,11 +13,10 @@ Rows are appended to the table; what is there already is left out.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import torch
-from planner_ablations import labels_of
+from planner_ablations import disturbance_notes, labels_of
 from resumable_table import open_table
 from tensordict import TensorDict
 
@@ -31,10 +30,9 @@ PACE, AHEAD, PLACES, MOVED = 0.003, 14, 500, 0.001  # m, control steps, number, 
 
 
 def disturbed_how(dataset: str) -> str:
-    """How the operators of a data set were disturbed, as `koap demos` notes."""
-    about = json.loads((Path(dataset) / "ted" / "about.json").read_text(encoding="utf-8"))
-    kept = about["notes"].get("disturbance", {}).get("kept", {})
-    sideways = any(kept.get(kind) for kind in ("impulse", "slip", "late_turn"))
+    """How the operators of a data set were disturbed, in words."""
+    kept = disturbance_notes(dataset).get("kept", {})
+    sideways = any(count for kind, count in kept.items() if kind != "drift")
     ways = [word for word, there in (("sideways", sideways), ("in height", kept.get("drift"))) if there]
     return " and ".join(ways) or "never"
 

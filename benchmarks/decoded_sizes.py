@@ -47,8 +47,9 @@ def main() -> None:
         size = recorded.norm(dim=-1)
         moving = size > MOVING
         along = (decoded * recorded).sum(-1)[moving] / size[moving]
-        write((*facts, len(last), int(moving.sum()), f"{float(along.sum() / size[moving].sum()):.3f}"))
-        print(*facts, f"{float(along.sum() / size[moving].sum()):.3f}")
+        share = float(along.sum() / size[moving].sum())
+        write((*facts, len(last), int(moving.sum()), f"{share:.3f}"))
+        print(*facts, f"{share:.3f}")
 
 
 if __name__ == "__main__":

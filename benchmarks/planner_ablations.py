@@ -43,13 +43,18 @@ def planner_of(config: dict) -> str:
     return " ".join([config["denoiser"], *(f"{name}={value}" for name, value in words.items())])
 
 
-def disturbed_share(dataset: str) -> float:
-    """Share of the demonstrations of a data set that were recorded with a disturbed operator, as `koap demos` notes."""
+def disturbance_notes(dataset: str) -> dict:
+    """How the operators of a data set were disturbed, as `koap demos` notes; nothing where they were not."""
     for folder in (Path(dataset), Path(dataset) / "ted"):
         if (folder / "about.json").is_file():
             notes = json.loads((folder / "about.json").read_text(encoding="utf-8")).get("notes") or {}
-            return float(notes.get("disturbance", {}).get("share", 0.0))
-    return 0.0
+            return notes.get("disturbance", {})
+    return {}
+
+
+def disturbed_share(dataset: str) -> float:
+    """Share of the demonstrations of a data set that were recorded with a disturbed operator."""
+    return float(disturbance_notes(dataset).get("share", 0.0))
 
 
 def labels_of(config: dict) -> str:
