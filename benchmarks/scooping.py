@@ -8,7 +8,8 @@ Records robot and hand, embeds, trains one planner per set of unlabelled demonst
 rolls each out. Folder by folder what is there already is not made again, and rows of the table are not run again.
 
 Unlabelled demonstrations are those of the robot, of the hand (then the robot's labelled ones are all there is of it),
-or both. Labelled ones are the robot's first: they begin at the three start positions in turn.
+of the hand with its embeddings aligned to the robot's labelled ones (`koap embed --align-to robot`), both, or none.
+Labelled ones are the robot's first: they begin at the three start positions in turn.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ from torchrl_koap.vision.encoder import FrozenImageEncoder
 from torchrl_koap.vision.projections import SCOOPING, load_encoder, save_encoder
 
 TABLE = Path(__file__).parent / "results" / "scooping.csv"
-UNLABELLED = ("robot", "hand", "both")
+UNLABELLED = ("robot", "hand", "both", "hand_aligned", "none")
+FEW_ROBOTS = ("hand", "hand_aligned", "none")  # the labelled demonstrations are all there are of the robot
 METHODS = ["koap", "koap_paper", "dd", "vae", "lapo", "dp", "pca", "linear"]
 COLUMNS = (
     "labels", "unlabelled", "method", "execution", "blend_decay", "seed", "n", "successes", "success_low",
@@ -46,19 +48,25 @@ KEYS = COLUMNS[:7]  # what tells rows apart
 
 def data_set(folder: Path, unlabelled: str, labels: int) -> Path:
     """The data set of a cell, embedded where it is not there."""
-    out = folder / (f"data_hand_{labels}" if unlabelled == "hand" else f"data_{unlabelled}")
+    out = folder / f"data_{_name(unlabelled, labels)}"
     if not (out / "ted").is_dir():
         robot, hand = Source(folder / "robot", embodiment="robot"), Source(folder / "hand", embodiment="hand")
-        sources = {"robot": [robot], "both": [robot, hand], "hand": [Source(folder / "robot", labels), hand]}
+        robots = [Source(folder / "robot", labels) if unlabelled in FEW_ROBOTS else robot]
+        sources = robots if unlabelled in ("robot", "none") else [*robots, hand]
+        align_to = "robot" if unlabelled == "hand_aligned" else None
         encoder = load_encoder(cache=folder / "cache")
-        embed_demonstrations(out, sources[unlabelled], encoder, mixed=unlabelled != "robot")
+        embed_demonstrations(out, sources, encoder, mixed=len(sources) > 1, align_to=align_to)
     return out
+
+
+def _name(unlabelled: str, labels: int) -> str:
+    """A set of unlabelled demonstrations, with the labels that decide what it is."""
+    return f"{unlabelled}_{labels}" if unlabelled in FEW_ROBOTS else unlabelled
 
 
 def planner_of(folder: Path, unlabelled: str, labels: int, seed: int, steps: int) -> Path:
     """A run that holds the planner of a cell, trained where it is not there."""
-    name = f"planner_{unlabelled}{f'_{labels}' if unlabelled == 'hand' else ''}_{seed}"
-    run = folder / name
+    run = folder / f"planner_{_name(unlabelled, labels)}_{seed}"
     if not (run / "summary.json").is_file():
         options = {"method": "linear", "steps": steps, "seed": seed, "analysis": False, "resume": run.exists()}
         train(_config(run, folder, unlabelled, labels, **options))
@@ -79,7 +87,7 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
     if not (run / "summary.json").is_file():
         settings = {"method": method, "seed": seed, "planner_from": planner, "steps": options.steps}
         settings["resume"] = run.exists()
-        settings |= {"controller_steps": options.controller_steps, "analysis": unlabelled != "hand"}
+        settings |= {"controller_steps": options.controller_steps, "analysis": unlabelled not in FEW_ROBOTS}
         train(_config(run, folder, unlabelled, labels, **settings))
     ways = {name: getattr(options, name) for name in ("execution", "replan_interval", "blend_decay")}
     if method.startswith("dp"):  # it has no plans to follow: its chunks of actions are executed as they are

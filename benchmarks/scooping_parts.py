@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -94,6 +96,12 @@ def imagined(run, states: list[torch.Tensor], steps: int) -> int:
     )
 
 
+def whose_demonstrations(run: Path) -> str:
+    """Whose unlabelled demonstrations a run of ``benchmarks/scooping.py`` was trained on."""
+    folder = Path(json.loads((run / "config.json").read_text())["dataset"]).name
+    return re.fullmatch(r"data_([a-z_]+?)(_\d+)?", folder)[1]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, required=True, help="of benchmarks/scooping.py")
@@ -106,18 +114,19 @@ def main() -> None:
     states = [data["observation"][data["episode"] == e] for e in range(ROBOTS - options.episodes, ROBOTS)]
     sims, n = ScoopingSimulations("robot", 1), options.episodes
     taken, again = experts(sims, n)
-    rows = [("expert", "", taken), ("replay", "", again)]
+    rows = [("expert", "", "", taken), ("replay", "", "", again)]
     with torch.no_grad():
         for path in options.run:
             run = load_run(path)
-            rows.append(("controller", run.method.name, decoded(sims, run, states)))
-            if not any(part == "planner" for part, _, _ in rows):
-                rows.append(("planner", "", imagined(run, states, options.steps)))
+            whose = whose_demonstrations(path)
+            rows.append(("controller", run.method.name, whose, decoded(sims, run, states)))
+            if ("planner", whose) not in {(part, of) for part, _, of, _ in rows}:
+                rows.append(("planner", "", whose, imagined(run, states, options.steps)))
     with TABLE.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["part", "method", "n", "successes", "success_low", "success_high"])
-        for part, method, count in rows:
-            writer.writerow([part, method, n, count, *(f"{value:.4f}" for value in wilson_interval(count, n))])
+        writer.writerow(["part", "method", "unlabelled", "n", "successes", "success_low", "success_high"])
+        for part, method, whose, count in rows:
+            writer.writerow([part, method, whose, n, count, *(f"{value:.4f}" for value in wilson_interval(count, n))])
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ def scooping_cell(labels: int, method: str, unlabelled: str = "both", rims: bool
 def scooping_table() -> str:
     """A row per cell of the study: plans decoded once and left as they are."""
     cells = [cell for cell in scooping_cells() if (cell["execution"], cell["blend_decay"]) == _HOW]
-    order = ("both", "robot", "hand")
+    order = ("both", "robot", "hand_aligned", "hand", "none")
     cells.sort(key=lambda cell: (int(cell["labels"]), order.index(cell["unlabelled"]), -cell["successes"] / cell["n"]))
     body = []
     for cell in cells:
@@ -126,8 +126,8 @@ def scooping_parts_table() -> str:
     body = []
     for row in sorted(rows, key=lambda row: list(titles).index(row["part"])):
         method = f"`{row['method']}`" if row["method"] else ""
-        body.append([titles[row["part"]], method, row["n"], percent(row, 0)])
-    return table(["part", "method", "episodes", "succeed"], body)
+        body.append([titles[row["part"]], method, row["unlabelled"], row["n"], percent(row, 0)])
+    return table(["part", "method", "unlabelled", "episodes", "succeed"], body)
 
 
 def scooping_cost_table() -> str:

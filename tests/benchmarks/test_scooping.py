@@ -92,6 +92,32 @@ def test_hand_alone_has_a_planner_per_number_of_labels_and_no_analysis(study, tm
     ] is False
 
 
+@pytest.mark.parametrize(
+    ("unlabelled", "whose", "align_to"),
+    [
+        ("both", [("robot", None), ("hand", None)], None),
+        ("robot", [("robot", None)], None),
+        ("hand", [("robot", 2), ("hand", None)], None),
+        ("hand_aligned", [("robot", 2), ("hand", None)], "robot"),
+        ("none", [("robot", 2)], None),
+    ],
+)
+def test_a_data_set_holds_whose_demonstrations_it_is_called_after(
+    benchmark_script, study, monkeypatch, tmp_path, unlabelled, whose, align_to
+):
+    asked = []
+    monkeypatch.setattr(
+        study, "embed_demonstrations", lambda out, sources, encoder, **how: asked.append((sources, how))
+    )
+    out = study.data_set(tmp_path, unlabelled, 2)
+    ((sources, how),) = asked
+    assert [(source.folder.name, source.episodes) for source in sources] == whose
+    assert how == {"mixed": len(whose) > 1, "align_to": align_to}
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text(json.dumps({"dataset": str(out)}))
+    assert benchmark_script("scooping_parts").whose_demonstrations(tmp_path / "run") == unlabelled
+
+
 def test_cells_pool_seeds_and_take_the_longest_row_of_each(benchmark_script):
     base = {"labels": "5", "unlabelled": "both", "method": "koap", "execution": "open_loop", "blend_decay": "0.0"}
     rates = {"left": "0.5", "near": "1.0", "right": "0.0", "action_error_mrad": "100.0"}

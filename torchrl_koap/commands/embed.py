@@ -31,6 +31,8 @@ class Embed(Command):
         out: folder to write: OUT/ted.
         episodes: how many of each source, from the first (default: all).
         mixed: the sources may be of several embodiments.
+        align_to: with --mixed, the embodiment whose frames those of all others are made to resemble, by an affine map
+            that is fitted without labels (default: they are left as they are).
         weights: file of the network's weights (default: EfficientNet-Lite0, extra "vision").
         projection: file of the principal components (default: those of Scooping that come with the package).
         cache: folder that keeps what went through the network.
@@ -40,6 +42,7 @@ class Embed(Command):
     out: Path
     episodes: tuple[int, ...] = ()
     mixed: bool = False
+    align_to: str | None = None
     weights: Path | None = None
     projection: Path | None = None
     cache: Path | None = None
@@ -49,7 +52,7 @@ class Embed(Command):
 
         Raises:
             WeightsError: if weights are missing or of another network.
-            ImageDataError: if a source is none, or embodiments are mixed without saying so.
+            ImageDataError: if a source is none, embodiments are mixed without saying so, or there is nothing to align.
             CacheError: if the cache is of other weights.
             ValueError: if projection or cache are damaged.
         """
@@ -64,7 +67,7 @@ class Embed(Command):
                 encoder = load_encoder(self.projection, self.weights, cache=self.cache)
         numbers = self.episodes or (None,) * len(self.sources)
         sources = [Source(folder, number) for folder, number in zip(self.sources, numbers, strict=True)]
-        folder = embed_demonstrations(self.out, sources, encoder, mixed=self.mixed)
+        folder = embed_demonstrations(self.out, sources, encoder, mixed=self.mixed, align_to=self.align_to)
         about = read_about(folder / "ted")
         whose = about["notes"]["embodiments"]
         return {

@@ -4,20 +4,24 @@
 from torchrl_koap.lookup import exports
 
 _LAZY = {
+    "Alignment": "torchrl_koap.vision.alignment",
     "CacheError": "torchrl_koap.vision.cache",
     "EmbeddingCache": "torchrl_koap.vision.cache",
     "FrozenImageEncoder": "torchrl_koap.vision.encoder",
     "Projection": "torchrl_koap.vision.pooling",
     "WeightsError": "torchrl_koap.vision.backbones",
+    "fit_alignment": "torchrl_koap.vision.alignment",
     "load_backbone": "torchrl_koap.vision.backbones",
 }
 
 __all__ = [  # noqa: F822 - __getattr__ finds them
+    "Alignment",
     "CacheError",
     "EmbeddingCache",
     "FrozenImageEncoder",
     "Projection",
     "WeightsError",
+    "fit_alignment",
     "load_backbone",
 ]
 

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchrl_koap.data import flatten_trajectories, save_ted
 from torchrl_koap.data.lerobot.images import ImageDataError, ImageEpisode, read_image_episodes
 from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.vision.alignment import fit_alignment
 from torchrl_koap.vision.encoder import FrozenImageEncoder
 from torchrl_koap.vision.pooling import Projection
 
@@ -68,6 +70,7 @@ def embed_demonstrations(
     encoder: FrozenImageEncoder,
     *,
     mixed: bool = False,
+    align_to: str | None = None,
     task: Task | str = "scooping",
 ) -> Path:
     """Writes demonstrations as embeddings; an embodiment without actions has no labels.
@@ -79,13 +82,16 @@ def embed_demonstrations(
 
     Keyword Args:
         mixed (bool): the data set may hold several embodiments; its notes say which episodes are whose.
+        align_to (str, optional): an embodiment that all others are moved to, each by an affine map of its embeddings
+            (:func:`~torchrl_koap.vision.alignment.fit_alignment`). Default: embeddings are left as they are.
         task (Task or str): the task, whose observation is the embedding and what the recordings hold besides.
 
     Returns:
         Path: the folder.
 
     Raises:
-        ImageDataError: if embodiments are mixed without saying so, or a data set is unfinished.
+        ImageDataError: if embodiments are mixed without saying so, none or all of the demonstrations are of the one to
+            align to, or a data set is unfinished.
         ValueError: if the embedding has another size than the task's, or frames another size than the encoder's.
     """
     task = get_task(task) if isinstance(task, str) else task
@@ -97,9 +103,16 @@ def embed_demonstrations(
             f"the sources mix the embodiments {' and '.join(names)}: pass mixed=True (koap embed --mixed) if that is"
             " meant"
         )
-    for episode in (episode for episodes in read for episode in episodes):
-        embedding = encoder.embed(torch.from_numpy(episode.frames)).float().numpy()
-        seen = np.concatenate([embedding, episode.state], axis=1)
+    if align_to is not None and (align_to not in names or len(names) < 2):
+        raise ImageDataError(
+            f"nothing can be aligned to the embodiment {align_to!r}: the sources have {' and '.join(names)}"
+        )
+    together = [episode for episodes in read for episode in episodes]
+    embeddings = [encoder.embed(torch.from_numpy(episode.frames)).float() for episode in together]
+    if align_to is not None:
+        embeddings = _aligned(embeddings, [episode.embodiment for episode in together], align_to)
+    for episode, embedding in zip(together, embeddings, strict=True):
+        seen = np.concatenate([embedding.numpy(), episode.state], axis=1)
         if seen.shape[1] != task.observation_dim:
             raise ValueError(
                 f"task {task.name!r} observes {task.observation_dim} columns, embedding and recording have"
@@ -110,4 +123,18 @@ def embed_demonstrations(
         actions.append(torch.from_numpy(missing if episode.action is None else episode.action))
         whose.append(episode.embodiment)
     notes = {"embodiments": whose, "encoder": encoder.identity}
+    if align_to is not None:
+        notes["aligned_to"] = align_to
     return save_ted(flatten_trajectories(states, actions), Path(out) / "ted", task=task.name, notes=notes).parent
+
+
+def _aligned(embeddings: list[Tensor], whose: list[str], to: str) -> list[Tensor]:
+    """Embeddings of every demonstration as if one embodiment had moved in all of them."""
+    out = list(embeddings)
+    target = [part for part, name in zip(embeddings, whose, strict=True) if name == to]
+    for other in sorted(set(whose) - {to}):
+        rows = [row for row, name in enumerate(whose) if name == other]
+        alignment = fit_alignment([embeddings[row] for row in rows], target)
+        for row in rows:
+            out[row] = alignment(embeddings[row])
+    return out
