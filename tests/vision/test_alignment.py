@@ -58,9 +58,19 @@ def test_the_hand_is_seen_as_the_robot_would_be_at_its_place(bodies):
 
 def test_partners_begin_at_the_same_place_and_are_taken_equally_often(bodies):
     _, hand, seen, other, _ = bodies
-    partners = fit_alignment(other, seen).partners
+    partners = fit_alignment(other, seen, free_rounds=0).partners
     assert [partner % 3 for partner in partners] == [number % 3 for number in range(len(hand))]
     assert all(partners.count(number) == 5 for number in range(6))
+
+
+def test_starts_need_not_be_shown_equally_often(bodies):
+    _, _, seen, other, _ = bodies
+    uneven = [number for number in range(30) if number % 3 or number < 9]  # the first start is rare
+    parts = [other[number] for number in uneven]
+    partners = fit_alignment(parts, seen).partners
+    assert [partner % 3 for partner in partners] == [number % 3 for number in uneven]
+    even = fit_alignment(parts, seen, free_rounds=0).partners
+    assert [partner % 3 for partner in even] != [number % 3 for number in uneven]
 
 
 def test_dtype_and_batch_are_those_of_what_is_moved(bodies):
@@ -99,7 +109,8 @@ def test_what_cannot_be_aligned_is_refused(bodies, spoil, said):
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("phases", 1), ("rounds", 0), ("ridge", -0.1), ("ridge", math.nan), ("ridge", math.inf)]
+    ("option", "value"),
+    [("phases", 1), ("rounds", 0), ("free_rounds", -1), ("ridge", -0.1), ("ridge", math.nan), ("ridge", math.inf)],
 )
 def test_options_out_of_range_are_refused_by_name(bodies, option, value):
     _, _, seen, other, _ = bodies

@@ -55,13 +55,15 @@ def fit_alignment(
     phases: int = 40,
     ridge: float = 0.02,
     rounds: int = 20,
+    free_rounds: int = 4,
 ) -> Alignment:
     """Fits the affine map that takes the demonstrations of one embodiment to those of another.
 
     Two steps take turns until nothing changes: every demonstration of the source gets a partner among those of the
     target, and a ridge regression takes frames at the same share of the way to one another. All partners are chosen
-    equally often: if each were free to take the nearest, all would end at the one or two that are easiest to fit. Both
-    embodiments are therefore taken to show the same starts and goals about equally often.
+    equally often: if each were free to take the nearest from the beginning, all would end at the one or two that are
+    easiest to fit. Once the map is nearly right each is, for a few rounds, since starts and goals need not be shown
+    equally often by both.
 
     Args:
         source (sequence of Tensor): embeddings ``[T_i, E]`` of the demonstrations to move.
@@ -71,6 +73,7 @@ def fit_alignment(
         phases (int): frames that every demonstration is resampled to. Defaults to ``40``.
         ridge (float): penalty, as a share of the mean variance of the columns. Defaults to ``0.02``.
         rounds (int): turns at most. Defaults to ``20``.
+        free_rounds (int): turns afterwards in which partners are simply the nearest. Defaults to ``4``.
 
     Returns:
         Alignment: to be called with embeddings of the source.
@@ -88,7 +91,12 @@ def fit_alignment(
         >>> fit_alignment(hand, robot).partners
         (0, 1)
     """
-    for name, value, least in (("phases", phases, 2), ("ridge", ridge, 0), ("rounds", rounds, 1)):
+    for name, value, least in (
+        ("phases", phases, 2),
+        ("ridge", ridge, 0),
+        ("rounds", rounds, 1),
+        ("free_rounds", free_rounds, 0),
+    ):
         if not least <= value < math.inf:
             raise ValueError(f"{name} must be at least {least} and finite, got {value}")
     moved, fixed = (_resampled(parts, side, phases) for parts, side in ((source, "source"), (target, "target")))
@@ -102,21 +110,23 @@ def fit_alignment(
     solve = torch.linalg.pinv(gram + penalty, hermitian=True) @ centred.T
     weight, offset = torch.eye(len(gram), dtype=gram.dtype), fixed.flatten(0, 1).mean(0) - mean
     partners = torch.empty(0, dtype=torch.long)
-    for _ in range(rounds):
-        chosen = _even_partners((frames @ weight + offset).view_as(moved), fixed)
-        if chosen.equal(partners):
-            break
-        partners = chosen
-        wanted = fixed[partners].flatten(0, 1)
-        weight = solve @ (wanted - wanted.mean(0))
-        offset = wanted.mean(0) - mean @ weight
+    for most, times in ((rounds, -(-len(moved) // len(fixed))), (free_rounds, len(moved))):
+        for _ in range(most):
+            chosen = _partners((frames @ weight + offset).view_as(moved), fixed, times)
+            if chosen.equal(partners):
+                break
+            partners = chosen
+            wanted = fixed[partners].flatten(0, 1)
+            weight = solve @ (wanted - wanted.mean(0))
+            offset = wanted.mean(0) - mean @ weight
     return Alignment(weight, offset, tuple(partners.tolist()))
 
 
-def _even_partners(moved: Tensor, fixed: Tensor) -> Tensor:
-    """Which of ``fixed`` every one of ``moved`` is nearest to if all are taken equally often, up to one ``[N]``."""
+def _partners(moved: Tensor, fixed: Tensor, times: int) -> Tensor:
+    """The nearest of ``fixed`` for each of ``moved``, none taken more often than so many times ``[N]``."""
     distances = torch.cdist(moved.flatten(1), fixed.flatten(1)).square()
-    times = -(-len(moved) // len(fixed))
+    if times >= len(moved):
+        return distances.argmin(1)
     _, place = linear_sum_assignment(distances.repeat_interleave(times, dim=1).numpy())
     return torch.from_numpy(place // times)
 
