@@ -15,6 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from bench_rows import bench_cost, bench_means, bench_sentence, bench_size, bench_table, paper_levels_table, paper_size
 from fault_rows import kill_rows, ledger_rows, raw_rows, resume_rows, soak_rows, version_rows
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from planner_rows import (
@@ -61,6 +62,7 @@ from result_rows import (
     window_rows,
 )
 from scooping_rows import (
+    scooping_alignment_table,
     scooping_cell,
     scooping_cost_table,
     scooping_minutes,
@@ -83,60 +85,19 @@ from unlabelled_rows import (
 )
 
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layout_rows, paper_entries
-from torchrl_koap.studies.paper_results import paper_cells, paper_levels
-from torchrl_koap.studies.paper_tables import PAPER_TASKS
-from torchrl_koap.studies.table import read_cells
 
 ROOT = Path(__file__).resolve().parents[1]
-CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
 BEGIN, END = "<!-- results: made by benchmarks/make_results.py -->", "<!-- end of results -->"
 PICTURES = Path("docs") / "pictures"
 DRAWN = ("koap", "koap_untrained", "linear_steps", "linear", "dd_lookahead", "dd", "dp")
 
 
-def paper_levels_table() -> str:
-    """The shares of labels that are the paper's levels, by task."""
-    body = [[f"`{task}`", *map(share, paper_levels(task))] for task in PAPER_TASKS]
-    return table(["task", *(f"level {level}" for level in range(1, 6))], body)
-
-
-def bench_table(name: str) -> str:
-    """Cells of a comparison in the layout of the paper's tables, the paper's beside each.
-
-    Args:
-        name (str): file of cells without its ending.
-    """
-    return as_markdown(layout_rows(paper_entries(read_cells(CELLS / f"{name}.csv"))))
-
-
-def paper_size() -> str:
-    """Number of cells that the paper's tables have."""
-    return str(sum(cell.task != "stacking_1" for number in (1, 2) for cell in paper_cells(number)))
-
-
-def bench_sentence(name: str) -> str:
-    """In how many cells of a comparison KOAP is above the paper's."""
-    above, both = above_the_paper(paper_entries(read_cells(CELLS / f"{name}.csv")))
-    return f"{above} of {both}"
-
-
-def bench_size(name: str) -> str:
-    """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
-    cells = [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
-    seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
-    rollouts = " or ".join(map(str, sorted(episodes)))
-    plural = "s" if len(seeds) > 1 else ""
-    return (
-        f"{len(cells)} cells, {len(seeds)} training seed{plural}, {rollouts} rollouts each, {'/'.join(units)}s labelled"
-    )
-
-
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
-_PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size)
+_PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size, bench_means, bench_cost)
 _UNLABELLED = (followed, followed_rows, unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
 _FAULTS = (ledger_rows, kill_rows, soak_rows, raw_rows, resume_rows, version_rows)
 _SCOOPING = (
+    scooping_alignment_table,
     scooping_cell,
     scooping_cost_table,
     scooping_minutes,

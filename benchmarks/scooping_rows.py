@@ -130,6 +130,20 @@ def scooping_parts_table() -> str:
     return table(["part", "method", "unlabelled", "episodes", "succeed"], body)
 
 
+def scooping_alignment_table() -> str:
+    """A row per number of robot demonstrations that the hand's are aligned to."""
+    found: dict[str, dict[str, Mapping[str, str]]] = {}
+    for row in rows_if_measured("scooping_alignment"):
+        found.setdefault(row["robots"], {})[row["moved"]] = row
+    body = [
+        [robots, *(own[way]["error_mm"] for way in ("not at all", "by the means", "aligned"))]
+        + [f"{own['aligned']['same_start']} of {own['aligned']['hands']}"]
+        for robots, own in found.items()
+    ]
+    head = ["robot demonstrations", "as they are (mm)", "means moved (mm)", "aligned (mm)", "partners begin alike"]
+    return table(head, body)
+
+
 def scooping_cost_table() -> str:
     """Wall seconds of a cell by part, and their sum in minutes."""
     rows = rows_if_measured("scooping_cost")

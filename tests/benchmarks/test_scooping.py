@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -273,3 +274,30 @@ def test_an_imagined_spoon_must_go_in_before_it_comes_out(played, steps, lifted)
             return plan
 
     assert parts.imagined(SimpleNamespace(planner=Scripted()), states, 8) == lifted
+
+
+def test_the_alignment_of_a_hand_is_measured_in_mm_and_written_once(benchmark_script, monkeypatch, tmp_path):
+    script = benchmark_script("scooping_alignment")
+    generator, width = torch.Generator().manual_seed(0), script.EMBEDDING_DIM
+    look = torch.randn(3, width, generator=generator)
+
+    def parts(shift):
+        starts = torch.tensor([[0.5, 0.2, 0.2], [0.3, 0.0, 0.2], [0.5, -0.2, 0.2]])
+        share = torch.linspace(0, 1, 30)[:, None]
+        places = [starts[number % 3] * (1 - share) + 0.01 * number * share**2 for number in range(12)]
+        return [torch.cat([place @ look + shift, place], 1) for place in places]
+
+    steps = parts(0.0) + parts(5.0)
+    numbers = torch.cat([torch.full((len(part),), number) for number, part in enumerate(steps)])
+    data = {"observation": torch.cat(steps), "episode": numbers}
+    monkeypatch.setattr(script, "load_ted", lambda folder: data)
+    table = tmp_path / "table.csv"
+    words = ["scooping_alignment.py", "--folder", str(tmp_path), "--robots", "3", "--table", str(table)]
+    monkeypatch.setattr(sys, "argv", words)
+    script.main()
+    script.main()
+    with table.open(newline="") as file:
+        rows = {row["moved"]: row for row in csv.DictReader(file)}
+    assert len(rows) == 3 and rows["aligned"]["same_start"] == "12"
+    assert float(rows["aligned"]["error_mm"]) < 0.2 * float(rows["not at all"]["error_mm"])
+    assert float(rows["by the means"]["error_mm"]) < 0.2 * float(rows["not at all"]["error_mm"])

@@ -1,0 +1,89 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Committed cells of `koap bench` as tables of docs/results, the paper's beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from result_rows import SOURCE, percent, share, table
+
+from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layout_rows, paper_entries
+from torchrl_koap.studies.paper_results import paper_cells, paper_levels
+from torchrl_koap.studies.paper_tables import PAPER_TASKS
+from torchrl_koap.studies.table import read_cells
+
+CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
+
+
+def paper_levels_table() -> str:
+    """The shares of labels that are the paper's levels, by task."""
+    body = [[f"`{task}`", *map(share, paper_levels(task))] for task in PAPER_TASKS]
+    return table(["task", *(f"level {level}" for level in range(1, 6))], body)
+
+
+def bench_table(name: str) -> str:
+    """Cells of a comparison in the layout of the paper's tables, the paper's beside each.
+
+    Args:
+        name (str): file of cells without its ending.
+    """
+    return as_markdown(layout_rows(paper_entries(read_cells(CELLS / f"{name}.csv"))))
+
+
+def paper_size() -> str:
+    """Number of cells that the paper's tables have."""
+    return str(sum(cell.task != "stacking_1" for number in (1, 2) for cell in paper_cells(number)))
+
+
+def bench_sentence(name: str) -> str:
+    """In how many cells of a comparison KOAP is above the paper's."""
+    above, both = above_the_paper(paper_entries(read_cells(CELLS / f"{name}.csv")))
+    return f"{above} of {both}"
+
+
+def bench_size(name: str) -> str:
+    """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
+    cells = [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
+    seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
+    rollouts = " or ".join(map(str, sorted(episodes)))
+    plural = "s" if len(seeds) > 1 else ""
+    return (
+        f"{len(cells)} cells, {len(seeds)} training seed{plural}, {rollouts} rollouts each, {'/'.join(units)}s labelled"
+    )
+
+
+def bench_means(name: str) -> str:
+    """A row per task and a column per method with all levels of the task: success over levels and seeds together.
+
+    Args:
+        name (str): file of cells without its ending.
+    """
+    found: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
+    for row in read_cells(CELLS / f"{name}.csv"):
+        if row["status"] == "done":
+            found.setdefault(row["task"], {}).setdefault(row["method"], []).append(row)
+    whole = {
+        task: {method: rows for method, rows in own.items() if len({row["fraction"] for row in rows}) == 5}
+        for task, own in found.items()
+    }
+    methods = list(dict.fromkeys(method for own in whole.values() for method in own))
+    body = []
+    for task, own in whole.items():
+        paper = [cell.success for cell in paper_cells(1) if (cell.task, cell.method) == (task, "koap")]
+        cells = [_together(own[method]) if method in own else "not all run" for method in methods]
+        body.append([f"`{task}`", *cells, f"{100 * sum(paper) / len(paper):.1f} %"])
+    return table(["task", *(f"`{method}`" for method in methods), "the paper's KOAP"], body)
+
+
+def _together(rows: list[Mapping[str, Any]]) -> str:
+    """Success of several cells together, with the number of rollouts."""
+    counts = {"successes": str(sum(row["successes"] for row in rows)), "n": str(sum(row["episodes"] for row in rows))}
+    return f"{percent(counts)} of {counts['n']}"
+
+
+def bench_cost(name: str) -> str:
+    """Hours of one core that the cells of a comparison took, and the mean minutes of one."""
+    rows = [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
+    seconds = sum(row["train_seconds"] + row["eval_seconds"] for row in rows)
+    return f"{seconds / 3600:.1f} hours ({seconds / 60 / len(rows):.1f} minutes a cell)"
