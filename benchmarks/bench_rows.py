@@ -6,8 +6,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from result_rows import SOURCE, percent, share, table
+from result_rows import SOURCE, share, table
 
+from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layout_rows, paper_entries
 from torchrl_koap.studies.paper_results import paper_cells, paper_levels
 from torchrl_koap.studies.paper_tables import PAPER_TASKS
@@ -54,7 +55,9 @@ def bench_size(name: str) -> str:
 
 
 def bench_means(name: str) -> str:
-    """A row per task and a column per method with all levels of the task: success over levels and seeds together.
+    """A row per task and a column per method with all levels of the task: success averaged over the levels.
+
+    All cells of a task meet the same contexts and noise, so the interval is that of one cell with the average success.
 
     Args:
         name (str): file of cells without its ending.
@@ -77,9 +80,11 @@ def bench_means(name: str) -> str:
 
 
 def _together(rows: list[Mapping[str, Any]]) -> str:
-    """Success of several cells together, with the number of rollouts."""
-    counts = {"successes": str(sum(row["successes"] for row in rows)), "n": str(sum(row["episodes"] for row in rows))}
-    return f"{percent(counts)} of {counts['n']}"
+    """Mean success of cells that met the same contexts and noise, with the interval of one of them."""
+    trials = rows[0]["episodes"]
+    mean = sum(row["successes"] / row["episodes"] for row in rows) / len(rows)
+    low, high = wilson_interval(round(mean * trials), trials)
+    return f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f})"
 
 
 def bench_cost(name: str) -> str:

@@ -30,6 +30,7 @@ SIZES = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "pl
 UNITS = {"trajectory": "trajectories", "window": "windows", "transition": "transitions"}
 # in rows that were written before the column
 OLDER = {"controller": "learned", "stacked": "", "disturbed": "0.0", "command_lead": "0.0", "action_gain": "1.0"}
+OLDER |= {"preset": "default"}
 OTHERS = ("first_steps_weight", "precision", "recovery_sigma", "planner_learning_rate")
 PLANS = ("frame", "plan_steps", "observed_frames", "gripper_recovery")
 
@@ -124,6 +125,7 @@ def row_of(path: Path, results: list[dict], choices: dict, note: str, controller
         "disturbed": disturbed_share(trained["dataset"]),
         "command_lead": results[0].get("command_lead", 0.0),  # evaluations of before have none
         "action_gain": results[0].get("action_gain", 1.0),
+        "preset": config["controller"]["preset"] if "controller" in config else OLDER["preset"],
     }
 
 

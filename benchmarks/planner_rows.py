@@ -64,6 +64,11 @@ def paced(row: Mapping[str, str]) -> str:
     return "" if float(row["action_gain"]) == 1 else f"actions times {float(row['action_gain']):g}"
 
 
+def method_words(row: Mapping[str, str]) -> str:
+    """The method, and its preset where that is not the default's."""
+    return f"`{row['method']}`" + (f", `{row['preset']}`" if row["preset"] == "semi_supervised" else "")
+
+
 def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
     """A row per trained planner and way to run it."""
     head = [
@@ -81,7 +86,7 @@ def planner_table(rows: Sequence[Mapping[str, str]]) -> str:
     body = [
         [
             row["labels"],
-            "*oracle*" if row["controller"] == "oracle" else f"`{row['method']}`",
+            "*oracle*" if row["controller"] == "oracle" else method_words(row),
             planner_words(row["denoiser"]),
             row["demonstrations"] + (" disturbed" if disturbed(row) else ""),
             f"{row['updates']} x {row['batch']}",

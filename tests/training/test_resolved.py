@@ -1,10 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a run trains where nothing is asked for."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from torchrl_koap.tasks import get_task
 from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.resolved import resolve
 
@@ -27,3 +29,26 @@ class TestTheTasksMethod:
 
     def test_settings_of_the_first_public_code_are_its_own_method(self):
         assert resolve(TrainConfig(out=Path("run"), task="stacking", released_settings=True)).method.name == "koap"
+
+
+class TestTheTasksPreset:
+    def preset(self, **options):
+        return resolve(TrainConfig(out=Path("run"), **options)).controller["preset"]
+
+    def test_is_that_of_its_own_method_unless_another_is_asked_for(self):
+        assert self.preset(task="po_sorting") == "semi_supervised"
+        assert self.preset(task="po_sorting", preset="default") == "default"
+        assert self.preset(task="po_sorting", released_settings=True) == "released"
+        assert self.preset(task="sorting") == "default"
+
+    @pytest.mark.parametrize(
+        ("method", "own"), [("koap_untrained", "default"), ("koap_paper", "paper"), ("pca", "default")]
+    )
+    def test_is_not_that_of_other_methods(self, method, own):
+        assert self.preset(task="po_sorting", method=method) == own
+
+    def test_must_be_one_of_the_methods(self):
+        task = get_task("po_sorting")
+        task = replace(task, name="other", defaults=replace(task.defaults, method="pca"))
+        with pytest.raises(ValueError, match="'other' asks for preset 'semi_supervised', method 'pca' has"):
+            resolve(TrainConfig(out=Path("run"), task="po_sorting"), task)

@@ -173,6 +173,7 @@ register_task(
         data="sorting",
         gym_id="",
         defaults=Defaults(
+            preset="semi_supervised",  # positions are noisy
             demonstrations=1000,
             planner_steps=24000,
             planner=WIDE_MLP,

@@ -74,6 +74,7 @@ class Defaults:
 
     Args:
         method (str): what `koap train` trains.
+        preset (str, optional): of that method, where none is asked for. Default: the method's own.
         demonstrations (int): number of scripted demonstrations to record.
         disturbance (float): share of them in which the operator is disturbed.
         planner_steps (int): planner updates.
@@ -96,6 +97,7 @@ class Defaults:
     """
 
     method: str = "koap"
+    preset: str | None = None
     demonstrations: int = 200
     disturbance: float = 0.0
     planner_steps: int = 12000

@@ -32,7 +32,8 @@ class TrainConfig:
             that plugins register included (default: that of the task; "koap" with --released-settings).
         released_settings: the unequal network, learning rate and updates that the first public code has for the method.
         epochs: with released settings, epochs instead of the first code's.
-        preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the method's own).
+        preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the
+            task's for its own method, else the method's).
         koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
         action_coeff: weight of the action term, for methods whose action decoder is trained with the rest (default: 1).
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.

@@ -121,7 +121,7 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         planner = _planner_entry(options, task)
     if released is not None and not method.has_planner:
         planner |= POLICY
-    preset = "released" if options.released_settings else options.preset or method.presets[0]
+    preset = "released" if options.released_settings else options.preset or _own_preset(method, task)
     controller: dict[str, Any] = {
         "method": options.method,
         "decoder": options.decoder,
@@ -147,6 +147,15 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         planner=planner,
         controller=controller,
     )
+
+
+def _own_preset(method: Method, task: Task) -> str:
+    """The preset where none is asked for: the task's for its own method, else the method's."""
+    own = task.defaults.preset if method.name == task.defaults.method else None
+    if own is not None and own not in method.presets:
+        has = list(method.presets)
+        raise ValueError(f"task {task.name!r} asks for preset {own!r}, method {method.name!r} has {has}")
+    return own or method.presets[0]
 
 
 WORLD = "world"  # no object's frame, where a task has one by default
