@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from result_rows import SOURCE, share, table
+from result_rows import SOURCE, read_rows, share, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layout_rows, paper_entries
@@ -85,6 +85,17 @@ def _together(rows: list[Mapping[str, Any]]) -> str:
     mean = sum(row["successes"] / row["episodes"] for row in rows) / len(rows)
     low, high = wilson_interval(round(mean * trials), trials)
     return f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f})"
+
+
+def noise_share(task: str, noise: float) -> str:
+    """Error of decoded actions over their size where frames have so many mm of noise, over the runs of a task."""
+    shares = [float(row["share"]) for row in read_rows("noise_answers", task=task, noise_mm=noise)]
+    return f"{sum(shares) / len(shares):.2f}"
+
+
+def plan_error(task: str) -> str:
+    """How far the first step of plans is from what was recorded, in mm."""
+    return read_rows("noise_answers", task=task)[0]["plan_error_mm"]
 
 
 def bench_cost(name: str) -> str:

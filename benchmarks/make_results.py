@@ -15,7 +15,17 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from bench_rows import bench_cost, bench_means, bench_sentence, bench_size, bench_table, paper_levels_table, paper_size
+from bench_rows import (
+    bench_cost,
+    bench_means,
+    bench_sentence,
+    bench_size,
+    bench_table,
+    noise_share,
+    paper_levels_table,
+    paper_size,
+    plan_error,
+)
 from fault_rows import kill_rows, ledger_rows, raw_rows, resume_rows, soak_rows, version_rows
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from planner_rows import (
@@ -93,7 +103,17 @@ DRAWN = ("koap", "koap_untrained", "linear_steps", "linear", "dd_lookahead", "dd
 
 
 _TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
-_PAPER = (paper_levels_table, paper_size, bench_table, bench_sentence, bench_size, bench_means, bench_cost)
+_PAPER = (
+    paper_levels_table,
+    paper_size,
+    bench_table,
+    bench_sentence,
+    bench_size,
+    bench_means,
+    bench_cost,
+    noise_share,
+    plan_error,
+)
 _UNLABELLED = (followed, followed_rows, unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
 _FAULTS = (ledger_rows, kill_rows, soak_rows, raw_rows, resume_rows, version_rows)
 _SCOOPING = (

@@ -1,0 +1,75 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Committed cells as tables: averages over levels with an honest interval, and answers of decoders to noise."""
+
+from __future__ import annotations
+
+import csv
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.studies.table import write_cells
+
+LEVELS = (0.02, 0.05, 0.1, 0.25, 0.5)
+
+
+@pytest.fixture
+def rows(benchmark_script, monkeypatch, tmp_path):
+    module = benchmark_script("bench_rows")
+    monkeypatch.setattr(module, "CELLS", tmp_path)
+    return module
+
+
+def cell(method, fraction, successes, seconds=30.0):
+    done = {"task": "avoiding", "observations": 1.0, "seed": 0, "label_unit": "window", "status": "done"}
+    times = {"train_seconds": seconds, "eval_seconds": 30.0}
+    return done | times | {"method": method, "fraction": fraction, "episodes": 60, "successes": successes}
+
+
+def test_averages_have_the_interval_of_a_single_cell_and_need_all_levels(rows, tmp_path):
+    cells = [cell("koap", level, count) for level, count in zip(LEVELS, (60, 54, 48, 54, 54), strict=True)]
+    write_cells(tmp_path / "made.csv", [*cells, cell("pca", 0.02, 30)])
+    head, _, line = rows.bench_means("made").splitlines()
+    assert "`koap`" in head and "pca" not in head
+    assert "| 90.0 % (80-95) |" in line  # of 60 rollouts; of 300 it would be 86-93
+    assert line.endswith("| 93.8 % |")
+    assert rows.bench_cost("made") == "0.1 hours (1.0 minutes a cell)"
+
+
+def test_noise_of_the_frames_is_told_as_a_share_of_the_actions(benchmark_script, monkeypatch, tmp_path):
+    script = benchmark_script("noise_answers")
+    steps = torch.arange(120)
+    state = torch.stack([0.01 * (steps % 60), torch.zeros(120), torch.zeros(120), torch.zeros(120)], 1).double()
+    action = torch.full((120, 2), 0.01).double()
+    data = TensorDict({"state": state, "action": action, "episode": steps // 60}, [120])
+
+    class Difference(torch.nn.Module):
+        """Reads the first coordinate's next step as both actions."""
+
+        num_past = 0
+
+        def __init__(self):
+            super().__init__()
+            self.weight = torch.nn.Buffer(torch.ones(1))
+
+        def forward(self, windows):
+            ahead = windows["state"][..., 1:, :1] - windows["state"][..., :-1, :1]
+            return windows.set("action", torch.cat([ahead, ahead[..., -1:, :]], -2).expand(*[-1] * (ahead.ndim - 1), 2))
+
+    planner = SimpleNamespace(history=2, plan=lambda seen, generator: seen[:, -1:] + torch.tensor([0.012, 0.0, 0, 0]))
+    task = SimpleNamespace(name="made", action_columns=lambda: [0, 1])
+    method = SimpleNamespace(name="koap")
+    run = SimpleNamespace(task=task, method=method, planner=planner, columns=(0, 1, 2, 3), controller=Difference())
+    monkeypatch.setattr(script, "load_run", lambda path: run)
+    monkeypatch.setattr(script, "load_demonstrations", lambda folder, task: data)
+    table = tmp_path / "table.csv"
+    words = ["noise_answers.py", "made", "--dataset", "none", "--noise", "0", "1", "--table", str(table)]
+    monkeypatch.setattr("sys.argv", words)
+    script.main()
+    script.main()
+    with table.open(newline="") as file:
+        quiet, noisy = csv.DictReader(file)
+    assert float(quiet["share"]) < 1e-3 and 0.08 < float(noisy["share"]) < 0.2  # sqrt(2) mm of a step of 10 mm
+    assert float(quiet["plan_error_mm"]) == pytest.approx(1.41, abs=0.01)  # 2 mm in one of two columns
