@@ -93,6 +93,11 @@ def noise_share(task: str, noise: float) -> str:
     return f"{sum(shares) / len(shares):.2f}"
 
 
+def worst_action(task: str) -> str:
+    """The action with the largest error on recorded windows."""
+    return read_rows("noise_answers", task=task, noise_mm=0)[0]["worst"]
+
+
 def plan_error(task: str) -> str:
     """How far the first step of plans is from what was recorded, in mm."""
     return read_rows("noise_answers", task=task)[0]["plan_error_mm"]

@@ -5,7 +5,8 @@
 
 The recorded windows of the last demonstrations, as they are and with white noise on the robot's position; the error of
 the decoded actions is told as a share of the recorded ones' size, both root mean squares over the actions of the first
-unit. Beside it, how far the first step of the run's own plans is from what was recorded there.
+unit, with the action whose error is the largest. Beside it, how far the first step of the run's own plans is from what
+was recorded there.
 
 Rows are appended to the table; a run that is there already is left out.
 """
@@ -25,7 +26,7 @@ from torchrl_koap.training.action_errors import first_actions
 from torchrl_koap.training.datasets import load_demonstrations
 
 TABLE = Path(__file__).parent / "results" / "noise_answers.csv"
-COLUMNS = ("task", "run", "method", "demonstrations", "noise_mm", "error", "size", "share", "plan_error_mm")
+COLUMNS = ("task", "run", "method", "demonstrations", "noise_mm", "error", "size", "share", "worst", "plan_error_mm")
 EVERY = 37  # steps between the frames that plans are made from
 
 
@@ -73,7 +74,8 @@ def main() -> None:
                 decoded, recorded, _ = first_actions(run.controller, noisy, data["episode"].unique())
                 pair = (decoded - recorded)[:, actions], recorded[:, actions]
                 error, size = (float(part.square().mean().sqrt()) for part in pair)
-                write((*facts, f"{error:.5f}", f"{size:.5f}", f"{error / size:.3f}", f"{1e3 * ahead:.2f}"))
+                worst = task.action_names[actions[int(pair[0].square().mean(0).argmax())]]
+                write((*facts, f"{error:.5f}", f"{size:.5f}", f"{error / size:.3f}", worst, f"{1e3 * ahead:.2f}"))
 
 
 if __name__ == "__main__":

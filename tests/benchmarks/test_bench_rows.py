@@ -59,7 +59,7 @@ def test_noise_of_the_frames_is_told_as_a_share_of_the_actions(benchmark_script,
             return windows.set("action", torch.cat([ahead, ahead[..., -1:, :]], -2).expand(*[-1] * (ahead.ndim - 1), 2))
 
     planner = SimpleNamespace(history=2, plan=lambda seen, generator: seen[:, -1:] + torch.tensor([0.012, 0.0, 0, 0]))
-    task = SimpleNamespace(name="made", action_columns=lambda: [0, 1])
+    task = SimpleNamespace(name="made", action_columns=lambda: [0, 1], action_names=("x", "y"))
     method = SimpleNamespace(name="koap")
     run = SimpleNamespace(task=task, method=method, planner=planner, columns=(0, 1, 2, 3), controller=Difference())
     monkeypatch.setattr(script, "load_run", lambda path: run)
@@ -72,4 +72,5 @@ def test_noise_of_the_frames_is_told_as_a_share_of_the_actions(benchmark_script,
     with table.open(newline="") as file:
         quiet, noisy = csv.DictReader(file)
     assert float(quiet["share"]) < 1e-3 and 0.08 < float(noisy["share"]) < 0.2  # sqrt(2) mm of a step of 10 mm
+    assert noisy["worst"] in ("x", "y")
     assert float(quiet["plan_error_mm"]) == pytest.approx(1.41, abs=0.01)  # 2 mm in one of two columns

@@ -175,7 +175,7 @@ class LinearActionDecoder(TensorDictModuleBase):
             groups = rows
 
         mean_x, mean_y = (x.mean(0), y.mean(0)) if bias else (torch.zeros_like(x[0]), torch.zeros_like(y[0]))
-        centred, target = x - mean_x, y - mean_y
+        centred, target = (x - mean_x, y - mean_y) if bias else (x, y)  # a copy may take gigabytes
         left, singular, right = _thin_svd(centred)
         unit = centred.square().sum(-1).mean()
         unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # constant latent actions: any scale will do
