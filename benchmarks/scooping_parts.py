@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scooping_alignment import spoon_reader
 from tensordict import TensorDict
 
 from torchrl_koap.data import load_ted
@@ -80,16 +81,13 @@ def decoded(sims: ScoopingSimulations, run, states: list[torch.Tensor]) -> int:
 
 def imagined(run, states: list[torch.Tensor], steps: int) -> int:
     """How often the planner, which is shown the first frame and then its own plans, lifts the spoon out of the bowl."""
-    seen = torch.cat(states).double()
-    design = torch.cat([seen[:, :EMBEDDING_DIM], torch.ones(len(seen), 1).double()], 1)
-    gram = design.T @ design + 1e-3 * torch.eye(design.shape[1]).double()
-    weight = torch.linalg.solve(gram, design.T @ seen[:, EMBEDDING_DIM:])
+    read = spoon_reader(torch.cat(states).double())
     planner, generator = run.planner, torch.Generator().manual_seed(0)
     path = [torch.stack([part[0, :EMBEDDING_DIM] for part in states]).float()] * planner.history
     while len(path) < MOST_STEPS:
         plan = planner.plan(torch.stack(path[-planner.history :], 1), generator=generator)
         path += list(plan[:, :steps].unbind(1))
-    heights = torch.stack(path, 1).double() @ weight[:-1, 2] + weight[-1, 2]
+    heights = read(torch.stack(path, 1).double())[..., 2]
     lowest = heights.argmin(1)
     return sum(
         bool(own[low] < IN_BOWL and own[low:].max() > LEFT_BOWL) for own, low in zip(heights, lowest, strict=True)
