@@ -75,6 +75,7 @@ class Embed(Command):
             "trajectories": ", ".join(f"{whose.count(name)} {name}" for name in sorted(set(whose))),
             "steps": about["steps"],
             "labelled steps": about["labelled_steps"],
+            **({"aligned to": self.align_to} if self.align_to else {}),
             "next": f"koap train --task scooping --dataset {folder} --out runs/scooping",
         }
 
