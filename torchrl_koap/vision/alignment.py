@@ -40,12 +40,12 @@ class Alignment:
     partners: tuple[int, ...]
 
     def __call__(self, embeddings: Tensor) -> Tensor:
-        """Moved embeddings ``[*B, E]``, of the same dtype.
+        """Moved embeddings ``[*B, E]``, of the same dtype and on the same device.
 
         Args:
             embeddings (Tensor): ``[*B, E]``.
         """
-        return (embeddings.to(self.weight) @ self.weight + self.offset).to(embeddings.dtype)
+        return (embeddings.to(self.weight) @ self.weight + self.offset).to(embeddings)
 
 
 def fit_alignment(
@@ -142,7 +142,7 @@ def _resampled(parts: Sequence[Tensor], side: str, phases: int) -> Tensor:
             raise ValueError(f"{side}: demonstration {number} has {what}, an alignment needs two and finite ones")
         place = torch.linspace(0, len(part) - 1, phases, dtype=torch.double)
         before = place.long().clamp(max=len(part) - 2)
-        part = part.double()
+        part = part.double().cpu()  # so is what assigns partners
         rows.append(torch.lerp(part[before], part[before + 1], (place - before)[:, None]))
     if len({row.shape[-1] for row in rows}) > 1:
         raise ValueError(f"{side}: the demonstrations have embeddings of different sizes")
