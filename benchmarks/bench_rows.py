@@ -17,6 +17,11 @@ from torchrl_koap.studies.table import read_cells
 CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
 
 
+def _done(name: str) -> list[dict[str, Any]]:
+    """The finished cells of a comparison."""
+    return [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
+
+
 def paper_levels_table() -> str:
     """The shares of labels that are the paper's levels, by task."""
     body = [[f"`{task}`", *map(share, paper_levels(task))] for task in PAPER_TASKS]
@@ -45,7 +50,7 @@ def bench_sentence(name: str) -> str:
 
 def bench_size(name: str) -> str:
     """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
-    cells = [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
+    cells = _done(name)
     seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
     rollouts = " or ".join(map(str, sorted(episodes)))
     plural = "s" if len(seeds) > 1 else ""
@@ -63,9 +68,8 @@ def bench_means(name: str) -> str:
         name (str): file of cells without its ending.
     """
     found: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
-    for row in read_cells(CELLS / f"{name}.csv"):
-        if row["status"] == "done":
-            found.setdefault(row["task"], {}).setdefault(row["method"], []).append(row)
+    for row in _done(name):
+        found.setdefault(row["task"], {}).setdefault(row["method"], []).append(row)
     whole = {
         task: {method: rows for method, rows in own.items() if len({row["fraction"] for row in rows}) == 5}
         for task, own in found.items()
@@ -105,6 +109,6 @@ def plan_error(task: str) -> str:
 
 def bench_cost(name: str) -> str:
     """Hours of one core that the cells of a comparison took, and the mean minutes of one."""
-    rows = [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
+    rows = _done(name)
     seconds = sum(row["train_seconds"] + row["eval_seconds"] for row in rows)
     return f"{seconds / 3600:.1f} hours ({seconds / 60 / len(rows):.1f} minutes a cell)"

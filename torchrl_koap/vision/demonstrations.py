@@ -108,16 +108,19 @@ def embed_demonstrations(
             f"nothing can be aligned to the embodiment {align_to!r}: the sources have {' and '.join(names)}"
         )
     together = [episode for episodes in read for episode in episodes]
-    embeddings = [encoder.embed(torch.from_numpy(episode.frames)).float() for episode in together]
-    if align_to is not None:
-        embeddings = _aligned(embeddings, [episode.embodiment for episode in together], align_to)
-    for episode, embedding in zip(together, embeddings, strict=True):
-        seen = np.concatenate([embedding.numpy(), episode.state], axis=1)
-        if seen.shape[1] != task.observation_dim:
+    embeddings = []
+    for episode in together:
+        embedding = encoder.embed(torch.from_numpy(episode.frames)).float()
+        if embedding.shape[1] + episode.state.shape[1] != task.observation_dim:
             raise ValueError(
                 f"task {task.name!r} observes {task.observation_dim} columns, embedding and recording have"
                 f" {embedding.shape[1]} and {episode.state.shape[1]}"
             )
+        embeddings.append(embedding)
+    if align_to is not None:
+        embeddings = _aligned(embeddings, [episode.embodiment for episode in together], align_to)
+    for episode, embedding in zip(together, embeddings, strict=True):
+        seen = np.concatenate([embedding.numpy(), episode.state], axis=1)
         states.append(torch.from_numpy(seen))
         missing = np.full((len(episode), task.action_dim), np.nan, dtype=np.float32)
         actions.append(torch.from_numpy(missing if episode.action is None else episode.action))
