@@ -11,10 +11,12 @@ from torch import Tensor
 
 from torchrl_koap.modules import CommandResponse
 from torchrl_koap.tasks import Task
+from torchrl_koap.training.multi_step_fit import Stretches, fit_predictions, prediction_errors
 
-AHEAD = 8  # control steps over which labelled steps left out are predicted
-PENALTY = 1e-5  # relative; larger ones predict labels left out as well, but shrink momentum, and plans are lost
+AHEAD = 12  # control steps that are predicted, in the fit and where labelled steps are left out
+PENALTY = 1e-5  # relative; larger ones shrink momentum, and plans are lost
 _FOLDS = 5
+_LEAST = 9  # steps of a block, where a single stretch is cut
 
 
 def tracked_columns(task: Task) -> dict[str, Any]:
@@ -74,6 +76,9 @@ class LabelledSteps(NamedTuple):
 def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, Any]:
     """Fits a response to the labelled steps; axes are coupled if stretches left out are predicted better by it.
 
+    A ridge regression of single steps is where the fit of predictions over up to 12 steps begins
+    (:func:`~torchrl_koap.training.multi_step_fit.fit_predictions`).
+
     Where a trajectory has labels on parts of it only, its commands are hidden and the changes alone are known: every
     such stretch then has an unknown offset of its own, which is taken out (fixed effects).
 
@@ -83,7 +88,7 @@ def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, A
 
     Returns:
         dict: ``coupled``, ``labels_used`` and ``held_out_error``: root mean square of predictions over up
-        to 8 steps, in the unit of the axes; None if there was too little to leave out.
+        to 12 steps, in the unit of the axes; None if there was too little to leave out.
 
     Raises:
         ValueError: if no stretch of labelled steps is long enough.
@@ -101,14 +106,14 @@ def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, A
             out = folds == fold
             if not out.any() or out.all():
                 continue
-            _fit(response, steps.take(~out), coupled=coupled)
-            errors.append(_prediction_errors(response, data, steps.take(out), changes).flatten())
+            _fit(response, data, steps.take(~out), changes, coupled=coupled)
+            errors.append(prediction_errors(response, _stretches(response, data, steps.take(out), changes)).flatten())
         errors = torch.cat(errors)
         error = errors.pow(2).mean().sqrt().item() if len(errors) else float("inf")
         if best is None or error < best[0]:
             best = error, coupled
     error, coupled = best if best is not None and best[0] < float("inf") else (None, False)
-    _fit(response, steps, coupled=coupled)
+    _fit(response, data, steps, changes, coupled=coupled)
     return {
         "coupled": coupled,
         "labels_used": len(steps.row),
@@ -164,8 +169,10 @@ def _counted(changes: Tensor, segment: Tensor) -> Tensor:
     return total - before[segment]
 
 
-def _fit(response: CommandResponse, steps: LabelledSteps, *, coupled: bool) -> None:
-    """A ridge after the means of the stretches with unknown commands were taken out."""
+def _fit(
+    response: CommandResponse, data: TensorDictBase, steps: LabelledSteps, changes: Tensor, *, coupled: bool
+) -> None:
+    """A ridge after the means of the stretches with unknown commands were taken out, then predictions of many steps."""
     read, wanted = steps.coordinates, steps.steps
     if not steps.known.all():
         _, group, size = steps.segment.unique(return_inverse=True, return_counts=True)
@@ -176,6 +183,7 @@ def _fit(response: CommandResponse, steps: LabelledSteps, *, coupled: bool) -> N
             means.append((total / size.unsqueeze(-1))[group] * hidden.unsqueeze(-1))
         read, wanted = read - means[0].view_as(read), wanted - means[1]
     response.fit_ridge(read, wanted, penalty=PENALTY, coupled=coupled)
+    fit_predictions(response, _stretches(response, data, steps, changes), coupled=coupled)
 
 
 def _folds(steps: LabelledSteps) -> Tensor | None:
@@ -183,36 +191,26 @@ def _folds(steps: LabelledSteps) -> Tensor | None:
     count = int(steps.segment[-1]) + 1
     if count >= _FOLDS:
         return steps.segment % _FOLDS
-    if len(steps.row) < _FOLDS * (AHEAD + 1):
+    if len(steps.row) < _FOLDS * _LEAST:
         return None
     return torch.arange(len(steps.row), device=steps.row.device) * _FOLDS // len(steps.row)
 
 
-def _prediction_errors(
-    response: CommandResponse, data: TensorDictBase, steps: LabelledSteps, changes: Tensor
-) -> Tensor:
-    """Errors ``[m, AHEAD, J]`` of the positions predicted from every second step that has as many after it."""
+def _stretches(response: CommandResponse, data: TensorDictBase, steps: LabelledSteps, changes: Tensor) -> Stretches:
+    """What follows every second step that has as many labelled ones after it, :data:`AHEAD` where they are in a row."""
     row, memory = steps.row, response.memory
     length = min(AHEAD, int(steps.segment.bincount().max()))
     enough = torch.zeros_like(row, dtype=torch.bool)
     enough[: len(row) - length + 1] = row[length - 1 :] - row[: len(row) - length + 1] == length - 1
     start = steps.take(enough)
     start = start.take(torch.arange(0, len(start.row), 2, device=row.device))
-    if not len(start.row):
-        return changes.new_zeros(0, length, response.num_axes)
     row = start.row
     positions = data["state"][:, response.states].double()
-    history = torch.stack([positions[row - back] for back in range(memory, -1, -1)], 1)
-    past = torch.stack([changes[row - back] for back in range(memory, 0, -1)], 1)
-    future = torch.stack([changes[row + ahead] for ahead in range(length)], 1).nan_to_num(0.0)  # the last has no effect
-    command = positions[row] + start.coordinates[..., memory]  # the lead
-    predicted = response.predict(history, command, past, future)
-    error = predicted - torch.stack([positions[row + 1 + ahead] for ahead in range(length)], 1)
-    if start.known.all():
-        return error
-    # a hidden command differs by a constant, whose effect is linear: what no constant explains is the error
-    axes, nothing = response.num_axes, torch.zeros(response.num_axes, memory + 1, response.num_axes).to(error)
-    offset = torch.eye(axes).to(error)
-    effect = response.predict(nothing, offset, nothing[:, 1:], torch.zeros(axes, length, axes).to(error)).flatten(1).T
-    explained = effect @ torch.linalg.lstsq(effect, error.flatten(1).T).solution
-    return torch.where(start.known[:, None, None], error, error - explained.T.view_as(error))
+    return Stretches(
+        torch.stack([positions[row - back] for back in range(memory, -1, -1)], 1),
+        positions[row] + start.coordinates[..., memory],  # the lead
+        torch.stack([changes[row - back] for back in range(memory, 0, -1)], 1),
+        torch.stack([changes[row + ahead] for ahead in range(length)], 1).nan_to_num(0.0),  # the last has no effect
+        torch.stack([positions[row + 1 + ahead] for ahead in range(length)], 1),
+        start.known,
+    )

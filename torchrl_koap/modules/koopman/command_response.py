@@ -91,7 +91,9 @@ class CommandResponse(nn.Module):
         steps = positions.diff(dim=-2).flip(-2).movedim(-2, -1)
         return torch.cat([steps, lead.unsqueeze(-1), changes.flip(-2).movedim(-2, -1)], -1)
 
-    def predict(self, positions: Tensor, command: Tensor, changes: Tensor, future: Tensor) -> Tensor:
+    def predict(
+        self, positions: Tensor, command: Tensor, changes: Tensor, future: Tensor, *, weight: Tensor | None = None
+    ) -> Tensor:
         """Positions under given changes of the command.
 
         Args:
@@ -100,10 +102,13 @@ class CommandResponse(nn.Module):
             changes (Tensor): that led to it ``[*B, memory, J]``, the latest last.
             future (Tensor): the changes to come ``[*B, N, J]``; the last one is not seen within N steps.
 
+        Keyword Args:
+            weight (Tensor, optional): coefficients ``[J, J, 2 memory + 1]`` to predict with. Default: its own.
+
         Returns:
             Tensor: ``[*B, N, J]``, the next N positions.
         """
-        weight, predicted = self.weight.to(positions.dtype), []
+        weight, predicted = (self.weight if weight is None else weight).to(positions.dtype), []
         for change in future.unbind(-2):
             now = positions[..., -1, :]
             step = torch.einsum("...jf,kjf->...k", self.coordinates(positions, command - now, changes), weight)
