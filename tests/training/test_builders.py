@@ -128,9 +128,12 @@ def test_unknown_planner_options_suggest_the_nearest(option, value, message):
 def test_every_controller_acts_and_takes_over_weights(method, preset, data):
     labelled, _ = LabelBudget(2).apply(data)
     tracking = {"states": [0, 1], "commands": [0, 1], "actions": [0, 1]}
-    options = {"method": method, "preset": preset, "revised": True, "tracking": tracking}
+    posture = {"state_dim": 3, "commands": [0, 1], "actions": [0, 1]}
+    options = {"method": method, "preset": preset, "revised": True, "tracking": tracking, "posture": posture}
     torch.manual_seed(0)
     controller = build_controller(options, 2, 2, labelled).eval()
+    if METHODS[method].keeps_posture:  # its scales are those of its labels
+        controller.posture.set_scales(torch.randn(9, 3), torch.randn(9, 2))
     restored = build_controller(options, 2, 2).eval()
     restored.load_state_dict(controller.state_dict())
     states = data["state"][:32].reshape(2, 16, 2)

@@ -29,7 +29,9 @@ def make(name, data):
         "commands": [0, 1],
         "actions": [0, 1],
     }  # read by methods that follow plans by prediction
-    return build_controller({"method": name, "preset": "default", "revised": True, "tracking": tracking}, 3, 2, data)
+    posture = {"state_dim": 3, "commands": [0, 1], "actions": [0, 1]}
+    options = {"method": name, "preset": "default", "revised": True, "tracking": tracking, "posture": posture}
+    return build_controller(options, 3, 2, data)
 
 
 def same(first, second):

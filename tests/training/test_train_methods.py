@@ -43,10 +43,11 @@ def train_tiny(out, demonstrations, planner, method, **options):
     return train(TrainConfig(out=out, dataset=str(demonstrations), method=method, **options))
 
 
-def poisoned(data, budget, *, inside=False):
+def poisoned(data, budget, *, inside=False, told=False):
     """Fully labelled data whose actions and commands outside the budget are senseless; or whose labels are others.
 
-    Of a trajectory with a hidden action all commands are: their differences are its actions.
+    Of a trajectory with a hidden action all commands are: their differences are its actions. But for those of labelled
+    steps where a label tells the command too.
     """
     labelled = budget.apply(data, command=TASK.command_columns)[0]
     data = data.clone()
@@ -55,7 +56,8 @@ def poisoned(data, budget, *, inside=False):
         return data
     data["action"] = torch.where(labelled["has_action"], data["action"], POISON)
     for key in ("observation", ("next", "observation")):
-        data[key] = torch.where(labelled[key].isnan(), POISON, data[key])
+        kept = labelled["has_action"] if told and key == "observation" else torch.zeros_like(labelled["has_action"])
+        data[key] = torch.where(labelled[key].isnan() & ~kept, POISON, data[key])
     return data
 
 
@@ -73,7 +75,8 @@ def test_no_weight_of_any_method_depends_on_a_hidden_label(
 ):
     budget = LabelBudget(2, unit=unit, seed=0, window=16, history=2)
     real = load_demonstrations(str(demonstrations), TASK)
-    variants = {"clean": real, "outside": poisoned(real, budget), "inside": poisoned(real, budget, inside=True)}
+    outside = poisoned(real, budget, told=METHODS[method].keeps_posture)
+    variants = {"clean": real, "outside": outside, "inside": poisoned(real, budget, inside=True)}
     kept = budget.apply(real)[0]["has_action"].squeeze(-1)
     assert (variants["outside"]["action"][~kept] == POISON).all() and 0 < kept.sum() < len(kept)
     assert torch.equal(variants["outside"]["action"][kept], real["action"][kept])

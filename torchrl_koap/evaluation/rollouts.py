@@ -22,6 +22,7 @@ from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.policies.command_leash import CommandLeash
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
+from torchrl_koap.modules.policies.posture_tracking import PostureTracking
 from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
 from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
 from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
@@ -46,7 +47,8 @@ def make_policy(
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two.
 
-    A controller that has a ``response`` follows plans by it (:class:`~torchrl_koap.modules.PredictiveTracking`).
+    A controller that has a ``response`` follows plans by it (:class:`~torchrl_koap.modules.PredictiveTracking`), and so
+    does one with a ``posture`` (:class:`~torchrl_koap.modules.PostureTracking`).
 
     Args:
         planner (StatePlanner): the planner.
@@ -63,9 +65,10 @@ def make_policy(
         candidates (int): plans sampled whenever one is due.
         choice (str): the rule by which one of them is taken.
     """
-    response = getattr(controller, "response", None)
+    response, posture = getattr(controller, "response", None), getattr(controller, "posture", None)
     frames = [planner.history, controller.num_past + 1] + ([] if response is None else [response.history])
     kind = PlanThenControl if response is None else partial(PredictiveTracking, response=response)
+    kind = kind if posture is None else partial(PostureTracking, posture=posture)
     return kind(
         planner,
         controller,

@@ -195,7 +195,8 @@ def execution_of(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:
     own = dict(trained.task.defaults.execution)
     if trained.planner is None or config.controller == "oracle":  # chunks are executed as they are; an oracle looks
         own.pop("execution", None)
-    if config.controller == "oracle" or trained.method.tracks:  # they know what they commanded, and how it is answered
+    knows = trained.method.tracks or trained.method.keeps_posture
+    if config.controller == "oracle" or knows:  # they know what they commanded, and how it is answered
         own.pop("action_gain", None)
     asked = {name: getattr(config, name) for name in options if getattr(config, name) is not None}
     return options | own | asked

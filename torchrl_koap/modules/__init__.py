@@ -16,6 +16,7 @@ from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.unet import TemporalUnet
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.koopman.command_posture import CommandPosture
 from torchrl_koap.modules.koopman.command_response import CommandResponse
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import (
@@ -33,6 +34,7 @@ from torchrl_koap.modules.policies.asynchronous import AsynchronousAgent
 from torchrl_koap.modules.policies.command_leash import CommandLeash
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
 from torchrl_koap.modules.policies.policy_env import PolicyEnv, SeededNoise
+from torchrl_koap.modules.policies.posture_tracking import PostureTracking
 from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
 from torchrl_koap.modules.policies.receding_horizon import RecedingHorizonPolicy, policy_transforms
 from torchrl_koap.modules.policies.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
@@ -44,6 +46,7 @@ __all__ = [
     "AsynchronousAgent",
     "ChunkedPolicy",
     "CommandLeash",
+    "CommandPosture",
     "CommandResponse",
     "DiffusionPolicy",
     "EpisodeNoise",
@@ -66,6 +69,7 @@ __all__ = [
     "Normalizer",
     "PlanThenControl",
     "PolicyEnv",
+    "PostureTracking",
     "PredictiveTracking",
     "PrincipalInverseDynamics",
     "QuantizedInverseDynamics",

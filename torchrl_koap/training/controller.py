@@ -25,6 +25,7 @@ from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.method import COEFFICIENTS, LABELLED_SHARES, Method, Phase
 from torchrl_koap.training.planner import augmentation, planner_weight_decay, training_dtype
+from torchrl_koap.training.posture import POSTURE_SHARE, UPDATES, fit_posture
 from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.resolved import ResolvedConfig
 from torchrl_koap.training.response import fit_response
@@ -82,6 +83,10 @@ def learn_actions(
         controller, fit, values = _train_network(train_one, method, resolved.controller, view)
         if method.tracks:
             fit = fit | {"response": fit_response(controller.response, data)}
+        if method.keeps_posture:
+            own = min(resolved.options.controller_steps, resolved.options.steps)
+            updates = min(max(POSTURE_SHARE * own, 1), UPDATES)
+            fit = fit | {"posture": fit_posture(controller.posture, data, updates=updates)}
     else:
         controller, values = _train_policy(train_one, resolved, data)
     values["updates"] = train_one.updates

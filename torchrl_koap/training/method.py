@@ -81,6 +81,9 @@ class Method:
         tracks (bool): its controller has a ``response`` (:class:`~torchrl_koap.modules.CommandResponse`), which is
             fitted to the labelled steps; plans are followed by it (:class:`~torchrl_koap.modules.PredictiveTracking`);
             ``build`` finds its columns under ``"tracking"`` of the options.
+        keeps_posture (bool): its controller has a ``posture`` (:class:`~torchrl_koap.modules.CommandPosture`), fitted
+            to the commands of labelled steps; plans are followed by it
+            (:class:`~torchrl_koap.modules.PostureTracking`); ``build`` finds it under ``"posture"``.
         earlier (str): the method that runs hold which name this one but were trained before it was what it is now:
             those whose ``controller`` entry does not say ``"revised"``.
 
@@ -108,6 +111,7 @@ class Method:
     presets: tuple[str, ...] = ("default",)
     earlier: str = ""
     tracks: bool = False
+    keeps_posture: bool = False
 
     def __post_init__(self):
         lookup(KINDS, self.kind, "kind of method")

@@ -28,6 +28,7 @@ from torchrl.objectives import LossModule
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import (
     PRESETS,
+    CommandPosture,
     CommandResponse,
     LinearInverseDynamics,
     NonlinearInverseDynamics,
@@ -69,6 +70,12 @@ def _koap(state_dim, action_dim, normalizers, options, **overrides):
 def _koap_mpc(state_dim, action_dim, normalizers, options):
     model = _koap(state_dim, action_dim, normalizers, options)
     model.response = CommandResponse(**options["tracking"])
+    return model
+
+
+def _koap_posture(state_dim, action_dim, normalizers, options):
+    model = _koap(state_dim, action_dim, normalizers, options)
+    model.posture = CommandPosture(**options["posture"])
     return model
 
 
@@ -165,6 +172,15 @@ for _method in (
         closed_form=True,
         presets=_ANY_PRESET,
         tracks=True,
+    ),
+    Method(
+        "koap_posture",
+        "KOAP, plans followed by the commands of their states",
+        _koap_posture,
+        (Phase("controller", without_actions),),
+        closed_form=True,
+        presets=_ANY_PRESET,
+        keeps_posture=True,
     ),
     Method("koap_sgd", "KOAP, decoder trained with the rest", _koap, _JOINT, other_decoder="koap", presets=_ANY_PRESET),
     Method("koap_paper", "KOAP as in the paper", _koap, _JOINT, presets=("paper",)),

@@ -19,6 +19,7 @@ from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.loggers import check_logger
 from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
 from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.posture import posture_columns
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.response import tracked_columns
 from torchrl_koap.training.run_directory import RunDirectory
@@ -135,6 +136,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         controller["revised"] = True
     if method.tracks:
         controller["tracking"] = tracked_columns(task)
+    if method.keeps_posture:
+        controller["posture"] = posture_columns(task)
     if len(task.absolute_actions) == task.action_dim and not task.action_targets:
         controller["absolute"] = True
     return ResolvedConfig(

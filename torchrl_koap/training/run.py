@@ -24,6 +24,7 @@ from torchrl_koap.training.digests import forget_digests, write_digests
 from torchrl_koap.training.loggers import close_logger, make_logger
 from torchrl_koap.training.planner import train_planner
 from torchrl_koap.training.plugins import load_plugins
+from torchrl_koap.training.posture import with_label_commands
 from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.provenance import fingerprint, to_json
 from torchrl_koap.training.resolved import ResolvedConfig, resolve
@@ -87,6 +88,8 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         options = resolved.options
         content["label_fraction"] = options.label_fraction
         labelled, report = resolved.budget.apply(data, command=task.command_columns)
+        if resolved.method.keeps_posture:
+            labelled = with_label_commands(labelled, data, task.command_columns)
         # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
         labelled = subsample_trajectories(labelled, options.observation_fraction).to(options.device)
         content["data"] = fingerprint(labelled)

@@ -91,7 +91,7 @@ def test_those_who_know_what_they_commanded_go_without(tracks, controller, gain)
     task = get_task("po_sorting")
     own = task.defaults.execution["action_gain"]
     assert own > 1
-    trained = SimpleNamespace(task=task, planner=object(), method=SimpleNamespace(tracks=tracks))
+    trained = SimpleNamespace(task=task, planner=object(), method=SimpleNamespace(tracks=tracks, keeps_posture=False))
     assert execution_of(trained, EvalConfig(controller=controller))["action_gain"] == (own if gain else 1.0)
     assert execution_of(trained, EvalConfig(controller="oracle"))["action_gain"] == 1.0
     assert execution_of(trained, EvalConfig(controller=controller, action_gain=1.4))["action_gain"] == 1.4

@@ -1,0 +1,93 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Fitting the commands of a state: on labelled steps alone, and on what belongs to them."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.data import LabelBudget, flatten_trajectories
+from torchrl_koap.modules import CommandPosture
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training import TrainConfig, resolve
+from torchrl_koap.training.posture import LABEL_COMMAND, fit_posture, posture_columns, with_label_commands
+
+
+def recordings(episodes: int = 6, length: int = 60) -> TensorDict:
+    """Two commands that are functions of one seen number: observation is commands and that number."""
+    torch.manual_seed(0)
+    observed, actions = [], []
+    for _ in range(episodes):
+        x = torch.rand(1) + torch.linspace(0, 1, length + 1)
+        command = torch.stack([x, (3 * x).sin()], -1)
+        observed.append(torch.cat([command, x.unsqueeze(-1)], -1))
+        actions.append(command.diff(dim=0))
+    data = flatten_trajectories(observed, actions)
+    return data.set("state", data["observation"][:, 2:])
+
+
+def posture() -> CommandPosture:
+    torch.manual_seed(0)
+    return CommandPosture(1, [0, 1], [0, 1], width=32)
+
+
+def test_commands_are_found_from_windows():
+    data = recordings()
+    labelled = LabelBudget(0.1, unit="window", window=8, history=2).apply(data, command=slice(0, 2))[0]
+    assert labelled["observation"][:, :2].isnan().all()
+    module = posture()
+    found = fit_posture(module, with_label_commands(labelled, data, slice(0, 2)), updates=600)
+    assert found["labels_used"] == found["commands_told"] == int(labelled["has_action"].sum())
+    x = torch.linspace(0.5, 1.3, 9).unsqueeze(-1)
+    torch.testing.assert_close(module(x), torch.cat([x, (3 * x).sin()], -1), atol=0.08, rtol=0)
+
+
+def test_trajectories_that_are_labelled_throughout_need_nothing_added():
+    labelled = LabelBudget(2).apply(recordings(), command=slice(0, 2))[0]
+    found = fit_posture(posture(), labelled, updates=20)
+    assert found["labels_used"] == int(labelled["has_action"].sum()) and found["commands_told"] == 0
+
+
+def test_steps_without_label_are_not_read():
+    data = recordings()
+    budget = LabelBudget(0.1, unit="window", window=8, history=2)
+    weights = []
+    for other in (data, data.clone()):
+        free = ~budget.apply(data)[0]["has_action"].reshape(-1)
+        if weights:
+            other["observation"][free] = 1e6
+            other["action"][free] = 1e6
+        labelled = with_label_commands(budget.apply(other, command=slice(0, 2))[0], other, slice(0, 2))
+        assert labelled[LABEL_COMMAND][free].isnan().all() and labelled[LABEL_COMMAND][~free].isfinite().all()
+        module = posture()
+        torch.manual_seed(1)
+        fit_posture(module, labelled, updates=20)
+        weights.append(torch.cat([value.flatten() for value in module.state_dict().values()]))
+    assert torch.equal(*weights)
+
+
+def test_without_a_known_command_it_says_so():
+    labelled = LabelBudget(0.1, unit="window", window=8, history=2).apply(recordings(), command=slice(0, 2))[0]
+    with pytest.raises(ValueError, match="labelled steps whose command is known"):
+        fit_posture(posture(), labelled)
+
+
+def test_columns_of_tasks():
+    columns = posture_columns(get_task("stacking_unobserved_joints"))
+    assert columns["commands"] == columns["actions"] == list(range(7))
+    assert columns["gripper"] == [7, 3] and columns["state_dim"] == 19
+    assert CommandPosture(**columns, width=4).num_axes == 7
+    assert posture_columns(get_task("avoiding"))["gripper"] is None
+    assert posture_columns(get_task("stacking"))["gripper"] == [7, 7]
+
+
+def test_tasks_whose_actions_are_commands_are_refused():
+    with pytest.raises(ValueError, match="scooping"):
+        resolve(TrainConfig(out="", task="scooping", method="koap_posture"), get_task("scooping"))
+
+
+def test_a_run_says_what_its_posture_reads():
+    resolved = resolve(TrainConfig(out="", method="koap_posture"), get_task("avoiding"))
+    assert resolved.controller["posture"]["commands"] == [0, 1]
+    assert not math.isnan(sum(resolved.controller["posture"]["actions"]))

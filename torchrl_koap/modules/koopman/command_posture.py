@@ -1,0 +1,112 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The commands that demonstrations had in a state: a lifting whose steps are latent actions that can be summed up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_koap.modules.normalizer import Normalizer
+from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
+
+
+class CommandPosture(nn.Module):
+    r"""Decodes the command in force, not its change, from a lifted state.
+
+    .. math::
+        c_t = W g(x_t) + b, \qquad a_t = c_{t+1} - c_t = W (z_{t+1} - z_t) = W u_t, \quad z_t = g(x_t)
+
+    which is Koopman inverse dynamics (KOAP, section 4) with the operator ``K = 1``: the latent action is the step of
+    the lifted state, and its sum over a path depends on the path's ends alone. Where actions move more than is seen, as
+    a joint does that turns the hand about the tool, changes that are decoded one by one add up to a posture that no
+    demonstration had, and nothing observed tells; a command that is decoded whole says where it ought to be.
+
+    Args:
+        state_dim (int): columns of the state ``d``.
+        commands (sequence of int): columns of the observation that repeat the commands ``[J]``.
+        actions (sequence of int): columns of the action that change them ``[J]``.
+
+    Keyword Args:
+        gripper (tuple of int, optional): action column of a gripper and state column of its width, whose number a
+            policy reads off the planned widths.
+        relative (sequence): what the lifting reads besides: ``((place), (origin), (yaw), (other yaw))`` of first and
+            last-plus-one columns each, the last two None where there is no such angle
+            (:class:`~torchrl_koap.tasks.relative_positions.RelativePosition`).
+        width (int): of the lifting ``g``, a perceptron, and of ``z``. Defaults to ``256``.
+        depth (int): its hidden layers. Defaults to ``3``.
+
+    Raises:
+        ValueError: if a size is below 1, or the columns of commands and actions differ in number.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import CommandPosture
+        >>> posture = CommandPosture(4, [0, 1], [0, 1], relative=[((0, 2), (2, 4), None, None)], width=8)
+        >>> posture.set_scales(torch.randn(9, 4), torch.randn(9, 2))
+        >>> posture(torch.zeros(5, 4)).shape
+        torch.Size([5, 2])
+    """
+
+    def __init__(
+        self,
+        state_dim: int,
+        commands: Sequence[int],
+        actions: Sequence[int],
+        *,
+        gripper: Sequence[int] | None = None,
+        relative: Sequence = (),
+        width: int = 256,
+        depth: int = 3,
+    ):
+        super().__init__()
+        if len(commands) != len(actions):
+            raise ValueError(f"got {len(commands)} columns of commands and {len(actions)} of actions that change them")
+        for name, size in {"state_dim": state_dim, "commands": len(commands), "width": width, "depth": depth}.items():
+            if size < 1:
+                raise ValueError(f"{name} must be at least 1, got {size}")
+        self.commands, self.actions = list(commands), list(actions)
+        self.gripper = None if gripper is None else tuple(gripper)
+        pairs = [RelativePosition(*(None if part is None else slice(*part) for part in pair)) for pair in relative]
+        self.features = RelativePositionFeatures(pairs) if pairs else None
+        size = state_dim + (self.features.num_features if self.features is not None else 0)
+        layers: list[nn.Module] = []
+        for _ in range(depth):
+            layers += [nn.Linear(size, width), nn.SiLU()]
+            size = width
+        self.lifting, self.decoder = nn.Sequential(*layers), nn.Linear(size, len(actions))
+        self.inputs, self.outputs = Normalizer(), Normalizer()
+
+    @property
+    def num_axes(self) -> int:
+        """``J``."""
+        return self.decoder.out_features
+
+    def set_scales(self, states: Tensor, commands: Tensor) -> None:
+        """Takes mean and standard deviation of what is read and of what is decoded.
+
+        Args:
+            states (Tensor): ``[N, d]``.
+            commands (Tensor): ``[N, J]``.
+        """
+        self.inputs = Normalizer.fit(self._read(states), mode="standard")
+        self.outputs = Normalizer.fit(commands, mode="standard")
+
+    def scaled(self, states: Tensor) -> Tensor:
+        """Commands ``[*B, J]`` in units of their standard deviation."""
+        return self.decoder(self.lifting(self.inputs(self._read(states))))
+
+    def forward(self, states: Tensor) -> Tensor:
+        """The commands in force.
+
+        Args:
+            states (Tensor): ``[*B, d]``, raw units.
+
+        Returns:
+            Tensor: ``[*B, J]``, the unit of the commands.
+        """
+        return self.outputs.inverse(self.scaled(states))
+
+    def _read(self, states: Tensor) -> Tensor:
+        return states if self.features is None else torch.cat([states, self.features(states.unsqueeze(-2))], -1)
