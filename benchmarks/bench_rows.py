@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
-from result_rows import SOURCE, read_rows, share, table
+from result_rows import SOURCE, percent, read_rows, share, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layout_rows, paper_entries
-from torchrl_koap.studies.paper_results import paper_cells, paper_levels
+from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels
 from torchrl_koap.studies.paper_tables import PAPER_TASKS
 from torchrl_koap.studies.table import read_cells
 
@@ -42,9 +43,12 @@ def paper_size() -> str:
     return str(sum(cell.task != "stacking_1" for number in (1, 2) for cell in paper_cells(number)))
 
 
-def bench_sentence(name: str) -> str:
-    """In how many cells of a comparison KOAP is above the paper's."""
-    above, both = above_the_paper(paper_entries(read_cells(CELLS / f"{name}.csv")))
+def bench_sentence(name: str, method: str = "") -> str:
+    """In how many cells of a comparison KOAP is above the paper's, or another method above the paper's KOAP."""
+    entries = paper_entries(read_cells(CELLS / f"{name}.csv"))
+    if method:
+        entries = [replace(entry, paper=paper_cell(entry.task, "koap", entry.level)) for entry in entries]
+    above, both = above_the_paper(entries, method or "koap")
     return f"{above} of {both}"
 
 
@@ -105,6 +109,16 @@ def worst_action(task: str) -> str:
 def plan_error(task: str) -> str:
     """How far the first step of plans is from what was recorded, in mm."""
     return read_rows("noise_answers", task=task)[0]["plan_error_mm"]
+
+
+def posture_table() -> str:
+    """Success of a controller of Stacking without joints of which parts are replaced."""
+    words = {"decoded": "by the controller", "planned": "off the planned widths", "posture": "of the posture's steps"}
+    body = []
+    for row in read_rows("hidden_posture"):
+        pull = row["pull"] if float(row["pull"]) else "none"
+        body.append([words[row["gripper"]], words[row["motion"]], pull, f"{percent(row)} of {row['n']}"])
+    return table(["gripper", "motion of the joints", "pull towards the posture", "success"], body)
 
 
 def bench_cost(name: str) -> str:

@@ -25,6 +25,7 @@ from bench_rows import (
     paper_levels_table,
     paper_size,
     plan_error,
+    posture_table,
     worst_action,
 )
 from fault_rows import kill_rows, ledger_rows, raw_rows, resume_rows, soak_rows, version_rows
@@ -114,6 +115,7 @@ _PAPER = (
     bench_cost,
     noise_share,
     plan_error,
+    posture_table,
     worst_action,
 )
 _UNLABELLED = (followed, followed_rows, unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)

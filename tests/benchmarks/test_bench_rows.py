@@ -38,6 +38,21 @@ def test_averages_have_the_interval_of_a_single_cell_and_need_all_levels(rows, t
     assert rows.bench_cost("made") == "0.1 hours (1.0 minutes a cell)"
 
 
+def test_another_method_is_counted_against_the_papers_koap(rows, tmp_path):
+    cells = [cell("koap", 0.02, 60), cell("pca", 0.02, 60), cell("pca", 0.05, 40), cell("koap", 0.05, 60)]
+    write_cells(tmp_path / "made.csv", cells)
+    assert rows.bench_sentence("made") == "2 of 2"
+    assert rows.bench_sentence("made", "pca") == "1 of 2"  # the paper's KOAP has 78.0 and 98.05 %
+
+
+def test_replaced_parts_of_a_controller_are_a_table(rows, monkeypatch, tmp_path):
+    kept = {"gripper": "planned", "motion": "decoded", "pull": "0.0", "n": "60", "successes": "3"}
+    pulled = kept | {"motion": "posture", "pull": "0.3", "successes": "30"}
+    monkeypatch.setattr(rows, "read_rows", lambda name: [kept, pulled])
+    _, _, first, second = rows.posture_table().splitlines()
+    assert "| none |" in first and "| 0.3 | 50.0 % (37.7-62.3) of 60 |" in second
+
+
 def test_noise_of_the_frames_is_told_as_a_share_of_the_actions(benchmark_script, monkeypatch, tmp_path):
     script = benchmark_script("noise_answers")
     steps = torch.arange(120)

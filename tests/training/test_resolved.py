@@ -18,7 +18,7 @@ class TestTheTasksMethod:
             ("avoiding", "koap"),
             ("stacking", "koap_mpc"),
             ("stacking_1", "koap_mpc"),
-            ("stacking_unobserved_joints", "koap"),
+            ("stacking_unobserved_joints", "koap_posture"),
         ],
     )
     def test_is_trained_unless_another_is_asked_for(self, task, method):

@@ -141,7 +141,7 @@ register_task(
         robot=tuple(range(4)),  # position of the tool, width of the gripper
         tool_kinematics=None,
         gripper=None,
-        defaults=replace(_STACKING.defaults, method="koap"),  # what the commands move is not seen
+        defaults=replace(_STACKING.defaults, method="koap_posture"),  # what the commands move is not seen
         in_paper=True,
     )
 )

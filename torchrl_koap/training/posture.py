@@ -15,8 +15,8 @@ from torchrl_koap.tasks import Task
 from torchrl_koap.training.progress import progress_bar
 
 LABEL_COMMAND = "label_command"  # commands in force at labelled steps [N, J], NaN elsewhere
-POSTURE_SHARE = 8  # updates of a posture for each of the controller's, up to UPDATES
-UPDATES, BATCH, RATE, WEIGHT_DECAY = 4000, 512, 2e-3, 1e-4
+POSTURE_SHARE = 16  # updates of a posture for each of the controller's, up to UPDATES
+UPDATES, BATCH, RATE, WEIGHT_DECAY = 8000, 512, 2e-3, 1e-4
 
 
 def posture_columns(task: Task) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def fit_posture(posture: CommandPosture, data: TensorDictBase, *, updates: int =
             observation, which the budget leaves in trajectories that are labelled throughout.
 
     Keyword Args:
-        updates (int): of 512 steps each. Defaults to ``4000``.
+        updates (int): of 512 steps each. Defaults to ``8000``.
 
     Returns:
         dict: ``labels_used``; ``commands_told``, how many of them told a command that the budget blanks because it is
