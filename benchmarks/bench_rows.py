@@ -52,6 +52,12 @@ def bench_sentence(name: str, method: str = "") -> str:
     return f"{above} of {both}"
 
 
+def first_successes(name: str, task: str, method: str) -> str:
+    """Successes of a method at the lowest label level of a task, of how many rollouts."""
+    row = min((r for r in _done(name) if (r["task"], r["method"]) == (task, method)), key=lambda r: r["fraction"])
+    return f"{row['successes']} of {row['episodes']}"
+
+
 def bench_size(name: str) -> str:
     """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
     cells = _done(name)
