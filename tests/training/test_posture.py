@@ -67,6 +67,12 @@ def test_steps_without_label_are_not_read():
     assert torch.equal(*weights)
 
 
+def test_commands_that_nobody_hid_count_at_labelled_steps_alone():
+    data = recordings()
+    data["has_action"] = (data["step_count"] < 7).reshape(-1, 1)
+    assert fit_posture(posture(), data, updates=2)["labels_used"] == 6 * 7
+
+
 def test_without_a_known_command_it_says_so():
     labelled = LabelBudget(0.1, unit="window", window=8, history=2).apply(recordings(), command=slice(0, 2))[0]
     with pytest.raises(ValueError, match="labelled steps whose command is known"):

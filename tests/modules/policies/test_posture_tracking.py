@@ -87,6 +87,9 @@ def test_a_gripper_opens_by_the_planned_widths():
     plan[:, :, 1] = torch.linspace(0.03, 0.08, 14).clamp_max(0.08) + torch.tensor([0.05] * 14)
     assert policy._replaced(torch.zeros(1, 5, 5), history, plan, torch.zeros(1, 1, 3))[0, 0, 2] >= 0.075
 
+    history[..., 1], plan[:, :, 1] = 0.08, torch.linspace(0.06, 0.03, 14)
+    assert policy._replaced(torch.zeros(1, 5, 5), history, plan, torch.zeros(1, 1, 3))[0, 0, 2] == plan[0, 0, 1]
+
 
 @pytest.mark.parametrize(
     ("options", "named"), [({"pull": 1.5}, "pull"), ({"pull": -0.1}, "pull"), ({"execution": "open_loop"}, "execution")]
