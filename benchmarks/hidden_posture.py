@@ -30,8 +30,9 @@ from torchrl_koap.evaluation.run import place_of
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.evaluation.trained_run import load_policy, load_run
 from torchrl_koap.modules import CommandPosture, PlanThenControl, PostureTracking
+from torchrl_koap.tasks.action_rules import ActionRule
 from torchrl_koap.training.datasets import load_demonstrations
-from torchrl_koap.training.posture import fit_posture, posture_columns
+from torchrl_koap.training.posture import build_posture, fit_posture, posture_columns
 
 TABLE = Path(__file__).parent / "results" / "hidden_posture.csv"
 COLUMNS = ("task", "run", "gripper", "motion", "pull", "seed", "n", "successes", "low", "high")
@@ -50,10 +51,8 @@ class Replaced(PostureTracking):
 
     def _replaced(self, observed: Tensor, history: Tensor, plan: Tensor, action: Tensor) -> Tensor:
         changed = super()._replaced(observed, history, plan, action)
-        joints, gripper = self.posture.actions, self.posture.gripper[0]
-        if self.parts[0] == "decoded":
-            changed[..., gripper] = action[..., gripper]
         if self.parts[1] == "decoded":
+            joints = self.posture.actions
             now, command = history[..., -1, :], observed[..., -1:, self.posture.commands]
             pulled = self.pull * (self.posture(now).unsqueeze(-2) - command)
             changed[..., joints] = action[..., joints] + pulled.to(action)
@@ -64,6 +63,7 @@ def replace_parts(policy: PlanThenControl, posture: CommandPosture, variant: tup
     """Turns a loaded policy into one whose parts are those of a variant."""
     policy.__class__ = Replaced
     policy.posture, policy.parts, policy.pull = posture, variant[:2], variant[2]
+    policy.action_rule = ActionRule(posture.gripper) if variant[0] == "planned" else None
 
 
 def main() -> None:
@@ -86,7 +86,7 @@ def main() -> None:
             if facts in done:
                 continue
             if posture is None:
-                posture = CommandPosture(**posture_columns(task))
+                posture = build_posture(posture_columns(task))
                 fit_posture(posture, load_demonstrations(options.dataset, task))
             config = EvalConfig(episodes=options.episodes, seed=seed)
             place, policy = place_of(task, config), load_policy(run, config)

@@ -11,7 +11,13 @@ from torchrl_koap.data import LabelBudget, flatten_trajectories
 from torchrl_koap.modules import CommandPosture
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import TrainConfig, resolve
-from torchrl_koap.training.posture import LABEL_COMMAND, fit_posture, posture_columns, with_label_commands
+from torchrl_koap.training.posture import (
+    LABEL_COMMAND,
+    build_posture,
+    fit_posture,
+    posture_columns,
+    with_label_commands,
+)
 
 
 def recordings(episodes: int = 6, length: int = 60) -> TensorDict:
@@ -83,7 +89,7 @@ def test_columns_of_tasks():
     columns = posture_columns(get_task("stacking_unobserved_joints"))
     assert columns["commands"] == columns["actions"] == list(range(7))
     assert columns["gripper"] == [7, 3] and columns["state_dim"] == 19
-    assert CommandPosture(**columns, width=4).num_axes == 7
+    assert build_posture(columns).num_axes == 7
     assert posture_columns(get_task("avoiding"))["gripper"] is None
     assert posture_columns(get_task("stacking"))["gripper"] == [7, 7]
 

@@ -27,6 +27,7 @@ from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
 from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
 from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
 from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.action_rules import ActionRule
 from torchrl_koap.training.response import tracked_columns
 
 AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
@@ -48,7 +49,8 @@ def make_policy(
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two.
 
     A controller that has a ``response`` follows plans by it (:class:`~torchrl_koap.modules.PredictiveTracking`), and so
-    does one with a ``posture`` (:class:`~torchrl_koap.modules.PostureTracking`).
+    does one with a ``posture`` (:class:`~torchrl_koap.modules.PostureTracking`). The number of its gripper is read off the
+    planned widths where no other rule is given.
 
     Args:
         planner (StatePlanner): the planner.
@@ -68,7 +70,10 @@ def make_policy(
     response, posture = getattr(controller, "response", None), getattr(controller, "posture", None)
     frames = [planner.history, controller.num_past + 1] + ([] if response is None else [response.history])
     kind = PlanThenControl if response is None else partial(PredictiveTracking, response=response)
-    kind = kind if posture is None else partial(PostureTracking, posture=posture)
+    if posture is not None:
+        kind = partial(PostureTracking, posture=posture)
+        if action_rule is None and posture.gripper is not None:
+            action_rule = ActionRule(posture.gripper)
     return kind(
         planner,
         controller,

@@ -28,7 +28,6 @@ from torchrl.objectives import LossModule
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import (
     PRESETS,
-    CommandPosture,
     CommandResponse,
     LinearInverseDynamics,
     NonlinearInverseDynamics,
@@ -51,6 +50,7 @@ from torchrl_koap.objectives import (
 from torchrl_koap.training.diffusion_builders import build_diffusion_policy
 from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.plugins import load_entry_points
+from torchrl_koap.training.posture import build_posture
 
 LOOK_AHEAD = (1, 2, 3, 4, 5)
 GROUP = "torchrl_koap.methods"  # of entry points
@@ -75,7 +75,7 @@ def _koap_mpc(state_dim, action_dim, normalizers, options):
 
 def _koap_posture(state_dim, action_dim, normalizers, options):
     model = _koap(state_dim, action_dim, normalizers, options)
-    model.posture = CommandPosture(**options["posture"])
+    model.posture = build_posture(options["posture"])
     return model
 
 

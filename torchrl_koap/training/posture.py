@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, STATE
 from torchrl_koap.modules import CommandPosture
 from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
 from torchrl_koap.training.progress import progress_bar
 
 LABEL_COMMAND = "label_command"  # commands in force at labelled steps [N, J], NaN elsewhere
@@ -20,7 +21,7 @@ UPDATES, BATCH, RATE, WEIGHT_DECAY = 8000, 512, 2e-3, 1e-4
 
 
 def posture_columns(task: Task) -> dict[str, Any]:
-    """What a :class:`~torchrl_koap.modules.CommandPosture` of a task is built with.
+    """What a :class:`~torchrl_koap.modules.CommandPosture` of a task is built with (:func:`build_posture`).
 
     The number of a gripper is read off planned widths where the task says so (``Task.gripper``), and where an absolute
     action ``name`` has its width in the state, as the part ``name_width``.
@@ -63,6 +64,18 @@ def _gripper(task: Task) -> list[int] | None:
         return list(task.gripper)
     widths = [(i, task.state_slices.get(f"{name}_width")) for i, name in enumerate(task.actions)]
     return next(([i, part.start] for i, part in widths if part is not None), None)
+
+
+def build_posture(columns: dict[str, Any]) -> CommandPosture:
+    """The module that :func:`posture_columns` describes.
+
+    Args:
+        columns (dict): as there, or as a run's ``config.json`` has it.
+    """
+    own = dict(columns)
+    pairs = [[None if part is None else slice(*part) for part in pair] for pair in own.pop("relative", ())]
+    features = RelativePositionFeatures([RelativePosition(*pair) for pair in pairs]) if pairs else None
+    return CommandPosture(**own, features=features)
 
 
 def _ends(part: slice | None) -> list[int] | None:

@@ -6,7 +6,17 @@ import torch
 
 from torchrl_koap.modules import CommandPosture
 
-PLACES = [((0, 2), (2, 4), None, None)]
+
+class Gap(torch.nn.Module):
+    """From the last two columns to the first two."""
+
+    num_features = 2
+
+    def forward(self, history):
+        return history[..., -1, :2] - history[..., -1, 2:]
+
+
+GAP = Gap()
 
 
 def a_posture(**options) -> CommandPosture:
@@ -18,7 +28,7 @@ def a_posture(**options) -> CommandPosture:
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 0, 4)])
 def test_any_number_of_batch_dimensions(batch):
-    assert a_posture(relative=PLACES)(torch.randn(*batch, 4)).shape == (*batch, 3)
+    assert a_posture(features=GAP)(torch.randn(*batch, 4)).shape == (*batch, 3)
 
 
 def test_commands_come_out_in_their_own_unit():
@@ -28,13 +38,13 @@ def test_commands_come_out_in_their_own_unit():
 def test_relative_places_are_read():
     states = torch.randn(5, 4)
     moved = states + torch.tensor([1.0, 0.0, 1.0, 0.0])  # the gap stays
-    posture = a_posture(relative=PLACES)
-    assert posture._read(states).shape[-1] > 4
+    posture = a_posture(features=GAP)
+    assert posture._read(states).shape[-1] == 6
     torch.testing.assert_close(posture._read(states)[:, 4:], posture._read(moved)[:, 4:], atol=1e-5, rtol=1e-5)
 
 
 def test_weights_and_scales_are_saved():
-    posture, fresh = a_posture(relative=PLACES), CommandPosture(4, [0, 1, 2], [1, 2, 3], relative=PLACES, width=8)
+    posture, fresh = a_posture(features=GAP), CommandPosture(4, [0, 1, 2], [1, 2, 3], features=GAP, width=8)
     fresh.load_state_dict(posture.state_dict())
     states = torch.randn(5, 4)
     assert torch.equal(posture(states), fresh(states))

@@ -5,9 +5,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_koap.evaluation.rollouts import make_policy
 from torchrl_koap.modules import CommandPosture, MLPDenoiser, PostureTracking, StatePlanner
 from torchrl_koap.modules import make_koopman_inverse_dynamics as make_controller
 from torchrl_koap.modules.policies.posture_tracking import PULL
+from torchrl_koap.tasks.action_rules import ActionRule
 
 
 class Known(CommandPosture):
@@ -78,17 +80,23 @@ def test_the_first_of_several_decoded_steps_is_the_action_of_the_step():
     torch.testing.assert_close(chunk[:, 0], policy(td)["action"])
 
 
-def test_a_gripper_opens_by_the_planned_widths():
-    policy = policy_of(Known(gripper=(2, 1)))
+@torch.no_grad()
+def test_a_gripper_is_commanded_by_the_planned_widths():
+    policy = policy_of(Known(gripper=(2, 1)), action_rule=ActionRule((2, 1)))
     history, plan = torch.zeros(1, 5, 2), torch.zeros(1, 14, 2)
     plan[:, :, 1] = torch.linspace(0.01, 0.08, 14)
-    opening = policy._replaced(torch.zeros(1, 5, 5), history, plan, torch.zeros(1, 1, 3))
-    assert opening[0, 0, 2] < 0.075  # it opens much later
-    plan[:, :, 1] = torch.linspace(0.03, 0.08, 14).clamp_max(0.08) + torch.tensor([0.05] * 14)
-    assert policy._replaced(torch.zeros(1, 5, 5), history, plan, torch.zeros(1, 1, 3))[0, 0, 2] >= 0.075
-
+    assert policy.act(history, plan)[0, 2] < 0.075  # it opens much later
+    plan[:, :, 1] = torch.linspace(0.05, 0.08, 14)
+    assert policy.act(history, plan)[0, 2] == pytest.approx(0.05)
     history[..., 1], plan[:, :, 1] = 0.08, torch.linspace(0.06, 0.03, 14)
-    assert policy._replaced(torch.zeros(1, 5, 5), history, plan, torch.zeros(1, 1, 3))[0, 0, 2] == plan[0, 0, 1]
+    assert policy.act(history, plan)[0, 2] == plan[0, 0, 1]
+
+
+def test_a_controller_with_a_posture_has_the_rule_of_its_gripper():
+    controller = make_controller(2, 3)
+    controller.posture = Known(gripper=(2, 1))
+    policy = make_policy(policy_of().planner, controller, state_columns=(3, 4))
+    assert isinstance(policy, PostureTracking) and policy.action_rule == ActionRule((2, 1))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_koap.modules.normalizer import Normalizer
-from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
 
 
 class CommandPosture(nn.Module):
@@ -31,9 +30,8 @@ class CommandPosture(nn.Module):
     Keyword Args:
         gripper (tuple of int, optional): action column of a gripper and state column of its width, whose number a
             policy reads off the planned widths.
-        relative (sequence): what the lifting reads besides: ``((place), (origin), (yaw), (other yaw))`` of first and
-            last-plus-one columns each, the last two None where there is no such angle
-            (:class:`~torchrl_koap.tasks.relative_positions.RelativePosition`).
+        features (Module, optional): what the lifting reads besides, such as relative positions: from ``[*B, 1, d]`` to
+            ``[*B, num_features]``.
         width (int): of the lifting ``g``, a perceptron, and of ``z``. Defaults to ``256``.
         depth (int): its hidden layers. Defaults to ``3``.
 
@@ -43,7 +41,7 @@ class CommandPosture(nn.Module):
     Examples:
         >>> import torch
         >>> from torchrl_koap.modules import CommandPosture
-        >>> posture = CommandPosture(4, [0, 1], [0, 1], relative=[((0, 2), (2, 4), None, None)], width=8)
+        >>> posture = CommandPosture(4, [0, 1], [0, 1], width=8)
         >>> posture.set_scales(torch.randn(9, 4), torch.randn(9, 2))
         >>> posture(torch.zeros(5, 4)).shape
         torch.Size([5, 2])
@@ -56,7 +54,7 @@ class CommandPosture(nn.Module):
         actions: Sequence[int],
         *,
         gripper: Sequence[int] | None = None,
-        relative: Sequence = (),
+        features: nn.Module | None = None,
         width: int = 256,
         depth: int = 3,
     ):
@@ -68,9 +66,8 @@ class CommandPosture(nn.Module):
                 raise ValueError(f"{name} must be at least 1, got {size}")
         self.commands, self.actions = list(commands), list(actions)
         self.gripper = None if gripper is None else tuple(gripper)
-        pairs = [RelativePosition(*(None if part is None else slice(*part) for part in pair)) for pair in relative]
-        self.features = RelativePositionFeatures(pairs) if pairs else None
-        size = state_dim + (self.features.num_features if self.features is not None else 0)
+        self.features = features
+        size = state_dim + (0 if features is None else features.num_features)
         layers: list[nn.Module] = []
         for _ in range(depth):
             layers += [nn.Linear(size, width), nn.SiLU()]

@@ -14,7 +14,6 @@ from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.koopman.command_posture import CommandPosture
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
 from torchrl_koap.modules.policies.receding_horizon import STATE_HISTORY
-from torchrl_koap.tasks.gripper import PLANNED_OPEN_ABOVE, gripper_number
 
 PULL = 0.3  # share of the distance to the posture that is gone at every step
 
@@ -28,7 +27,7 @@ class PostureTracking(PlanThenControl):
     with the decoded command ``f`` (:class:`~torchrl_koap.modules.CommandPosture`), the plan ``p`` bent into the present
     state, the command in force ``c``, which the policy knows, and the pull ``rho``. The first part moves what is seen;
     the second keeps what is not seen where demonstrations had it. Action entries that the posture does not have are
-    decoded by the controller, as in :class:`~torchrl_koap.modules.PlanThenControl`, but for a gripper's number.
+    decoded by the controller, as in :class:`~torchrl_koap.modules.PlanThenControl`.
 
     Args:
         planner (StatePlanner): plans states from the last observed ones.
@@ -122,8 +121,4 @@ class PostureTracking(PlanThenControl):
         now, command = history[..., -1, :], observed[..., -1, self.posture.commands]
         bent = blend_plan(history, plan, self.blend_decay)[..., :count, :]
         action[..., self.posture.actions] = self.follow(now, command, bent).to(action.dtype)
-        if self.posture.gripper is not None:
-            entry, column = self.posture.gripper
-            widths = torch.cat([now[..., column : column + 1], plan[..., column]], -1)
-            action[..., entry] = gripper_number(widths, open_above=PLANNED_OPEN_ABOVE)[..., :count].to(action.dtype)
         return action
