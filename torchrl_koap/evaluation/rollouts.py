@@ -48,9 +48,9 @@ def make_policy(
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two.
 
-    A controller that has a ``response`` follows plans by it (:class:`~torchrl_koap.modules.PredictiveTracking`), and so
-    does one with a ``posture`` (:class:`~torchrl_koap.modules.PostureTracking`). The number of its gripper is read off the
-    planned widths where no other rule is given.
+    A controller that has a ``response`` follows plans by it (:class:`~torchrl_koap.modules.PredictiveTracking`), one
+    with a ``posture`` by that (:class:`~torchrl_koap.modules.PostureTracking`), and the number of a gripper that the
+    posture names is read off the planned widths where no other rule is given.
 
     Args:
         planner (StatePlanner): the planner.
