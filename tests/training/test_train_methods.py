@@ -114,6 +114,7 @@ def settled(summary):
 LONGER = {"steps": 12, "controller_steps": 12}
 KILLED = {
     "koap": ["controller"],
+    "koap_posture": ["controller"],
     "pretrain": ["controller", "finetune"],
     "vae": ["controller", "decoder"],
     "lapo": ["controller", "decoder"],

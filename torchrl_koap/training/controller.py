@@ -84,8 +84,7 @@ def learn_actions(
         if method.tracks:
             fit = fit | {"response": fit_response(controller.response, data)}
         if method.keeps_posture:
-            own = min(resolved.options.controller_steps, resolved.options.steps)
-            updates = min(max(POSTURE_SHARE * own, 1), UPDATES)
+            updates = min(max(POSTURE_SHARE * train_one.controller_budget, 1), UPDATES)
             fit = fit | {"posture": fit_posture(controller.posture, data, updates=updates)}
     else:
         controller, values = _train_policy(train_one, resolved, data)
@@ -100,6 +99,7 @@ class _Training:
         self.run, self.options, self.logger, self.task = run, resolved.options, logger, resolved.task
         self.released = resolved.released
         self.epochs = resolved.task.defaults.released_epochs
+        self.controller_budget = min(self.options.controller_steps, self.options.steps)
         self.updates = 0
 
     def batch_size(self, own: int) -> int:
@@ -151,7 +151,7 @@ def _train_network(
         windows = windows[windows["has_action"].squeeze(-1).any(-1)]
     controller.fit_scales(windows["state"])
     values: dict[str, float] = {}
-    budget = min(options.controller_steps, options.steps)
+    budget = train_one.controller_budget
     table = WindowTable.build(data, window, pad_before=history)
     for phase in method.phases if budget else ():
         buffer = make_window_buffer(

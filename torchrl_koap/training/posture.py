@@ -138,8 +138,8 @@ def fit_posture(posture: CommandPosture, data: TensorDictBase, *, updates: int =
             schedule.step()
             bar.update(1)
     with torch.no_grad():
-        parts = [posture(rows) - wanted for rows, wanted in zip(states.split(8192), commands.split(8192), strict=True)]
-    error = torch.cat(parts).square().mean().sqrt().item()
+        errors = [posture(x) - c for x, c in zip(states.split(8192), commands.split(8192), strict=True)]
+    error = torch.cat(errors).square().mean().sqrt().item()
     return {"labels_used": len(states), "commands_told": told, "fit_error": float(f"{error:.4g}")}
 
 

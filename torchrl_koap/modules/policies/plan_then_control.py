@@ -160,10 +160,13 @@ class PlanThenControl(RecedingHorizonPolicy):
         Returns:
             Tensor: ``[*B, replan_interval, act]``.
         """
-        history = self.state_of(observations)
-        return self.scaled(
-            self._decode_chunk(history, self.planner.plan(history[..., -self.planner.history :, :], noise))
-        )
+        states = self.state_of(observations)
+        plan = self.planner.plan(states[..., -self.planner.history :, :], noise)
+        return self.scaled(self._decode_ahead(observations, states, plan))
+
+    def _decode_ahead(self, observations: Tensor, states: Tensor, plan: Tensor) -> Tensor:
+        """The actions of the next steps ``[*B, interval, act]``, as if every planned state was reached."""
+        return self._decode_chunk(states, plan)
 
     def act(self, history: Tensor, cached: Tensor) -> Tensor:
         """Decodes the action from what remains of the plan, or hands out the one decoded before.

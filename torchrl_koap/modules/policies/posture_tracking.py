@@ -101,19 +101,8 @@ class PostureTracking(PlanThenControl):
         followed = self._replaced(observed, history, plan, action.unsqueeze(-2))
         return tensordict.set(self.out_keys[0], followed[..., 0, :])
 
-    def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Plans and finds the actions of the next steps, as if every planned state was reached.
-
-        Args:
-            observations (Tensor): ``[*B, history, obs]``, raw units.
-            noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
-
-        Returns:
-            Tensor: ``[*B, replan_interval, act]``.
-        """
-        states = self.state_of(observations)
-        plan = self.planner.plan(states[..., -self.planner.history :, :], noise)
-        return self.scaled(self._replaced(observations, states, plan, self._decode_chunk(states, plan)))
+    def _decode_ahead(self, observations: Tensor, states: Tensor, plan: Tensor) -> Tensor:
+        return self._replaced(observations, states, plan, self._decode_chunk(states, plan))
 
     def _replaced(self, observed: Tensor, history: Tensor, plan: Tensor, action: Tensor) -> Tensor:
         """Decoded actions ``[*B, n, act]`` of the next steps with the entries that postures tell."""

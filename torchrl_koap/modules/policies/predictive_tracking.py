@@ -150,20 +150,10 @@ class PredictiveTracking(PlanThenControl):
         tracked = self.track(observed, tensordict.get(STATE_HISTORY), plan)[..., 0, :]
         return tensordict.set(self.out_keys[0], self._with_tracked(action, tracked))
 
-    def plan_and_decode(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Plans and finds the actions of the next steps, as if the robot answered as predicted.
-
-        Args:
-            observations (Tensor): ``[*B, history, obs]``, raw units.
-            noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
-
-        Returns:
-            Tensor: ``[*B, replan_interval, act]``.
-        """
-        states = self.state_of(observations)
-        plan = self.planner.plan(states[..., -self.planner.history :, :], noise)
-        actions = self._decode_chunk(states, plan)
-        return self._with_tracked(actions, self.track(observations, states, plan)[..., : self.replan_interval, :])
+    def _decode_ahead(self, observations: Tensor, states: Tensor, plan: Tensor) -> Tensor:
+        """The actions of the next steps ``[*B, interval, act]``, as if the robot answered as predicted."""
+        tracked = self.track(observations, states, plan)[..., : self.replan_interval, :]
+        return self._with_tracked(self._decode_chunk(states, plan), tracked)
 
     def _with_tracked(self, action: Tensor, tracked: Tensor) -> Tensor:
         action = action.clone()
