@@ -10,9 +10,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.data import LabelBudget, load_ted, make_demonstrations, save_demonstrations, select_state
+from torchrl_koap.data import LabelBudget, cut_windows, load_ted, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.keys import LayoutError
-from torchrl_koap.tasks import get_task
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
+from torchrl_koap.tasks import WINDOW, get_task
 from torchrl_koap.training import Recipe, TrainConfig, fit_controller, fit_planner, train
 from torchrl_koap.training.checkpoints import load_tensors
 from torchrl_koap.training.resolved import resolve
@@ -155,3 +156,29 @@ def test_a_forecast_is_the_default_without_an_environment(tmp_path):
     assert "forecast" not in entry(method="dp")
     with pytest.raises(ValueError, match="'dp' is a policy of its own and has no plans to forecast"):
         entry(method="dp", forecast=True)
+
+
+@pytest.mark.parametrize(
+    ("method", "steps", "asked"),
+    [
+        ("koap", 3, [(3, 4)]),
+        ("koap_labelled_only", 3, [(3, 1)]),
+        ("koap_untrained", 3, []),
+        ("koap", 0, []),
+    ],
+)
+def test_a_lifting_is_unfolded_for_as_many_updates_as_it_is_trained_and_on_the_same_trajectories(
+    monkeypatch, method, steps, asked
+):
+    seen = []
+
+    def unfold(lifting, windows, updates, progress):
+        seen.append((updates, len(windows)))
+
+    monkeypatch.setattr(CompactLifting, "unfold", unfold)
+    walks = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(4)]
+    wide = [np.tanh(walk @ np.random.default_rng(9).normal(size=(2, 20)) / 4) for walk in walks]
+    data, task = make_demonstrations(wide, [np.diff(walks[0], axis=0), None, None, None], control_hz=30)
+    fit_controller(data, task, method=method, preset="semi_supervised", steps=steps, progress=False)
+    own = len(cut_windows(select_state(data, task.state_of), WINDOW, pad_before=8)) // 4  # of a trajectory
+    assert [(updates, round(windows / own)) for updates, windows in seen] == asked

@@ -16,6 +16,7 @@ from torch import nn
 from torchrl_koap.data import WindowTable, cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.modules import KoopmanInverseDynamics
+from torchrl_koap.modules.koopman.compact_lifting import UNFOLD_UPDATES
 from torchrl_koap.tasks import HORIZON, WINDOW
 from torchrl_koap.training import released_settings
 from torchrl_koap.training.builders import build_controller
@@ -26,7 +27,7 @@ from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.method import COEFFICIENTS, LABELLED_SHARES, Method, Phase
 from torchrl_koap.training.planner import augmentation, planner_weight_decay, training_dtype
 from torchrl_koap.training.posture import POSTURE_SHARE, UPDATES, fit_posture
-from torchrl_koap.training.progress import progress_bar, show_losses
+from torchrl_koap.training.progress import count_up_to, progress_bar, show_losses
 from torchrl_koap.training.resolved import ResolvedConfig
 from torchrl_koap.training.response import fit_response
 from torchrl_koap.training.run_directory import RunDirectory
@@ -152,6 +153,9 @@ def _train_network(
     controller.fit_scales(windows["state"])
     values: dict[str, float] = {}
     budget = train_one.controller_budget
+    if budget and method.phases and getattr(controller, "unfolds", False):
+        with progress_bar(2 * min(budget, UNFOLD_UPDATES), "unfolding", smoothing=0.05, mininterval=0.5) as bar:
+            controller.unfold(windows["state"], min(budget, UNFOLD_UPDATES), count_up_to(bar))
     table = WindowTable.build(data, window, pad_before=history)
     for phase in method.phases if budget else ():
         buffer = make_window_buffer(

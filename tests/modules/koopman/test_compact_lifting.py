@@ -71,6 +71,17 @@ class TestNoiseAdjustedComponents:
         components.fit(torch.zeros(20, 17, 3))
         assert components(torch.ones(4, 3)).isfinite().all() and components.weights.isfinite().all()
 
+    def test_no_direction_is_free_of_noise_by_the_chance_of_few_windows(self):
+        place = turning(count=60, bodies=2).sin()
+        clean = place @ torch.randn(2, 40, generator=torch.Generator().manual_seed(3))
+        windows = clean + 0.3 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(4))
+        components = NoiseAdjustedComponents(40, 40)
+        components.fit(windows)
+        noise = components.analysis.square().sum(-1).sqrt()  # what white noise leaves in each component
+        ratio = components(clean).flatten(0, 1).std(0) / noise.clamp_min(1e-9)
+        assert ratio[:2].min() > 3 * ratio[2:].max()
+        assert components.weights[:2].min() > 5 * components.weights[2:].max()
+
     @pytest.mark.parametrize("count", [0, 5])
     def test_wrong_numbers_of_components(self, count):
         with pytest.raises(ValueError, match="num_components must be 1 to 4"):
@@ -88,6 +99,25 @@ class TestCompactLifting:
         assert (lifted.flatten(0, 1).std(0) > 1e-3).sum() == kept
         error = (lifting.decode(lifted) - windows).square().mean() / windows.var()
         assert error < 0.2
+
+    def test_a_folded_state_is_unfolded_before_it_is_trained_on(self):
+        place = torch.linspace(0, 1, 120)[:, None, None] + 0.004 * torch.arange(15)[:, None]  # [120, 15, 1]
+        windows = (-0.5 * ((place - torch.linspace(0, 1, 24)) / 0.04) ** 2).exp()
+        windows = windows + 0.02 * torch.randn(windows.shape, generator=torch.Generator().manual_seed(0))
+        torch.manual_seed(0)
+        lifting, told = CompactLifting(24, 1), []
+        lifting.fit_unlabelled(windows)
+
+        def matches():
+            lifted = lifting.small.encode(lifting.components(windows)).flatten()
+            return torch.corrcoef(torch.stack([lifted, place.flatten()]))[0, 1].abs()
+
+        assert matches() < 0.9
+        lifting.unfold(windows, 300, lambda done, wanted: told.append((done, wanted)))
+        assert matches() > 0.99
+        assert told[0] == (1, 600) and told[-1] == (600, 600)
+        error = lifting.reconstruction_error(lifting.encode(windows), windows).mean()
+        assert error < 0.3 * lifting.components(windows).square().mul(lifting.components.weights).mean()
 
     def test_training_makes_the_error_smaller(self):
         windows = embedded(turning(bodies=2).sin())

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey
@@ -11,11 +11,15 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_koap.keys import LIFTED_STATE, STATE
+from torchrl_koap.modules.koopman.geodesic_coordinates import geodesic_coordinates
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
 from torchrl_koap.modules.koopman.smoothing import noise_covariance
 
 MOST_WINDOWS = 2000  # for the covariance of the noise; neighbouring windows hold nearly the same frames
+MIN_NOISE = 0.5  # no sum of columns is believed to have less than so much of the noise that independent columns give it
 MIN_RATIO = 2.0  # a component with less variance than so many times the noise's is left out
+AVERAGED, UNFOLDED = 5, 2000  # frames of each mean, and means, that coordinates along the surface are found of
+UNFOLD_UPDATES, UNFOLD_RATE = 1000, 3e-3  # with which the networks learn these coordinates
 GAIN = 0.7  # twice the coordinates are read if they leave less than this share of the reconstruction error
 
 
@@ -82,7 +86,7 @@ class NoiseAdjustedComponents(nn.Module):
             ValueError: for windows of less than five frames.
         """
         windows = windows.flatten(0, -3)
-        noise = noise_covariance(windows[:: -(-len(windows) // MOST_WINDOWS)])
+        noise = _credible(noise_covariance(windows[:: -(-len(windows) // MOST_WINDOWS)]))
         states = windows.flatten(0, -2).double()
         states = states - states.mean(0)
         total = states.mT @ states / len(states)
@@ -101,6 +105,17 @@ class NoiseAdjustedComponents(nn.Module):
         self.analysis.copy_(analysis * (sign * kept / size)[:, None])
         self.synthesis.copy_(synthesis * (sign * kept * size))
         self.weights.copy_(torch.where(kept, ratio, 0.0) * count / ratio[kept].sum().clamp_min(1e-9))
+
+
+def _credible(noise: Tensor) -> Tensor:
+    """The covariance ``[d, d]`` of noise without directions that are free of it by the chance of few windows.
+
+    An estimate of many columns has such directions nearly always, and components that are ordered by how far they stand
+    out of the noise would follow them before all others.
+    """
+    spread = noise.diagonal().clamp_min(1e-12).sqrt()
+    values, vectors = torch.linalg.eigh(noise / spread / spread[:, None])
+    return vectors * values.clamp_min(MIN_NOISE) @ vectors.mT * spread * spread[:, None]
 
 
 class CompactLifting(KoopmanLifting):
@@ -204,6 +219,43 @@ class CompactLifting(KoopmanLifting):
             ):
                 assert linear is not None
                 linear.weight.mul_(factor)
+
+    @torch.enable_grad()
+    def unfold(
+        self, windows: Tensor, updates: int = UNFOLD_UPDATES, progress: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Trains both networks to coordinates along the surface that states lie on, and back, before any loss does.
+
+        A state that is a nonlinear picture of a few coordinates may be folded up so much that no gradient of the losses
+        unfolds it: an encoder that starts at linear components leaves states together that are far apart. These start
+        at :func:`~torchrl_koap.modules.koopman.geodesic_coordinates.geodesic_coordinates` of means of a few successive
+        frames, which have less noise than any of them.
+
+        Args:
+            windows (Tensor): ``[*B, T, d]`` in the networks' units, ``T >= 5``; no label is read.
+            updates (int): of each network. Defaults to ``1000``.
+            progress (callable, optional): called with the number of updates done and wanted, of both networks.
+        """
+        weights, components = self.components.weights, self.components(windows.flatten(0, -3)).detach()
+        spans = components.unfold(1, AVERAGED, AVERAGED).flatten(0, 1)  # [N, k, AVERAGED]
+        chosen = torch.randperm(len(spans), generator=torch.Generator().manual_seed(0))[:UNFOLDED]
+        spans = spans[chosen.to(spans.device)]
+        components = spans[..., AVERAGED // 2]
+        wanted = geodesic_coordinates(spans.mean(-1) * weights.sqrt(), 2 * self.coordinates)
+        for number, (network, size) in enumerate(((self.small, self.coordinates), (self.large, 2 * self.coordinates))):
+            target, parameters = wanted[:, :size], list(network.parameters())
+            optimizer = torch.optim.Adam(parameters, lr=UNFOLD_RATE)
+            schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, UNFOLD_RATE, total_steps=updates + 1)
+            for done in range(1, updates + 1):
+                optimizer.zero_grad()
+                there = (network.encode(components) - target).square().mean()
+                back = ((network.decode(target) - components).square() * weights).mean()
+                (there + back).backward()
+                optimizer.step()
+                schedule.step()
+                if progress is not None:
+                    progress(number * updates + done, 2 * updates)
+            optimizer.zero_grad()
 
     @torch.no_grad()
     def choose_size(self, windows: Tensor, *, batch_size: int = 2048) -> int:

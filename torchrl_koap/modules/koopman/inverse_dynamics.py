@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl_koap.keys import ACTION, STATE
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 
@@ -174,6 +175,22 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
         """
         self.lifting.fit_unlabelled(self.normalize_state(windows))
         super().fit_scales(windows)
+
+    @property
+    def unfolds(self) -> bool:
+        """Whether there is anything for :meth:`unfold` to train."""
+        return isinstance(self.lifting, CompactLifting)
+
+    def unfold(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
+        """Trains a compact lifting to coordinates along the surface that states lie on, before its losses do.
+
+        Args:
+            windows (Tensor): raw states ``[*B, T, d]``; no label is read.
+            updates (int): see :meth:`~torchrl_koap.modules.koopman.compact_lifting.CompactLifting.unfold`.
+            progress (callable, optional): likewise.
+        """
+        if isinstance(self.lifting, CompactLifting):
+            self.lifting.unfold(self.normalize_state(windows), updates, progress)
 
     @torch.no_grad()
     def fit_unlabelled(self, windows: Tensor) -> None:
