@@ -3,6 +3,7 @@
 
     python benchmarks/scooping.py --folder runs/scooping
     python benchmarks/scooping.py --folder runs/scooping --methods koap linear dd --labels 2 5 20 --unlabelled both
+    python benchmarks/scooping.py --folder runs/moving --task scooping_moving_bowl
 
 Records robot and hand, embeds, trains one planner per set of unlabelled demonstrations and one controller per cell, and
 rolls each out. Folder by folder what is there already is not made again, and rows of the table are not run again.
@@ -32,9 +33,10 @@ from torchrl_koap.training import TrainConfig, train
 from torchrl_koap.vision.backbones import load_backbone
 from torchrl_koap.vision.demonstrations import Source, embed_demonstrations, fit_projection
 from torchrl_koap.vision.encoder import FrozenImageEncoder
-from torchrl_koap.vision.projections import SCOOPING, load_encoder, save_encoder
+from torchrl_koap.vision.projections import SCOOPING, load_encoder, projection_of, save_encoder
 
 TABLE = Path(__file__).parent / "results" / "scooping.csv"
+TASKS = ("scooping", "scooping_moving_bowl")
 UNLABELLED = ("robot", "hand", "both", "hand_aligned", "none")
 FEW_ROBOTS = ("hand", "hand_aligned", "none")  # the labelled demonstrations are all there are of the robot
 METHODS = ["koap", "koap_paper", "dd", "vae", "lapo", "dp", "pca", "linear"]
@@ -46,7 +48,7 @@ COLUMNS = (
 KEYS = COLUMNS[:7]  # what tells rows apart
 
 
-def data_set(folder: Path, unlabelled: str, labels: int) -> Path:
+def data_set(folder: Path, unlabelled: str, labels: int, task: str = "scooping") -> Path:
     """The data set of a cell, embedded where it is not there."""
     out = folder / f"data_{_name(unlabelled, labels)}"
     if not (out / "ted").is_dir():
@@ -54,8 +56,8 @@ def data_set(folder: Path, unlabelled: str, labels: int) -> Path:
         robots = [Source(folder / "robot", labels) if unlabelled in FEW_ROBOTS else robot]
         sources = robots if unlabelled in ("robot", "none") else [*robots, hand]
         align_to = "robot" if unlabelled == "hand_aligned" else None
-        encoder = load_encoder(cache=folder / "cache")
-        embed_demonstrations(out, sources, encoder, mixed=len(sources) > 1, align_to=align_to)
+        encoder = load_encoder(projection_of(task), cache=folder / "cache")
+        embed_demonstrations(out, sources, encoder, mixed=len(sources) > 1, align_to=align_to, task=task)
     return out
 
 
@@ -64,17 +66,17 @@ def _name(unlabelled: str, labels: int) -> str:
     return f"{unlabelled}_{labels}" if unlabelled in FEW_ROBOTS else unlabelled
 
 
-def planner_of(folder: Path, unlabelled: str, labels: int, seed: int, steps: int) -> Path:
+def planner_of(folder: Path, unlabelled: str, labels: int, seed: int, options) -> Path:
     """A run that holds the planner of a cell, trained where it is not there."""
     run = folder / f"planner_{_name(unlabelled, labels)}_{seed}"
     if not (run / "summary.json").is_file():
-        options = {"method": "linear", "steps": steps, "seed": seed, "analysis": False, "resume": run.exists()}
-        train(_config(run, folder, unlabelled, labels, **options))
+        known = {"method": "linear", "steps": options.steps, "seed": seed, "analysis": False, "resume": run.exists()}
+        train(_config(run, folder, unlabelled, labels, options.task, **known))
     return run
 
 
-def _config(run: Path, folder: Path, unlabelled: str, labels: int, **options) -> TrainConfig:
-    known = {"task": "scooping", "dataset": str(data_set(folder, unlabelled, labels))}
+def _config(run: Path, folder: Path, unlabelled: str, labels: int, task: str, **options) -> TrainConfig:
+    known = {"task": task, "dataset": str(data_set(folder, unlabelled, labels, task))}
     return TrainConfig(out=run, label_episodes=tuple(range(labels)), **known, **options)
 
 
@@ -83,12 +85,12 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
     run = folder / f"{method}_{unlabelled}_{labels}_{seed}"
     planner = None
     if not method.startswith("dp"):
-        planner = planner_of(folder, unlabelled, labels, seed, options.steps)
+        planner = planner_of(folder, unlabelled, labels, seed, options)
     if not (run / "summary.json").is_file():
         settings = {"method": method, "seed": seed, "planner_from": planner, "steps": options.steps}
         settings["resume"] = run.exists()
         settings |= {"controller_steps": options.controller_steps, "analysis": unlabelled not in FEW_ROBOTS}
-        train(_config(run, folder, unlabelled, labels, **settings))
+        train(_config(run, folder, unlabelled, labels, options.task, **settings))
     ways = {name: getattr(options, name) for name in ("execution", "replan_interval", "blend_decay")}
     if method.startswith("dp"):  # it has no plans to follow: its chunks of actions are executed as they are
         ways["execution"] = None
@@ -125,6 +127,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--task", choices=TASKS, default=TASKS[0], help="each has a folder and a table of its own")
     parser.add_argument("--demonstrations", type=int, default=100)
     parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--labels", type=int, nargs="+", default=[5, 2, 20])
@@ -176,18 +179,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
     for who in EMBODIMENTS:
         if not (options.folder / who).exists():
-            record_videos(options.folder / who, who, options.demonstrations)
+            record_videos(options.folder / who, who, options.demonstrations, task=options.task)
     if options.fit_projection:
         encoder = FrozenImageEncoder(load_backbone(), pooling="grid", cache=options.folder / "cache")
         sources = [Source(options.folder / who) for who in EMBODIMENTS]
         encoder.projection = fit_projection(encoder, sources, EMBEDDING_DIM)
-        save_encoder(encoder, SCOOPING, stride=8, fitted_on="unlabelled frames of robot and hand, koap demos, seed 0")
+        fitted_on = "unlabelled frames of robot and hand, koap demos, seed 0"
+        save_encoder(encoder, SCOOPING.with_stem(options.task), stride=8, fitted_on=fitted_on)
         return
-    plans = (options.execution, options.blend_decay)
+    plans, table = (options.execution, options.blend_decay), TABLE.with_stem(options.task)
     for seed, unlabelled, labels, method in product(options.seeds, options.unlabelled, options.labels, options.methods):
-        if tuple(map(str, (labels, unlabelled, method, *plans, seed, options.episodes))) not in measured(TABLE):
+        if tuple(map(str, (labels, unlabelled, method, *plans, seed, options.episodes))) not in measured(table):
             row = run_cell(options.folder, unlabelled, labels, method, seed, options)
-            append(TABLE, row)
+            append(table, row)
             print(row, flush=True)
 
 

@@ -51,8 +51,8 @@ def study(benchmark_script, monkeypatch, tmp_path):
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "evaluate", evaluate)
     monkeypatch.setattr(module, "embed_demonstrations", lambda out, *_, **__: (out / "ted").mkdir(parents=True))
-    monkeypatch.setattr(module, "load_encoder", lambda cache: None)
-    monkeypatch.setattr(module, "TABLE", tmp_path / "table.csv")
+    monkeypatch.setattr(module, "load_encoder", lambda projection, cache: None)
+    monkeypatch.setattr(module, "TABLE", tmp_path / "scooping.csv")
     for who in ("robot", "hand"):
         (tmp_path / who).mkdir()
     module.asked = asked
@@ -113,7 +113,7 @@ def test_a_data_set_holds_whose_demonstrations_it_is_called_after(
     out = study.data_set(tmp_path, unlabelled, 2)
     ((sources, how),) = asked
     assert [(source.folder.name, source.episodes) for source in sources] == whose
-    assert how == {"mixed": len(whose) > 1, "align_to": align_to}
+    assert how == {"mixed": len(whose) > 1, "align_to": align_to, "task": "scooping"}
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.json").write_text(json.dumps({"dataset": str(out)}))
     assert benchmark_script("scooping_parts").whose_demonstrations(tmp_path / "run") == unlabelled

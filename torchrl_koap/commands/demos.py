@@ -14,7 +14,7 @@ from torchrl_koap.envs.experts.recording import expert_of
 from torchrl_koap.envs.experts.recording_report import RecordingReport
 from torchrl_koap.envs.experts.scooping_recording import VideoReport, record_videos
 from torchrl_koap.lookup import lookup
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.progress import count_up_to, progress_bar
 
@@ -68,7 +68,7 @@ class Demos(Command):
         if self.embodiment is not None and not embodiments:
             raise ValueError(f"--embodiment was given, but task {task.name!r} has one embodiment alone")
         if embodiments:
-            return self._film(episodes, embodiments)
+            return self._film(task, episodes, embodiments)
         with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:  # refusals come without a bar
             return record_to_folder(
                 self.out,
@@ -81,7 +81,7 @@ class Demos(Command):
                 disturbance=self.disturbance,
             )
 
-    def _film(self, episodes: int, embodiments: Sequence[str]) -> VideoReport:
+    def _film(self, task: Task, episodes: int, embodiments: Sequence[str]) -> VideoReport:
         """Records camera frames."""
         if self.embodiment is None:
             raise ValueError(f"say who demonstrates: --embodiment {' or '.join(embodiments)}")
@@ -89,4 +89,4 @@ class Demos(Command):
         if self.disturbance:
             raise ValueError("--disturbance was given, but demonstrations before a camera are not disturbed")
         with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:
-            return record_videos(self.out, self.embodiment, episodes, self.seed, count_up_to(bar))
+            return record_videos(self.out, self.embodiment, episodes, self.seed, count_up_to(bar), task=task)

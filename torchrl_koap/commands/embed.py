@@ -14,10 +14,11 @@ import tyro
 from torchrl_koap.commands.command import Command
 from torchrl_koap.data import read_about
 from torchrl_koap.files import check_file
+from torchrl_koap.tasks import get_task
 from torchrl_koap.vision.backbones import WeightsError
 from torchrl_koap.vision.cache import CacheError
 from torchrl_koap.vision.demonstrations import Source, embed_demonstrations
-from torchrl_koap.vision.projections import load_encoder
+from torchrl_koap.vision.projections import load_encoder, projection_of
 
 
 @dataclass(kw_only=True)
@@ -29,17 +30,19 @@ class Embed(Command):
     Attributes:
         sources: folders of demonstrations, in the order in which the data set has them.
         out: folder to write: OUT/ted.
+        task: the task that was recorded.
         episodes: how many of each source, from the first (default: all).
         mixed: the sources may be of several embodiments.
         align_to: with --mixed, the embodiment whose frames those of all others are made to resemble, by an affine map
             that is fitted without labels (default: they are left as they are).
         weights: file of the network's weights (default: EfficientNet-Lite0, extra "vision").
-        projection: file of the principal components (default: those of Scooping that come with the package).
+        projection: file of the principal components (default: those of the task that come with the package).
         cache: folder that keeps what went through the network.
     """
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
     out: Path
+    task: str = "scooping"
     episodes: tuple[int, ...] = ()
     mixed: bool = False
     align_to: str | None = None
@@ -58,16 +61,18 @@ class Embed(Command):
         """
         if self.episodes and len(self.episodes) != len(self.sources):
             raise ValueError(f"--episodes names {len(self.episodes)} numbers for {len(self.sources)} sources")
+        task = get_task(self.task)
         if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
-        with _naming("projection", self.projection):
-            encoder = load_encoder(self.projection, self.weights)
+        projection = projection_of(task.name) if self.projection is None else self.projection
+        with _naming("projection", projection):
+            encoder = load_encoder(projection, self.weights)
         if self.cache is not None:
             with _naming("cache", self.cache):
-                encoder = load_encoder(self.projection, self.weights, cache=self.cache)
+                encoder = load_encoder(projection, self.weights, cache=self.cache)
         numbers = self.episodes or (None,) * len(self.sources)
         sources = [Source(folder, number) for folder, number in zip(self.sources, numbers, strict=True)]
-        folder = embed_demonstrations(self.out, sources, encoder, mixed=self.mixed, align_to=self.align_to)
+        folder = embed_demonstrations(self.out, sources, encoder, mixed=self.mixed, align_to=self.align_to, task=task)
         about = read_about(folder / "ted")
         whose = about["notes"]["embodiments"]
         return {
@@ -76,19 +81,19 @@ class Embed(Command):
             "steps": about["steps"],
             "labelled steps": about["labelled_steps"],
             **({"aligned to": self.align_to} if self.align_to else {}),
-            "next": f"koap train --task scooping --dataset {folder} --out runs/scooping",
+            "next": f"koap train --task {task.name} --dataset {folder} --out runs/{task.name}",
         }
 
 
 @contextlib.contextmanager
-def _naming(what: str, path: Path | None) -> Iterator[None]:
+def _naming(what: str, path: Path) -> Iterator[None]:
     """Whatever a damaged file leads to inside the block says which file it is."""
     try:
-        if path is not None and path.exists() and not path.is_dir():
+        if path.exists() and not path.is_dir():
             check_file(path)
         yield
     except (WeightsError, CacheError, FileNotFoundError):  # they say so themselves
         raise
     except Exception as error:
         fault = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"the {what} {path or 'of Scooping'} cannot be used: {fault}") from error
+        raise ValueError(f"the {what} {path} cannot be used: {fault}") from error

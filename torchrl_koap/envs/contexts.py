@@ -58,6 +58,9 @@ def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | i
         regions = starts.regions
         if starts.dealt:
             regions = tuple(regions[index] for index in drawing.permutation(len(regions)))
+        elif starts.whose is not None:
+            own = [starts.of(body) for body in range(len(context))]
+            regions = tuple(each[drawing.integers(len(each))] for each in own)
         for row, (x, y) in zip(context, regions, strict=False):
             row[:] = drawing.uniform(*x), drawing.uniform(*y), math.radians(drawing.uniform(*starts.yaw))
     return contexts

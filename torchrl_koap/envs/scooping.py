@@ -18,7 +18,7 @@ from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE
 from torchrl_koap.vision.encoder import FrozenImageEncoder
-from torchrl_koap.vision.projections import load_encoder
+from torchrl_koap.vision.projections import load_encoder, projection_of
 
 JOINT_SPEED = 2.5  # rad/s; targets that are further away are gone towards at this speed
 PIXELS = "pixels"
@@ -44,7 +44,8 @@ class ScoopingEnv(ManipulationEnv):
     A step is a frame of 100 ms, in which the joints' servos are commanded three times (30 Hz), on a straight line from
     the last target to the new one. *Over the rim*: the middle of the spoon's floor is inside the rim's circle and less
     than 5 cm above it. *Success*: afterwards the spoon is 4 cm above the rim and carries a piece for 0.2 s. There is no
-    failure, and what is observed is the present frame, unlike in D3IL's tasks.
+    failure, and what is observed is the present frame, unlike in D3IL's tasks. Where the bowl moves, columns 99 and 100
+    and a second row of the context are its position (m).
 
     Args:
         num_envs (int): number of environments, the batch size.
@@ -55,9 +56,10 @@ class ScoopingEnv(ManipulationEnv):
         dtype (torch.dtype): floating type of observation, action and reward.
 
     Keyword Args:
-        contexts (array, optional): table of contexts [C, 1, 3] to take in turn; random ones by default.
+        task (str): ``"scooping"``, or ``"scooping_moving_bowl"``, whose bowl stands somewhere else in every episode.
+        contexts (array, optional): table of contexts [C, bodies, 3] to take in turn; random ones by default.
         encoder (FrozenImageEncoder, str or Path, optional): what embeds the frames, or the file of its projection.
-            Default: EfficientNet-Lite0 and the projection that comes with the package.
+            Default: EfficientNet-Lite0 and the projection of the task that comes with the package.
         embed (bool): embed the frames. Without, the embedding is zero and neither OpenGL nor weights are needed.
         pixels (bool): hand the frames out too.
 
@@ -83,6 +85,7 @@ class ScoopingEnv(ManipulationEnv):
         device: torch.device | str | None = None,
         dtype: torch.dtype = torch.float32,
         *,
+        task: str = "scooping",
         contexts=None,
         encoder: FrozenImageEncoder | str | Path | None = None,
         embed: bool = True,
@@ -91,15 +94,19 @@ class ScoopingEnv(ManipulationEnv):
         self._arm = SpoonKinematics()
         chosen = None
         if embed:
-            chosen = encoder if isinstance(encoder, FrozenImageEncoder) else load_encoder(encoder)
+            if isinstance(encoder, FrozenImageEncoder):
+                chosen = encoder
+            else:
+                chosen = load_encoder(projection_of(task) if encoder is None else encoder)
             dim = 0 if chosen.projection is None else chosen.projection.dim
             if dim != EMBEDDING_DIM:
                 raise ValueError(f"the encoder's projection must have {EMBEDDING_DIM} components, got {dim}")
+        self._bowl_moves = "bowl" in get_task(task).observation
         self._pixels = np.zeros((num_envs, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8) if embed or pixels else None
         self._hand_out = pixels
         self._camera: Renderer | None = None
         super().__init__(
-            get_task("scooping"),
+            get_task(task),
             None,
             start_joints=np.zeros(7),
             num_mode_flags=1,
@@ -123,7 +130,8 @@ class ScoopingEnv(ManipulationEnv):
         rows = self._rows(tensordict, "_reset")
         self._draw_contexts(rows, contexts)
         joints = np.stack([start_joints(context, "robot", self._arm) for context in self._contexts[rows]])
-        self.sims.reset(rows, joints, self._contexts[rows, 0, 2])
+        bowls = self._contexts[rows, 1, :2] if self._bowl_moves else None
+        self.sims.reset(rows, joints, self._contexts[rows, 0, 2], bowls)
         self._begin_episode(rows)
         return self._leaves(np.zeros(self.batch_size[0], dtype=bool))
 
@@ -144,7 +152,10 @@ class ScoopingEnv(ManipulationEnv):
             self._pixels[rows] = [self._camera.render(self.sims.data[row], _CAMERA) for row in rows]
             if self._encoder is not None:
                 embedding = self._encoder.embed(torch.from_numpy(self._pixels[rows])).double().numpy()
-        return np.concatenate([embedding, self.sims.spoon_position[rows]], axis=1)
+        seen = [embedding, self.sims.spoon_position[rows]]
+        if self._bowl_moves:
+            seen.append(self.sims.bowl_positions[rows])
+        return np.concatenate(seen, axis=1)
 
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.sims.success[rows], np.zeros(len(rows), dtype=bool)

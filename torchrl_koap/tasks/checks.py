@@ -101,4 +101,7 @@ def _body_faults(task: Task) -> list[str]:
     starts = task.start_regions
     if starts is not None and len(starts.regions) < len(task.bodies):
         faults.append(f"start_regions: {len(starts.regions)} regions for {len(task.bodies)} bodies")
+    elif starts is not None:
+        without = [body.name for index, body in enumerate(task.bodies) if not starts.of(index)]
+        faults += [f"start_regions: no region is for the body {name!r}" for name in without]
     return faults

@@ -112,17 +112,32 @@ class StartRegions:
         regions (tuple): x range and y range (m) of every body, in their order.
         dealt (bool): the regions are dealt out to the bodies at random, each to one at most; there may be more of them.
         yaw (tuple of float): least and greatest yaw (deg).
+        whose (tuple of int, optional): number of the body that each region is for, where a body has several of them, in
+            any of which it may start. Default: one each, or dealt.
+
+    Raises:
+        ValueError: if ``whose`` names another number of regions, or they are dealt besides.
 
     Examples:
         >>> from torchrl_koap.tasks.scene import StartRegions
-        >>> StartRegions((((0.4, 0.6), (-0.25, -0.1)),)).yaw
-        (-90.0, 90.0)
+        >>> left, right, ahead = (((x, x + 0.1), (0.0, 0.1)) for x in (0.2, 0.6, 0.4))
+        >>> starts = StartRegions((left, right, ahead), whose=(0, 0, 1))
+        >>> starts.of(0) == (left, right), starts.of(1) == (ahead,)
+        (True, True)
     """
 
     regions: tuple[Region, ...]
     dealt: bool = False
     yaw: tuple[float, float] = (-90.0, 90.0)
+    whose: tuple[int, ...] | None = None
+
+    def __post_init__(self):
+        if self.whose is not None and (self.dealt or len(self.whose) != len(self.regions)):
+            fault = "dealt out too" if self.dealt else f"{len(self.regions)}, not {len(self.whose)}"
+            raise ValueError(f"whose says which body each region is for, but the regions are {fault}")
 
     def of(self, index: int) -> tuple[Region, ...]:
         """Regions in one of which body ``index`` starts."""
+        if self.whose is not None:
+            return tuple(region for region, body in zip(self.regions, self.whose, strict=True) if body == index)
         return self.regions if self.dealt else self.regions[index : index + 1]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from torchrl_koap.tasks.registry import register_task
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
 BOWL = (0.52, 0.0)  # centre of the bowl (m)
+BOWL_REACH = (0.05, 0.06)  # how far from there it may stand where it moves, x and y (m)
 BOWL_RADIUS = 0.055  # of its floor (m)
 RIM_RADIUS, RIM_HEIGHT = 0.11, 0.05  # m
 NUM_PIECES, PIECE_RADIUS = 36, 0.009  # m
@@ -30,7 +32,7 @@ IMAGE_SIZE = 96  # pixels, both ways
 
 
 def start_of(context: np.ndarray) -> int:
-    """Number of the start position that a context ``[1, 3]`` was drawn around, in the order of :data:`STARTS`.
+    """Number of the start position that a context ``[bodies, 3]`` was drawn around, in the order of :data:`STARTS`.
 
     Examples:
         >>> import numpy as np
@@ -70,7 +72,8 @@ def scores(
     return rates
 
 
-register_task(
+_START_REGIONS = tuple(((x - START_HALF, x + START_HALF), (y - START_HALF, y + START_HALF)) for x, y in STARTS.values())
+_SCOOPING = register_task(
     Task(
         name="scooping",
         observation_parts={"embedding": EMBEDDING_DIM, "spoon": ("x", "y", "z")},
@@ -83,11 +86,7 @@ register_task(
         control_hz=FRAME_HZ,
         score="torchrl_koap.tasks.scooping:scores",
         bodies=(Body("spoon", "spoon", color="grey", half=(0.02, 0.02)),),
-        start_regions=StartRegions(
-            tuple(((x - START_HALF, x + START_HALF), (y - START_HALF, y + START_HALF)) for x, y in STARTS.values()),
-            dealt=True,
-            yaw=(-180.0, 180.0),
-        ),
+        start_regions=StartRegions(_START_REGIONS, dealt=True, yaw=(-180.0, 180.0)),
         env="torchrl_koap.envs.scooping:ScoopingEnv",
         expert="torchrl_koap.envs.experts.scooping:ScoopingExpert",
         scene=Scene(
@@ -105,5 +104,23 @@ register_task(
             # a place read off every frame with an error acts as a velocity: docs/results/scooping.md
             execution={"execution": "open_loop", "replan_interval": 8, "blend_decay": 0.0},
         ),
+    )
+)
+# harder: the bowl stands somewhere else in every episode, and a few demonstrations do not show all the places
+_BOWL_REGION = (
+    (BOWL[0] - BOWL_REACH[0], BOWL[0] + BOWL_REACH[0]),
+    (BOWL[1] - BOWL_REACH[1], BOWL[1] + BOWL_REACH[1]),
+)
+register_task(
+    replace(
+        _SCOOPING,
+        name="scooping_moving_bowl",
+        observation_parts={**_SCOOPING.observation_parts, "bowl": ("bowl_x", "bowl_y")},
+        observation_units=_SCOOPING.observation_units + ("m",) * 2,
+        hidden=("spoon", "bowl"),
+        bodies=(*_SCOOPING.bodies, Body("bowl", "bowl", half=(BOWL_RADIUS, BOWL_RADIUS), still=True)),
+        start_regions=StartRegions((*_START_REGIONS, _BOWL_REGION), yaw=(-180.0, 180.0), whose=(0, 0, 0, 1)),
+        env_options={"task": "scooping_moving_bowl"},
+        scene=replace(_SCOOPING.scene, shapes=(), caption=" The spoon's path, and where the bowl stands."),
     )
 )

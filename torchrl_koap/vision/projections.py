@@ -12,6 +12,27 @@ from torchrl_koap.vision.pooling import Projection
 SCOOPING = Path(__file__).with_name("scooping.safetensors")
 
 
+def projection_of(task: str) -> Path:
+    """The file of a task's projection that comes with the package.
+
+    Args:
+        task (str): name of the task, ``"scooping"`` or ``"scooping_moving_bowl"``.
+
+    Raises:
+        ValueError: if none was fitted for the task.
+
+    Examples:
+        >>> from torchrl_koap.vision.projections import projection_of
+        >>> projection_of("scooping").name
+        'scooping.safetensors'
+    """
+    path = SCOOPING.with_stem(task)
+    if not path.is_file():
+        known = ", ".join(sorted(each.stem for each in SCOOPING.parent.glob("*.safetensors")))
+        raise ValueError(f"no projection comes with the package for task {task!r} (only for {known}): pass your own")
+    return path
+
+
 def save_encoder(encoder: FrozenImageEncoder, path: str | Path, *, stride: int, fitted_on: str) -> Path:
     """Writes an encoder's projection and what it belongs to; the network's weights stay where they are.
 

@@ -11,7 +11,7 @@ import numpy as np
 from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
 from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics, rotation_of
 from torchrl_koap.lookup import lookup
-from torchrl_koap.tasks.scooping import BOWL, FRAME_HZ, START_HEIGHT, STARTS
+from torchrl_koap.tasks.scooping import FRAME_HZ, START_HEIGHT, STARTS
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,7 @@ class ScoopingExpert:
         self._generator = np.random.default_rng(seed)
         self._arm = SpoonKinematics() if sims.embodiment == "robot" else None
         self._start, self.attempts, self._wander = start, 0, np.zeros(3)
+        self._bowl = sims.bowl_positions[row]
         self._pose = np.array([*sims.spoon_position[row], 0.0, 0.0, 0.0])  # x, y, z, yaw, pitch, roll
         self._queue: list[tuple[np.ndarray, float]] = []
         self._segment: tuple[np.ndarray, np.ndarray, int, int] | None = None
@@ -93,19 +94,20 @@ class ScoopingExpert:
         ahead = np.array([math.cos(heading), math.sin(heading)])
         aside = np.array([-ahead[1], ahead[0]])
         pieces = self.sims.piece_positions[self.row]
-        local = np.stack([(pieces[:, :2] - BOWL) @ ahead, (pieces[:, :2] - BOWL) @ aside], 1)[pieces[:, 2] < 0.05]
+        places = pieces[pieces[:, 2] < 0.05, :2] - self._bowl
+        local = np.stack([places @ ahead, places @ aside], 1)
         offsets = np.linspace(-0.02, 0.02, 9)
         ahead_of = local[local[:, 0] > _STROKE[0] + 0.01]
         caught = [(np.abs(ahead_of[:, 1] - offset) < 0.015).sum() for offset in offsets]
         offset = offsets[int(np.argmax(np.array(caught) + 0.5 * draw.random(len(offsets))))]
 
         def at(along, height, pitch):
-            x, y = BOWL + along * ahead + offset * aside
+            x, y = self._bowl + along * ahead + offset * aside
             return np.array([x, y, height, heading, pitch, self._tilt])
 
         reach = _STROKE[1] - 0.3 * abs(offset) + 0.003 * draw.standard_normal()
         above = habits.above + 0.008 * draw.standard_normal()
-        leave = BOWL + 0.5 * (np.array(list(STARTS.values())[self._start]) - BOWL)
+        leave = self._bowl + 0.5 * (np.array(list(STARTS.values())[self._start]) - self._bowl)
         self._queue = [
             (at(_STROKE[0], above, _NOSE_DOWN), habits.speed),
             (at(_STROKE[0], _FLOOR, _NOSE_DOWN), 0.8 * habits.speed),
@@ -154,7 +156,8 @@ def start_joints(context: np.ndarray, embodiment: str, arm: SpoonKinematics | No
     """Joints with which an episode begins.
 
     Args:
-        context (np.ndarray): context ``[1, 3]``: where the spoon is, x, y (m); the last number is not looked at.
+        context (np.ndarray): context ``[bodies, 3]``; its first row says where the spoon is, x, y (m). Nothing else is
+            looked at.
         embodiment (str): ``"robot"`` or ``"hand"``.
         arm (SpoonKinematics, optional): where there is one already.
 

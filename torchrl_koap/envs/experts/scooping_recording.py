@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,8 @@ from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
 from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics
 from torchrl_koap.lookup import lookup
-from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.scooping import FRAME_HZ, IMAGE_SIZE, STARTS, start_of
+from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE, STARTS, start_of
 
 AFTERWARDS = 12  # frames that are recorded after a success: a controller's labels end before its look-ahead does
 MAX_ATTEMPTS = 10
@@ -50,7 +50,7 @@ class VideoReport:
 
 
 def play_episodes(
-    embodiment: str, episodes: int, seed: int = 0, *, size: int = IMAGE_SIZE
+    embodiment: str, episodes: int, seed: int = 0, *, size: int = IMAGE_SIZE, task: str = "scooping"
 ) -> Iterator[tuple[ImageEpisode, int, int]]:
     """Demonstrations in their order; one that does not succeed is played again, from another place.
 
@@ -63,6 +63,7 @@ def play_episodes(
 
     Keyword Args:
         size (int): pixels of the frames, both ways.
+        task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
 
     Yields:
         tuple: the demonstration, how often it was played, and how often the spoon went into the bowl.
@@ -83,10 +84,14 @@ def play_episodes(
         for number in range(episodes):
             for attempt in range(MAX_ATTEMPTS):
                 own = (seed, stream, number, attempt)
-                context = _context_at(number % len(STARTS), np.random.default_rng((*own, 1)))
-                sims.reset(rows, start_joints(context, embodiment, arm)[None], [context[0, 2]])
+                context = _context_at(task, number % len(STARTS), np.random.default_rng((*own, 1)))
+                bowls = context[None, 1, :2] if len(context) > 1 else None
+                sims.reset(rows, start_joints(context, embodiment, arm)[None], [context[0, 2]], bowls)
                 expert = ScoopingExpert(sims, 0, start_of(context), own)
                 episode = _play(sims, expert, lambda: renderer.render(sims.data[0], CAMERA))
+                if episode is not None and bowls is not None:
+                    stands = np.repeat(bowls, len(episode.frames), axis=0)
+                    episode = replace(episode, state=np.concatenate([episode.state, stands], axis=1))
                 if episode is not None:
                     yield episode, attempt + 1, expert.attempts
                     break
@@ -97,10 +102,10 @@ def play_episodes(
         sims.close()
 
 
-def _context_at(start: int, generator: np.random.Generator) -> np.ndarray:
+def _context_at(task: str, start: int, generator: np.random.Generator) -> np.ndarray:
     """A random context around one of the start positions."""
     while True:
-        context = draw_contexts("scooping", 1, generator)[0]
+        context = draw_contexts(task, 1, generator)[0]
         if start_of(context) == start:
             return context
 
@@ -131,6 +136,8 @@ def record_videos(
     episodes: int,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    task: Task | str = "scooping",
 ) -> VideoReport:
     """Records demonstrations as a LeRobot data set with pictures.
 
@@ -141,19 +148,22 @@ def record_videos(
         seed (int): of starts and players; the two embodiments never share a start.
         progress (callable, optional): called with the number of demonstrations recorded and wanted.
 
+    Keyword Args:
+        task (Task or str): ``"scooping"`` or ``"scooping_moving_bowl"``.
+
     Raises:
         FileExistsError: if the folder holds demonstrations already.
         ValueError: for another embodiment, or a number out of range.
         RuntimeError: if there is no OpenGL library, pyarrow is missing, or the expert fails again and again.
     """
-    task, folder = get_task("scooping"), Path(folder)
+    task, folder = get_task(task) if isinstance(task, str) else task, Path(folder)
     if folder.exists() and any(folder.iterdir()):
         raise FileExistsError(f"{folder} is not empty; choose another folder")
-    players = play_episodes(embodiment, episodes, seed)
+    players = play_episodes(embodiment, episodes, seed, task=task.name)
     writer = ImageEpisodeWriter(
         folder,
         fps=FRAME_HZ,
-        state_names=("spoon_x", "spoon_y", "spoon_z"),
+        state_names=("spoon_x", "spoon_y", "spoon_z", *task.observation_names[EMBEDDING_DIM + 3 :]),
         action_names=task.action_names if embodiment == "robot" else (),
         embodiment=embodiment,
         task="take a piece out of the bowl with the spoon",

@@ -34,7 +34,8 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
         pieces (bool): put pieces into the bowl.
 
     Returns:
-        mujoco.MjModel: the pieces' free joints come first, then the joints of what holds the spoon.
+        mujoco.MjModel: the pieces' free joints come first, then the joints of what holds the spoon; the bowl is its
+        only mocap body.
 
     Raises:
         ValueError: for another embodiment.
@@ -107,7 +108,7 @@ def _bowl(sides: int = 16) -> str:
         for turn in (2 * math.pi * side / sides for side in range(sides))
     )
     floor = f'<geom type="cylinder" size="{BOWL_RADIUS + 0.005} 0.0005" rgba="0.88 0.86 0.78 1"/>'
-    return f'<body name="bowl" pos="{BOWL[0]} {BOWL[1]} 0">{floor}{walls}</body>'
+    return f'<body name="bowl" mocap="true" pos="{BOWL[0]} {BOWL[1]} 0">{floor}{walls}</body>'
 
 
 def _quat(yaw: float, pitch: float) -> str:

@@ -84,6 +84,11 @@ class ScoopingSimulations:
         return np.stack([_positions(data) for data in self.data])
 
     @property
+    def bowl_positions(self) -> np.ndarray:
+        """Where the bowls' centres stand ``[n, 2]``: x, y (m)."""
+        return np.stack([data.mocap_pos[0, :2] for data in self.data])
+
+    @property
     def success(self) -> np.ndarray:
         """Whether the spoon has left the bowl with a piece, bool ``[n]``."""
         return self.held >= HELD_TICKS
@@ -97,16 +102,18 @@ class ScoopingSimulations:
         inside = (np.abs(local[:, :2]) < np.array(SPOON_HALF) + 0.002).all(1)
         return int((inside & (local[:, 2] > 0) & (local[:, 2] < 4 * PIECE_RADIUS)).sum())
 
-    def reset(self, rows: np.ndarray, joints: np.ndarray, turns) -> None:
+    def reset(self, rows: np.ndarray, joints: np.ndarray, turns, bowls: np.ndarray | None = None) -> None:
         """Starts episodes.
 
         Args:
             rows (np.ndarray): indices of the simulations.
             joints (np.ndarray): joints ``[len(rows), nu]`` (rad; the hand's first three in m).
             turns (sequence of float): number in -pi to pi for each of them that decides where the pieces lie.
+            bowls (np.ndarray, optional): where the bowls stand ``[len(rows), 2]`` (m). Default: all in the same place.
         """
         bank = settled_layouts()
-        for row, own, turn in zip(rows, joints, turns, strict=True):
+        places = np.tile(BOWL, (len(rows), 1)) if bowls is None else bowls
+        for row, own, turn, bowl in zip(rows, joints, turns, places, strict=True):
             data = self.data[row]
             mujoco.mj_resetData(self.model, data)
             share = (turn + math.pi) / (2 * math.pi)
@@ -114,6 +121,9 @@ class ScoopingSimulations:
             angle = 2 * math.pi / _SIDES * int(share * _LAYOUTS * _SIDES % _SIDES)
             poses = data.qpos[: self._pieces].reshape(NUM_PIECES, 7)
             poses[:, :3] = _turned(layout, angle)
+            if bowls is not None:
+                poses[:, :2] += bowl - BOWL
+                data.mocap_pos[0, :2] = bowl
             data.qpos[self._pieces :] = own
             data.ctrl[:] = own
             mujoco.mj_forward(self.model, data)
@@ -154,7 +164,8 @@ class ScoopingSimulations:
 
     def _judge(self, row: int, data: mujoco.MjData) -> None:
         x, y, height = data.site_xpos[self._site]
-        over = math.hypot(x - BOWL[0], y - BOWL[1]) < RIM_RADIUS
+        bowl = data.mocap_pos[0]
+        over = math.hypot(x - bowl[0], y - bowl[1]) < RIM_RADIUS
         self.rim[row] |= over and height < OVER_RIM
         left = self.rim[row] and height > LEFT_BOWL
         if self.held[row] < HELD_TICKS:
