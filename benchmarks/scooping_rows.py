@@ -41,7 +41,9 @@ def scooping_cells(rows: Sequence[Mapping[str, str]] | None = None) -> list[dict
     return cells
 
 
-def scooping_cell(labels: int, method: str, unlabelled: str = "both", rims: bool = False) -> str:
+def scooping_cell(
+    labels: int, method: str, unlabelled: str = "both", rims: bool = False, task: str = "scooping"
+) -> str:
     """Success of a cell of the study in words, or how often the spoon came over the rim.
 
     Args:
@@ -49,19 +51,26 @@ def scooping_cell(labels: int, method: str, unlabelled: str = "both", rims: bool
         method (str): its name.
         unlabelled (str): whose demonstrations there are besides.
         rims (bool): the rim instead of the success.
+        task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
     """
     wanted = (str(labels), unlabelled, method, *_HOW)
-    for cell in scooping_cells():
+    for cell in scooping_cells(rows_if_measured(task)):
         if tuple(cell[key] for key in _CELL) == wanted:
             shown = {"successes": cell["rims" if rims else "successes"], "n": cell["n"]}
             seeds = len(cell["seeds"])
             return f"{percent(shown, 0)} of {cell['n']} rollouts, {seeds} seed{'s' if seeds > 1 else ''}"
-    raise KeyError(f"scooping.csv has no row of {wanted}")
+    raise KeyError(f"{task}.csv has no row of {wanted}")
 
 
-def scooping_table() -> str:
-    """A row per cell of the study: plans decoded once and left as they are."""
-    cells = [cell for cell in scooping_cells() if (cell["execution"], cell["blend_decay"]) == _HOW]
+def scooping_table(task: str = "scooping") -> str:
+    """A row per cell of the study: plans decoded once and left as they are.
+
+    Args:
+        task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
+    """
+    cells = [
+        cell for cell in scooping_cells(rows_if_measured(task)) if (cell["execution"], cell["blend_decay"]) == _HOW
+    ]
     order = ("both", "robot", "hand_aligned", "hand", "none")
     cells.sort(key=lambda cell: (int(cell["labels"]), order.index(cell["unlabelled"]), -cell["successes"] / cell["n"]))
     body = []

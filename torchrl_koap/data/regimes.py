@@ -29,11 +29,11 @@ class Regime:
         title (str): what tables and pictures call it.
         embed (callable, optional): from standardised states ``[N, d]`` to what a sensor shows without noise ``[N, c]``.
             Default: the state itself.
+        fit (callable, optional): from the recorded standardised states to such an ``embed``, where it depends on them.
         noise (float): white noise on every column, in typical (root mean square) steps of that column.
         distractors (int): coordinates beside the state that move by themselves (a slow random oscillation each) and
             are embedded with it.
         hidden (tuple of int): columns of the state that no sensor shows.
-        fitted (bool): ``embed`` is fitted to the states that it is given, and does not know what others look like.
 
     Examples:
         >>> from torchrl_koap.data.regimes import REGIMES
@@ -44,10 +44,10 @@ class Regime:
     name: str
     title: str
     embed: Callable[[Tensor], Tensor] | None = None
+    fit: Callable[[Tensor], Callable[[Tensor], Tensor]] | None = None
     noise: float = 0.0
     distractors: int = 0
     hidden: tuple[int, ...] = ()
-    fitted: bool = False
 
 
 def apply_regime(data: TensorDictBase, regime: str | Regime, *, seed: int = 0) -> TensorDictBase:
@@ -118,7 +118,10 @@ class RegimeSensor:
         self.distractors = None
         if self.regime.distractors:
             self.distractors = _oscillations(episode, self.regime.distractors, self._generator).to(state)
-        self.recorded = self._embedded(state, self.distractors)
+        self._embed = self.regime.embed
+        if self.regime.fit is not None:
+            self._embed = self.regime.fit(self._standardised(state, self.distractors))
+        self.recorded = self.show(state, self.distractors)
         within = (episode[1:] == episode[:-1])[:, None]
         moved = torch.where(within, self.recorded.diff(dim=0), 0.0)
         self.step = (moved.square().sum(0) / within.sum()).sqrt()
@@ -131,22 +134,19 @@ class RegimeSensor:
             distractors (Tensor, optional): coordinates beside them ``[N, k]``.
 
         Raises:
-            ValueError: if the regime has distractors and none are given, or knows the recorded states alone.
+            ValueError: if the regime has distractors and none are given.
         """
-        if self.regime.fitted:
-            raise ValueError(f"regime {self.regime.name!r} is fitted to the recorded states and cannot show others")
-        return self._embedded(state, distractors)
-
-    def _embedded(self, state: Tensor, distractors: Tensor | None) -> Tensor:
-        seen = state[:, self._columns]
-        if self.regime.embed is None:
-            return seen
+        if self._embed is None:
+            return state[:, self._columns]
         if self.regime.distractors and distractors is None:
             raise ValueError(
                 f"regime {self.regime.name!r} shows {self.regime.distractors} distractors beside the state"
             )
-        seen = (seen - self._mean) / self._spread
-        return self.regime.embed(seen if distractors is None else torch.cat([seen, distractors], -1))
+        return self._embed(self._standardised(state, distractors))
+
+    def _standardised(self, state: Tensor, distractors: Tensor | None) -> Tensor:
+        seen = (state[:, self._columns] - self._mean) / self._spread
+        return seen if distractors is None else torch.cat([seen, distractors], -1)
 
     def noisy(self, shown: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The same with noise, other noise at every call.
@@ -190,11 +190,13 @@ def random_network(columns: int, gain: float, seed: int = 0) -> Callable[[Tensor
     return embed
 
 
-def disc_picture(state: Tensor, *, pixels: int = PICTURE, radius: float = 2.5, kept: int = 64) -> Tensor:
-    """A small picture of a bright disc at the first two coordinates, reduced to principal components of all pictures.
+def disc_pictures(
+    recorded: Tensor, *, pixels: int = PICTURE, radius: float = 2.5, kept: int = 64
+) -> Callable[[Tensor], Tensor]:
+    """Small pictures of a bright disc at the first two coordinates, as principal components of all recorded ones.
 
     Args:
-        state (Tensor): standardised states ``[N, d]``.
+        recorded (Tensor): standardised states ``[N, d]``.
 
     Keyword Args:
         pixels (int): pixels along an edge. Defaults to ``32``.
@@ -202,15 +204,19 @@ def disc_picture(state: Tensor, *, pixels: int = PICTURE, radius: float = 2.5, k
         kept (int): principal components.
 
     Returns:
-        Tensor: ``[N, kept]``.
+        callable: from standardised states ``[N, d]`` to their pictures' components ``[N, kept]``.
     """
-    place = (pixels - 1) * (0.5 + state[:, :2] / 5)  # two and a half spreads to either side
-    axis = torch.arange(pixels, device=state.device, dtype=state.dtype)
-    profile = torch.exp(-0.5 * ((axis - place[..., None]) / radius) ** 2)  # [N, 2, pixels]
-    picture = (profile[:, 1, :, None] * profile[:, 0, None, :]).flatten(1)
-    centred = picture - picture.mean(0)
+
+    def draw(state: Tensor) -> Tensor:
+        place = (pixels - 1) * (0.5 + state[:, :2] / 5)  # two and a half spreads to either side
+        axis = torch.arange(pixels, device=state.device, dtype=state.dtype)
+        profile = torch.exp(-0.5 * ((axis - place[..., None]) / radius) ** 2)  # [N, 2, pixels]
+        return (profile[:, 1, :, None] * profile[:, 0, None, :]).flatten(1)
+
+    mean = draw(recorded).mean(0)
+    centred = draw(recorded) - mean
     components = torch.linalg.eigh(centred.mT @ centred)[1][:, -kept:].flip(-1)
-    return centred @ components
+    return lambda state: (draw(state) - mean) @ components
 
 
 REGIMES = {
@@ -223,7 +229,7 @@ REGIMES = {
         Regime("wide_64_gain_1", "64 columns, weaker", random_network(64, 1.0), noise=2.0),
         Regime("wide_64_gain_4", "64 columns, stronger", random_network(64, 4.0), noise=2.0),
         Regime("wide_512", "512 nonlinear columns", random_network(512, 2.0), noise=2.0),
-        Regime("pictures", "32 x 32 pictures", disc_picture, noise=1.0, fitted=True),
+        Regime("pictures", "32 x 32 pictures", fit=disc_pictures, noise=1.0),
         Regime("distractors", "64 columns, 2 distractors", random_network(64, 1.0), noise=1.0, distractors=2),
     )
 }
