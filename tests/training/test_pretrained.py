@@ -10,10 +10,12 @@ import torch
 from tiny_runs import TINY, koap, write_demonstrations
 
 from torchrl_koap.evaluation.trained_run import load_run
-from torchrl_koap.training import pretrained
+from torchrl_koap.studies.paper_tables import PRESETS, BenchConfig, _curves
+from torchrl_koap.training import run_lookup
 from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.pretrained import copy_run, find_run, publish
+from torchrl_koap.training.pretrained import copy_run, publish
 from torchrl_koap.training.run_directory import RunDirectoryError
+from torchrl_koap.training.run_lookup import find_run
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,7 @@ def policies(run, tmp_path, monkeypatch):
 
 
 def test_names(policies):
-    assert find_run("runs/mine") == pretrained.Path("runs/mine")
+    assert find_run("runs/mine") == run_lookup.Path("runs/mine")
     assert find_run("pretrained:avoiding").resolve() == policies / "avoiding"
     with pytest.raises(ValueError, match="unknown pretrained policy 'algning'; did you mean 'aligning'"):
         find_run("pretrained:algning")
@@ -44,7 +46,7 @@ def test_names(policies):
 
 def test_an_installed_wheel_has_none(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(pretrained, "__file__", str(tmp_path / "site-packages" / "torchrl_koap" / "training" / "x.py"))
+    monkeypatch.setattr(run_lookup, "__file__", str(tmp_path / "site-packages" / "torchrl_koap" / "training" / "x.py"))
     with pytest.raises(RunDirectoryError, match="no folder 'pretrained' here or beside the package"):
         find_run("pretrained:aligning")
 
@@ -64,6 +66,23 @@ def test_a_published_policy_is_small_and_plans_the_same(run, policies):
     assert 0 < gap < 0.05 * spread
     assert next(planner.denoiser.parameters()).dtype == torch.float32
     assert not (policies / "avoiding" / "checkpoints").exists()
+
+
+def test_a_planner_is_taken_over_by_name(run, policies, capsys):
+    known = ("--task", "avoiding", "--dataset", json.loads((run / "config.json").read_text())["dataset"])
+    few = ("--label-count", "1", "--controller-steps", "2", "--no-analysis", "--quiet", "--threads", "1")
+    assert koap("train", "--out", "mine", *known, "--planner-from", "pretrained:avoiding", *few) == 0
+    mine, published = (load_run(folder).planner.state_dict() for folder in ("mine", policies / "avoiding"))
+    assert all(torch.equal(mine[name], value) for name, value in published.items())
+    assert koap("train", "--out", "other", *known, "--planner-from", "pretrained:avoidin", *few) == 1
+    assert "did you mean 'avoiding'?" in capsys.readouterr().err and not (policies.parent / "other").exists()
+
+
+def test_a_table_shares_planners_by_name(policies):
+    asked = BenchConfig(out="bench", table=1, tasks="avoiding", planners="avoiding=pretrained:avoiding")
+    (curve,) = _curves(asked, PRESETS["table 1"])
+    assert curve.planner_from.resolve() == policies / "avoiding"
+    assert curve.dataset == "scripted"  # a published policy does not say where its data set was
 
 
 def test_places_are_left_out_and_what_is_left_is_sealed(run, tmp_path):

@@ -18,8 +18,9 @@ from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_p
 from torchrl_koap.training.builders import set_up_torch
 from torchrl_koap.training.checkpoints import save_tensors
 from torchrl_koap.training.plugins import load_plugins
-from torchrl_koap.training.pretrained import PREFIX, copy_run, find_run
+from torchrl_koap.training.pretrained import copy_run
 from torchrl_koap.training.progress import count_up_to, progress_bar
+from torchrl_koap.training.run_lookup import PREFIX, find_run
 
 
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:

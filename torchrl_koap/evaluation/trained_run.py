@@ -88,7 +88,7 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
 
     Examples:
         >>> from torchrl_koap.evaluation import load_run
-        >>> from torchrl_koap.training.pretrained import find_run
+        >>> from torchrl_koap.training.run_lookup import find_run
         >>> trained = load_run(find_run("pretrained:avoiding"))  # or the folder of a run of yours
         >>> trained.task.name, trained.planner.horizon
         ('avoiding', 14)
@@ -135,7 +135,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     Examples:
         >>> import numpy as np
         >>> from torchrl_koap import Agent, load_policy
-        >>> from torchrl_koap.training.pretrained import find_run
+        >>> from torchrl_koap.training.run_lookup import find_run
         >>> agent = Agent(load_policy(find_run("pretrained:avoiding")), seed=0)
         >>> agent.reset()
         >>> agent.act(np.array([0.525, -0.28, 0.525, -0.28])).shape  # commanded and measured xy to a change of xy (m)

@@ -34,6 +34,7 @@ from torchrl_koap.training.released_settings import get_released
 from torchrl_koap.training.resolved import resolve
 from torchrl_koap.training.run import check_networks
 from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.training.run_lookup import find_run
 
 ALL = "koap,koap_labelled_only,linear,dd,vae,lapo,dp,relabel,nonlinear,pretrain"
 
@@ -62,8 +63,8 @@ class CurveConfig(CellOptions):
         workers: cells at a time (default: one per core; a cluster given by its address decides for itself).
         launcher: "local" or "ray".
         address: of a Ray cluster (default: one on this machine).
-        planner_from: finished run whose planner all cells share instead of training one; it must have been trained on
-            the same data, which nothing here can check.
+        planner_from: finished run, or pretrained:NAME, whose planner all cells share instead of training one; it must
+            have been trained on the same data, which nothing here can check.
         planner_observations: share of the trajectories that planners are trained on (default: that of the cell).
         first_seed_only: of the fractions, those that are measured with the first seed alone.
         data_share: share of the trajectories that are used at all, drawn before any label is; `fractions` stay shares
@@ -102,6 +103,7 @@ class CurveConfig(CellOptions):
 
     def __post_init__(self):
         self.out = Path(self.out)  # so that a string will do in Python
+        self.planner_from = None if self.planner_from is None else find_run(self.planner_from)
 
 
 def run_curve(config: CurveConfig) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from torchrl_koap.tasks import TASKS, Task, get_task
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.training.run_lookup import PREFIX, find_run
 
 PAPER_TASKS = tuple(name for name, task in TASKS.items() if task.in_paper)
 # a planner of these is as good as any that was tried (docs/results/planners.md)
@@ -115,8 +116,8 @@ class BenchConfig(CellOptions):
         levels: label levels (1: fewest labels) with commas between, instead of the preset's.
         units: what label levels are shares of: "window" (the first public code's unit) or "trajectory".
         dataset: "scripted", a folder for a single task, or task=FOLDER with commas between.
-        planners: task=RUN with commas between: finished runs whose planners are shared instead of training them; the
-            data set they were trained on is used where --dataset names none for the task.
+        planners: task=RUN with commas between: finished runs, or pretrained:NAME, whose planners are shared instead of
+            training them; the data set a run was trained on is used where --dataset names none for the task.
         data_share: share of the demonstrations that are used at all, labels staying shares of the whole: "all", or
             "paper" for its half or quarter, by one reading of its text.
         demonstrations: number of scripted demonstrations (default: that of the task).
@@ -266,7 +267,7 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
                 units=units,
                 observations=preset.observations,
                 planner_observations=preset.planner_observations,
-                planner_from=None if planner is None else Path(planner),
+                planner_from=None if planner is None else find_run(planner),
                 released_settings=config.released_settings,
                 epochs=config.epochs,
                 workers=config.workers,
@@ -317,5 +318,7 @@ def _by_task(name: str, text: str, tasks: Sequence[Task]) -> dict[str, str]:
 
 
 def _dataset_of(planner: str | None) -> str | None:
-    """The data set that a planner to share was trained on."""
-    return None if planner is None else RunDirectory(planner).read_entry("config.json", "dataset")
+    """The data set that a planner to share was trained on; a published one does not say where it was."""
+    if planner is None or planner.startswith(PREFIX):
+        return None
+    return RunDirectory(planner).read_entry("config.json", "dataset")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchrl_koap.training.plugins import Plugins
+from torchrl_koap.training.run_lookup import find_run
 
 
 @dataclass
@@ -77,7 +78,7 @@ class TrainConfig:
         exchange: exchange objects that are alike.
         solver: solver used at evaluation unless told otherwise.
         solver_steps: its number of steps.
-        planner_from: run directory whose planner is taken over instead of training one.
+        planner_from: run directory whose planner is taken over instead of training one, or pretrained:NAME.
         episodes: number of scripted demonstrations (default: that of the task).
         threads: torch threads.
         device: "cpu" or "cuda".
@@ -160,3 +161,4 @@ class TrainConfig:
 
     def __post_init__(self):
         self.out = Path(self.out)  # so that a string will do in Python
+        self.planner_from = None if self.planner_from is None else find_run(self.planner_from)

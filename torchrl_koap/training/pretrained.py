@@ -1,54 +1,20 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Trained policies that the repository holds, and runs that are evaluated in another folder than their own."""
+"""Publishing trained policies, and runs that are evaluated in another folder than their own."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
 
-from torchrl_koap.lookup import lookup
 from torchrl_koap.training.checkpoints import load_tensors, save_tensors
 from torchrl_koap.training.compact_weights import compact
 from torchrl_koap.training.digests import DIGESTS, write_digests
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
-PREFIX = "pretrained:"
 # what a run is made of; evaluations, reports and checkpoints are made from it
 WEIGHTS = ("planner.safetensors", "controller.safetensors")
 PLACES = ("out", "dataset", "planner_from")
 FILES = ("config.json", "summary.json", "metrics.csv", "eigenvalues.safetensors", *WEIGHTS, DIGESTS)
-
-
-def pretrained_folders() -> dict[str, Path]:
-    """Names and folders of the trained policies: those of the checkout, or below the present folder.
-
-    Examples:
-        >>> from torchrl_koap.training.pretrained import pretrained_folders
-        >>> all((folder / "config.json").exists() for folder in pretrained_folders().values())
-        True
-    """
-    roots = [Path("pretrained"), Path(__file__).resolve().parents[2] / "pretrained"]
-    folders = [folder for root in roots if root.is_dir() for folder in sorted(root.iterdir())]
-    return {folder.name: folder for folder in reversed(folders) if (folder / "config.json").exists()}
-
-
-def find_run(name: str | Path) -> Path:
-    """The folder of a run: a path as it is, ``pretrained:NAME`` looked up.
-
-    Raises:
-        ValueError: if there is no trained policy of that name; the message suggests the nearest.
-        RunDirectoryError: if there are none at all: the library was installed without its repository.
-    """
-    name = str(name)
-    if not name.startswith(PREFIX):
-        return Path(name)
-    folders = pretrained_folders()
-    if not folders:
-        raise RunDirectoryError(
-            f"{name!r} was asked for, but there is no folder 'pretrained' here or beside the package: it is part of the"
-            " repository, not of an installed wheel"
-        )
-    return lookup(folders, name.removeprefix(PREFIX), "pretrained policy")
 
 
 def copy_run(source: str | Path, target: str | Path) -> Path:

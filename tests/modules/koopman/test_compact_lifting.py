@@ -72,15 +72,14 @@ class TestNoiseAdjustedComponents:
         assert components(torch.ones(4, 3)).isfinite().all() and components.weights.isfinite().all()
 
     def test_no_direction_is_free_of_noise_by_the_chance_of_few_windows(self):
-        place = turning(count=60, bodies=2).sin()
-        clean = place @ torch.randn(2, 40, generator=torch.Generator().manual_seed(3))
-        windows = clean + 0.3 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(4))
+        place = turning(count=200, bodies=2).sin()
+        first, second = (torch.randn(2, 40, generator=torch.Generator().manual_seed(seed)) for seed in (3, 5))
+        clean = place @ first + 0.3 * (3 * place).sin() @ second
         components = NoiseAdjustedComponents(40, 40)
-        components.fit(windows)
-        noise = components.analysis.square().sum(-1).sqrt()  # what white noise leaves in each component
-        ratio = components(clean).flatten(0, 1).std(0) / noise.clamp_min(1e-9)
-        assert ratio[:2].min() > 3 * ratio[2:].max()
-        assert components.weights[:2].min() > 5 * components.weights[2:].max()
+        components.fit(clean + 0.3 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(4)))
+        noise = components.analysis.square().sum(-1).sqrt()  # what white noise of unit size leaves in each component
+        stand_out = components(clean).flatten(0, 1).std(0) / noise.clamp_min(1e-9)
+        assert stand_out[:2].min() > 3.5  # 1.1 and 2.7 where the estimate is believed as it is
 
     @pytest.mark.parametrize("count", [0, 5])
     def test_wrong_numbers_of_components(self, count):
