@@ -213,8 +213,9 @@ def disc_pictures(
         profile = torch.exp(-0.5 * ((axis - place[..., None]) / radius) ** 2)  # [N, 2, pixels]
         return (profile[:, 1, :, None] * profile[:, 0, None, :]).flatten(1)
 
-    mean = draw(recorded).mean(0)
-    centred = draw(recorded) - mean
+    pictures = draw(recorded)
+    mean = pictures.mean(0)
+    centred = pictures - mean
     components = torch.linalg.eigh(centred.mT @ centred)[1][:, -kept:].flip(-1)
     return lambda state: (draw(state) - mean) @ components
 

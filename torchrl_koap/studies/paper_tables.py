@@ -19,7 +19,7 @@ from torchrl_koap.tasks import TASKS, Task, get_task
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.training.run_lookup import PREFIX, find_run
+from torchrl_koap.training.run_lookup import PREFIX
 
 PAPER_TASKS = tuple(name for name, task in TASKS.items() if task.in_paper)
 # a planner of these is as good as any that was tried (docs/results/planners.md)
@@ -267,7 +267,7 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
                 units=units,
                 observations=preset.observations,
                 planner_observations=preset.planner_observations,
-                planner_from=None if planner is None else find_run(planner),
+                planner_from=None if planner is None else Path(planner),
                 released_settings=config.released_settings,
                 epochs=config.epochs,
                 workers=config.workers,

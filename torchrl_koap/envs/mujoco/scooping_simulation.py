@@ -121,9 +121,8 @@ class ScoopingSimulations:
             angle = 2 * math.pi / _SIDES * int(share * _LAYOUTS * _SIDES % _SIDES)
             poses = data.qpos[: self._pieces].reshape(NUM_PIECES, 7)
             poses[:, :3] = _turned(layout, angle)
-            if bowls is not None:
-                poses[:, :2] += bowl - BOWL
-                data.mocap_pos[0, :2] = bowl
+            poses[:, :2] += bowl - BOWL
+            data.mocap_pos[0, :2] = bowl
             data.qpos[self._pieces :] = own
             data.ctrl[:] = own
             mujoco.mj_forward(self.model, data)

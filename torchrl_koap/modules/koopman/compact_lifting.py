@@ -151,6 +151,7 @@ class CompactLifting(KoopmanLifting):
     """
 
     kept: Tensor
+    unfolds = True
 
     def __init__(
         self,

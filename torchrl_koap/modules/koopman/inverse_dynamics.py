@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torchrl_koap.keys import ACTION, STATE
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
-from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 
@@ -179,7 +178,7 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
     @property
     def unfolds(self) -> bool:
         """Whether there is anything for :meth:`unfold` to train."""
-        return isinstance(self.lifting, CompactLifting)
+        return self.lifting.unfolds
 
     def unfold(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
         """Trains a compact lifting to coordinates along the surface that states lie on, before its losses do.
@@ -189,8 +188,7 @@ class KoopmanInverseDynamics(InverseDynamics, TensorDictSequential):
             updates (int): see :meth:`~torchrl_koap.modules.koopman.compact_lifting.CompactLifting.unfold`.
             progress (callable, optional): likewise.
         """
-        if isinstance(self.lifting, CompactLifting):
-            self.lifting.unfold(self.normalize_state(windows), updates, progress)
+        self.lifting.unfold(self.normalize_state(windows), updates, progress)
 
     @torch.no_grad()
     def fit_unlabelled(self, windows: Tensor) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey
@@ -58,6 +58,8 @@ class KoopmanLifting(TensorDictModuleBase):
         True
     """
 
+    unfolds = False  # whether unfold() trains anything
+
     def __init__(
         self,
         state_dim: int,
@@ -98,6 +100,9 @@ class KoopmanLifting(TensorDictModuleBase):
         """Sets what is known before training from unlabelled windows ``[*B, T, d]``: the linear maps, if it has any."""
         if self.encoder_skip is not None:
             self.fit_linear(windows)
+
+    def unfold(self, windows: Tensor, updates: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
+        """Trains what is trained before the losses are, on unlabelled windows ``[*B, T, d]``: here nothing."""
 
     def choose_size(self, windows: Tensor) -> int:
         """Number of coordinates kept after training, chosen on unlabelled windows ``[*B, T, d]``: here all."""
