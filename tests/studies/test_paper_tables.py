@@ -11,6 +11,7 @@ from torchrl_koap.studies import paper_tables
 from torchrl_koap.studies.paper_tables import PRESETS, BenchConfig, run_bench
 from torchrl_koap.studies.table import read_cells, write_cells
 from torchrl_koap.tasks import TASKS, get_task
+from torchrl_koap.training import run_lookup
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.run_directory import RunDirectoryError
 
@@ -82,6 +83,24 @@ def test_quick_is_small_but_what_is_asked_for_stays(asked, tmp_path):
     (curve,) = asked
     assert (curve.fractions, curve.first_seed_only, curve.seeds) == ("0.02,0.5", "", 1)
     assert (curve.episodes, curve.demonstrations, curve.steps, curve.denoiser_width) == (7, 48, 3000, 99)
+    assert curve.planner_from is None  # a width was asked for: the planner is trained
+
+
+def test_quick_takes_the_planners_of_the_repository_unless_told_which_or_how(asked, tmp_path, monkeypatch):
+    known = {"aligning": tmp_path / "aligning", "sorting": tmp_path / "sorting"}
+    for module in (paper_tables, run_lookup):
+        monkeypatch.setattr(module, "pretrained_folders", lambda: known)
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "config.json").write_text('{"dataset": "here/demos"}')
+    named = {"quick": True, "tasks": "avoiding,aligning,sorting", "planners": f"sorting={mine}"}
+    run_bench(BenchConfig(tmp_path / "q", table=1, **named))
+    assert [curve.planner_from for curve in asked] == [None, known["aligning"], mine]
+    assert [curve.dataset for curve in asked] == ["scripted", "scripted", "here/demos"]
+    for number, how in enumerate(({"steps": 40}, {"planner_seeds": 2}, {"quick": False})):
+        asked.clear()
+        run_bench(BenchConfig(tmp_path / f"o{number}", table=1, **named | how))
+        assert [curve.planner_from for curve in asked] == [None, None, mine], how
 
 
 def test_a_quick_study_has_enough_trajectories_for_one_label(asked, tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.studies.cell_options import OPTION_NAMES, CellOptions
+from torchrl_koap.studies.cell_options import OPTION_NAMES, PLANNER, CellOptions
 from torchrl_koap.studies.label_efficiency import CurveConfig, check_curve, run_curve
 from torchrl_koap.studies.paper_layout import write_paper_layout
 from torchrl_koap.studies.paper_results import paper_points, paper_share
@@ -19,7 +19,7 @@ from torchrl_koap.tasks import TASKS, Task, get_task
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.training.run_lookup import PREFIX
+from torchrl_koap.training.run_lookup import PREFIX, pretrained_folders
 
 PAPER_TASKS = tuple(name for name, task in TASKS.items() if task.in_paper)
 # a planner of these is as good as any that was tried (docs/results/planners.md)
@@ -109,8 +109,9 @@ class BenchConfig(CellOptions):
         table: 1 (methods) or 2 (variants).
         study: "observations" (unlabelled data of the controller at 1 % of the labels, the planner fixed) or
             "observations_and_planner" (the planner grows too) instead of a table.
-        quick: a small comparison, to be read and not to be cited: few demonstrations, a small planner, one seed, lowest
-            and highest level, ten rollouts.
+        quick: a small comparison, to be read and not to be cited: few demonstrations, one seed, lowest and highest
+            level, ten rollouts, and the planners that the repository holds (pretrained:TASK); a small one is trained
+            where it holds none, or where an option says how planners are made.
         tasks: names with commas between, instead of the preset's.
         methods: names with commas between, instead of the preset's.
         levels: label levels (1: fewest labels) with commas between, instead of the preset's.
@@ -223,7 +224,7 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
     names = preset.tasks if config.tasks is None else [task.strip() for task in config.tasks.split(",")]
     tasks = [get_task(name) for name in names]
     datasets = _by_task("dataset", "" if config.dataset == "scripted" else config.dataset, tasks)
-    planners = _by_task("planners", config.planners, tasks)
+    planners = _shared_planners(config, tasks)
     lookup(("all", "paper"), config.data_share, "share of the data")
     # studies need labels of whole trajectories: windows of a share touch nearly all of them
     units = config.units or ("window" if config.study is None else "trajectory")
@@ -279,6 +280,16 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
             )
         )
     return curves
+
+
+def _shared_planners(config: BenchConfig, tasks: Sequence[Task]) -> dict[str, str]:
+    """Runs whose planners are shared, by task: those asked for; for a quick comparison also those of the repository."""
+    named = _by_task("planners", config.planners, tasks)
+    made = [*PLANNER, "steps", "released_settings"]  # whoever says how planners are made wants them made
+    if not config.quick or config.planner_seeds != 1 or any(getattr(config, name) for name in made):
+        return named
+    found = [task.name for task in tasks if task.name in pretrained_folders()]
+    return {name: f"{PREFIX}{name}" for name in found} | named
 
 
 def _levels(config: BenchConfig, preset: Preset, task: Task) -> list[int]:
