@@ -80,6 +80,19 @@ def test_a_cell_is_trained_rolled_out_and_written_once(study, tmp_path):
     assert len(study.asked) == 4 and study.asked[3][1].blend_decay == 0.8  # nothing is trained anew
 
 
+def test_where_every_robot_demonstration_is_labelled_there_is_no_action_error(study, tmp_path, monkeypatch):
+    trained = study.train
+
+    def without_errors(config):
+        trained(config)
+        note = {"planner": {"loss_planner": 0.25}, "action_error_mrad": {"note": "nothing to measure on"}}
+        (config.out / "summary.json").write_text(json.dumps(note))
+
+    monkeypatch.setattr(study, "train", without_errors)
+    (row,) = run(study, tmp_path, "--unlabelled", "both")
+    assert (row["successes"], row["action_error_mrad"]) == ("6", "")
+
+
 def test_hand_alone_has_a_planner_per_number_of_labels_and_no_analysis(study, tmp_path):
     run(study, tmp_path, "--unlabelled", "hand", "both", "--labels", "5", "2")
     names = [config.out.name for config in study.asked if not isinstance(config, tuple)]
@@ -301,3 +314,30 @@ def test_the_alignment_of_a_hand_is_measured_in_mm_and_written_once(benchmark_sc
     assert len(rows) == 3 and rows["aligned"]["same_start"] == "12"
     assert float(rows["aligned"]["error_mm"]) < 0.2 * float(rows["not at all"]["error_mm"])
     assert float(rows["by the means"]["error_mm"]) < 0.2 * float(rows["not at all"]["error_mm"])
+
+
+def test_the_height_of_a_stroke_is_that_of_its_first_three_seconds_below_two_centimetres(benchmark_script):
+    height = benchmark_script("scooping_strokes").stroke_height
+    down, up = np.full(10, 0.1), np.full(10, 0.15)
+    first, second = np.linspace(0.006, 0.010, 20), np.full(40, 0.018)  # a second stroke comes later than three seconds
+    assert height(np.concatenate([down, first, up, second])) == pytest.approx(0.008)
+    assert height(down) is None
+
+
+def test_rollouts_are_played_again_and_one_that_ends_otherwise_is_refused(benchmark_script, monkeypatch, tmp_path):
+    strokes = benchmark_script("scooping_strokes")
+    env = strokes.ScoopingEnv(embed=False, seed=0)
+    env.reset()
+    actions = torch.from_numpy(env.sims.commands[0]).float().expand(1, 4, 7)  # stays where it is
+    context = torch.tensor([[[0.5, 0.22, 0.0]]])
+    rollouts = {"action": actions, "length": torch.tensor([4]), "outcome": torch.tensor([0]), "context": context}
+    assert strokes.play_again(env, rollouts, 0) == (None, 0)
+    with pytest.raises(RuntimeError, match="rollout 0 does not end as recorded"):
+        strokes.play_again(env, rollouts | {"outcome": torch.tensor([1])}, 0)
+    monkeypatch.setattr(strokes, "play_again", lambda env, rollouts, number: ((0.012, 0), (None, 3))[number])
+    config = {"label_episodes": [0, 1], "dataset": "x/data_none_2", "method": "koap", "seed": 1}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    two = {"context": context.expand(2, -1, -1), "outcome": torch.tensor([0, 0])}
+    monkeypatch.setattr(strokes, "load_file", lambda path: two)
+    (row,) = strokes.rows_of(tmp_path, env)
+    assert list(row.values()) == [2, "none", "koap", 1, row["start"], 0, 2, "12.0", "", "1.5"]
