@@ -63,10 +63,8 @@ def bench_size(name: str) -> str:
     cells = _done(name)
     seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
     rollouts = " or ".join(map(str, sorted(episodes)))
-    plural = "s" if len(seeds) > 1 else ""
-    return (
-        f"{len(cells)} cells, {len(seeds)} training seed{plural}, {rollouts} rollouts each, {'/'.join(units)}s labelled"
-    )
+    trained = "1 training seed" if len(seeds) == 1 else f"up to {len(seeds)} training seeds"
+    return f"{len(cells)} cells, {trained}, {rollouts} rollouts each, {'/'.join(units)}s labelled"
 
 
 def bench_means(name: str) -> str:
@@ -96,7 +94,10 @@ def bench_means(name: str) -> str:
 def _together(rows: list[Mapping[str, Any]]) -> str:
     """Mean success of cells that met the same contexts and noise, with the interval of one of them."""
     trials = rows[0]["episodes"]
-    mean = sum(row["successes"] / row["episodes"] for row in rows) / len(rows)
+    levels: dict[float, list[float]] = {}  # some have more seeds than others
+    for row in rows:
+        levels.setdefault(row["fraction"], []).append(row["successes"] / row["episodes"])
+    mean = sum(sum(level) / len(level) for level in levels.values()) / len(levels)
     low, high = wilson_interval(round(mean * trials), trials)
     return f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f})"
 

@@ -84,6 +84,7 @@ from scooping_rows import (
     scooping_plans_table,
     scooping_probe_errors,
     scooping_probe_table,
+    scooping_strokes_table,
     scooping_table,
 )
 from unlabelled_picture import REGIMES, draw_errors
@@ -132,6 +133,7 @@ _SCOOPING = (
     scooping_plans_table,
     scooping_probe_errors,
     scooping_probe_table,
+    scooping_strokes_table,
     scooping_table,
 )
 _HELPERS = (

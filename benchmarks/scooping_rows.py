@@ -139,6 +139,16 @@ def scooping_parts_table() -> str:
     return table(["part", "method", "unlabelled", "episodes", "succeed"], body)
 
 
+def scooping_strokes_table() -> str:
+    """A row per number of labels, start position and outcome of the rollouts that were played again."""
+    body = [
+        [row["labels"], row["start"], "yes" if row["success"] == "1" else "no"]
+        + [row["n"], row["height_mm"] + (f" +- {row['height_sd']}" if row["height_sd"] else ""), row["pieces"]]
+        for row in rows_if_measured("scooping_strokes")
+    ]
+    return table(["labelled", "start", "success", "rollouts", "height of the stroke (mm)", "pieces on the spoon"], body)
+
+
 def scooping_alignment_table() -> str:
     """A row per number of robot demonstrations that the hand's are aligned to."""
     found: dict[str, dict[str, Mapping[str, str]]] = {}

@@ -1,12 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How high the spoon is led through the bowl, by start position and outcome: what a controller with few labels gets wrong.
+"""How high the spoon is led through the bowl, by start position and outcome.
 
     koap eval RUN --episodes 60                 # or benchmarks/scooping.py, which leaves the same files
     python benchmarks/scooping_strokes.py --run runs/scooping/koap_both_5_2 runs/scooping/koap_both_100_2
 
-The commands of the recorded rollouts are played again in the simulation, without frames; an episode that ends otherwise
-than recorded stops the script. A stroke is what is lower than 2 cm within three seconds of the first such frame. Rows of
-the table are replaced by those of the runs given.
+The commands of recorded rollouts are played again in the simulation, without frames; an episode that ends otherwise
+than recorded stops the script. A stroke is what is lower than 2 cm within three seconds of the first such frame. Rows
+of the table are replaced by those of the runs given.
 """
 
 from __future__ import annotations
