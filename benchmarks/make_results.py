@@ -63,6 +63,7 @@ from result_rows import (
     percent,
     pivot,
     pooled,
+    precision_rows,
     preset_rows,
     read_rows,
     rows_if_measured,
@@ -106,7 +107,17 @@ PICTURES = Path("docs") / "pictures"
 DRAWN = ("koap", "koap_untrained", "linear_steps", "linear", "dd_lookahead", "dd", "dp")
 
 
-_TABLES = (count_rows, window_rows, error_rows, suggestion_rows, level_rows, env_rows, training_rows, ablation_rows)
+_TABLES = (
+    count_rows,
+    window_rows,
+    error_rows,
+    suggestion_rows,
+    level_rows,
+    env_rows,
+    training_rows,
+    precision_rows,
+    ablation_rows,
+)
 _PAPER = (
     paper_levels_table,
     paper_size,

@@ -211,6 +211,11 @@ def training_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     ]
 
 
+def precision_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """Table of updates per second by the number type of the matrix products."""
+    return [[row["processor"], "yes" if row["units"] == "1" else "no", *list(row.values())[2:]] for row in rows]
+
+
 def ablation_rows(topic: str) -> list[list[str]]:
     """Table of the ablations of a topic: successes with their interval, other measures with their unit."""
     return [

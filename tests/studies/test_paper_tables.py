@@ -81,8 +81,8 @@ def test_the_observation_study_varies_what_the_controller_knows_at_fixed_labels_
 def test_quick_is_small_but_what_is_asked_for_stays(asked, tmp_path):
     run_bench(BenchConfig(tmp_path / "q", table=1, quick=True, tasks="avoiding", episodes=7, denoiser_width=99))
     (curve,) = asked
-    assert (curve.fractions, curve.first_seed_only, curve.seeds) == ("0.02,0.5", "", 1)
-    assert (curve.episodes, curve.demonstrations, curve.steps, curve.denoiser_width) == (7, 48, 3000, 99)
+    assert (curve.fractions, curve.first_seed_only, curve.seeds) == ("0.02", "", 1)
+    assert (curve.episodes, curve.demonstrations, curve.steps, curve.denoiser_width) == (7, 48, 2000, 99)
     assert curve.planner_from is None  # a width was asked for: the planner is trained
 
 

@@ -28,6 +28,7 @@ from torchrl_koap.training.checkpoints import load_tensors
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.digests import DIGESTS
 from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.training.precision import has_bfloat16_units
 from torchrl_koap.training.progress import count_up_to, progress_bar
 
 _LATER = (DIGESTS, "eval.json", "inspect.json", "suggestions.json")  # files that a run may have
@@ -123,6 +124,7 @@ def machine_facts() -> dict[str, str]:
             facts[name] = "MISSING"
     facts["processors"] = str(os.cpu_count())
     facts["torch threads"] = str(torch.get_num_threads())
+    facts["bfloat16 (--precision)"] = "quick" if has_bfloat16_units() else "emulated, many times slower than float32"
     facts["CUDA"] = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
     facts["rendering (3-D pictures)"] = _rendering()
     for extra, module in {"wandb": "wandb", "video": "imageio", "lerobot": "pyarrow"}.items():

@@ -46,7 +46,8 @@ class CellOptions:
         denoiser_width: its hidden width.
         denoiser_depth: its number of residual layers.
         condition_octaves: octaves of the Fourier features of what was observed.
-        precision: "float32", or "bfloat16" for the matrix products of its training.
+        precision: of the matrix products of its training, a name as of `koap train` (default: float32; `koap bench`:
+            auto).
         batch_size: windows per update of planner and dp (default: 128).
         planner_learning_rate: peak learning rate of planner and dp (default: 3e-3).
         planner_seeds: number of planners, trained with seeds 0, 1, ...; a cell of seed s has planner s modulo that.

@@ -28,14 +28,14 @@ WIDE_PLANNER = {
     "denoiser_width": 512,
     "denoiser_depth": 4,
     "condition_octaves": 1,
-    "precision": "bfloat16",
+    "precision": "auto",
     "batch_size": 256,
     "planner_learning_rate": 1e-3,
 }
 SMALL_PLANNER = WIDE_PLANNER | {"denoiser_width": 256, "denoiser_depth": 3, "batch_size": 128}
 # what --quick asks for where nothing else is: a table that can be read, not one to be cited
-QUICK = {"demonstrations": 48, "seeds": 1, "episodes": 10, "steps": 3000, "controller_steps": 200}
-QUICK_LEVELS = (1, 5)
+QUICK = {"demonstrations": 48, "seeds": 1, "episodes": 10, "steps": 2000, "controller_steps": 200}
+QUICK_LEVEL = 1
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,8 @@ class BenchConfig(CellOptions):
         table: 1 (methods) or 2 (variants).
         study: "observations" (unlabelled data of the controller at 1 % of the labels, the planner fixed) or
             "observations_and_planner" (the planner grows too) instead of a table.
-        quick: a small comparison, to be read and not to be cited: few demonstrations, one seed, lowest and highest
-            level, ten rollouts, and the planners that the repository holds (pretrained:TASK); a small one is trained
+        quick: a small comparison, to be read and not to be cited: few demonstrations, one seed, the level of fewest
+            labels, ten rollouts, and the planners that the repository holds (pretrained:TASK); a small one is trained
             where it holds none, or where an option says how planners are made.
         tasks: names with commas between, instead of the preset's.
         methods: names with commas between, instead of the preset's.
@@ -295,7 +295,7 @@ def _shared_planners(config: BenchConfig, tasks: Sequence[Task]) -> dict[str, st
 def _levels(config: BenchConfig, preset: Preset, task: Task) -> list[int]:
     """The levels asked for, each of which the task must have."""
     if config.levels is None:
-        return [level for level in preset.levels if not config.quick or level in QUICK_LEVELS]
+        return [level for level in preset.levels if not config.quick or level == QUICK_LEVEL]
     try:
         levels = [int(part) for part in config.levels.split(",")]
     except ValueError:

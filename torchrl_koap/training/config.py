@@ -52,8 +52,8 @@ class TrainConfig:
         dropout: share of the hidden units of "mlp" dropped in training (default: 0).
         planner_weight_decay: decoupled weight decay of the planner (default: 1e-4).
         first_steps_weight: weight of the first planned step in the planner's loss against the last one's (default: 1).
-        precision: "float32", or "bfloat16" for the matrix products of the planner's training: several times quicker
-            where the processor has them (default: float32).
+        precision: "float32", "bfloat16" for the matrix products of the planner's training, several times quicker where
+            the processor has units for them and many times slower where not, or "auto", which looks (default: float32).
         candidates: plans sampled whenever one is due at evaluation, unless told otherwise there (default: 1).
         channels: widths of the U-Net's levels (default: the task's).
         schedule: "squared_cosine", "linear" or "flow".

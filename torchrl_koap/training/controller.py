@@ -25,8 +25,9 @@ from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
 from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.method import COEFFICIENTS, LABELLED_SHARES, Method, Phase
-from torchrl_koap.training.planner import augmentation, planner_weight_decay, training_dtype
+from torchrl_koap.training.planner import augmentation, planner_weight_decay
 from torchrl_koap.training.posture import POSTURE_SHARE, UPDATES, fit_posture
+from torchrl_koap.training.precision import training_dtype
 from torchrl_koap.training.progress import count_up_to, progress_bar, show_losses
 from torchrl_koap.training.resolved import ResolvedConfig
 from torchrl_koap.training.response import fit_response
@@ -203,7 +204,7 @@ def _train_policy(
     states = cut_windows(extrapolate_ends(seen, HORIZON - 1), WINDOW, select=["state"], pad_before=1)["state"]
     policy.fit_normalizers(states, data["action"][has_action])
     policy.to(options.device)
-    policy.training_dtype = training_dtype(options.precision)
+    policy.training_dtype = training_dtype(options.precision, options.device)
     # at the end of a demonstration only the steps that were recorded count
     buffer = make_window_buffer(
         data,

@@ -6,7 +6,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
@@ -19,7 +18,6 @@ from torchrl_koap.data import (
     extrapolate_ends,
     make_window_buffer,
 )
-from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.tasks import HISTORY, Task
@@ -27,6 +25,7 @@ from torchrl_koap.training.checkpoints import load_weights, save_weights
 from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.loop import moving_average, phase_finished, train_phase
+from torchrl_koap.training.precision import training_dtype
 from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.resolved import ResolvedConfig
 from torchrl_koap.training.run_directory import RunDirectory
@@ -98,7 +97,7 @@ def learn_states(
     def draw() -> TensorDictBase:
         return augment(buffer.sample())[:, unseen:]
 
-    planner.training_dtype = training_dtype(options.precision)
+    planner.training_dtype = training_dtype(options.precision, options.device)
     weight = 1.0 if options.first_steps_weight is None else options.first_steps_weight
     loss = PlannerLoss(planner, first_steps_weight=weight)
     with progress_bar(options.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
@@ -118,15 +117,6 @@ def learn_states(
         )
     loss.target_planner_params.to_module(planner)
     return values
-
-
-def training_dtype(precision: str | None) -> torch.dtype | None:
-    """Type of the denoiser's matrix products in training; None leaves them as they are.
-
-    Raises:
-        ValueError: for another name than ``"float32"`` or ``"bfloat16"``.
-    """
-    return lookup({"float32": None, "bfloat16": torch.bfloat16}, precision or "float32", "precision")
 
 
 def planner_weight_decay(options: TrainConfig) -> float:

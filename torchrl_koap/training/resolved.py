@@ -20,6 +20,7 @@ from torchrl_koap.training.loggers import check_logger
 from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.posture import posture_columns
+from torchrl_koap.training.precision import PRECISIONS
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.response import tracked_columns
 from torchrl_koap.training.run_directory import RunDirectory
@@ -242,7 +243,7 @@ def _check(options: TrainConfig, method: Method) -> None:
             raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
     if options.label_fraction is not None and not 0 < options.label_fraction <= 1:
         raise ValueError(f"label_fraction: a fraction must be in (0, 1], got {options.label_fraction}")
-    lookup(("float32", "bfloat16"), options.precision or "float32", "precision")
+    lookup(PRECISIONS, options.precision or "float32", "precision")
     if options.seed < 0:
         raise ValueError(f"seed must be >= 0, got {options.seed}")
     if not 0 <= (options.validation_fraction or 0) < 1:

@@ -1,0 +1,44 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Matrix products in bfloat16 only where the machine has units for them, unless asked for by name."""
+
+import warnings
+
+import pytest
+import torch
+
+from torchrl_koap.studies.paper_tables import SMALL_PLANNER, WIDE_PLANNER
+from torchrl_koap.training.precision import has_bfloat16_units, training_dtype
+
+
+@pytest.fixture(params=["amx_bf16", "avx512_bf16", None])
+def units(request, monkeypatch):
+    monkeypatch.setattr(
+        torch.cpu, "get_capabilities", lambda: {"avx2": True} | {name: True for name in [request.param] if name}
+    )
+    return request.param
+
+
+def test_auto_is_what_the_processor_has_units_for(units):
+    assert has_bfloat16_units() == (units is not None)
+    assert training_dtype("auto") is (None if units is None else torch.bfloat16)
+
+
+def test_float32_is_the_default_on_every_processor(units):
+    assert training_dtype(None) is None and training_dtype("float32") is None
+
+
+def test_bfloat16_by_name_is_obeyed_and_warns_where_it_is_emulated(units):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert training_dtype("bfloat16") is torch.bfloat16
+    assert len(caught) == (units is None)
+    assert units is not None or "'auto'" in str(caught[0].message)
+
+
+def test_another_precision_is_refused_by_name():
+    with pytest.raises(ValueError, match="precision 'bfloat61'"):
+        training_dtype("bfloat61")
+
+
+def test_comparisons_train_planners_with_what_the_machine_is_quick_at():
+    assert WIDE_PLANNER["precision"] == SMALL_PLANNER["precision"] == "auto"

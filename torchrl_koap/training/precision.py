@@ -1,0 +1,68 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Number type of the matrix products in a planner's training."""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+
+from torchrl_koap.lookup import lookup
+
+PRECISIONS = ("float32", "bfloat16", "auto")
+_BFLOAT16 = ("amx_bf16", "avx512_bf16")  # what processors that multiply bfloat16 matrices say of themselves
+
+
+def training_dtype(precision: str | None, device: str | torch.device = "cpu") -> torch.dtype | None:
+    """Type of the denoiser's matrix products in training; None leaves them as they are.
+
+    Without units for bfloat16 a processor emulates it, which takes ten times as long as float32; with them it is
+    several times quicker (``benchmarks/planner_speed.py``).
+
+    Args:
+        precision (str, optional): "float32", "bfloat16", or "auto": bfloat16 where the device has units for it.
+            Default: float32.
+        device (str or torch.device, optional): where the training runs. Default: "cpu".
+
+    Raises:
+        ValueError: for another precision.
+
+    Warns:
+        UserWarning: if bfloat16 was asked for by name where it is emulated.
+
+    Examples:
+        >>> from torchrl_koap.training.precision import training_dtype
+        >>> training_dtype("bfloat16")  # doctest: +SKIP
+        torch.bfloat16
+        >>> training_dtype("float32") is None
+        True
+    """
+    lookup(PRECISIONS, precision or "float32", "precision")
+    if precision in (None, "float32"):
+        return None
+    quick = has_bfloat16_units(device)
+    if precision == "auto":
+        return torch.bfloat16 if quick else None
+    if not quick:
+        told = (
+            f"precision 'bfloat16': {torch.device(device).type} has no units for it and emulates it, many times slower"
+        )
+        warnings.warn(f"{told} than 'float32'; 'auto' takes what is quick on the machine", stacklevel=2)
+    return torch.bfloat16
+
+
+def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
+    """Whether a device multiplies bfloat16 matrices itself.
+
+    Args:
+        device (str or torch.device, optional): ``"cpu"`` or ``"cuda"``. Default: "cpu".
+
+    Examples:
+        >>> from torchrl_koap.training.precision import has_bfloat16_units
+        >>> isinstance(has_bfloat16_units(), bool)
+        True
+    """
+    if torch.device(device).type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    features = torch.cpu.get_capabilities()
+    return any(features.get(name, False) for name in _BFLOAT16)
