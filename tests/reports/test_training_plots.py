@@ -11,37 +11,14 @@ import matplotlib
 import numpy as np
 import pytest
 import torch
-from matplotlib.collections import LineCollection
+from figure_parts import drawn_lines, titles
 from matplotlib.figure import Figure
 from PIL import Image
 from run_files import make_demonstrations, make_object_rollouts, make_rollouts
 
 from torchrl_koap.evaluation.latent_space import spectrum
-from torchrl_koap.reports import mode_plots, objects, rollout_plots, training_plots
+from torchrl_koap.reports import demonstration_plot, mode_plots, objects, rollout_plots, training_plots
 from torchrl_koap.reports.mode_colors import mode_colors
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """Collects the figures that are saved."""
-    saved = []
-    save = Figure.savefig
-
-    def keep(self, *args, **kwargs):
-        saved.append(self)
-        return save(self, *args, **kwargs)
-
-    monkeypatch.setattr(Figure, "savefig", keep)
-    return saved
-
-
-def titles(figure):
-    return [axes.get_title(loc="left") for axes in figure.axes]
-
-
-def drawn_lines(axes):
-    return [line for item in axes.collections if isinstance(item, LineCollection) for line in item.get_segments()]
-
 
 ROLLOUTS = make_rollouts()
 EVERY = {
@@ -51,7 +28,7 @@ EVERY = {
     "modes": lambda path: mode_plots.plot_modes(torch.arange(9), path, reference=torch.arange(24)),
     "rollouts": lambda path: rollout_plots.plot_rollouts(ROLLOUTS, path),
     "plans": lambda path: rollout_plots.plot_plans(ROLLOUTS, path),
-    "demonstrations": lambda path: rollout_plots.plot_demonstrations(make_demonstrations(), path),
+    "demonstrations": lambda path: demonstration_plot.plot_demonstrations(make_demonstrations(), path),
 }
 
 
@@ -322,35 +299,6 @@ def test_plan_deviation_is_the_distance_to_the_polyline():
 )
 def test_episodes_are_chosen_for_variety(mode, outcome, count, wanted):
     assert rollout_plots.choose_episodes(list(mode), outcome, count) == wanted
-
-
-def test_demonstrations_emphasise_exactly_the_labelled_transitions(figures, tmp_path):
-    data = make_demonstrations()
-    data["labelled"] = torch.zeros(40, dtype=torch.bool)
-    data["labelled"][[3, 19, 25]] = True  # 19 is the last step of the first one: no line to the second
-    rollout_plots.plot_demonstrations(data, tmp_path / "a.png")
-    axes = figures[0].axes[0]
-    grey, blue = axes.collections
-    assert [len(line) for line in grey.get_segments()] == [20, 20]
-    np.testing.assert_allclose(blue.get_segments(), torch.stack([data["state"][[3, 25]], data["state"][[4, 26]]], 1))
-    assert titles(figures[0])[0] == ("2 demonstrations; labels on 3 of 40 transitions (7.5%)\nin 2 of 2 demonstrations")
-
-
-def test_demonstrations_with_objects(figures, tmp_path):
-    data = make_demonstrations() | {"state": torch.rand(40, 8), "position": make_demonstrations()["state"]}
-    data["objects"] = torch.rand(40, 3, 2)
-    rollout_plots.plot_demonstrations(data, tmp_path / "a.png", task="stacking")
-    axes, beside = figures[0].axes
-    np.testing.assert_allclose(axes.collections[0].get_segments()[1], data["position"][20:])
-    np.testing.assert_allclose(drawn_lines(beside)[3], data["objects"][20:, 1])  # green box of the second one
-    assert [text.get_text() for text in beside.get_legend().get_texts()] == ["red box", "green box", "blue box", "end"]
-
-
-def test_first_columns_of_older_demonstrations_are_the_position(figures, tmp_path):
-    data = make_demonstrations()
-    data["state"] = torch.cat([data["state"], torch.rand(40, 5)], 1)
-    rollout_plots.plot_demonstrations(data, tmp_path / "a.png", task="aligning")
-    np.testing.assert_allclose(figures[0].axes[0].collections[0].get_segments()[0], data["state"][:20, :2])
 
 
 @pytest.mark.parametrize(

@@ -30,10 +30,11 @@ from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.mujoco.simulation import SimulationBatch
 from torchrl_koap.envs.raw_log import RawLog
+from torchrl_koap.envs.saved_state import SavedState
 from torchrl_koap.tasks import Task
 
 
-class ManipulationEnv(RawLog, Foresight, EnvBase):
+class ManipulationEnv(RawLog, Foresight, SavedState, EnvBase):
     """Base of the D3IL tasks: a batch of simulations, outcome bookkeeping, partial resets and partial steps.
 
     A task implements four hooks; each receives ``rows``, the indices of the environments concerned:
@@ -128,9 +129,6 @@ class ManipulationEnv(RawLog, Foresight, EnvBase):
         self._renderer: Renderer | None = None
         self._make_specs(action_bound)
         self._set_seed(seed)
-
-    # everything about the episodes in progress, a row per environment
-    _EPISODE = tuple("_observation _commands _mode _success _collision _seen _steps _ready _contexts".split())
 
     def _make_specs(self, action_bound) -> None:
         shape, device = self.batch_size, self.device
@@ -289,48 +287,6 @@ class ManipulationEnv(RawLog, Foresight, EnvBase):
 
     def _tensor(self, array: np.ndarray, dtype: torch.dtype | None = None) -> torch.Tensor:
         return torch.tensor(array, dtype=dtype, device=self.device)  # a copy: the arrays change with the next step
-
-    def get_state(self, index: int) -> dict:
-        """Full state of one environment: simulation, controller, command, mode, outcome and step count.
-
-        Args:
-            index (int): which environment.
-
-        Returns:
-            dict: arrays for :meth:`set_state`; also valid in another environment of the same task.
-        """
-        rows = {name: np.copy(getattr(self, name)[index]) for name in self._EPISODE}
-        return {"simulation": self.sims.get_state(index)} | rows
-
-    def set_state(self, index: int, state: dict) -> None:
-        """Restores what :meth:`get_state` returned; the episode then continues bit for bit.
-
-        Args:
-            index (int): which environment.
-            state (dict): from :meth:`get_state`, of any environment of the same task.
-        """
-        self.sims.set_state(index, state["simulation"])
-        for name, value in state.items():
-            if name != "simulation":
-                getattr(self, name)[index] = value
-
-    def set_physics(self, index: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
-        """Starts a fresh episode of one environment from a given physics state.
-
-        Args:
-            index (int): which environment; its context stays.
-            qpos (array): positions [nq] (m, rad).
-            qvel (array, optional): velocities [nv]; zero if not given.
-            qacc_warmstart (array, optional): warm start of the solver [nv].
-            ctrl (array, optional): motor commands of the substep before [nu].
-            time (float): clock (s).
-
-        Raises:
-            ValueError: if a size is wrong.
-        """
-        self.sims.set_physics(index, qpos, qvel, qacc_warmstart=qacc_warmstart, ctrl=ctrl, time=time)
-        self.sims.widths[index] = controller.FINGER_OPEN
-        self._begin_episode(np.array([index]))
 
     @property
     def commands(self) -> np.ndarray:

@@ -38,6 +38,7 @@ FACTS = {
 }
 _BUILT_IN = (
     "rollout_plots",
+    "demonstration_plot",
     "offline_plots",
     "animation",
     "mode_plots",
