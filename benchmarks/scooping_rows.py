@@ -142,11 +142,16 @@ def scooping_parts_table() -> str:
 def scooping_strokes_table() -> str:
     """A row per number of labels, start position and outcome of the rollouts that were played again."""
     body = [
-        [row["labels"], row["start"], "yes" if row["success"] == "1" else "no"]
-        + [row["n"], row["height_mm"] + (f" +- {row['height_sd']}" if row["height_sd"] else ""), row["pieces"]]
+        [row["labels"], row["seed"], row["start"], "yes" if row["success"] == "1" else "no", row["n"]]
+        + [
+            row[f"{name}_mm"] + (f" +- {row[f'{name}_sd']}" if row[f"{name}_sd"] else "")
+            for name in ("entry", "height")
+        ]
+        + [row["pieces"]]
         for row in rows_if_measured("scooping_strokes")
     ]
-    return table(["labelled", "start", "success", "rollouts", "height of the stroke (mm)", "pieces on the spoon"], body)
+    head = ["labelled", "seed", "start", "success", "rollouts", "entry off the usual one (mm)"]
+    return table([*head, "height of the stroke (mm)", "pieces on the spoon"], body)
 
 
 def scooping_alignment_table() -> str:

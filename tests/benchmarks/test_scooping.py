@@ -23,6 +23,7 @@ import torch
         (["--episodes", "0"], "--episodes must be at least 1, got 0"),
         (["--controller-steps", "-1"], "--controller-steps must be at least 0, got -1"),
         (["--blend-decay", "1"], "--blend-decay must be in [0, 1), got 1.0"),
+        (["--neighbor-recovery", "nan"], "--neighbor-recovery must be at least 0, got nan"),
         (["--unlabelled", "foot"], "invalid choice: 'foot'"),
     ],
 )
@@ -78,6 +79,17 @@ def test_a_cell_is_trained_rolled_out_and_written_once(study, tmp_path):
     again = run(study, tmp_path, "--unlabelled", "both", "--execution", "feedback", "--blend-decay", "0.8")
     assert [(r["execution"], r["blend_decay"]) for r in again] == [("open_loop", "0.0"), ("feedback", "0.8")]
     assert len(study.asked) == 4 and study.asked[3][1].blend_decay == 0.8  # nothing is trained anew
+
+
+def test_planners_with_recovery_have_runs_and_a_table_of_their_own(study, tmp_path):
+    before = run(study, tmp_path, "--unlabelled", "both")
+    assert run(study, tmp_path, "--unlabelled", "both", "--neighbor-recovery", "0.5") == before
+    with (tmp_path / "scooping_recovery0.5.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) == 1
+    planner, cell = study.asked[3:5]
+    assert (planner.out.name, planner.neighbor_recovery) == ("planner_both_recovery0.5_0", 0.5)
+    assert (cell.out.name, cell.planner_from) == ("koap_both_5_recovery0.5_0", planner.out)
+    assert [config.neighbor_recovery for config in study.asked[:2]] == [0.0, None]
 
 
 def test_where_every_robot_demonstration_is_labelled_there_is_no_action_error(study, tmp_path, monkeypatch):
@@ -314,30 +326,3 @@ def test_the_alignment_of_a_hand_is_measured_in_mm_and_written_once(benchmark_sc
     assert len(rows) == 3 and rows["aligned"]["same_start"] == "12"
     assert float(rows["aligned"]["error_mm"]) < 0.2 * float(rows["not at all"]["error_mm"])
     assert float(rows["by the means"]["error_mm"]) < 0.2 * float(rows["not at all"]["error_mm"])
-
-
-def test_the_height_of_a_stroke_is_that_of_its_first_three_seconds_below_two_centimetres(benchmark_script):
-    height = benchmark_script("scooping_strokes").stroke_height
-    down, up = np.full(10, 0.1), np.full(10, 0.15)
-    first, second = np.linspace(0.006, 0.010, 20), np.full(40, 0.018)  # a second stroke comes later than three seconds
-    assert height(np.concatenate([down, first, up, second])) == pytest.approx(0.008)
-    assert height(down) is None
-
-
-def test_rollouts_are_played_again_and_one_that_ends_otherwise_is_refused(benchmark_script, monkeypatch, tmp_path):
-    strokes = benchmark_script("scooping_strokes")
-    env = strokes.ScoopingEnv(embed=False, seed=0)
-    env.reset()
-    actions = torch.from_numpy(env.sims.commands[0]).float().expand(1, 4, 7)  # stays where it is
-    context = torch.tensor([[[0.5, 0.22, 0.0]]])
-    rollouts = {"action": actions, "length": torch.tensor([4]), "outcome": torch.tensor([0]), "context": context}
-    assert strokes.play_again(env, rollouts, 0) == (None, 0)
-    with pytest.raises(RuntimeError, match="rollout 0 does not end as recorded"):
-        strokes.play_again(env, rollouts | {"outcome": torch.tensor([1])}, 0)
-    monkeypatch.setattr(strokes, "play_again", lambda env, rollouts, number: ((0.012, 0), (None, 3))[number])
-    config = {"label_episodes": [0, 1], "dataset": "x/data_none_2", "method": "koap", "seed": 1}
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    two = {"context": context.expand(2, -1, -1), "outcome": torch.tensor([0, 0])}
-    monkeypatch.setattr(strokes, "load_file", lambda path: two)
-    (row,) = strokes.rows_of(tmp_path, env)
-    assert list(row.values()) == [2, "none", "koap", 1, row["start"], 0, 2, "12.0", "", "1.5"]

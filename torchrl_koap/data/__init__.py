@@ -16,6 +16,7 @@ from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstra
 from torchrl_koap.data.gripper_recovery import GripperRecovery
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands
 from torchrl_koap.data.lerobot.reader import read_lerobot
+from torchrl_koap.data.neighbor_recovery import NeighborRecovery
 from torchrl_koap.data.recorded_replay import RecordedExperienceReplay
 from torchrl_koap.data.recordings import Recordings, RecordingsError, make_recordings
 from torchrl_koap.data.sources import read_recordings
@@ -41,6 +42,7 @@ __all__ = [
     "GripperRecovery",
     "LabelBudget",
     "LabelReport",
+    "NeighborRecovery",
     "ObjectPermutation",
     "RandomPlanarTransform",
     "RawEpisode",

@@ -101,6 +101,7 @@ _SCOOPING = register_task(
             planner_steps=4000,
             relative=False,
             recovery_sigma=0.0,
+            view={"neighbor_recovery": 2.0},  # no column is a position that could be displaced
             # a place read off every frame with an error acts as a velocity: docs/results/scooping.md
             execution={"execution": "open_loop", "replan_interval": 8, "blend_decay": 0.0},
         ),
@@ -121,6 +122,8 @@ register_task(
         bodies=(*_SCOOPING.bodies, Body("bowl", "bowl", half=(BOWL_RADIUS, BOWL_RADIUS), still=True)),
         start_regions=StartRegions((*_START_REGIONS, _BOWL_REGION), yaw=(-180.0, 180.0), whose=(0, 0, 0, 1)),
         env_options={"task": "scooping_moving_bowl"},
+        # the nearest other picture may show the bowl elsewhere: not tried
+        defaults=replace(_SCOOPING.defaults, view={}),
         scene=replace(_SCOOPING.scene, shapes=(), caption=" The spoon's path, and where the bowl stands."),
     )
 )

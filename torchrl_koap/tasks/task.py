@@ -84,7 +84,7 @@ class Defaults:
         planner (dict): options of `koap train` for the planner's network and its training that are used together where
             no denoiser is asked for: ``denoiser``, its sizes, ``batch_size``, ``planner_learning_rate``.
         recovery_response (str): how that augmentation leads back, ``"first_order"`` or ``"second_order"``.
-        view (dict): options of `koap train` for what the planner sees: ``observed_frames``, ``frame``, ``plan_steps``.
+        view (dict): options of `koap train` for what the planner sees: ``observed_frames``, ``neighbor_recovery``, ...
         released_epochs (int): epochs of a controller in KOAP's first public code.
         execution (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig` for how plans are followed.
 

@@ -73,6 +73,9 @@ class TrainConfig:
             robots that follow their commands late can do (default: the task's).
         gripper_recovery: share of the windows with open fingers that are shown with fingers closed on nothing, which
             open again; for tasks with a gripper (default: 0.1); 0 turns it off.
+        neighbor_recovery: farthest share of the way to the nearest other window of a batch that windows are moved, and
+            come back, for states without a column that is a position, such as embeddings (default: the task's, else
+            none); 0 turns it off.
         scene_shift: typical displacement (m) of whole scenes, for tasks whose place on the table does not matter.
         scene_turn: typical angle (rad) by which such scenes are turned.
         exchange: exchange objects that are alike.
@@ -143,6 +146,7 @@ class TrainConfig:
     recovery_sigma: float | None = None
     recovery_response: str | None = None
     gripper_recovery: float | None = None
+    neighbor_recovery: float | None = None
     scene_shift: float = 0.05
     scene_turn: float = 0.3
     exchange: bool = True

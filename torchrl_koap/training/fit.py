@@ -35,6 +35,7 @@ PLANNER_OPTIONS = (
         "recovery_sigma",
         "recovery_response",
         "gripper_recovery",
+        "neighbor_recovery",
         "scene_shift",
         "scene_turn",
         "exchange",

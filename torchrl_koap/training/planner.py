@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictSequential
 
 from torchrl_koap.data import (
     GripperRecovery,
+    NeighborRecovery,
     ObjectPermutation,
     RandomPlanarTransform,
     RecoveryAugmentation,
@@ -153,4 +154,6 @@ def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> 
         steps.append(RecoveryAugmentation(options.recovery_sigma, history=HISTORY, **way, **tool))
     if task.gripper is not None and options.gripper_recovery and not actions:
         steps.append(GripperRecovery(task.gripper[1], share=options.gripper_recovery, history=HISTORY))
+    if options.neighbor_recovery and not actions:
+        steps.append(NeighborRecovery(options.neighbor_recovery, history=HISTORY))
     return TensorDictSequential(*steps)

@@ -229,7 +229,7 @@ def _check(options: TrainConfig, method: Method) -> None:
             raise ValueError(f"{name} must be >= 0, got {value}")
     if not method.has_planner and options.planner_from is not None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
-    for name in ("frame", "plan_steps", "observed_frames"):
+    for name in ("frame", "plan_steps", "observed_frames", "neighbor_recovery"):
         if getattr(options, name) is not None and not method.has_planner:
             raise ValueError(f"{name} is the planner's, which method {options.method!r} does not have")
     if options.observed_frames not in (None, *range(1, HISTORY + 1)):
@@ -243,6 +243,8 @@ def _check(options: TrainConfig, method: Method) -> None:
             raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
     if options.label_fraction is not None and not 0 < options.label_fraction <= 1:
         raise ValueError(f"label_fraction: a fraction must be in (0, 1], got {options.label_fraction}")
+    if options.neighbor_recovery is not None and not 0 <= options.neighbor_recovery < math.inf:
+        raise ValueError(f"neighbor_recovery must be a share of at least 0, got {options.neighbor_recovery}")
     lookup(PRECISIONS, options.precision or "float32", "precision")
     if options.seed < 0:
         raise ValueError(f"seed must be >= 0, got {options.seed}")

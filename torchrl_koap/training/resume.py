@@ -19,7 +19,11 @@ FREE = frozenset(
 )
 _EVERY_TIME = ("resume", "force_data")  # asked for anew or not at all
 
-_OFF_BEFORE = {"forecast": False, "gripper_recovery": 0.0}  # in runs of before there was such an option
+_OFF_BEFORE = {
+    "forecast": False,
+    "gripper_recovery": 0.0,
+    "neighbor_recovery": 0.0,
+}  # in runs of before there was such an option
 
 
 def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
