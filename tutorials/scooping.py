@@ -145,7 +145,7 @@ figure.savefig("scooping.png", dpi=90)
 # A network trained on other pictures, videos most of which have no actions, and five labelled demonstrations: the
 # spoon comes over the bowl, and it leaves with a piece in most trials. What a set of this size does not tell is which
 # controller is best: the intervals overlap, and features that stay random do about as well as those that were trained.
-# In the study with four times the videos, ``docs/results/scooping.md``, they do better with the fewest labels.
+# Nor are they told apart in the study with four times the videos, ``docs/results/scooping.md``.
 #
 # From the shell: ``koap demos --task scooping --embodiment robot --out robot``, the same with ``hand``, then ``koap
 # embed robot hand --mixed --out data``, ``koap train --task scooping --dataset data --label-episodes 0 1 2 3 4`` and
