@@ -9,12 +9,12 @@ Both are measured in the same run, in turn. A processor without units for bfloat
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from pathlib import Path
 
 import torch
 from planner_speed import median_seconds
+from resumable_table import open_table
 from tensordict import TensorDict
 
 from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner
@@ -22,6 +22,7 @@ from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.training.precision import has_bfloat16_units
 
 TABLE = Path(__file__).parent / "results" / "planner_precision.csv"
+COLUMNS = ("processor", "units", "width", "depth", "batch", "float32", "bfloat16", "ratio")
 STATE_DIM, HISTORY, HORIZON = 19, 2, 14
 
 
@@ -45,7 +46,7 @@ def update_of(width: int, depth: int, batch: int, dtype: torch.dtype | None):
 
 
 def main() -> None:
-    """Measures and adds a row per size to the table."""
+    """Measures what the table has not of this processor; adds a row per size."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--table", type=Path, default=TABLE)
@@ -53,20 +54,18 @@ def main() -> None:
     torch.set_num_threads(1)
     processor = torch.cpu.get_capabilities()["cpu_name"]
     units = has_bfloat16_units()
-    new = not options.table.exists()
-    with options.table.open("a", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        if new:
-            writer.writerow(["processor", "units", "width", "depth", "batch", "float32", "bfloat16", "ratio"])
-        for width, depth, batch in ((512, 4, 512), (512, 4, 256), (256, 3, 128)):
-            rates = [
-                1 / median_seconds(update_of(width, depth, batch, dtype), options.repeats, time.perf_counter)
-                for dtype in (None, torch.bfloat16)
-            ]
-            row = [processor, int(units), width, depth, batch, *(f"{rate:.2f}" for rate in rates)]
-            row.append(f"{rates[1] / rates[0]:.2f}")
-            writer.writerow(row)
-            print(*row)
+    done, write = open_table(options.table, COLUMNS, COLUMNS[:5])
+    for size in ((512, 4, 512), (512, 4, 256), (256, 3, 128)):
+        cell = (processor, int(units), *size)
+        if tuple(map(str, cell)) in done:
+            continue
+        rates = [
+            1 / median_seconds(update_of(*size, dtype), options.repeats, time.perf_counter)
+            for dtype in (None, torch.bfloat16)
+        ]
+        row = [*cell, *(f"{rate:.2f}" for rate in rates), f"{rates[1] / rates[0]:.2f}"]
+        write(row)
+        print(*row)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
     python benchmarks/scooping.py --folder runs/scooping
     python benchmarks/scooping.py --folder runs/scooping --methods koap linear dd --labels 2 5 20 --unlabelled both
     python benchmarks/scooping.py --folder runs/moving --task scooping_moving_bowl
-    python benchmarks/scooping.py --folder runs/scooping --neighbor-recovery 1   # into a table of its own
+    python benchmarks/scooping.py --folder runs/scooping --neighbor-recovery 2   # into a table of its own
 
 Records robot and hand, embeds, trains one planner per set of unlabelled demonstrations and one controller per cell, and
 rolls each out. Folder by folder what is there already is not made again, and rows of the table are not run again.
@@ -90,10 +90,11 @@ def _config(run: Path, folder: Path, unlabelled: str, labels: int, task: str, **
 
 def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int, options) -> dict:
     """Trains and rolls out one cell."""
-    planner, way = None, "" if method.startswith("dp") else _way(options)
-    run = folder / f"{method}_{unlabelled}_{labels}{way}_{seed}"
+    planner, way = None, ""
     if not method.startswith("dp"):
+        way = _way(options)
         planner = planner_of(folder, unlabelled, labels, seed, options)
+    run = folder / f"{method}_{unlabelled}_{labels}{way}_{seed}"
     if not (run / "summary.json").is_file():
         settings = {"method": method, "seed": seed, "planner_from": planner, "steps": options.steps}
         settings["resume"] = run.exists()

@@ -19,11 +19,8 @@ FREE = frozenset(
 )
 _EVERY_TIME = ("resume", "force_data")  # asked for anew or not at all
 
-_OFF_BEFORE = {
-    "forecast": False,
-    "gripper_recovery": 0.0,
-    "neighbor_recovery": 0.0,
-}  # in runs of before there was such an option
+# of options that there were none of in runs of before
+_OFF_BEFORE = {"forecast": False, "gripper_recovery": 0.0, "neighbor_recovery": 0.0}
 
 
 def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
