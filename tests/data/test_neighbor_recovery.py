@@ -87,3 +87,10 @@ def test_a_run_of_before_goes_on_without(tmp_path):
 def test_options_out_of_range_are_refused(share):
     with pytest.raises(ValueError, match="neighbor_recovery must be a share of at least 0"):
         resolve(TrainConfig(out="run", task="avoiding", neighbor_recovery=share))
+
+
+def test_a_batch_without_neighbours_is_refused_before_any_work():
+    with pytest.raises(ValueError, match="batch_size: neighbor_recovery 2 looks for neighbours in a batch of two"):
+        resolve(TrainConfig(out="run", task="scooping", batch_size=1))
+    options = resolve(TrainConfig(out="run", task="scooping", batch_size=1, neighbor_recovery=0.0)).options
+    assert options.batch_size == 1

@@ -162,9 +162,10 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
     planner, controller = trained.planner.to(config.device), trained.controller.to(config.device)
     asked = EvalConfig(replan_interval=config.replan_interval, blend_decay=config.blend_decay)
     settings = execution_of(trained, asked)
-    interval, leash = settings["replan_interval"], make_leash(task, settings.pop("command_lead"))
-    gain = make_gain(task, settings.pop("action_gain"))
+    interval = settings["replan_interval"]
     settings |= {"controller_columns": trained.columns, "action_rule": task.action_rule}
+    settings["leash"] = make_leash(task, settings.pop("command_lead"))
+    settings["action_gain"] = make_gain(task, settings["action_gain"])
     seeds = list(range(config.seed, config.seed + config.episodes))
     from torchrl_koap.envs.registry import make_env_of  # takes seconds
 
@@ -172,7 +173,6 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
     _, contexts = choose_contexts(task, config.episodes)
     with progress_bar(3, "experiments", unit="experiment") as bar:
         policy = make_policy(planner, controller, state_columns=task.state_of, **settings)
-        policy.leash, policy.action_gain = leash, gain
         closed = roll_out(policy, make_env, seeds, max_steps=task.max_steps, contexts=contexts)
         bar.update()
         followed = follow_recordings(planner, controller, task, data, make_env, episodes=config.episodes, **settings)

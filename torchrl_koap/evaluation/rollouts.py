@@ -45,6 +45,8 @@ def make_policy(
     action_rule: Callable[[Tensor, Tensor], Tensor] | None = None,
     candidates: int = 1,
     choice: str = "quarter",
+    leash: CommandLeash | None = None,
+    action_gain: Tensor | None = None,
 ) -> PlanThenControl:
     """Planner and controller as a policy that observes as many frames as the longer-sighted of the two.
 
@@ -66,6 +68,8 @@ def make_policy(
         action_rule (callable, optional): has the last word on actions, such as ``task.action_rule``.
         candidates (int): plans sampled whenever one is due.
         choice (str): the rule by which one of them is taken.
+        leash (CommandLeash, optional): how far the command may be ahead of the robot (:func:`make_leash`).
+        action_gain (Tensor, optional): what every entry of an action is multiplied by ``[act]`` (:func:`make_gain`).
     """
     response, posture = getattr(controller, "response", None), getattr(controller, "posture", None)
     frames = [planner.history, controller.num_past + 1] + ([] if response is None else [response.history])
@@ -74,7 +78,7 @@ def make_policy(
         kind = partial(PostureTracking, posture=posture)
         if action_rule is None and posture.gripper is not None:
             action_rule = ActionRule(posture.gripper)
-    return kind(
+    policy = kind(
         planner,
         controller,
         state_columns=state_columns,
@@ -87,6 +91,8 @@ def make_policy(
         candidates=candidates,
         choice=choice,
     )
+    policy.leash, policy.action_gain = leash, action_gain
+    return policy
 
 
 def make_gain(task: Task, gain: float) -> Tensor | None:

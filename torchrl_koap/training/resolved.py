@@ -245,6 +245,11 @@ def _check(options: TrainConfig, method: Method) -> None:
         raise ValueError(f"label_fraction: a fraction must be in (0, 1], got {options.label_fraction}")
     if options.neighbor_recovery is not None and not 0 <= options.neighbor_recovery < math.inf:
         raise ValueError(f"neighbor_recovery must be a share of at least 0, got {options.neighbor_recovery}")
+    if options.neighbor_recovery and options.batch_size == 1:
+        raise ValueError(
+            f"batch_size: neighbor_recovery {options.neighbor_recovery:g} looks for neighbours in a batch of two or"
+            " more, got 1; neighbor_recovery 0 goes without"
+        )
     lookup(PRECISIONS, options.precision or "float32", "precision")
     if options.seed < 0:
         raise ValueError(f"seed must be >= 0, got {options.seed}")
