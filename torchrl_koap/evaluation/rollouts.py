@@ -115,10 +115,9 @@ def make_gain(task: Task, gain: float) -> Tensor | None:
         raise ValueError(f"action_gain must be a number above 0, got {gain}")
     if gain == 1:
         return None
-    changes = [name not in task.absolute_actions for name in task.actions]
-    if task.action_targets or not any(changes):
+    if task.action_targets or not task.num_delta_actions:
         raise ValueError(f"action_gain was given, but no action of task {task.name!r} is a change of a command")
-    return torch.tensor([gain if change else 1.0 for change in changes])
+    return torch.tensor([gain] * task.num_delta_actions + [1.0] * len(task.absolute_actions))
 
 
 def make_leash(task: Task, lead: float) -> CommandLeash | None:

@@ -43,7 +43,7 @@ def posture_columns(task: Task) -> dict[str, Any]:
             f"task {task.name!r} cannot keep a posture: its observation has no part that repeats the last command"
             " (Task.command)"
         )
-    actions = [i for i, name in enumerate(task.actions) if name not in task.absolute_actions]
+    actions = list(range(task.num_delta_actions))
     if not actions or task.action_targets:
         raise ValueError(f"task {task.name!r} needs no posture: its actions are commands, not changes of them")
     commands = list(range(task.observation_dim))[task.command_columns]

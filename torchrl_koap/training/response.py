@@ -35,7 +35,7 @@ def tracked_columns(task: Task) -> dict[str, Any]:
         {'states': [0, 1], 'commands': [0, 1], 'actions': [0, 1], 'absolute': False}
     """
     absolute = bool(task.action_targets)
-    actions = [i for i, name in enumerate(task.actions) if absolute or name not in task.absolute_actions]
+    actions = list(range(task.action_dim if absolute else task.num_delta_actions))
     moved = list(task.action_targets or task.actuated or task.robot[: len(actions)])
     if task.command is None:
         raise ValueError(
