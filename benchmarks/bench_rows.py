@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,13 +29,39 @@ def paper_levels_table() -> str:
     return table(["task", *(f"level {level}" for level in range(1, 6))], body)
 
 
-def bench_table(name: str) -> str:
+def bench_table(name: str, beside: str = "", methods: Sequence[str] = ()) -> str:
     """Cells of a comparison in the layout of the paper's tables, the paper's beside each.
 
     Args:
         name (str): file of cells without its ending.
+        beside (str): another comparison, whose cells with the same task, share and seed stand before them.
+        methods (sequence of str): of those, the methods that do.
     """
-    return as_markdown(layout_rows(paper_entries(read_cells(CELLS / f"{name}.csv"))))
+    rows = read_cells(CELLS / f"{name}.csv")
+    places = {_place(row) for row in rows}
+    others = [row for row in _done(beside) if row["method"] in methods and _place(row) in places] if beside else []
+    return as_markdown(layout_rows(paper_entries([*others, *rows])))
+
+
+def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[part] for part in ("task", "fraction", "seed", "label_unit"))
+
+
+def observation_table(name: str) -> str:
+    """A row per share of the trajectories that the controller knows, a column per method: success in percent.
+
+    Args:
+        name (str): file of cells without its ending.
+    """
+    found: dict[float, dict[str, Mapping[str, Any]]] = {}
+    for row in _done(name):
+        found.setdefault(row["observations"], {})[row["method"]] = row | {"n": row["episodes"]}
+    methods = list(dict.fromkeys(method for own in found.values() for method in own))
+    body = [
+        [share(part), *(percent(own[method]) if method in own else "not run" for method in methods)]
+        for part, own in sorted(found.items())
+    ]
+    return table(["demonstrations", *(f"`{method}`" for method in methods)], body)
 
 
 def paper_size() -> str:

@@ -26,7 +26,13 @@ PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 STRATEGIES = {"lowest": "lowest-direct", "newest": "highest"}
 TESTS = (
     *("tests/test_keys.py", "tests/test_files.py", "tests/test_lookup.py", "tests/tasks", "tests/modules"),
-    *("tests/objectives", "tests/data", "tests/envs/test_avoiding.py", "tests/training/test_loop.py"),
+    *(
+        "tests/objectives",
+        "tests/data",
+        "tests/envs/test_avoiding.py",
+        "tests/envs/test_avoiding_batches.py",
+        "tests/training/test_loop.py",
+    ),
 )
 TOOLS = ("pytest", "pytest-timeout", "hypothesis")
 EXTRAS = ("--extra", "lerobot", "--extra", "hdf5")

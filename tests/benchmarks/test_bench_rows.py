@@ -45,6 +45,21 @@ def test_another_method_is_counted_against_the_papers_koap(rows, tmp_path):
     assert rows.bench_sentence("made", "pca") == "1 of 2"  # the paper's KOAP has 78.0 and 98.05 %
 
 
+def test_cells_of_another_comparison_stand_beside(rows, tmp_path):
+    write_cells(tmp_path / "first.csv", [cell("koap", 0.02, 60), cell("koap", 0.05, 30), cell("pca", 0.02, 0)])
+    write_cells(tmp_path / "made.csv", [cell("relabel", 0.02, 30)])
+    head, _, line = rows.bench_table("made", "first", ("koap",)).splitlines()
+    assert "koap" in head and "pca" not in head and "100.0 (94-100)" in line and "50.0 (38-62)" in line  # level 1 alone
+
+
+def test_a_study_of_observations_has_a_row_per_share(rows, tmp_path):
+    few = cell("koap", 0.01, 30) | {"observations": 0.1}
+    write_cells(tmp_path / "made.csv", [cell("koap", 0.01, 60), cell("pca", 0.01, 15), few])
+    head, _, first, second = rows.observation_table("made").splitlines()
+    assert first.startswith("| 10 % | 50.0 %") and first.endswith("| not run |") and "`pca`" in head
+    assert second.startswith("| 100 % | 100.0 %")
+
+
 def test_replaced_parts_of_a_controller_are_a_table(rows, monkeypatch, tmp_path):
     kept = {"gripper": "planned", "motion": "decoded", "pull": "0.0", "n": "60", "successes": "3"}
     pulled = kept | {"motion": "posture", "pull": "0.3", "successes": "30"}

@@ -1,13 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Windows stay inside their trajectory, are equally likely, hold the promised labels, and resume exactly."""
+"""Windows stay inside their trajectory, are equally likely, and hold the promised labels."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from counted_windows import LENGTHS, demonstrations, seen
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torchrl.checkpoint import Checkpoint, GlobalRNGState
 from torchrl.data import LazyMemmapStorage, LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer, TensorStorage
 
 from torchrl_koap.data import (
@@ -23,17 +23,7 @@ from torchrl_koap.data import (
     save_ted,
 )
 
-LENGTHS = (20, 33, 16, 40)
 GPU = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))
-
-
-def demonstrations(lengths=LENGTHS):
-    """Every observation is (trajectory, step, 0, 0); every action (trajectory, step)."""
-    frames = [
-        torch.stack([torch.full((n + 1,), float(i)), torch.arange(n + 1.0), torch.zeros(n + 1), torch.zeros(n + 1)], 1)
-        for i, n in enumerate(lengths)
-    ]
-    return flatten_trajectories(frames, [frame[:-1, :2] for frame in frames])
 
 
 def by_hand(lengths, window, before=0, after=0):
@@ -43,11 +33,6 @@ def by_hand(lengths, window, before=0, after=0):
         for start in range(-before, length + after - window + 1):
             found.append((trajectory, tuple(min(max(start + j, 0), length - 1) for j in range(window))))
     return found
-
-
-def seen(batch):
-    values = batch["observation"]
-    return [(int(w[0, 0]), tuple(int(step) for step in w[:, 1])) for w in values]
 
 
 @settings(max_examples=60, deadline=None)
@@ -283,75 +268,6 @@ def test_a_table_of_other_data_is_refused():
     buffer = ReplayBuffer(storage=TensorStorage(demonstrations((20,))), sampler=sampler, sample_unit=sampler.unit())
     with pytest.raises(ValueError, match="109 steps, the storage has 20"):
         buffer.sample(2)
-
-
-def make(replacement, share, seed=5):
-    data, _ = LabelBudget(1, "trajectory", seed=1).apply(demonstrations())
-    return make_window_buffer(data, 16, 6, labelled_share=share, replacement=replacement)
-
-
-@pytest.mark.parametrize("share", [None, 0.5])
-@pytest.mark.parametrize("replacement", [True, False])
-@pytest.mark.parametrize("how", ["dumps", "state_dict", "checkpoint"])
-def test_exact_resume(how, replacement, share, tmp_path):
-    torch.manual_seed(3)
-    buffer = make(replacement, share)
-    for _ in range(4):
-        buffer.sample()
-    rng = GlobalRNGState()
-    if how == "checkpoint":
-        checkpoint = Checkpoint()
-        checkpoint.register("buffer", buffer)
-        checkpoint.register("rng", rng)
-        checkpoint.save(tmp_path / "state")
-    elif how == "dumps":
-        buffer.dumps(tmp_path / "state")
-        state = rng.state_dict()
-    else:
-        state, saved = rng.state_dict(), buffer.state_dict()
-    expected = [seen(buffer.sample()) for _ in range(9)]
-
-    torch.manual_seed(999)
-    resumed = make(replacement, share)
-    resumed.sample()
-    rng = GlobalRNGState()
-    if how == "checkpoint":
-        checkpoint = Checkpoint()
-        checkpoint.register("buffer", resumed)
-        checkpoint.register("rng", rng)
-        checkpoint.load(tmp_path / "state")
-    elif how == "dumps":
-        resumed.loads(tmp_path / "state")
-        rng.load_state_dict(state)
-    else:
-        resumed.load_state_dict(saved)
-        rng.load_state_dict(state)
-    assert [seen(resumed.sample()) for _ in range(9)] == expected
-
-
-def test_other_options_are_refused(tmp_path):
-    make(False, 0.5).dumps(tmp_path / "state")
-    with pytest.raises(ValueError, match=r"labelled_share 0\.5 \(here -1\)"):
-        make(False, None).loads(tmp_path / "state")
-
-
-def test_an_own_generator():
-    draws = []
-    for _ in range(2):
-        torch.manual_seed(len(draws))
-        buffer = make(True, 0.5)
-        buffer.set_rng(torch.Generator().manual_seed(0))
-        draws.append(seen(buffer.sample()))
-    assert draws[0] == draws[1]
-
-
-def test_sampling_uses_the_global_generator():
-    buffer = make(True, 0.5)
-    torch.manual_seed(0)
-    first = seen(buffer.sample())
-    torch.manual_seed(0)
-    assert seen(buffer.sample()) == first
-    assert seen(buffer.sample()) != first
 
 
 def test_from_a_data_set():

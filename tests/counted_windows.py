@@ -1,0 +1,24 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Trajectories whose observations say which trajectory and step they are, so that windows can be told apart."""
+
+from __future__ import annotations
+
+import torch
+
+from torchrl_koap.data import flatten_trajectories
+
+LENGTHS = (20, 33, 16, 40)
+
+
+def demonstrations(lengths=LENGTHS):
+    """Every observation is (trajectory, step, 0, 0); every action (trajectory, step)."""
+    frames = [
+        torch.stack([torch.full((n + 1,), float(i)), torch.arange(n + 1.0), torch.zeros(n + 1), torch.zeros(n + 1)], 1)
+        for i, n in enumerate(lengths)
+    ]
+    return flatten_trajectories(frames, [frame[:-1, :2] for frame in frames])
+
+
+def seen(batch):
+    values = batch["observation"]
+    return [(int(w[0, 0]), tuple(int(step) for step in w[:, 1])) for w in values]
