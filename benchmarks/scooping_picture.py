@@ -3,7 +3,8 @@
 
     python benchmarks/scooping_picture.py --folder runs/scooping
 
-Frames are those of the recordings, bars those of ``benchmarks/results/scooping.csv``.
+Frames are those of the recordings, bars those of ``benchmarks/results/scooping_recovery2.csv``, whose planners are the
+task's default, and for Diffusion Policy, which has none, of ``scooping.csv``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from result_rows import rows_if_measured
 from scooping_rows import scooping_cells
 
 from torchrl_koap.data.lerobot.images import read_image_episodes
@@ -76,13 +78,19 @@ def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], pa
     return path
 
 
+def bars() -> list[dict[str, Any]]:
+    """Cells behind the planners that are the default, and those that have none."""
+    without = [cell for cell in scooping_cells(rows_if_measured("scooping")) if cell["method"].startswith("dp")]
+    return [*scooping_cells(rows_if_measured("scooping_recovery2")), *without]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, required=True, help="of benchmarks/scooping.py")
     options = parser.parse_args()
     captions = {"hand": "a hand: no actions", "robot": "robot: few labels"}
     films = {words: read_image_episodes(options.folder / who, episodes=1)[0].frames for who, words in captions.items()}
-    print(draw(films, scooping_cells(), PICTURE), PICTURE.stat().st_size)
+    print(draw(films, bars(), PICTURE), PICTURE.stat().st_size)
 
 
 if __name__ == "__main__":

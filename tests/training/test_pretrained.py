@@ -106,9 +106,26 @@ def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
     assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--no-report") == 0  # again, into the same folder
 
 
+def test_they_are_inspected_exported_and_timed_by_name(policies, tmp_path, capfd):
+    out, exported = tmp_path / "mine", tmp_path / "exported"
+    assert koap("demos", "--out", tmp_path / "demos", "--episodes", "4", "--threads", "1", "--quiet") == 0
+    looked = ("--latent-only", "--threads", "1", "--dataset", tmp_path / "demos")
+    assert koap("inspect", "pretrained:avoiding", "--out", out, *looked) == 0
+    assert "verdict" in json.loads((out / "inspect.json").read_text())
+    assert koap("export", "pretrained:avoiding", "--out", exported, "--no-latency", "--solver-steps", "1") == 0
+    assert len(list(exported.iterdir())) == 3
+    assert koap("latency", "pretrained:avoiding", "--steps", "2") == 0
+    written = {path.name for path in (policies / "avoiding").iterdir()}
+    assert not {"inspect.json", "exported", "plots"} & written
+    capfd.readouterr()
+    for command in ("inspect", "export"):
+        assert koap(command, "pretrained:avoiding") == 1
+        assert "nothing is written into pretrained:avoiding: name a folder" in capfd.readouterr().err
+
+
 def test_wrong_calls(policies, tmp_path, capfd):
     assert koap("eval", "pretrained:avoiding") == 1
-    assert "name it with --out" in capfd.readouterr().err
+    assert "name a folder of your own with --out" in capfd.readouterr().err
     assert koap("eval", "pretrained:avoiding", "--out", tmp_path / "a", "--task", "sorting") == 1
     assert "trained on task 'avoiding', not on 'sorting'" in capfd.readouterr().err
     assert not (tmp_path / "a").exists()

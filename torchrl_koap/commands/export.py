@@ -16,6 +16,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PlanThenControl
 from torchrl_koap.modules.policies.export import PARTS, SUFFIXES, export_part, exportable
 from torchrl_koap.training.builders import set_up_torch
+from torchrl_koap.training.pretrained import writable_folder
 from torchrl_koap.training.progress import progress_bar
 
 
@@ -24,7 +25,7 @@ class Export(Command):
     """Write the whole policy, its controller and its denoiser, and compare each with the original (1e-5).
 
     Attributes:
-        run: run directory of `koap train`.
+        run: run directory of `koap train`, or pretrained:NAME.
         out: folder to write (default: RUN/exported).
         format: "torch" (torch.export), "onnx" (ONNX Runtime) or "aoti" (AOTInductor, needs a C++ compiler).
         solver_steps: solver steps that are unrolled (default: the run's).
@@ -32,7 +33,7 @@ class Export(Command):
         latency: time the exported parts against eager ones.
     """
 
-    run: tyro.conf.Positional[Path]
+    run: tyro.conf.Positional[str]
     out: Path | None = None
     format: str = "torch"
     solver_steps: int | None = None
@@ -45,7 +46,7 @@ class Export(Command):
         set_up_torch(self.threads, "cpu")
         trained = load_run(self.run)
         policy = load_policy(trained, EvalConfig(solver_steps=self.solver_steps))
-        out = self.run / "exported" if self.out is None else self.out
+        out = writable_folder(self.run) / "exported" if self.out is None else self.out
         out.mkdir(parents=True, exist_ok=True)
         parts = [part for part in PARTS if part != "controller" or isinstance(policy, PlanThenControl)]
         result: dict[str, Any] = {}

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import tyro
@@ -23,22 +22,23 @@ class Inspect(Command):
     """Find out which part of a trained run fails, and what its latent actions hold.
 
     Attributes:
-        run: run directory of `koap train`.
+        run: run directory of `koap train`, or pretrained:NAME.
         config: all options.
     """
 
-    run: tyro.conf.Positional[Path]
+    run: tyro.conf.Positional[str]
     config: Options[InspectConfig]
 
     def __call__(self) -> dict[str, Any]:
         """Inspects, draws, and writes ``inspect.json``."""
         found = inspect(self.run, self.config)
-        result, pictures = found.result, self.run / FOLDER
+        result, folder = found.result, found.folder
+        pictures = folder / FOLDER
         if "multi_step" in result["latent"]:
             plot_latent(result["latent"], pictures / "latent.png", task=found.task, eigenvalues=found.eigenvalues)
-        RunDirectory(self.run).write_json("inspect.json", result)
+        RunDirectory(folder).write_json("inspect.json", result)
         if not self.config.latent_only:
             plot_inspection(result, found.task, pictures / "inspect.png")
-        if (self.run / "index.html").exists():
-            write_report(self.run, draw=False)
+        if (folder / "index.html").exists():
+            write_report(folder, draw=False)
         return result

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import tyro
@@ -18,11 +17,11 @@ class Latency(Command):
     """Run a control loop in real time with a trained policy and count the steps that come too late.
 
     Attributes:
-        run: run directory of `koap train`.
+        run: run directory of `koap train`, or pretrained:NAME.
         config: length and rate of the loop.
     """
 
-    run: tyro.conf.Positional[Path]
+    run: tyro.conf.Positional[str]
     config: Options[LatencyConfig]
 
     def __call__(self) -> dict[str, Any]:

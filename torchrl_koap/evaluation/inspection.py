@@ -32,7 +32,9 @@ from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.builders import set_up_torch
 from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.training.pretrained import writable_folder
 from torchrl_koap.training.progress import progress_bar
+from torchrl_koap.training.run_directory import RunDirectory
 
 _NEAR = 0.015  # m; recorded tool paths followed within this are followed well
 
@@ -44,6 +46,7 @@ class InspectConfig:
     Attributes:
         episodes: episodes of each of the three experiments.
         dataset: demonstrations to compare with (default: those the run was trained on).
+        out: folder to write to instead of the run's own; what the run is made of is copied there.
         seed: seed of the planner's noise.
         replan_interval: control steps per plan (default: as `koap eval` has it, and likewise the next).
         blend_decay: share of the distance between state and plan that is left after each step.
@@ -60,6 +63,7 @@ class InspectConfig:
 
     episodes: int = 30
     dataset: str | None = None
+    out: Path | None = None
     seed: int = 500
     replan_interval: int | None = None
     blend_decay: float | None = None
@@ -78,6 +82,7 @@ class Inspection:
         result (dict): what ``inspect.json`` holds: the three experiments, if they were made, ``latent``, ``verdict``.
         task (Task): the task.
         eigenvalues (Tensor, optional): of the Koopman operator, complex ``[m]``; None for a method without one.
+        folder (Path, optional): where the run is, or what it is made of was copied to.
 
     Examples:
         >>> from torchrl_koap.evaluation.inspection import Inspection
@@ -89,6 +94,7 @@ class Inspection:
     result: dict[str, Any]
     task: Task
     eigenvalues: Tensor | None
+    folder: Path | None = None
 
 
 def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
@@ -100,7 +106,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
     outside the budget, for analysis only.
 
     Args:
-        run (str or Path): a run directory.
+        run (str or Path): a run directory, or ``"pretrained:NAME"``.
         config (InspectConfig, optional): how many episodes, and how.
 
     Returns:
@@ -135,14 +141,15 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
     trained = load_run(run)
-    directory, task = trained.directory, trained.task
+    task = trained.task
     if task.env is None and not config.latent_only:
         raise ValueError(
             f"task {task.name!r} has no environment to make experiments in: --latent-only looks into the latent space,"
             " `koap eval` judges plans and actions on recorded data"
         )
-    dataset = config.dataset or directory.read_entry("config.json", "dataset")
+    dataset = config.dataset or trained.directory.read_entry("config.json", "dataset")
     data = load_training_data(trained, dataset)
+    directory = RunDirectory(writable_folder(run, config.out))
     if config.latent_only:  # what earlier experiments found stays
         earlier = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
         result = {name: value for name, value in earlier.items() if name != "verdict"}
@@ -154,7 +161,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
     result["latent"] = _look_into(config, trained, data)
     result["verdict"] = verdict(result, task)
     values = getattr(getattr(trained.controller, "operator", None), "eigenvalues", None)
-    return Inspection(result, task, None if values is None else values())
+    return Inspection(result, task, None if values is None else values(), directory.path)
 
 
 def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBase) -> dict[str, Any]:

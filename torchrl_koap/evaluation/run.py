@@ -18,9 +18,8 @@ from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_p
 from torchrl_koap.training.builders import set_up_torch
 from torchrl_koap.training.checkpoints import save_tensors
 from torchrl_koap.training.plugins import load_plugins
-from torchrl_koap.training.pretrained import copy_run
+from torchrl_koap.training.pretrained import writable_folder
 from torchrl_koap.training.progress import count_up_to, progress_bar
-from torchrl_koap.training.run_lookup import PREFIX, find_run
 
 
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
@@ -124,14 +123,9 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
 
 def _folder(run: str | Path, config: EvalConfig) -> Path:
     """The folder to evaluate in: the run's own, or a copy of what it is made of."""
-    source = find_run(run)
-    if config.out is None:
-        if str(run).startswith(PREFIX):
-            raise ValueError(f"{run} is evaluated in a folder of your own: name it with --out")
-        return source
-    if config.task is not None:  # before anything is copied
-        load_run(source, task=config.task)
-    return copy_run(source, config.out)
+    if config.out is not None and config.task is not None:  # before anything is copied
+        load_run(run, task=config.task)
+    return writable_folder(run, config.out)
 
 
 def _judge_offline(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:

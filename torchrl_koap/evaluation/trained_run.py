@@ -27,6 +27,7 @@ from torchrl_koap.training.digests import check_digests
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.training.run_lookup import find_run
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
     """Loads a finished run, its networks in evaluation mode; the plugins it was trained with are imported first.
 
     Args:
-        run (str or Path): its folder.
+        run (str or Path): its folder, or ``"pretrained:NAME"``.
 
     Keyword Args:
         task (str, optional): refuse a run of another task.
@@ -88,12 +89,11 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
 
     Examples:
         >>> from torchrl_koap.evaluation import load_run
-        >>> from torchrl_koap.training.run_lookup import find_run
-        >>> trained = load_run(find_run("pretrained:avoiding"))  # or the folder of a run of yours
+        >>> trained = load_run("pretrained:avoiding")  # or the folder of a run of yours
         >>> trained.task.name, trained.planner.horizon
         ('avoiding', 14)
     """
-    directory = RunDirectory(run)
+    directory = RunDirectory(find_run(run))
     trained_on, planner_entry, entry = (
         directory.read_entry("config.json", name) for name in ("task", "planner", "controller")
     )
@@ -121,7 +121,8 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     last observations; an :class:`~torchrl_koap.modules.Agent` keeps them itself.
 
     Args:
-        run (str, Path or TrainedRun): a run directory, what :func:`load_run` made of one, or a file.
+        run (str, Path or TrainedRun): a run directory, ``"pretrained:NAME"``, what :func:`load_run` made of one, or a
+            file.
         config (EvalConfig, optional): execution, solver, interval between plans, device and plugins; the rest is not
             used. What is not asked for is as ``koap eval`` has it, for a file as it was saved.
 
@@ -135,8 +136,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     Examples:
         >>> import numpy as np
         >>> from torchrl_koap import Agent, load_policy
-        >>> from torchrl_koap.training.run_lookup import find_run
-        >>> agent = Agent(load_policy(find_run("pretrained:avoiding")), seed=0)
+        >>> agent = Agent(load_policy("pretrained:avoiding"), seed=0)
         >>> agent.reset()
         >>> agent.act(np.array([0.525, -0.28, 0.525, -0.28])).shape  # commanded and measured xy to a change of xy (m)
         (2,)

@@ -10,6 +10,7 @@ from torchrl_koap.training.checkpoints import load_tensors, save_tensors
 from torchrl_koap.training.compact_weights import compact
 from torchrl_koap.training.digests import DIGESTS, write_digests
 from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.training.run_lookup import PREFIX, find_run
 
 # what a run is made of; evaluations, reports and checkpoints are made from it
 WEIGHTS = ("planner.safetensors", "controller.safetensors")
@@ -39,6 +40,25 @@ def copy_run(source: str | Path, target: str | Path) -> Path:
         if (source / name).exists():
             shutil.copyfile(source / name, target / name)
     return target
+
+
+def writable_folder(run: str | Path, out: str | Path | None = None) -> Path:
+    """The folder that results about a run are written to: its own, or one to which what it is made of is copied.
+
+    Args:
+        run (str or Path): run directory, or ``"pretrained:NAME"``.
+        out (str or Path, optional): the other folder.
+
+    Raises:
+        ValueError: if a pretrained run comes without another folder.
+        RunDirectoryError: as :func:`copy_run` and :func:`~torchrl_koap.training.run_lookup.find_run`.
+    """
+    source = find_run(run)
+    if out is not None:
+        return copy_run(source, out)
+    if str(run).startswith(PREFIX):
+        raise ValueError(f"nothing is written into {run}: name a folder of your own with --out")
+    return source
 
 
 def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int | None = None) -> Path:
