@@ -147,9 +147,10 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
             f"task {task.name!r} has no environment to make experiments in: --latent-only looks into the latent space,"
             " `koap eval` judges plans and actions on recorded data"
         )
+    folder = writable_folder(run) if config.out is None else None  # refused before anything is read
     dataset = config.dataset or trained.directory.read_entry("config.json", "dataset")
     data = load_training_data(trained, dataset)
-    directory = RunDirectory(writable_folder(run, config.out))
+    directory = RunDirectory(folder or writable_folder(run, config.out))
     if config.latent_only:  # what earlier experiments found stays
         earlier = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
         result = {name: value for name, value in earlier.items() if name != "verdict"}
