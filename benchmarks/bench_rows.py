@@ -15,6 +15,7 @@ from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_le
 from torchrl_koap.studies.paper_tables import PAPER_TASKS
 from torchrl_koap.studies.table import read_cells
 
+_PLURAL = {"window": "windows", "trajectory": "trajectories"}
 CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
 
 
@@ -90,7 +91,7 @@ def bench_size(name: str) -> str:
     seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
     rollouts = " or ".join(map(str, sorted(episodes)))
     trained = "1 training seed" if len(seeds) == 1 else f"up to {len(seeds)} training seeds"
-    return f"{len(cells)} cells, {trained}, {rollouts} rollouts each, {'/'.join(units)}s labelled"
+    return f"{len(cells)} cells, {trained}, {rollouts} rollouts each, {'/'.join(map(_PLURAL.get, units))} labelled"
 
 
 def bench_means(name: str) -> str:

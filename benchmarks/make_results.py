@@ -86,6 +86,7 @@ from scooping_rows import (
     scooping_plans_table,
     scooping_probe_errors,
     scooping_probe_table,
+    scooping_start,
     scooping_strokes_table,
     scooping_table,
 )
@@ -146,6 +147,7 @@ _SCOOPING = (
     scooping_plans_table,
     scooping_probe_errors,
     scooping_probe_table,
+    scooping_start,
     scooping_strokes_table,
     scooping_table,
 )

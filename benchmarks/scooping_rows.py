@@ -53,12 +53,23 @@ def scooping_cell(
         rims (bool): the rim instead of the success.
         task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
     """
+    cell = _cell(task, labels, unlabelled, method)
+    shown = {"successes": cell["rims" if rims else "successes"], "n": cell["n"]}
+    seeds = len(cell["seeds"])
+    return f"{percent(shown, 0)} of {cell['n']} rollouts, {seeds} seed{'s' if seeds > 1 else ''}"
+
+
+def scooping_start(labels: int, method: str, unlabelled: str, start: str, task: str = "scooping") -> str:
+    """How often a cell succeeds from one of the start positions, in percent; arguments as of :func:`scooping_cell`."""
+    return f"{100 * _cell(task, labels, unlabelled, method)[start]:.0f} %"
+
+
+def _cell(task: str, labels: int, unlabelled: str, method: str) -> dict[str, Any]:
+    """A cell whose plans are followed as the study does."""
     wanted = (str(labels), unlabelled, method, *_HOW)
     for cell in scooping_cells(rows_if_measured(task)):
         if tuple(cell[key] for key in _CELL) == wanted:
-            shown = {"successes": cell["rims" if rims else "successes"], "n": cell["n"]}
-            seeds = len(cell["seeds"])
-            return f"{percent(shown, 0)} of {cell['n']} rollouts, {seeds} seed{'s' if seeds > 1 else ''}"
+            return cell
     raise KeyError(f"{task}.csv has no row of {wanted}")
 
 
