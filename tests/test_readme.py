@@ -103,6 +103,7 @@ def test_links_lead_somewhere(page):
     links = [link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", page.read_text()) if "://" not in link]
     for link in filter(None, links):
         assert (page.parent / link).exists(), link
+        assert "generated" not in Path(link).parts, f"{link} is not there before the documentation is built"
 
 
 @pytest.mark.parametrize("path", sorted(set(PATHS)))
