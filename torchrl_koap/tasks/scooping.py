@@ -122,7 +122,7 @@ register_task(
         bodies=(*_SCOOPING.bodies, Body("bowl", "bowl", half=(BOWL_RADIUS, BOWL_RADIUS), still=True)),
         start_regions=StartRegions((*_START_REGIONS, _BOWL_REGION), yaw=(-180.0, 180.0), whose=(0, 0, 0, 1)),
         env_options={"task": "scooping_moving_bowl"},
-        # the nearest other picture may show the bowl elsewhere: not tried
+        # the nearest other picture may show the bowl elsewhere: no gain (docs/results/scooping.md)
         defaults=replace(_SCOOPING.defaults, view={}),
         scene=replace(_SCOOPING.scene, shapes=(), caption=" The spoon's path, and where the bowl stands."),
     )
