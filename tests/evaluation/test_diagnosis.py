@@ -150,11 +150,12 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_judged_without_a_
     plans = {"execution": "open_loop", "replan_interval": 8, "blend_decay": 0.0}
     own = plans | {"action_gain": 1.2, "command_lead": 0.05}
     task = replace(trained.task, goal=None, defaults=replace(trained.task.defaults, execution=own))
-    made, make_policy = [], inspection.make_policy
+    made, policies, make_policy = [], [], inspection.make_policy
 
     def noted(planner, controller, **options):
         made.append(options)
-        return make_policy(planner, controller, **options)
+        policies.append(make_policy(planner, controller, **options))
+        return policies[-1]
 
     monkeypatch.setattr(inspection, "load_run", lambda run: replace(trained, task=task))
     for module in (inspection, diagnosis):
@@ -162,8 +163,8 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_judged_without_a_
     config = inspection.InspectConfig(episodes=2, threads=1)
     result = inspection.inspect(trained_run, config).result
     assert [{name: options[name] for name in plans} for options in made] == [plans, plans]
-    for options in made:  # recordings are followed by the same actions as plans
-        assert options["action_gain"].tolist() == pytest.approx([1.2, 1.2]) and options["leash"].lead == 0.05
+    for policy in policies:  # recordings are followed by the same actions as plans
+        assert policy.action_gain.tolist() == pytest.approx([1.2, 1.2]) and policy.leash.lead == 0.05
     assert "imagined" not in result and result["closed_loop"]["episodes"] == 2
     assert result["plan_to_execution"] == {}  # actions are kept, not plans
     assert plot_inspection(result, task, tmp_path / "inspect.png").exists()
