@@ -91,7 +91,9 @@ def bench_size(name: str) -> str:
     seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
     rollouts = " or ".join(map(str, sorted(episodes)))
     trained = "1 training seed" if len(seeds) == 1 else f"up to {len(seeds)} training seeds"
-    return f"{len(cells)} cells, {trained}, {rollouts} rollouts each, {'/'.join(map(_PLURAL.get, units))} labelled"
+    return (
+        f"{len(cells)} cells, {trained}, {rollouts} rollouts each, {'/'.join(_PLURAL[unit] for unit in units)} labelled"
+    )
 
 
 def bench_means(name: str) -> str:

@@ -80,7 +80,7 @@ def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], pa
 
 def bars() -> list[dict[str, Any]]:
     """Cells behind the planners that are the default, and those that have none."""
-    without = [cell for cell in scooping_cells(rows_if_measured("scooping")) if cell["method"].startswith("dp")]
+    without = [cell for cell in scooping_cells() if cell["method"].startswith("dp")]
     return [*scooping_cells(rows_if_measured("scooping_recovery2")), *without]
 
 

@@ -82,19 +82,21 @@ class Inspection:
         result (dict): what ``inspect.json`` holds: the three experiments, if they were made, ``latent``, ``verdict``.
         task (Task): the task.
         eigenvalues (Tensor, optional): of the Koopman operator, complex ``[m]``; None for a method without one.
-        folder (Path, optional): where the run is, or what it is made of was copied to.
+        folder (Path): where the run is, or what it is made of was copied to.
 
     Examples:
+        >>> from pathlib import Path
         >>> from torchrl_koap.evaluation.inspection import Inspection
         >>> from torchrl_koap.tasks import get_task
-        >>> Inspection({"verdict": "the planner fails"}, get_task("avoiding"), eigenvalues=None).result["verdict"]
+        >>> found = Inspection({"verdict": "the planner fails"}, get_task("avoiding"), None, Path("runs/koap"))
+        >>> found.result["verdict"]
         'the planner fails'
     """
 
     result: dict[str, Any]
     task: Task
     eigenvalues: Tensor | None
-    folder: Path | None = None
+    folder: Path
 
 
 def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
