@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_koap.keys import ACTION, LATENT_ACTION
+from torchrl_koap.modules.koopman.held_out_errors import held_out_errors, thin_svd
 
 # latent actions larger than this keep so many directions of their covariance: a square root of it would be gigabytes
 WIDE, DIRECTIONS = 2048, 256
@@ -176,24 +177,22 @@ class LinearActionDecoder(TensorDictModuleBase):
 
         mean_x, mean_y = (x.mean(0), y.mean(0)) if bias else (torch.zeros_like(x[0]), torch.zeros_like(y[0]))
         centred, target = (x - mean_x, y - mean_y) if bias else (x, y)  # a copy may take gigabytes
-        left, singular, right = _thin_svd(centred)
+        left, singular, right = thin_svd(centred, wide=WIDE)
         unit = centred.square().sum(-1).mean()
         unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # constant latent actions: any scale will do
         projected = left.mT @ target
 
-        def held_out(penalty: float) -> Tensor:
-            shrink = singular.square() / (singular.square() + penalty * unit)
-            return _held_out(left, shrink, projected, target, groups, centred=bias)
-
         least = input_noise * len(x)
         tried = sorted({max(float(penalty), least) for penalty in penalties})
-        errors = {penalty: held_out(penalty).square().mean().sqrt().item() for penalty in tried}
+        shrinks = torch.stack([singular.square() / (singular.square() + penalty * unit) for penalty in tried])
+        squares = held_out_errors(left, shrinks, target, groups, centred=bias)
+        errors = dict(zip(tried, squares.mean(-1).sqrt().tolist(), strict=True))
         best = min(errors, key=errors.get)
         scaled = singular.square() + best * unit
         weight = (right.mT * (singular / scaled)) @ projected  # [m, act]
         self.linear.weight.copy_(prior + weight.mT)
         self.linear.bias.copy_(mean_y - mean_x @ weight)
-        self.noise_variance.copy_(held_out(best).square().mean(0))
+        self.noise_variance.copy_(squares[tried.index(best)])
         # a root, column by column along the singular directions: in float32 the covariance itself would drown the
         # well-determined directions (1e-4) in the rounding of the undetermined ones (1e6)
         if self.is_wide:
@@ -236,38 +235,3 @@ class LinearActionDecoder(TensorDictModuleBase):
             prior = self.prior_variance * centred.square().sum(-1, keepdim=True)
             leverage = (prior - leverage).clamp_min(0)
         return (1 + self.mean_leverage + leverage) * self.noise_variance
-
-
-def _thin_svd(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Singular value decomposition ``[N, r], [r], [r, m]``, of many columns by way of the rows' products.
-
-    Directions below the rounding of the products (a millionth of the largest singular value) are left out there.
-    """
-    if matrix.shape[1] <= max(WIDE, 2 * matrix.shape[0]):
-        return torch.linalg.svd(matrix, full_matrices=False)
-    values, left = torch.linalg.eigh(matrix @ matrix.mT)
-    kept = values > 1e-12 * values[-1].clamp_min(1e-300)
-    singular, left = values[kept].flip(0).sqrt(), left[:, kept].flip(-1)
-    return left, singular, (left.mT @ matrix) / singular[:, None]
-
-
-def _held_out(
-    left: Tensor, shrink: Tensor, projected: Tensor, target: Tensor, groups: Tensor, *, centred: bool
-) -> Tensor:
-    """Residuals of every step, predicted without its group; a fitted mean counts as one more, unpenalised column."""
-    residual = target - left @ (shrink[:, None] * projected)
-    constant = 1 / len(left) if centred else 0.0
-    if len(left) > 1 and int(groups.max()) + 1 == len(left):  # single steps: the leverages are all that is needed
-        leverage = (left.square() * shrink).sum(-1, keepdim=True) + constant
-        return residual / (1 - leverage)
-    held_out = torch.empty_like(residual)
-    for group in range(int(groups.max()) + 1):
-        rows = groups == group
-        part = left[rows]
-        hat = (part * shrink) @ part.mT + constant
-        if centred and len(part) == len(left):  # nothing is left to take a mean of
-            held_out[rows] = torch.inf
-            continue
-        keep = torch.eye(len(part), dtype=part.dtype, device=part.device) - hat
-        held_out[rows] = torch.linalg.solve(keep, residual[rows])
-    return held_out
