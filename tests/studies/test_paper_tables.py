@@ -68,6 +68,17 @@ def test_a_table_is_a_curve_per_task_at_the_papers_levels(asked, tmp_path):
     assert "KOAP succeeds more often than the paper's KOAP in 1 of 2 cells." in text  # 70 against 80.3 and 61.7
 
 
+def test_tasks_of_earlier_calls_stay_in_the_tables_of_a_folder(asked, tmp_path):
+    run_bench(BenchConfig(tmp_path / "t", table=1, tasks="sorting"))
+    result = run_bench(BenchConfig(tmp_path / "t", table=1, tasks="aligning"))
+    assert [curve.task for curve in asked] == ["sorting", "aligning"]  # the first is not done again
+    assert (result["done"], result["failed"]) == (2, 2)
+    runs = [row["run"] for row in read_cells(tmp_path / "t/cells.csv")]
+    assert runs == ["aligning/cells/a", "aligning/cells/b", "sorting/cells/a", "sorting/cells/b"]
+    text = (tmp_path / "t/paper_table.md").read_text()
+    assert "| aligning | 1 (2 %) |" in text and "| sorting | 1 (1 %) | 70.0 (40-89) [61.7 +- 5.6] |" in text
+
+
 def test_the_observation_study_varies_what_the_controller_knows_at_fixed_labels_and_planner(asked, tmp_path):
     run_bench(BenchConfig(tmp_path / "s", study="observations"))
     run_bench(BenchConfig(tmp_path / "p", study="observations_and_planner"))

@@ -170,7 +170,7 @@ class BenchConfig(CellOptions):
 
 
 def run_bench(config: BenchConfig) -> dict[str, Any]:
-    """Does what is missing of a comparison; writes ``cells.csv`` and the report over all tasks.
+    """Does what is missing of a comparison; writes ``cells.csv`` and the report over all tasks of the folder.
 
     Args:
         config (BenchConfig): which comparison, and where to write it.
@@ -205,12 +205,14 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
     for curve in curves:
         check_curve(curve)
     root.write_json("bench.json", {"comparison": name})
-    rows, paper = [], []
+    # tasks that an earlier call did in the folder stay in its tables
+    names = list(dict.fromkeys([*preset.tasks, *(curve.task for curve in curves)]))
     for curve in curves:
         run_curve(curve)
-        rows += [row | {"run": f"{curve.task}/{row['run']}"} for row in read_cells(curve.out / "cells.csv")]
-        beside = config.table is not None and curve.units == "window"
-        paper += paper_points(curve.task) if beside else []
+        known = {name: read_cells(file) for name in names if (file := config.out / name / "cells.csv").exists()}
+        rows = [row | {"run": f"{name}/{row['run']}"} for name, cells in known.items() for row in cells]
+        beside = [name for name, cells in known.items() if {row["label_unit"] for row in cells} == {"window"}]
+        paper = [point for name in beside for point in paper_points(name)] if config.table is not None else []
         # after every task: a long benchmark can be looked at while it runs
         write_cells(config.out / "cells.csv", rows)
         layout = write_paper_layout(config.out, rows) if config.table is not None else None
