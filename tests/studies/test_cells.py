@@ -7,11 +7,14 @@ import json
 import math
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from torchrl_koap.evaluation import EvalConfig
+from torchrl_koap.studies import cells
 from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
 from torchrl_koap.studies.table import CELL_COLUMNS
 from torchrl_koap.tasks import get_task
@@ -63,6 +66,22 @@ def test_cells_have_folders_of_their_own():
     assert Cell("koap", 0.01, 1.0, 2).folder == "cells/koap-0.01-1-seed2"
     assert Cell("koap", 0.01, 0.5, 2).planner == planner_folder(0.5) == "planner-0.5"
     assert Cell("dp", 0.01, 1.0, 2).planner is None and Cell("dp_relabel", 0.01, 1.0, 2).planner is None
+
+
+def test_every_training_seed_meets_noise_of_its_own(monkeypatch, tmp_path):
+    asked = []
+
+    def note(path, config):
+        asked.append((config.seed, config.episodes))
+        return {"episodes": 2, "success_rate": 0.5}
+
+    monkeypatch.setattr(cells, "train", lambda config: None)
+    monkeypatch.setattr(cells, "evaluate", note)
+    monkeypatch.setattr(RunDirectory, "read_entry", lambda *names: {})
+    for cell in (CELL, replace(CELL, seed=1), replace(CELL, seed=2), replace(CELL, method="dd", seed=2)):
+        folder = tmp_path / cell.folder
+        do_cell(folder=str(folder), cell=vars(cell), planner=None, settings={}, evaluation={"episodes": 2})
+    assert asked == [(EvalConfig.seed, 2), (1100, 2), (2100, 2), (2100, 2)]
 
 
 def test_no_action_reaches_a_planner(planner, demonstrations, tmp_path, monkeypatch):

@@ -19,6 +19,9 @@ from torchrl_koap.training import RunDirectory, RunDirectoryError, TrainConfig, 
 from torchrl_koap.training.run import train_shared_planner
 
 DONE = "cell.json"
+# evaluation seeds of a training seed lie so far from the next one's: rollouts that differ in nothing but the training
+# would count as 180 where they are hardly more than 60
+NOISE_STEP = 1000
 _ERRORS = ("relative_plan_error", "relative_action_error")
 
 
@@ -118,7 +121,8 @@ def do_cell(
         cell (dict): fields of :class:`Cell`.
         planner (str, optional): folder of the planner to share.
         settings (dict): options of :class:`~torchrl_koap.training.TrainConfig`.
-        evaluation (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig`.
+        evaluation (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig`, without the seed: all cells with the
+            same training seed meet the same noise, those of the next one other noise, in the same contexts.
         label_fraction (float, optional): share of the labels of the data at hand, where the cell's is a share of more.
     """
     path, this = Path(folder), Cell(**cell)
@@ -137,7 +141,7 @@ def do_cell(
             )
         )
     trained = time.perf_counter()
-    result = evaluate(path, EvalConfig(**evaluation))
+    result = evaluate(path, EvalConfig(seed=EvalConfig.seed + NOISE_STEP * this.seed, **evaluation))
     run = RunDirectory(path)
     run.write_json(
         DONE,

@@ -55,7 +55,7 @@ class CurveConfig(CellOptions):
         units: "trajectory", "window" (the unit of the first public code) or "transition".
         observations: shares of the trajectories that are used at all, with commas between.
         seeds: number of seeds of label choice and training.
-        episodes: rollouts per cell; all cells meet the same ones.
+        episodes: rollouts per cell; all cells with the same seed meet the same contexts and noise.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: updates of every controller.
         released_settings: the unequal settings of the first public code instead of equal ones (koap, pretrain, dd, dp).
