@@ -59,6 +59,7 @@ from result_rows import (
     fact,
     first,
     label_sizes,
+    left_out_rows,
     level_rows,
     own_robot_rows,
     percent,
@@ -118,6 +119,7 @@ _TABLES = (
     env_rows,
     training_rows,
     precision_rows,
+    left_out_rows,
     ablation_rows,
 )
 _PAPER = (

@@ -216,6 +216,11 @@ def precision_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
     return [[row["processor"], "yes" if row["units"] == "1" else "no", *list(row.values())[2:]] for row in rows]
 
 
+def left_out_rows(rows: Sequence[Mapping[str, str]]) -> list[list[str]]:
+    """Table of what it takes to leave trajectories out, without the number of penalties, which is the same in all."""
+    return [[value for name, value in row.items() if name != "penalties"] for row in rows]
+
+
 def ablation_rows(topic: str) -> list[list[str]]:
     """Table of the ablations of a topic: successes with their interval, other measures with their unit."""
     return [
