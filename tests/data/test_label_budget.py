@@ -171,6 +171,8 @@ def test_commands_hide_with_the_actions():
     labelled, _ = LabelBudget(0.5, "transition").apply(data, command=COMMAND)
     assert labelled["observation"][:, COMMAND].isnan().all()
     assert labelled["next", "observation"][:, COMMAND].isnan().all()
+    again, report = LabelBudget(1).apply(LabelBudget(2).apply(data, command=COMMAND)[0], command=COMMAND)
+    assert report.selected_units == 1 and again["has_action"].any()  # data that lack labels are spent as well
     full, _ = LabelBudget(1.0).apply(data, command=COMMAND)
     assert (full == data).all()
     assert (hide_commands(data, COMMAND) == data).all()

@@ -8,8 +8,8 @@ import torch
 from loss_test_base import LossTestBase
 from tensordict import TensorDict
 
-from torchrl_koap.modules import Normalizer, RecurrentInverseDynamics
-from torchrl_koap.objectives import InverseDynamicsLoss
+from torchrl_koap.modules import Normalizer, RecurrentInverseDynamics, make_koopman_inverse_dynamics
+from torchrl_koap.objectives import InverseDynamicsLoss, KOAPLoss
 
 T = 7
 
@@ -96,3 +96,14 @@ def test_a_mask_of_another_shape_is_refused():
     batch["has_action"] = batch["has_action"][:, 1:].clone().float().expand(4, T - 1, 1)
     with pytest.raises(ValueError, match=r"'has_action' must be bool \[4, 7, 1\], got torch.float32 \[4, 6, 1\]"):
         make_loss()(batch)
+
+
+def test_actions_of_another_width_are_refused_and_not_broadcast():
+    network = RecurrentInverseDynamics(3, 2, hidden_dim=16)
+    batch = make_batch(4)
+    batch["action"] = batch["action"][..., :1].contiguous()
+    with pytest.raises(ValueError, match="'action' has 1 columns, the network decodes 2"):
+        InverseDynamicsLoss(network)(batch)
+    lifted = KOAPLoss(make_koopman_inverse_dynamics(3, 2, history=2, look_ahead=(2,)))
+    with pytest.raises(ValueError, match="'action' has 1 columns, the network decodes 2"):
+        lifted(batch)

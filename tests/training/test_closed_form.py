@@ -111,3 +111,16 @@ def test_labels_that_see_no_look_ahead_are_an_error():
     controller = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
     with pytest.raises(ValueError, match="no labelled frame"):
         fit_closed_form(controller, labelled)
+
+
+def test_keys_of_the_controller_and_no_normalizer_of_actions():
+    labelled, _ = LabelBudget(2).apply(numbered())
+    fits = []
+    for keys in ({}, {"state": "frames", "action": ("robot", "u")}):
+        torch.manual_seed(0)
+        controller = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
+        controller.action_normalizer = None
+        controller.set_keys(**keys)
+        fit_closed_form(controller, labelled)
+        fits.append(controller.action_decoder.linear.weight)
+    assert torch.equal(*fits) and fits[0].any()

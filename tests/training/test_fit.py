@@ -182,3 +182,21 @@ def test_a_lifting_is_unfolded_for_as_many_updates_as_it_is_trained_and_on_the_s
     fit_controller(data, task, method=method, preset="semi_supervised", steps=steps, progress=False)
     own = len(cut_windows(select_state(data, task.state_of), WINDOW, pad_before=8)) // 4  # of a trajectory
     assert [(updates, round(windows / own)) for updates, windows in seen] == asked
+
+
+@pytest.mark.parametrize("method", ["koap", "dd"])
+def test_data_in_double_precision_are_fitted_like_others(method):
+    data, task = make_demonstrations(**few_labels())
+    wide = data.clone()
+    for key in ("observation", ("next", "observation"), "action"):
+        wide[key] = data[key].double()
+    fitted = [fit_controller(each, task, method=method, steps=2, progress=False) for each in (data, wide)]
+    assert same_weights(*fitted)
+    assert wide["observation"].dtype == torch.float64
+
+
+def test_a_planner_needs_neither_actions_nor_their_number():
+    data, task = make_demonstrations(**few_labels())
+    unlabelled = data.exclude("action", "has_action")
+    planners = [fit_planner(each, steps=2, progress=False, **SMALL) for each in (data, unlabelled)]
+    assert same_weights(*planners)

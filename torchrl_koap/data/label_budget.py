@@ -177,7 +177,7 @@ class LabelBudget:
             ValueError: if there is no label at all, if the budget selects nothing, or more than there is.
         """
         data = data if keys.HAS_ACTION in data.keys() else mark_labels(data)
-        keys.validate(data)
+        keys.validate(data, command=command)
         available = data.get(keys.HAS_ACTION).squeeze(-1).cpu().numpy()
         if not available.any():
             raise ValueError(f"none of the {len(available)} steps has an action: there are no labels to spend")

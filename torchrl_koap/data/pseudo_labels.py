@@ -34,7 +34,7 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
 
     Args:
         controller (nn.Module): reads a window of raw states ``[B, T, d]``, its first in-key, and writes actions
-            ``[B, T, act]``, its last out-key; has ``history`` and ``num_window_frames``. It runs in evaluation mode.
+            ``[B, T, act]``, its last out-key; has ``num_past`` and ``num_window_frames``. It runs in evaluation mode.
         data (TensorDictBase): flat data ``[N]`` with ``state``, as the controller sees it, ``action``, ``has_action``
             and ``episode``; not changed.
 
@@ -102,7 +102,7 @@ def _predict(controller: nn.Module, data: TensorDictBase, hidden: Tensor, window
     try:
         actions = []
         for start, low in zip(starts.split(batch_size), first.split(batch_size), strict=True):
-            states = continued.get(STATE)[(start + offsets).clamp_min(low)].to(example.device)  # [B, T, d]
+            states = continued.get(STATE)[(start + offsets).clamp_min(low)].to(example)  # [B, T, d]
             windows = TensorDict({controller.in_keys[0]: states}, batch_size=states.shape[:-1])
             actions.append(controller(windows).get(controller.out_keys[-1])[:, now].to(starts.device))
     finally:

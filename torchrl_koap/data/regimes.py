@@ -164,6 +164,7 @@ class RegimeSensor:
 
 def _oscillations(episode: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Coordinates that oscillate at a period of 20 to 60 steps, each trajectory with its own phase and amplitude."""
+    episode = episode.cpu()  # drawn there, so that devices agree
     out = torch.empty(len(episode), count)
     for number in episode.unique():
         rows = episode == number

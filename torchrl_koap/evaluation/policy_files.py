@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
 from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy
 from torchrl_koap.lookup import lookup
@@ -247,11 +248,21 @@ def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
     if policy.leash is not None:
         about["command_lead"] = policy.leash.lead
     if policy.action_gain is not None:
-        about["action_gain"] = next(factor for factor in policy.action_gain.tolist() if factor != 1)
+        about["action_gain"] = _one_gain(policy.action_gain, made.task)
     if planned:
         about |= {"execution": policy.execution, "blend_decay": policy.blend_decay}
     save_tensors(path, tensors, about)
     return path
+
+
+def _one_gain(gain: Tensor, task: Task) -> float:
+    """The factor that all changes of a command have in common."""
+    factor = float(gain[0])
+    whole = torch.ones_like(gain)
+    whole[: task.num_delta_actions] = factor
+    if not torch.equal(gain, whole):
+        raise ValueError(f"a file holds one action_gain for all changes of a command, the policy has {gain.tolist()}")
+    return factor
 
 
 def read_policy(path: str | Path, *, plugins: Sequence[str] = (), **options: Any) -> RecedingHorizonPolicy:

@@ -24,7 +24,7 @@ from torchrl_koap.modules.policies.command_leash import CommandLeash
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
 from torchrl_koap.modules.policies.posture_tracking import PostureTracking
 from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
-from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, policy_transforms
+from torchrl_koap.modules.policies.receding_horizon import policy_transforms
 from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import ActionRule
@@ -193,18 +193,18 @@ def roll_out(
         raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
     if contexts is not None and len(contexts) != len(seeds):
         raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
-    device = _device_of(policy)
+    device, noise_key = _device_of(policy), policy.planner.noise_key or NOISE
     size, episodes = batch_size or min(len(seeds), AT_ONCE), []
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
         env = make_env(len(part))
         _seed_episodes(env, part)
-        transforms = policy_transforms(policy.history)
+        transforms = policy_transforms(policy.history, history_key=policy.in_keys[0])
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
         if futures is not None:
             noise = RecordedFutures(futures[begin : begin + size])
         else:
-            noise = EpisodeNoise(part, policy.noise_shape, num_steps=max_steps)
+            noise = EpisodeNoise(part, policy.noise_shape, num_steps=max_steps, noise_key=noise_key)
         if hasattr(policy, "attach"):  # it reads the simulation
             policy.attach(env)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
@@ -220,7 +220,7 @@ def roll_out(
         finally:
             env.close()
         rollout = rollout.exclude(
-            NOISE, RECORDED_FUTURE, OBSERVATION_HISTORY, ("next", OBSERVATION_HISTORY), "remaining_plan"
+            noise_key, RECORDED_FUTURE, policy.in_keys[0], ("next", policy.in_keys[0]), "remaining_plan"
         )
         done = rollout["next", "done"].squeeze(-1)
         lengths = torch.where(done.any(-1), done.int().argmax(-1) + 1, done.shape[-1])
@@ -262,7 +262,7 @@ def measure_latency(policy: PlanThenControl, observation_dim: int, *, repeats: i
     """
     device = _device_of(policy)
     observed = torch.zeros(1, policy.history, observation_dim, device=device)
-    td = TensorDict({OBSERVATION_HISTORY: observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1], device=device)
+    td = TensorDict({policy.in_keys[0]: observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1], device=device)
     between: list[float] = []
     with_plan: list[float] = []
     for repeat in range(repeats + 3):

@@ -160,6 +160,13 @@ class WindowLoss(LossModule):
         # zeroed before the residual: masking afterwards would leave NaN in the gradient
         return self.network.normalize_action(torch.where(counts.unsqueeze(-1), action, 0.0)), counts
 
+    def _action_error(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Mean squared error ``[*B, frames]`` of actions that must have as many columns as they are decoded to."""
+        if predicted.shape[-1] != target.shape[-1]:  # a single column would be broadcast
+            columns = f"{target.shape[-1]} columns, the network decodes {predicted.shape[-1]}"
+            raise ValueError(f"{self.tensor_keys.action!r} has {columns}")
+        return (predicted - target).square().mean(-1)
+
     def _reduce(self, error: Tensor, mask: Tensor) -> Tensor:
         error = torch.where(mask, error, 0.0)
         if self.reduction == "none":

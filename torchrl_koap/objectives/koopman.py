@@ -49,8 +49,7 @@ class _KoopmanLoss(WindowLoss):
         self, tensordict: TensorDictBase, state: Tensor, latent: Tensor, span: range, recorded: Tensor
     ) -> Tensor:
         target, counts = self._targets(tensordict, state, recorded, span)
-        error = (self.network.action_decoder.linear(latent) - target).square().mean(-1)
-        return self._reduce(error, counts)
+        return self._reduce(self._action_error(self.network.action_decoder.linear(latent), target), counts)
 
 
 class KoopmanReconstructionLoss(_KoopmanLoss):

@@ -72,5 +72,5 @@ class LatentDecoderLoss(WindowLoss):
         with self.network_params.to_module(self.network, preserve_module_state=False):
             latent = (self.network.sample if self.samples else self.network.infer)(state, span)
             latent = latent if self.train_encoder else latent.detach()
-            error = (self.network.decode(latent) - target).square().mean(-1)
+            error = self._action_error(self.network.decode(latent), target)
         return TensorDict({"loss_action": self._reduce(error, counts)})

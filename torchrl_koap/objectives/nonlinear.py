@@ -79,7 +79,7 @@ class NonlinearLoss(WindowLoss):
             lifted, latent = self.network.lift(state), self.network.infer(state, span)
             predicted = self.network.predict_next(lifted[..., frames, :], latent)
             dynamics = (predicted - lifted[..., span.start + 1 : span.stop + 1, :]).square().mean(-1)
-            error = (self.network.decode(latent) - target).square().mean(-1)
+            error = self._action_error(self.network.decode(latent), target)
             losses = {
                 "loss_reconstruction": self._reconstruction(state, lifted),
                 "loss_dynamics": self.dynamics_coeff * self._reduce(dynamics, recorded[..., frames]),

@@ -49,5 +49,5 @@ class InverseDynamicsLoss(WindowLoss):
         span = self.network.span(state.shape[-2])
         target, counts = self._targets(tensordict, state, recorded, span)
         with self.network_params.to_module(self.network, preserve_module_state=False):
-            error = (self.network.predict(state, span) - target).square().mean(-1)
+            error = self._action_error(self.network.predict(state, span), target)
         return TensorDict({"loss_action": self._reduce(error, counts)})

@@ -49,12 +49,16 @@ def fit_closed_form(
     Returns:
         dict: penalty, number of labels and held-out error of the fit, or what another controller's fit returns.
     """
+    names = {"state": getattr(controller, "in_key", "state"), "action": getattr(controller, "out_key", "action")}
     keys = ["state", "action", "has_action", "episode"]
     windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
     mask = windows["has_action"].squeeze(-1) & ~windows["padded"].squeeze(-1)
     # every step is frame `num_past` of one window; at other frames a clamped look-ahead would count it again
     mask[:, : controller.num_past], mask[:, controller.num_past + 1 :] = False, False
     groups = windows["episode"][:, -1]
+    for name, own in names.items():
+        if own != name:
+            windows.rename_key_(name, own)
     if not isinstance(controller, KoopmanInverseDynamics):
         fit = controller.fit_decoder(windows, mask, groups=groups)
     elif controller.latent_action.choices:
@@ -81,7 +85,8 @@ def _fit_koopman(
     input_noise: float,
 ) -> RidgeFit:
     """One fit, with tied axes where there are any: known ones, or likely ones if they help."""
-    through_zero = not controller.action_normalizer.offset.any()
+    normalizer = controller.action_normalizer
+    through_zero = normalizer is None or not normalizer.offset.any()
     penalty = PLACE_PENALTY if getattr(controller.latent_action, "place", 0.0) else DEFAULT_PENALTY
     options: dict[str, Any] = {
         "groups": groups,

@@ -118,7 +118,7 @@ def fit_planner(
         >>> planner.plan(data["observation"][None, :2]).shape
         torch.Size([1, 14, 2])
     """
-    data, task = _prepared(data, task)
+    data, task = _prepared(data, task, action_dim=1)  # no action is looked at
     _check_options(options, PLANNER_OPTIONS, "fit_planner")
     resolved = _resolved(task, steps=steps, seed=seed, device=device, **options)
     data = data.to(device)
@@ -206,10 +206,10 @@ def fit_controller(
     return controller.eval()
 
 
-def _prepared(data: TensorDictBase, task: Task | None) -> tuple[TensorDictBase, Task]:
+def _prepared(data: TensorDictBase, task: Task | None, *, action_dim: int | None = None) -> tuple[TensorDictBase, Task]:
     """The data with labels marked and ``state``, and the task they are of."""
     if keys.ACTION not in data.keys() or keys.HAS_ACTION not in data.keys():
-        data = mark_labels(data, action_dim=None if task is None else task.action_dim)
+        data = mark_labels(data, action_dim=action_dim if task is None else task.action_dim)
     task = _task_of_columns(data) if task is None else task
     keys.validate(data, command=task.command_columns)
     if keys.STATE not in data.keys():
@@ -217,7 +217,9 @@ def _prepared(data: TensorDictBase, task: Task | None) -> tuple[TensorDictBase, 
     for key, wanted in {keys.STATE: task.state_dim, keys.ACTION: task.action_dim}.items():
         if data[key].shape[-1] != wanted:
             raise ValueError(f"{key!r} has {data[key].shape[-1]} columns, task {task.name!r} has {wanted}")
-    return data, task
+    networks = torch.get_default_dtype()
+    wide = {key: data[key].to(networks) for key in (keys.STATE, keys.ACTION) if data[key].dtype != networks}
+    return (data.copy().update(wide) if wide else data), task
 
 
 def _task_of_columns(data: TensorDictBase) -> Task:

@@ -123,7 +123,9 @@ def train_phase(
     values: dict[str, float] = run.last_metrics(phase) if start else {}
     began, mark, marked = time.perf_counter(), time.perf_counter(), start
     for step in range(start, num_steps):
-        rate = learning_rate * (warmup_cosine(step, num_steps, warmup) if decay else min(1.0, (step + 1) / warmup))
+        rate = learning_rate * (
+            warmup_cosine(step, num_steps, warmup) if decay else min(1.0, (step + 1) / max(warmup, 1))
+        )
         for group in optimizer.param_groups:
             group["lr"] = rate
         losses = loss_module(sample())

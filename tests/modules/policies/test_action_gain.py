@@ -106,3 +106,12 @@ def test_what_is_no_gain_is_refused(gain):
 def test_a_task_without_changes_of_a_command_has_none():
     with pytest.raises(ValueError, match="action_gain was given, but no action of task 'scooping' is a change"):
         make_gain(get_task("scooping"), 1.1)
+
+
+def test_a_file_refuses_gains_that_it_cannot_hold(trained_run, tmp_path):
+    policy = load_policy(trained_run)
+    policy.action_gain = torch.tensor([1.2, 1.5])
+    with pytest.raises(ValueError, match="a file holds one action_gain for all changes of a command"):
+        save_policy(policy, tmp_path / "policy.safetensors")
+    policy.action_gain = torch.ones(2)  # which is none
+    assert load_policy(save_policy(policy, tmp_path / "policy.safetensors")).action_gain is None

@@ -133,3 +133,31 @@ def test_refusals():
         agent.act(np.zeros((1, 1, 2)))
     with pytest.raises(ValueError, match=r"columns \[1\] of the observation are NaN or infinite"):
         agent.act(np.array([0.0, np.nan]))
+
+
+def test_keys_of_the_policy_are_those_that_are_written_and_read():
+    def acted(noise_key, **keys):
+        torch.manual_seed(0)
+        planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2, noise_key=noise_key)
+        controller = make_koopman_inverse_dynamics(2, 2)
+        policy = PlanThenControl(planner, controller, state_columns=(2, 3), history=5, **keys).eval()
+        agent = Agent(policy, noise=EpisodeNoise([7], planner.noise_shape, num_steps=3, noise_key=noise_key))
+        agent.reset()
+        return np.stack([agent.act(np.full(4, float(step))) for step in range(3)])
+
+    usual = acted("noise")
+    np.testing.assert_array_equal(acted("z", history_key="frames", action_key=("robot", "u")), usual)
+
+
+def test_noise_that_the_policy_does_not_read_is_refused():
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2, noise_key="z")
+    policy = PlanThenControl(planner, make_koopman_inverse_dynamics(2, 2), state_columns=(2, 3), history=5)
+    with pytest.raises(ValueError, match=r"reads its noise from 'z', what was given writes \['noise'\]"):
+        Agent(policy, noise=EpisodeNoise([7], planner.noise_shape, num_steps=3))
+
+
+def test_a_planner_that_draws_by_itself_is_handed_no_noise():
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2, noise_key=None)
+    agent = Agent(PlanThenControl(planner, make_koopman_inverse_dynamics(2, 2), state_columns=(2, 3), history=5))
+    agent.reset()
+    assert np.isfinite(agent.act(np.zeros((3, 4)))).all()

@@ -10,7 +10,19 @@ import pytest
 import torch
 from toy_policies import CountingPlanner, EchoController
 
-from torchrl_koap.modules import Agent, AsynchronousAgent, CommandLeash, PlanThenControl, StatePlanner, TemporalUnet
+from torchrl_koap.modules import (
+    Agent,
+    AsynchronousAgent,
+    CommandLeash,
+    CommandPosture,
+    CommandResponse,
+    PlanThenControl,
+    PostureTracking,
+    PredictiveTracking,
+    StatePlanner,
+    TemporalUnet,
+    make_koopman_inverse_dynamics,
+)
 
 
 class HeldPlanner(CountingPlanner):
@@ -121,7 +133,31 @@ def test_refusals():
     policy = make_agent().policy
     with pytest.raises(ValueError, match="control_hz must be a positive number"):
         AsynchronousAgent(policy, control_hz=0)
+    policy.candidates = 4
+    with pytest.raises(ValueError, match="one at a time, not of 4 candidates"):
+        AsynchronousAgent(policy, control_hz=30)
     policy.execution = "open_loop"
     with pytest.raises(ValueError, match="execution 'feedback' only"):
         AsynchronousAgent(policy, control_hz=30)
     assert issubclass(AsynchronousAgent, Agent)
+
+
+@pytest.mark.parametrize("kind", [PredictiveTracking, PostureTracking])
+def test_plans_are_followed_as_the_policy_follows_them(kind):
+    torch.manual_seed(0)
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2)
+    if kind is PredictiveTracking:
+        law = CommandResponse([0, 1], [0, 1], [0, 1])
+        law.weight[[0, 1], [0, 1], 2] = 0.3
+    else:
+        law = CommandPosture(2, [0, 1], [0, 1], width=4)
+        law.forward = lambda states: 2 * states
+    policy = kind(planner, make_koopman_inverse_dynamics(2, 2), law, state_columns=(2, 3), history=5).eval()
+    observations = np.random.default_rng(0).normal(size=(3, 4))
+    plain = PlanThenControl(policy.planner, policy.controller, state_columns=(2, 3), history=5).eval()
+    acted = []
+    for agent in (Agent(policy), AsynchronousAgent(policy, control_hz=1.0), Agent(plain)):
+        agent.reset()
+        acted.append(np.stack([agent.act(row) for row in observations]))
+    np.testing.assert_allclose(acted[0], acted[1], atol=1e-6)
+    assert not np.allclose(acted[0], acted[2], atol=1e-6)

@@ -120,7 +120,7 @@ def test_a_robot_between_two_gaps_keeps_its_word(rule):
     def policy(candidates):
         return PlanThenControl(
             TwoGaps(),
-            EchoController(),
+            EchoController(num_past=0),
             state_columns=(0,),
             history=1,
             replan_interval=2,

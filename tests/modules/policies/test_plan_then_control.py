@@ -159,6 +159,8 @@ def test_wrong_arguments_are_named():
         make_policy("open-loop")
     with pytest.raises(ValueError, match="planner reads 2 observed frames, history is only 1"):
         make_policy(history=1)
+    with pytest.raises(ValueError, match="controller reads 4 observed frames, history is only 3"):
+        PlanThenControl(CountingPlanner(), EchoController(num_past=3), state_columns=(0, 1), history=3)
     for interval in (0, 7):
         with pytest.raises(ValueError, match=rf"replan_interval must be in 1..6 \(the horizon\), got {interval}"):
             make_policy(interval=interval)

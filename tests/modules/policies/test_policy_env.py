@@ -180,3 +180,13 @@ def test_in_processes_of_a_collector(make_policy):
         assert episode["is_init"].flatten().tolist() == [True] + [False] * 5
     alone(make_policy, batch)
     assert not torch.equal(batch["observation"][0], batch["observation"][1])
+
+
+def test_the_environment_writes_what_a_policy_of_other_keys_reads():
+    torch.manual_seed(0)
+    planner = StatePlanner(TemporalUnet(4, 8, channels=(8, 16)), state_dim=4, num_steps=2, noise_key=None)
+    policy = PlanThenControl(
+        planner, make_koopman_inverse_dynamics(4, 2), state_columns=range(4), history=5, history_key="frames"
+    )
+    start = PolicyEnv(bare(), policy).reset()
+    assert start["frames"].shape[-2:] == (5, 4) and "observation_history" not in start.keys()

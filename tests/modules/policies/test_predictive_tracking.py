@@ -163,3 +163,24 @@ def test_weights_that_are_loaded_later_count(whole):
         torch.testing.assert_close(mine, earlier)
     copied.load_state_dict(wanted.state_dict())
     torch.testing.assert_close(copied.gains()[0], wanted.gains()[0])
+
+
+def test_a_response_that_is_fitted_again_is_tracked_by_its_new_weights():
+    policy = policy_of()
+    before = policy.gains()[0].clone()
+    policy.response.weight.mul_(0.5)
+    after = policy.gains()[0]
+    assert not torch.equal(before, after)
+    torch.testing.assert_close(after, policy_of(copy.deepcopy(policy.response)).gains()[0])
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_chunks_longer_than_the_look_ahead_hold_the_last_command(absolute):
+    response = sluggish()
+    response.absolute = absolute
+    policy = policy_of(response, look_ahead=3)  # tells two actions of the four that are executed
+    observations, noise = torch.randn(1, 5, 4), torch.randn(1, 14, 2)
+    chunk = policy.plan_and_decode(observations, noise)
+    assert chunk.shape == (1, 4, 2)
+    held = chunk[:, 1] if absolute else torch.zeros(1, 2)
+    torch.testing.assert_close(chunk[:, 2:], held.unsqueeze(1).expand(-1, 2, -1))

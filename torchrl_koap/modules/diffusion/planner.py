@@ -176,7 +176,7 @@ class StatePlanner(ConditionedDiffusion):
         self.plan_normalizer = Normalizer.fit(plan, mode=mode).to(example)
         if self.forecast is not None:
             history, plan = self.split_window((windows if seen is None else seen).reshape(-1, *windows.shape[-2:]))
-            plan = plan - history[..., -1:, :] if self.relative else plan
+            plan = self._modelled(history, plan)
             groups = None if groups is None else groups.flatten()
             self.forecast.fit(self.encode_history(history), self.plan_normalizer(plan.flatten(-2)), groups, mode=mode)
 

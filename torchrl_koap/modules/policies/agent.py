@@ -13,8 +13,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_koap.keys import ACTION
-from torchrl_koap.modules.policies.receding_horizon import IS_INIT, OBSERVATION_HISTORY, RecedingHorizonPolicy
+from torchrl_koap.modules.policies.receding_horizon import IS_INIT, RecedingHorizonPolicy
 
 
 class Agent:
@@ -34,7 +33,8 @@ class Agent:
 
     Raises:
         RuntimeError: if it is asked to act before :meth:`reset`.
-        ValueError: for observations of another width, batch or number of axes than before, or that are not finite.
+        ValueError: for noise under another key than the policy reads; for observations of another width, batch or
+            number of axes than before, or that are not finite.
 
     Examples:
         >>> import numpy as np
@@ -52,6 +52,9 @@ class Agent:
     _frames: Tensor | None  # [n, history, obs]
 
     def __init__(self, policy: RecedingHorizonPolicy, *, seed: int = 0, noise: TensorDictModuleBase | None = None):
+        key = policy.planner.noise_key
+        if noise is not None and key not in noise.out_keys:
+            raise ValueError(f"the policy reads its noise from {key!r}, what was given writes {list(noise.out_keys)}")
         self.policy, self.seed, self.noise = policy, seed, noise
         example = next(policy.parameters(), torch.empty(0))
         self.device, self.dtype = example.device, example.dtype
@@ -109,16 +112,18 @@ class Agent:
         """The action for the frames observed by now ``[n, act]``."""
         robots = len(self._frames)
         td = TensorDict(batch_size=[robots], device=self.device) if self._carried is None else self._carried
-        td.set(OBSERVATION_HISTORY, self._frames)
+        td.set(self.policy.in_keys[0], self._frames)
         td.set(IS_INIT, torch.full((robots, 1), self._carried is None, device=self.device))
         td = self._with_noise(td)
         td = self.policy(td)
         self._carried = td
-        return td.get(ACTION).clone()
+        return td.get(self.policy.out_keys[0]).clone()
 
     def _with_noise(self, td: TensorDict) -> TensorDict:
         if self.noise is not None:
             return self.noise(td)
+        if self.policy.planner.noise_key is None:  # the planner draws by itself
+            return td
         return td.set(self.policy.planner.noise_key, self._noise_for(len(self._frames)))
 
     def _noise_for(self, robots: int) -> Tensor:

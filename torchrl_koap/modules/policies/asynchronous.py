@@ -39,7 +39,8 @@ class AsynchronousAgent(Agent):
         seed (int): as for :class:`Agent`.
 
     Raises:
-        ValueError: for another kind of policy, open-loop execution, or a rate that is not positive.
+        ValueError: for another kind of policy, open-loop execution, several candidates, or a rate that is not
+            positive.
 
     Examples:
         >>> import numpy as np
@@ -59,6 +60,8 @@ class AsynchronousAgent(Agent):
     def __init__(self, policy: PlanThenControl, *, control_hz: float, seed: int = 0):
         if not isinstance(policy, PlanThenControl) or policy.execution != "feedback":
             raise ValueError("plans are made asynchronously for a PlanThenControl with execution 'feedback' only")
+        if policy.candidates != 1:
+            raise ValueError(f"plans are made asynchronously one at a time, not of {policy.candidates} candidates")
         if not (math.isfinite(control_hz) and control_hz > 0):
             raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz}")
         self.control_hz = control_hz
@@ -112,7 +115,7 @@ class AsynchronousAgent(Agent):
             bound = self._remaining()[..., : min(self._delay, self.policy.planner.horizon - 1), :]
             self._pending = self._thread.submit(self._make, history, self._noise_for(len(history)), bound)
             self._begun = 0
-        action = self.policy.scaled(self.policy.act(history, self._remaining()))
+        action = self.policy.scaled(self.policy.decide(self._frames, history, self._remaining()))
         self._age += 1
         self._begun += 1
         return action if self.policy.leash is None else self.policy.leash.hold(self._frames, action)

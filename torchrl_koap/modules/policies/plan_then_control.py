@@ -63,7 +63,8 @@ class PlanThenControl(RecedingHorizonPolicy):
 
     Raises:
         ValueError: for an unknown execution or rule, several candidates in open loop, a history shorter than the
-            planner's, or an interval longer than the horizon. At the first call for a history of another length.
+            planner's or the controller's, or an interval longer than the horizon. At the first call for a history of
+            another length.
         KeyError: at the first call, if the environment lacks :func:`policy_transforms`.
 
     Examples:
@@ -116,6 +117,9 @@ class PlanThenControl(RecedingHorizonPolicy):
             raise ValueError(f"several candidates need execution 'feedback', which keeps its plan; got {execution!r}")
         if not 0 <= blend_decay < 1:
             raise ValueError(f"blend_decay must be in [0, 1), got {blend_decay}")
+        read = getattr(controller, "num_past", 0) + 1
+        if history < read:
+            raise ValueError(f"the controller reads {read} observed frames, history is only {history}")
         self.execution, self.blend_decay, self.action_rule = execution, blend_decay, action_rule
         self.controller = controller
 

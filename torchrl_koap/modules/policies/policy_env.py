@@ -92,9 +92,10 @@ class PolicyEnv(TransformedEnv):
     """
 
     def __init__(self, env: EnvBase, policy: RecedingHorizonPolicy, *, observation_key: NestedKey = OBSERVATION):
-        noise = SeededNoise(policy.noise_shape, noise_key=policy.planner.noise_key)
-        transforms = policy_transforms(policy.history, observation_key=observation_key)
-        super().__init__(env, Compose(*(transform.clone() for transform in transforms), noise))
+        key = policy.planner.noise_key  # None: the planner draws by itself
+        noise = [] if key is None else [SeededNoise(policy.noise_shape, noise_key=key)]
+        transforms = policy_transforms(policy.history, observation_key=observation_key, history_key=policy.in_keys[0])
+        super().__init__(env, Compose(*(transform.clone() for transform in transforms), *noise))
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seeds the environment and the noise.

@@ -6,14 +6,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.koopman.command_posture import CommandPosture
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
-from torchrl_koap.modules.policies.receding_horizon import STATE_HISTORY
 
 PULL = 0.3  # share of the distance to the posture that is gone at every step
 
@@ -94,12 +92,9 @@ class PostureTracking(PlanThenControl):
             command = command + changes[-1]
         return torch.stack(changes, -2)
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = super()._step(tensordict)
-        observed, action = tensordict.get(self.in_keys[0]), tensordict.get(self.out_keys[0])
-        plan, history = tensordict.get(self.receding.action_keys[0]), tensordict.get(STATE_HISTORY)
-        followed = self._replaced(observed, history, plan, action.unsqueeze(-2))
-        return tensordict.set(self.out_keys[0], followed[..., 0, :])
+    def decide(self, observed: Tensor, states: Tensor, cached: Tensor) -> Tensor:
+        """The decoded action with what postures tell; arguments as for :class:`RecedingHorizonPolicy`."""
+        return self._replaced(observed, states, cached, self.act(states, cached).unsqueeze(-2))[..., 0, :]
 
     def _decode_ahead(self, observations: Tensor, states: Tensor, plan: Tensor) -> Tensor:
         return self._replaced(observations, states, plan, self._decode_chunk(states, plan))

@@ -6,14 +6,12 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.koopman.command_response import CommandResponse
 from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
-from torchrl_koap.modules.policies.receding_horizon import STATE_HISTORY
 
 SMOOTHNESS = 3.0  # weight of a change of the commanded velocity against a distance from the plan
 END_SPEED = 5.0  # weight of the speed at the end of the look-ahead: a short one is unstable without
@@ -96,11 +94,7 @@ class PredictiveTracking(PlanThenControl):
         self.response, self.look_ahead = response, look_ahead
         self.smoothness, self.end_speed = smoothness, end_speed
         self._gains: tuple[Tensor, Tensor] | None = None
-        response.register_load_state_dict_post_hook(self._forget_gains)
-
-    def _forget_gains(self, *_: Any) -> None:
-        """The gains are those of a response that has got other weights."""
-        self._gains = None
+        self._gains_of = response.weight.clone()
 
     def track(self, observed: Tensor, states: Tensor, plan: Tensor) -> Tensor:
         """The next actions of the tracked entries.
@@ -129,7 +123,9 @@ class PredictiveTracking(PlanThenControl):
 
     def gains(self) -> tuple[Tensor, Tensor]:
         """Gains of the distance from the plan if the command is held ``[(N - 1) J, N J]``, and of its last change."""
-        if self._gains is None:
+        weight = self.response.weight
+        if self._gains is None or not (torch.compiler.is_compiling() or _equal(weight, self._gains_of)):
+            self._gains_of = weight.clone()  # the response may have been fitted again
             steps, axes = self.look_ahead, self.response.num_axes
             effect = self.response.impulse_matrix(steps).reshape(steps * axes, (steps - 1) * axes)
             own = torch.eye(axes).to(effect)
@@ -143,19 +139,23 @@ class PredictiveTracking(PlanThenControl):
             self._gains = inverse @ effect.T @ measured, self.smoothness * inverse[:, :axes]
         return self._gains
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = super()._step(tensordict)
-        observed, action = tensordict.get(self.in_keys[0]), tensordict.get(self.out_keys[0])
-        plan = tensordict.get(self.receding.action_keys[0])
-        tracked = self.track(observed, tensordict.get(STATE_HISTORY), plan)[..., 0, :]
-        return tensordict.set(self.out_keys[0], self._with_tracked(action, tracked))
+    def decide(self, observed: Tensor, states: Tensor, cached: Tensor) -> Tensor:
+        """The decoded action with the tracked entries; arguments as for :class:`RecedingHorizonPolicy`."""
+        return self._with_tracked(self.act(states, cached), self.track(observed, states, cached)[..., 0, :])
 
     def _decode_ahead(self, observations: Tensor, states: Tensor, plan: Tensor) -> Tensor:
         """The actions of the next steps ``[*B, interval, act]``, as if the robot answered as predicted."""
         tracked = self.track(observations, states, plan)[..., : self.replan_interval, :]
+        if (missing := self.replan_interval - tracked.shape[-2]) > 0:  # beyond the look-ahead the command is held
+            last = tracked[..., -1:, :] if self.response.absolute else torch.zeros_like(tracked[..., -1:, :])
+            tracked = torch.cat([tracked, last.expand(*last.shape[:-2], missing, -1)], -2)
         return self._with_tracked(self._decode_chunk(states, plan), tracked)
 
     def _with_tracked(self, action: Tensor, tracked: Tensor) -> Tensor:
         action = action.clone()
         action[..., self.response.actions] = tracked.to(action.dtype)
         return action
+
+
+def _equal(weight: Tensor, other: Tensor) -> bool:
+    return weight.device == other.device and weight.dtype == other.dtype and torch.equal(weight, other)

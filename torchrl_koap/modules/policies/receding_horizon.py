@@ -24,7 +24,9 @@ STATE_HISTORY = "state_history"
 IS_INIT = "is_init"
 
 
-def policy_transforms(history: int, *, observation_key: NestedKey = OBSERVATION) -> Compose:
+def policy_transforms(
+    history: int, *, observation_key: NestedKey = OBSERVATION, history_key: NestedKey = OBSERVATION_HISTORY
+) -> Compose:
     """Environment transforms that the policies need: ``is_init`` and the last ``history`` observations.
 
     At the start of an episode the first observation is repeated.
@@ -34,6 +36,8 @@ def policy_transforms(history: int, *, observation_key: NestedKey = OBSERVATION)
 
     Keyword Args:
         observation_key (NestedKey): entry of the observation ``[*B, obs]``. Defaults to ``"observation"``.
+        history_key (NestedKey): entry that the policy reads, its ``in_keys[0]``. Defaults to
+            ``"observation_history"``.
 
     Returns:
         Compose: transforms for a ``TransformedEnv``.
@@ -45,8 +49,8 @@ def policy_transforms(history: int, *, observation_key: NestedKey = OBSERVATION)
     """
     return Compose(
         InitTracker(),
-        UnsqueezeTransform(-2, in_keys=[observation_key], out_keys=[OBSERVATION_HISTORY]),
-        CatFrames(N=history, dim=-2, in_keys=[OBSERVATION_HISTORY], out_keys=[OBSERVATION_HISTORY]),
+        UnsqueezeTransform(-2, in_keys=[observation_key], out_keys=[history_key]),
+        CatFrames(N=history, dim=-2, in_keys=[history_key], out_keys=[history_key]),
     )
 
 
@@ -196,6 +200,19 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         """
         return cached
 
+    def decide(self, observed: Tensor, states: Tensor, cached: Tensor) -> Tensor:
+        """The action of the current step before gain and leash; a subclass may replace entries of :meth:`act`.
+
+        Args:
+            observed (Tensor): observations ``[B, history, obs]``, raw units.
+            states (Tensor): their states ``[B, history, d]``.
+            cached (Tensor): entry of the chunk that is in force: ``[B, ...]``.
+
+        Returns:
+            Tensor: ``[B, act]``, raw units.
+        """
+        return self.act(states, cached)
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of the current step (and the caches that the next one continues from)."""
         observed = tensordict.get(self.in_keys[0], None)
@@ -222,7 +239,8 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         batch = tensordict.batch_size
         if len(batch) == 1:
             return self._step(tensordict)
-        flat = tensordict.select(*self.in_keys, self.planner.noise_key, *kept, strict=False)
+        noise = [] if self.planner.noise_key is None else [self.planner.noise_key]
+        flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False)
         flat = self._step(flat.reshape(-1) if batch else flat.unsqueeze(0))
         written = flat.select(*self.out_keys, *kept, STATE_HISTORY)
         return tensordict.update(written.reshape(batch) if batch else written[0])
@@ -231,8 +249,9 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         """One step of a batch ``[n]``."""
         tensordict.set(STATE_HISTORY, self.state_of(tensordict.get(self.in_keys[0])))
         tensordict = self.receding(tensordict)
-        action = self.act(tensordict.get(STATE_HISTORY), tensordict.get(self.receding.action_keys[0]))
-        return tensordict.set(self.out_keys[0], action)
+        observed, states = tensordict.get(self.in_keys[0]), tensordict.get(STATE_HISTORY)
+        cached = tensordict.get(self.receding.action_keys[0])
+        return tensordict.set(self.out_keys[0], self.decide(observed, states, cached))
 
     def _select(self, observed: Tensor) -> Tensor:
         if observed.shape[-1] <= self._widest:
@@ -246,13 +265,14 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
 class _Chunk(TensorDictModuleBase):
     """The part that runs only when a new chunk is due."""
 
-    def __init__(self, make_chunk: Callable, noise_key: NestedKey, chunk_key: NestedKey):
+    def __init__(self, make_chunk: Callable, noise_key: NestedKey | None, chunk_key: NestedKey):
         super().__init__()
         self.make_chunk, self.noise_key = make_chunk, noise_key
         self.in_keys, self.out_keys = [STATE_HISTORY], [chunk_key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        noise, in_force = tensordict.get(self.noise_key, None), tensordict.get(self.out_keys[0], None)
+        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        in_force = tensordict.get(self.out_keys[0], None)
         fresh = tensordict.get(IS_INIT).squeeze(-1)
         chunk = self.make_chunk(tensordict.get(STATE_HISTORY), noise, in_force, fresh)
         return tensordict.set(self.out_keys[0], chunk)

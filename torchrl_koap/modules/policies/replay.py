@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
@@ -25,6 +25,7 @@ class EpisodeNoise(TensorDictModuleBase):
 
     Keyword Args:
         num_steps (int): control steps to draw for.
+        noise_key (NestedKey): entry that is written, ``planner.noise_key``. Defaults to ``"noise"``.
 
     Raises:
         RuntimeError: at the call, when all draws are used up.
@@ -39,10 +40,10 @@ class EpisodeNoise(TensorDictModuleBase):
         True
     """
 
-    def __init__(self, seeds: Sequence[int], shape: Sequence[int], *, num_steps: int):
+    def __init__(self, seeds: Sequence[int], shape: Sequence[int], *, num_steps: int, noise_key: NestedKey = NOISE):
         super().__init__()
-        self.in_keys: list[str] = []
-        self.out_keys = [NOISE]
+        self.in_keys: list[NestedKey] = []
+        self.out_keys = [noise_key]
         draws = [torch.randn(num_steps, *shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         self.register_buffer("draws", torch.stack(draws), persistent=False)  # [E, steps, *shape]
         self.step = 0
@@ -51,7 +52,7 @@ class EpisodeNoise(TensorDictModuleBase):
         """Writes the noise of the current step and moves on to the next."""
         if self.step == self.draws.shape[1]:
             raise RuntimeError(f"noise was drawn for {self.step} steps only")
-        tensordict.set(NOISE, self.draws[:, self.step])
+        tensordict.set(self.out_keys[0], self.draws[:, self.step])
         self.step += 1
         return tensordict
 
