@@ -26,7 +26,7 @@ def test_nothing_is_known_and_nothing_is_said():
 
 def test_a_run_that_succeeds_in_many_ways_needs_nothing():
     evaluation = {"success_rate": 0.95, "success_low": 0.86, "success_high": 0.98, "episodes": 60, "mode_entropy": 0.9}
-    summary = {"labels": {"labelled_transitions": 80}, "action_error_mm": {"koap": 1.0, "ridge": 3.0}}
+    summary = {"labels": {"labelled_transitions": 80}, "action_error_mm": {"controller": 1.0, "ridge": 3.0}}
     assert commands(config={"method": "koap"}, summary=summary, evaluation=evaluation, even_entropy=0.93) == []
 
 
@@ -69,11 +69,11 @@ def test_low_entropy(candidates, command):
 
 
 def test_a_ridge_that_errs_less_is_pointed_out():
-    numbers = Numbers(config={"method": "koap"}, summary={"action_error_mm": {"koap": 3.2, "ridge": 3.1}})
+    numbers = Numbers(config={"method": "koap"}, summary={"action_error_mm": {"controller": 3.2, "ridge": 3.1}})
     assert [item.finding for item in advice(numbers)] == [
         "the action error of koap is 3.2 mm, that of a plain ridge 3.1 mm"
     ]
-    assert not advice(Numbers(config={"method": "linear"}, summary={"action_error_mm": {"linear": 3, "ridge": 3}}))
+    assert not advice(Numbers(config={"method": "linear"}, summary={"action_error_mm": {"controller": 3, "ridge": 3}}))
 
 
 def test_recorded_data():

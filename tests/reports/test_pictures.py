@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -77,6 +78,18 @@ def test_nothing_to_draw_removes_an_earlier_picture(tmp_path):
     (run / "plots" / "none.png").write_bytes(b"of earlier data")
     assert draw_pictures(run, animation=False) == {} and not (run / "plots" / "none.png").exists()
     assert "None: not drawn, the evaluation is short." in write_report(run, draw=False).read_text()
+
+
+@pytest.mark.parametrize(("age", "stays"), [(-10, False), (10, True)])
+def test_films_of_an_earlier_evaluation_do_not_stay_beside_the_figures_of_another(age, stays, tmp_path):
+    run = write_run(tmp_path)
+    (run / "plots").mkdir()
+    film, source = run / "plots" / "rollouts.gif", run / all_pictures()["rollouts.gif"].source
+    source.touch()
+    film.write_bytes(b"film")
+    os.utime(film, (source.stat().st_mtime + age,) * 2)
+    draw_pictures(run, animation=False)
+    assert film.exists() == stays
 
 
 def test_every_picture_has_words_and_a_command():

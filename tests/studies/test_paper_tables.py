@@ -139,6 +139,14 @@ def test_a_folder_holds_one_comparison(asked, tmp_path):
     assert len(asked) == 1
 
 
+@pytest.mark.parametrize("file", ["config.json", "curve.json"])
+def test_folders_of_runs_and_curves_are_left_alone(file, asked, tmp_path):
+    (tmp_path / file).write_text("{}")
+    with pytest.raises(RunDirectoryError, match="is the folder of a run or curve"):
+        run_bench(BenchConfig(tmp_path, table=1, tasks="avoiding"))
+    assert not asked and [path.name for path in tmp_path.iterdir()] == [file]
+
+
 def test_wrong_calls_are_explained_before_any_work(asked, tmp_path):
     for options in (BenchConfig(tmp_path), BenchConfig(tmp_path, table=1, study="observations")):
         with pytest.raises(ValueError, match="exactly one of --table and --study"):

@@ -224,3 +224,9 @@ def test_the_package_alone_loads_neither_torch_nor_a_simulator():
     assert found.stdout.strip() == "[]", found.stderr
     with pytest.raises(AttributeError, match="has no attribute 'register_tusk'"):
         torchrl_koap.register_tusk  # noqa: B018
+
+
+@pytest.mark.parametrize("name", ["../x", "a/b", "a\\b", ".."])
+def test_names_that_would_lead_out_of_a_folder_are_refused(name):
+    with pytest.raises(ValueError, match="part of the names of files"):
+        Task(name=name, observation_parts={"xy": 2}, actions={"x": "m"}, position="xy")

@@ -171,7 +171,7 @@ def control_is_as_good(numbers: Numbers) -> Advice | None:
     for name, errors in numbers.summary.items():
         if not (name.startswith("action_error") and isinstance(errors, Mapping)):
             continue
-        own, ridge = number(errors.get(method)), number(errors.get("ridge"))
+        own, ridge = number(errors.get("controller")), number(errors.get("ridge"))
         if own is not None and ridge is not None and own >= ridge and method not in CONTROLS:
             unit = name.removeprefix("action_error").removeprefix("_")
             return Advice(

@@ -212,6 +212,8 @@ def draw_pictures(
                 problems[name] = f"{name} was not made: {error}"
             except (ValueError, KeyError, OSError, TypeError, SafetensorError) as error:
                 problems[name] = f"{item.source}: {error}"
+        elif (film := run_dir / FOLDER / name).exists() and _is_older(film, run_dir / item.source):
+            film.unlink()  # a film of an earlier evaluation beside the figures of this one
         if progress is not None:
             progress(number + 1, len(wanted))
     return problems
@@ -276,3 +278,8 @@ def _load(source: Path) -> Any:
         return json.loads(source.read_text(encoding="utf-8"))
     with source.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def _is_older(film: Path, source: Path) -> bool:
+    """Whether a film was made before what it shows was written (again)."""
+    return source.exists() and film.stat().st_mtime < source.stat().st_mtime

@@ -201,6 +201,9 @@ def run_bench(config: BenchConfig) -> dict[str, Any]:
     root = RunDirectory(config.out)
     if (root.path / "bench.json").exists() and root.read_entry("bench.json", "comparison") != name:
         raise RunDirectoryError(f"{root.path} holds another comparison than {name!r}; choose another --out")
+    for other in ("config.json", "curve.json"):
+        if (root.path / other).exists():
+            raise RunDirectoryError(f"{root.path} is the folder of a run or curve ({other}); choose another --out")
     curves = _curves(config, preset)
     for curve in curves:
         check_curve(curve)

@@ -31,6 +31,8 @@ def check_task(task: Task) -> None:
           - position: no part 'yx'; parts: xy
     """
     faults = [] if task.name and isinstance(task.name, str) else [f"name: wanted a name, got {task.name!r}"]
+    if not faults and (set("/\\") & set(task.name) or task.name in (".", "..")):
+        faults.append(f"name: part of the names of files, it may hold no / or \\, got {task.name!r}")
     if not task.observation_parts:
         faults.append("observation_parts: none")
     if not task.actions:

@@ -114,3 +114,20 @@ def test_other_columns_in_another_file(tmp_path):
 def test_an_empty_folder(tmp_path):
     with pytest.raises(FileNotFoundError, match="holds no"):
         read_tables(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK no archive", b"\x93NUMPY"])
+def test_damaged_archives_are_named(content, tmp_path):
+    (tmp_path / "a.npz").write_bytes(content)
+    with pytest.raises(RecordingsError, match=r"a\.npz: "):
+        read_tables(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [("time,x,y,x", "columns 2 and 4 are both named 'x'"), (",time,x,y", "column 1 has no name; is it the index")],
+)
+def test_columns_that_would_be_lost_are_refused(header, message, tmp_path):
+    (tmp_path / "a.csv").write_text(header + "\n0,0.1,1,2\n1,0.2,1,2\n")
+    with pytest.raises(RecordingsError, match=message):
+        read_tables(tmp_path)

@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import csv
 import importlib.util
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -24,6 +26,8 @@ import numpy as np
 from torchrl_koap.data.recordings.recordings import Recordings, RecordingsError, make_recordings
 from torchrl_koap.lookup import lookup
 
+# what readers of damaged files raise
+_UNREADABLE = (ValueError, OSError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, csv.Error)
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
 TIMES = ("timestamp", "timestamps", "time", "t")
@@ -88,8 +92,8 @@ def read_tables(
     for file in files:
         try:
             found, names, hz = _READERS[file.suffix](file, action_columns)
-        except (ValueError, OSError, KeyError) as error:
-            problems.append(f"{file}: {error}")
+        except _UNREADABLE as error:
+            problems.append(f"{file}: {error or type(error).__name__}")
             continue
         for index, (frames, steps) in enumerate(found):
             states.append(frames)
@@ -142,6 +146,11 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None):
     if len(rows) < 2:
         raise ValueError("wanted a header and a row per frame")
     header = [name.strip() for name in rows[0]]
+    for number, name in enumerate(header):
+        if not name:
+            raise ValueError(f"column {number + 1} has no name; is it the index of the rows? leave it out")
+        if header.index(name) != number:
+            raise ValueError(f"columns {header.index(name) + 1} and {number + 1} are both named {name!r}")
     values = np.empty((len(rows) - 1, len(header)))
     for number, row in enumerate(rows[1:]):
         if len(row) != len(header):
@@ -173,6 +182,8 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None):
             width = next((len(row) for row in rows if row is not None), 0)
             block = np.array([[np.nan] * width if row is None else row for row in rows], dtype=np.float64)
             columns |= {f"{name}_{index}": block[:, index] for index in range(width)}
+        elif pyarrow.types.is_boolean(kind):
+            columns[name] = np.array([np.nan if value is None else value for value in values.to_pylist()], float)
         elif pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind):
             columns[name] = values.to_numpy().astype(np.float64)
     return _split_columns(columns, action_columns)

@@ -79,7 +79,7 @@ def held_out_errors(left: Tensor, shrinks: Tensor, target: Tensor, groups: Tenso
     """
     coefficients = shrinks.unsqueeze(-1) * (left.mT @ target)  # [P, r, act]
     if centred and len(left) == 1:
-        return torch.full_like(coefficients[:, 0], torch.inf)
+        return target.new_full((len(shrinks), target.shape[1]), torch.inf)
     constant = len(left) ** -0.5 if centred else 0.0  # the mean's direction, in every row
     sizes = groups.bincount()
     if int(sizes.max()) == 1:  # single rows: the leverages are all that is needed
@@ -91,7 +91,7 @@ def held_out_errors(left: Tensor, shrinks: Tensor, target: Tensor, groups: Tenso
     if centred:
         shrinks = torch.cat([shrinks, shrinks.new_ones(len(shrinks), 1)], -1)
     roots = shrinks.sqrt().unsqueeze(-1)  # [P, r, 1]
-    total = torch.zeros_like(coefficients[:, 0])
+    total = target.new_zeros(len(shrinks), target.shape[1])
     for rows in groups.argsort(stable=True).split(sizes.tolist()):
         part = left[rows]
         error = target[rows] - part @ coefficients  # [P, |G|, act]
