@@ -104,6 +104,6 @@ def test_actions_of_another_width_are_refused_and_not_broadcast():
     batch["action"] = batch["action"][..., :1].contiguous()
     with pytest.raises(ValueError, match="'action' has 1 columns, the network decodes 2"):
         InverseDynamicsLoss(network)(batch)
-    lifted = KOAPLoss(make_koopman_inverse_dynamics(3, 2, history=2, look_ahead=(2,)))
+    lifted = KOAPLoss(make_koopman_inverse_dynamics(3, 2, num_past=2, look_ahead=(2,)))
     with pytest.raises(ValueError, match="'action' has 1 columns, the network decodes 2"):
         lifted(batch)
