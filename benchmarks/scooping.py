@@ -190,7 +190,7 @@ def append(table: Path, row: Mapping[str, object]) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
     for who in EMBODIMENTS:
-        if not (options.folder / who).exists():
+        if not (options.folder / who / "meta" / "info.json").exists():
             record_videos(options.folder / who, who, options.demonstrations, task=options.task)
     if options.fit_projection:
         encoder = FrozenImageEncoder(load_backbone(), pooling="grid", cache=options.folder / "cache")

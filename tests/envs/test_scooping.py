@@ -3,15 +3,19 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.commands.demos import Demos
+from torchrl_koap.data.lerobot.images import read_image_episodes
 from torchrl_koap.envs import ScoopingEnv
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.experts.scooping import ScoopingExpert, start_joints
+from torchrl_koap.envs.experts.scooping_recording import record_videos
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations, settled_layouts
 from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics, rotation_of
@@ -141,3 +145,33 @@ def test_no_graphics_is_one_clear_error(tmp_path, monkeypatch):
     with pytest.raises(RuntimeError, match="switched off by the environment variable MUJOCO_GL=off"):
         Demos(out=tmp_path / "a", task="scooping", embodiment="hand", episodes=1)()
     assert not (tmp_path / "a").exists()
+
+
+def test_an_interrupted_recording_goes_on(tmp_path):
+    record = functools.partial(record_videos, embodiment="robot", episodes=2)
+
+    def interrupt(number, total):
+        raise KeyboardInterrupt
+
+    try:
+        record(tmp_path / "whole")
+    except RuntimeError as error:
+        pytest.skip(f"no OpenGL library: {error}")
+    with pytest.raises(KeyboardInterrupt):
+        record(tmp_path / "parts", progress=interrupt)
+    with pytest.raises(FileExistsError, match=r'holds an interrupted recording of .*"seed": 0.*, not of .*"seed": 1'):
+        record(tmp_path / "parts", seed=1)
+    seen = []
+    report = record(tmp_path / "parts", progress=lambda number, total: seen.append(number))
+    assert seen == [1, 2] and report.episodes == 2 and report.attempts >= 2
+    parts, whole = (read_image_episodes(tmp_path / name) for name in ("parts", "whole"))
+    for one, other in zip(parts, whole, strict=True):
+        np.testing.assert_array_equal(one.frames, other.frames)
+        np.testing.assert_array_equal(one.action, other.action)
+    files = [
+        sorted(path.relative_to(tmp_path / name) for path in (tmp_path / name).rglob("*"))
+        for name in ("parts", "whole")
+    ]
+    assert files[0] == files[1]
+    with pytest.raises(FileExistsError, match="holds a data set already"):
+        record(tmp_path / "parts")

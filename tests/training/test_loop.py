@@ -236,3 +236,32 @@ def test_a_phase_is_finished_when_its_weights_are_there(tmp_path):
     assert not phase_finished(run, "planner")
     (tmp_path / "planner.safetensors").touch()
     assert phase_finished(run, "planner") and not phase_finished(run, "controller")
+
+
+def _koopman_loss():
+    return KOAPLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+
+
+def _planner_loss():
+    return PlannerLoss(
+        StatePlanner(MLPDenoiser(2, 4, horizon=6, width=16, depth=1), NoiseSchedule(), state_dim=2, horizon=6)
+    )
+
+
+@pytest.mark.parametrize(("make", "name"), [(_koopman_loss, "network"), (_planner_loss, "planner")])
+def test_ctrl_c_within_a_loss_is_ctrl_c(make, name):
+    loss = make()
+    before = {key: value.clone() for key, value in loss.state_dict().items()}
+
+    def interrupt(*args):
+        raise Interrupt
+
+    for inner in getattr(loss, name).modules():
+        inner.register_forward_pre_hook(interrupt)
+    shape = [4, 8]
+    windows = TensorDict({"state": torch.randn(*shape, 2), "action": torch.randn(*shape, 2)}, [4])
+    windows["has_action"] = torch.ones(*shape, 1, dtype=torch.bool)
+    with pytest.raises(Interrupt):
+        train_phase("x", loss, lambda: windows, num_steps=1, learning_rate=1e-3)
+    for key, value in loss.state_dict().items():
+        torch.testing.assert_close(value, before[key], equal_nan=True)

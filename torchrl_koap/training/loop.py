@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +129,8 @@ def train_phase(
         )
         for group in optimizer.param_groups:
             group["lr"] = rate
-        losses = loss_module(sample())
+        with _interrupts_let_through():
+            losses = loss_module(sample())
         terms = {key: losses.get(key) for key in losses.keys() if key.startswith("loss_")}
         sum(terms.values()).backward()
         limit_outlier(optimizer)
@@ -161,6 +163,17 @@ def train_phase(
     if num_steps > start:
         values["iterations_per_second"] = (num_steps - start) / elapsed
     return values
+
+
+@contextlib.contextmanager
+def _interrupts_let_through() -> Iterator[None]:
+    """Ctrl-C stays Ctrl-C: a loss's ``with params.to_module(network)`` makes a tensordict error of it."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error.__context__, KeyboardInterrupt):
+            raise error.__context__ from None
+        raise
 
 
 def phase_finished(run: RunDirectory, phase: str) -> bool:

@@ -6,17 +6,20 @@ from __future__ import annotations
 import importlib.util
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchrl_koap.files import check_file, read_bytes
+from torchrl_koap.files import check_file, read_bytes, replacing_file
 
 CAMERA = "observation.images.third_person"
 EMBODIMENT = "embodiment"
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+LOCK = ".lock"  # a file that may lie in the folder of a recording
+_UNFINISHED = "unfinished.jsonl"  # what was asked for, then a line per episode
 
 
 class ImageDataError(ValueError):
@@ -68,9 +71,16 @@ class ImageEpisodeWriter:
         action_names (sequence of str): columns of ``action``; empty for an embodiment without.
         embodiment (str): whose demonstrations they are.
         task (str): what is done, in words.
+        request (dict, optional): what tells this recording from others, as JSON can hold it. Default: the arguments
+            above.
+
+    Attributes:
+        accounts (list of dict): what :meth:`add` was told about every episode so far, those of an interrupted recording
+            included.
 
     Raises:
-        FileExistsError: if the folder holds a finished data set.
+        FileExistsError: if the folder holds a finished data set, an unfinished recording of another request, or
+            anything else.
 
     Examples:
         >>> import tempfile
@@ -84,22 +94,66 @@ class ImageEpisodeWriter:
         (4, 8, 8, 3)
     """
 
-    def __init__(self, folder: str | Path, *, fps: float, state_names, action_names, embodiment: str, task: str):
+    def __init__(
+        self,
+        folder: str | Path,
+        *,
+        fps: float,
+        state_names: Sequence[str],
+        action_names: Sequence[str],
+        embodiment: str,
+        task: str,
+        request: dict[str, Any] | None = None,
+    ):
         self.folder = Path(folder)
         self._fps, self._names, self._actions = fps, list(state_names), list(action_names)
         self._embodiment, self._task = embodiment, task
+        own = {"fps": fps, "states": self._names, "actions": self._actions, "embodiment": embodiment, "task": task}
+        self._request = own if request is None else request
         if (self.folder / "meta" / "info.json").exists():
             raise FileExistsError(f"{self.folder} holds a data set already; choose another folder")
         _pyarrow()
         self._shape: list[int] = []
         self._lengths: list[int] = []
         self._before = 0
+        self.accounts: list[dict[str, Any]] = []
+        self._go_on()
 
-    def add(self, episode: ImageEpisode) -> None:
-        """Writes an episode; its action after the last frame repeats the one before, as LeRobot has a row per frame."""
+    def _go_on(self) -> None:
+        """Takes over what an interrupted recording of the same left."""
+        path = self.folder / _UNFINISHED
+        if not path.exists():
+            if self.folder.exists() and any(entry.name != LOCK for entry in self.folder.iterdir()):
+                raise FileExistsError(f"{self.folder} is not empty; choose another folder")
+            return
+        asked, *lines = read_bytes(path).decode().splitlines() or ["{}"]
+        if json.loads(asked) != self._request:
+            raise FileExistsError(
+                f"{self.folder} holds an interrupted recording of {asked}, not of {json.dumps(self._request)}:"
+                " ask for the same to go on, or remove it"
+            )
+        for line in lines:
+            try:
+                known = json.loads(line)
+            except json.JSONDecodeError:  # the process ended while it wrote this line
+                break
+            self._count(known.pop("rows"), known.pop("shape"), known)
+
+    def _count(self, rows: int, shape: list[int], account: dict[str, Any]) -> None:
+        self._shape = shape
+        self._lengths.append(rows)
+        self._before += rows
+        self.accounts.append(account)
+
+    def add(self, episode: ImageEpisode, **account: Any) -> None:
+        """Writes an episode; its action after the last frame repeats the one before, as LeRobot has a row per frame.
+
+        Args:
+            episode (ImageEpisode): the episode.
+            **account: what shall be known about it if the recording is interrupted, as JSON can hold it.
+        """
         pyarrow = _pyarrow()
         number, rows = len(self._lengths), len(episode.frames)
-        self._shape = list(episode.frames.shape[1:])
         frames = np.arange(rows)
         columns: dict[str, Any] = {
             CAMERA: pyarrow.array(
@@ -117,11 +171,18 @@ class ImageEpisodeWriter:
             "index": self._before + frames,
             "task_index": np.zeros(rows, dtype=np.int64),
         }
-        file = self.folder / _DATA.format(episode_chunk=0, episode_index=number)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        pyarrow.parquet.write_table(pyarrow.table(columns), file)
-        self._lengths.append(rows)
-        self._before += rows
+        with replacing_file(self.folder / _DATA.format(episode_chunk=0, episode_index=number)) as aside:
+            pyarrow.parquet.write_table(pyarrow.table(columns), aside)
+        self._count(rows, list(episode.frames.shape[1:]), account)
+        self._note()
+
+    def _note(self) -> None:
+        """Writes down what there is, for a recording that is interrupted."""
+        lines: list[dict[str, Any]] = [self._request]
+        for rows, account in zip(self._lengths, self.accounts, strict=True):
+            lines.append(account | {"rows": rows, "shape": self._shape})
+        with replacing_file(self.folder / _UNFINISHED) as aside:
+            aside.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
     def close(self) -> Path:
         """Writes the description, which makes the data set a finished one."""
@@ -159,7 +220,9 @@ class ImageEpisodeWriter:
             "video_path": None,
             "features": features,
         }
-        (meta / "info.json").write_text(json.dumps(info, indent=2) + "\n")
+        with replacing_file(meta / "info.json") as aside:
+            aside.write_text(json.dumps(info, indent=2) + "\n")
+        (self.folder / _UNFINISHED).unlink(missing_ok=True)
         return self.folder
 
 

@@ -3,19 +3,20 @@
 
 from __future__ import annotations
 
-import shutil
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from torchrl_koap.data.lerobot.images import ImageEpisode, ImageEpisodeWriter
+from torchrl_koap.data.lerobot.images import LOCK, ImageEpisode, ImageEpisodeWriter
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.experts.scooping import HABITS, ScoopingExpert, start_joints
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
 from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics
+from torchrl_koap.files import one_at_a_time
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE, STARTS, start_of
@@ -50,7 +51,7 @@ class VideoReport:
 
 
 def play_episodes(
-    embodiment: str, episodes: int, seed: int = 0, *, size: int = IMAGE_SIZE, task: str = "scooping"
+    embodiment: str, episodes: int, seed: int = 0, *, size: int = IMAGE_SIZE, task: str = "scooping", first: int = 0
 ) -> Iterator[tuple[ImageEpisode, int, int]]:
     """Demonstrations in their order; one that does not succeed is played again, from another place.
 
@@ -64,6 +65,7 @@ def play_episodes(
     Keyword Args:
         size (int): pixels of the frames, both ways.
         task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
+        first (int): number of the first demonstration that is played; none depends on those before.
 
     Yields:
         tuple: the demonstration, how often it was played, and how often the spoon went into the bowl.
@@ -72,16 +74,12 @@ def play_episodes(
         ValueError: for another embodiment, or a number out of range.
         RuntimeError: if nothing can be drawn, or the expert fails again and again.
     """
-    lookup(HABITS, embodiment, "embodiment")
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
-    if seed < 0:
-        raise ValueError(f"seed must be at least 0, got {seed}")
+    _check(embodiment, episodes, seed)
     sims, arm = ScoopingSimulations(embodiment, 1), SpoonKinematics()
     renderer = Renderer(sims.model, size, size, shadows=False)
     stream, rows = sorted(HABITS).index(embodiment), np.zeros(1, dtype=np.int64)
     try:
-        for number in range(episodes):
+        for number in range(first, episodes):
             for attempt in range(MAX_ATTEMPTS):
                 own = (seed, stream, number, attempt)
                 context = _context_at(task, number % len(STARTS), np.random.default_rng((*own, 1)))
@@ -100,6 +98,14 @@ def play_episodes(
     finally:
         renderer.close()
         sims.close()
+
+
+def _check(embodiment: str, episodes: int, seed: int) -> None:
+    lookup(HABITS, embodiment, "embodiment")
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    if seed < 0:
+        raise ValueError(f"seed must be at least 0, got {seed}")
 
 
 def _context_at(task: str, start: int, generator: np.random.Generator) -> np.ndarray:
@@ -139,7 +145,7 @@ def record_videos(
     *,
     task: Task | str = "scooping",
 ) -> VideoReport:
-    """Records demonstrations as a LeRobot data set with pictures.
+    """Records demonstrations as a LeRobot data set with pictures; called again, it goes on where it was interrupted.
 
     Args:
         folder (str or Path): folder to write.
@@ -152,31 +158,42 @@ def record_videos(
         task (Task or str): ``"scooping"`` or ``"scooping_moving_bowl"``.
 
     Raises:
-        FileExistsError: if the folder holds demonstrations already.
+        FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.
+        LockedError: if another process records into the folder.
         ValueError: for another embodiment, or a number out of range.
         RuntimeError: if there is no OpenGL library, pyarrow is missing, or the expert fails again and again.
     """
     task, folder = get_task(task) if isinstance(task, str) else task, Path(folder)
-    if folder.exists() and any(folder.iterdir()):
-        raise FileExistsError(f"{folder} is not empty; choose another folder")
-    players = play_episodes(embodiment, episodes, seed, task=task.name)
-    writer = ImageEpisodeWriter(
-        folder,
-        fps=FRAME_HZ,
-        state_names=("spoon_x", "spoon_y", "spoon_z", *task.observation_names[EMBEDDING_DIM + 3 :]),
-        action_names=task.action_names if embodiment == "robot" else (),
-        embodiment=embodiment,
-        task="take a piece out of the bowl with the spoon",
-    )
-    attempts = frames = again = 0
-    try:
-        for number, (episode, played, scooped) in enumerate(players, 1):
-            writer.add(episode)
-            attempts, frames, again = attempts + played, frames + len(episode.frames), again + (scooped > 1)
+    _check(embodiment, episodes, seed)
+    with _alone_in(folder):
+        writer = ImageEpisodeWriter(
+            folder,
+            fps=FRAME_HZ,
+            state_names=("spoon_x", "spoon_y", "spoon_z", *task.observation_names[EMBEDDING_DIM + 3 :]),
+            action_names=task.action_names if embodiment == "robot" else (),
+            embodiment=embodiment,
+            task="take a piece out of the bowl with the spoon",
+            request={"task": task.name, "embodiment": embodiment, "episodes": episodes, "seed": seed},
+        )
+        done = len(writer.accounts)
+        if progress is not None and done:
+            progress(done, episodes)
+        for episode, played, scooped in play_episodes(embodiment, episodes, seed, task=task.name, first=done):
+            writer.add(episode, frames=len(episode.frames), played=played, scooped=scooped)
             if progress is not None:
-                progress(number, episodes)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    writer.close()
-    return VideoReport(embodiment, episodes, attempts, frames, again)
+                progress(len(writer.accounts), episodes)
+        writer.close()
+    played, frames = (sum(each[what] for each in writer.accounts) for what in ("played", "frames"))
+    return VideoReport(embodiment, episodes, played, frames, sum(each["scooped"] > 1 for each in writer.accounts))
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """One process at a time in a folder, which is left as it was where nothing was written."""
+    with one_at_a_time(folder / LOCK, busy=f"another process records into {folder}"):
+        try:
+            yield
+        finally:
+            (folder / LOCK).unlink()
+            if not any(folder.iterdir()):
+                folder.rmdir()
