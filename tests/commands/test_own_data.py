@@ -3,15 +3,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
 from tiny_runs import koap
 
 from torchrl_koap.data import load_ted, read_task
+from torchrl_koap.data.demonstrations import description_of
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
+from torchrl_koap.tasks import get_task
 
 TINY = ("--steps", 20, "--batch-size", 8, "--controller-batch-size", 8, "--channels", 8, 16)
 
@@ -93,6 +97,45 @@ def test_absolute_targets(arrays, tmp_path):
     moved = agent.act(far)
     # what is learnt is the distance to the target: a robot that starts elsewhere is sent elsewhere
     assert np.abs(moved - near).min() > 2
+
+
+def test_a_data_set_that_is_written_again_keeps_what_it_says_of_its_columns(arrays, tmp_path):
+    options = ("--robot", "q1", "q2", "--command", "goal1", "goal2", "--action-units", "rad", "--state-units", "m")
+    assert koap("convert", arrays, "--out", tmp_path / "arm", *options, "--max-steps", 77) == 0
+    assert koap("convert", tmp_path / "arm", "--out", tmp_path / "again") == 0
+    assert koap("convert", tmp_path / "arm", "--out", tmp_path / "longer", "--max-steps", 99, "--robot", "q2") == 0
+    first, again, longer = (read_task(tmp_path / name / "ted") for name in ("arm", "again", "longer"))
+    assert dataclasses.replace(again, name="arm") == first
+    assert dataclasses.replace(longer, name="arm", robot=first.robot, max_steps=77).actions == first.actions
+    assert longer.max_steps == 99 and [longer.state_names[column] for column in longer.robot] == ["q2"]
+    one, other = (load_ted(tmp_path / name / "ted") for name in ("arm", "again"))
+    assert (one["observation"] == other["observation"]).all() and (one["has_action"] == other["has_action"]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--control-hz", 5), "--control-hz was given, but .*arm is a data set of this library"),
+        (("--observations", "q1"), "--observations was given"),
+        (("--to", "npz", "--robot", "q1"), "--robot was given, but format 'npz' does not hold it"),
+        (("--to", "npz", "--action-kind", "delta"), "--action-kind was given"),
+    ],
+)
+def test_options_of_which_nothing_would_be_kept_are_refused(run, tmp_path, options, message, capsys):
+    assert koap("convert", run.parent / "arm", "--out", tmp_path / "x", *options) == 1
+    assert re.search(message, capsys.readouterr().err) and not (tmp_path / "x").exists()
+
+
+def test_a_task_that_hides_columns_is_not_described_as_one_that_shows_them():
+    with pytest.raises(ValueError, match="task 'po_sorting' hides red_1_tan_yaw"):
+        description_of(get_task("po_sorting"))
+
+
+def test_a_missing_data_set_is_named(run, tmp_path, capsys):
+    assert koap("train", "--dataset", "nowhere", "--out", tmp_path / "run") == 1
+    assert "dataset 'nowhere' is neither 'scripted' nor a folder" in capsys.readouterr().err
+    assert koap("train", "--dataset", run.parent / "arm", "--out", tmp_path / "run", "--task", "arn") == 1
+    assert "arn does not fit" in capsys.readouterr().err
 
 
 def test_export_and_latency(run, tmp_path, capsys):

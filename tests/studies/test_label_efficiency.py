@@ -138,7 +138,7 @@ def test_scripted_demonstrations_are_recorded_once_and_a_call_that_finds_too_few
     [
         ({"steps": 4}, "holds a curve with another steps (3); choose another --out"),
         ({"episodes": 2, "units": "window"}, "with another units (trajectory), episodes (1)"),
-        ({"dataset": "elsewhere"}, "with another dataset ("),
+        ({"dataset": "."}, "with another dataset ("),
     ],
 )
 def test_other_settings_are_named(options, message, curve, demonstrations, capsys):

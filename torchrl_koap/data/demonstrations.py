@@ -177,6 +177,43 @@ def make_demonstrations(
     return data, task
 
 
+def description_of(task: Task) -> dict[str, Any]:
+    """The keyword arguments of :func:`make_demonstrations` that describe a task, for data that are written again.
+
+    Args:
+        task (Task): a task whose data are those of a robot: all observation columns, the command included.
+
+    Returns:
+        dict: ``control_hz``, ``robot``, ``command``, ``action_kind``, ``targets``, both units and ``max_steps``.
+
+    Raises:
+        ValueError: if the task hides parts: the data set of a robot cannot say that.
+
+    Examples:
+        >>> from torchrl_koap.data.demonstrations import description_of
+        >>> from torchrl_koap.tasks import get_task
+        >>> about = description_of(get_task("avoiding"))
+        >>> about["command"], about["action_units"]
+        (('desired_xy_0', 'desired_xy_1'), ('m', 'm'))
+    """
+    own, names = task.state_names, task.observation_names
+    if task.hidden:
+        raise ValueError(
+            f"task {task.name!r} hides {', '.join(task.hidden)}, which the data set of a robot cannot say; another"
+            " format (--to npz) holds all columns"
+        )
+    return {
+        "control_hz": task.control_hz,
+        "robot": tuple(own[column] for column in task.robot) or None,
+        "command": names[task.command_columns] if task.command_columns is not None else (),
+        "action_kind": "absolute" if task.action_targets else "delta",
+        "targets": tuple(own[column] for column in task.action_targets) or None,
+        "action_units": tuple(task.actions.values()),
+        "state_units": task.observation_units or "",
+        "max_steps": task.max_steps,
+    }
+
+
 _COMMAND = "command"
 
 

@@ -9,7 +9,8 @@ known before it is labelled.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import shlex
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,14 @@ from torch import Tensor
 from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.evaluation.trained_run import load_run
+from torchrl_koap.evaluation.training_data import hide_labels_again, load_training_data
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.training.builders import set_up_torch
-from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.plugins import Plugins, load_plugins
 
+_FEW = 5  # suggestions that are made unasked
 _MEAN_SPREAD = 30.0  # prior deviation of a fitted mean against that of what the latent actions explain: nearly free
 
 
@@ -175,10 +177,11 @@ class SuggestConfig:
     """Which unlabelled demonstrations of a trained run to label next; no label outside the budget is read.
 
     Attributes:
-        count: demonstrations to suggest.
+        count: demonstrations to suggest (default: 5, or all that are left).
         criterion: "a_optimal" (lowers the decoder's mean uncertainty the most), "uncertainty" (the decoder is least
             certain about it) or "random".
         seed: seed of "random".
+        dataset: where the data set of the training is now (default: where it was).
         threads: torch threads.
         plugins: modules that register tasks or methods, besides those that the run was trained with.
 
@@ -187,9 +190,10 @@ class SuggestConfig:
         >>> suggest("runs/koap", SuggestConfig(count=3))  # doctest: +SKIP
     """
 
-    count: int = 5
+    count: int | None = None
     criterion: str = "a_optimal"
     seed: int = 0
+    dataset: str | None = None
     threads: int = 1
     plugins: Plugins = ()
 
@@ -204,6 +208,7 @@ class SuggestedLabels:
         labelled_steps (int): labels of the run that the choice builds on.
         labelled_episodes (list of int): trajectories with a label in the run.
         suggestions (list of dict): ``rank``, ``episode``, ``steps`` to label and ``score``, best first.
+        data (list of str): options of ``koap train`` that name task and data set.
 
     Examples:
         >>> from torchrl_koap.evaluation.active_labelling import SuggestedLabels
@@ -217,6 +222,7 @@ class SuggestedLabels:
     labelled_steps: int
     labelled_episodes: list[int]
     suggestions: list[dict[str, Any]]
+    data: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
         lines = [f"{'rank':>4}  {'episode':>7}  {'steps':>5}  {self.criterion:>10}"]
@@ -224,7 +230,8 @@ class SuggestedLabels:
             score = "-" if row["score"] is None else f"{row['score']:.4g}"
             lines.append(f"{row['rank']:>4}  {row['episode']:>7}  {row['steps']:>5}  {score:>10}")
         every = [*self.labelled_episodes, *(row["episode"] for row in self.suggestions)]
-        lines.append(f"with these labelled: koap train --label-episodes {' '.join(map(str, every))} ...")
+        words = ["koap", "train", *self.data, "--label-episodes", *map(str, every)]
+        lines.append(f"with these labelled: {shlex.join(words)} ...")
         return "\n".join(lines)
 
 
@@ -240,8 +247,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
 
     Raises:
         ValueError: for an unknown criterion, a count out of range, a run without latent actions or whose decoder was
-            not fitted in closed form, or demonstrations that are not those of the training any more.
-        RunDirectoryError: if the folder is no finished run.
+            was not fitted in closed form.
+        RunDirectoryError: if the folder is no finished run, or its demonstrations are not there or others.
 
     Examples:
         >>> import tempfile
@@ -278,23 +285,18 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
             f"the decoder of {directory.path} was not fitted in closed form and knows no uncertainty:"
             " train with `--decoder ridge`"
         )
-    dataset, episodes = (directory.read_entry("config.json", name) for name in ("dataset", "episodes"))
-    if dataset != "scripted" and not Path(dataset).is_dir():
-        raise ValueError(f"the demonstrations {dataset!r} that {directory.path} was trained on are not there any more")
-    data = load_demonstrations(dataset, task, episodes=episodes)
-    # from here on everything outside the budget is NaN
-    data, report = trained.budget.apply(data, command=task.command_columns)
-    recorded = directory.read_entry("summary.json", "labels")  # runs of older versions name fewer facts
-    if {name: report.as_dict().get(name) for name in recorded} != recorded:
-        raise ValueError(f"the demonstrations of {dataset!r} are not those that {directory.path} was trained on")
+    data = load_training_data(trained, config.dataset)
+    data, report = hide_labels_again(trained, data, config.dataset)
     steps = infer_steps(controller, controller_view(data, trained.columns, action_targets=task.action_targets))
+    left = int(steps[EPISODE][~steps[HAS_ACTION]].unique().numel())
+    count = max(1, min(_FEW, left)) if config.count is None else config.count
     choices = rank_trajectories(
         steps["latent_action"],
         steps[EPISODE],
         steps[HAS_ACTION],
         penalty=penalty,
         criterion=config.criterion,
-        count=config.count,
+        count=count,
         bias=bool(controller.action_decoder.mean_leverage),
         seed=config.seed,
     )
@@ -309,4 +311,5 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
         for rank, choice in enumerate(choices, 1)
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
-    return SuggestedLabels(config.criterion, penalty, report.labelled_transitions, labelled, rows)
+    again = ["--task", task.name, "--dataset", config.dataset or trained.config["dataset"]]
+    return SuggestedLabels(config.criterion, penalty, report.labelled_transitions, labelled, rows, again)

@@ -24,10 +24,10 @@ from torchrl_koap.evaluation.diagnosis import (
 )
 from torchrl_koap.evaluation.latent_space import analyse_latent
 from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET, error_unit, judge_latent_model
-from torchrl_koap.evaluation.offline import load_training_data
 from torchrl_koap.evaluation.places import choose_contexts
 from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy, roll_out
 from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_run
+from torchrl_koap.evaluation.training_data import load_training_data
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.builders import set_up_torch

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -14,10 +13,9 @@ from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation.chunk_errors import errors_of_chunks
 from torchrl_koap.evaluation.label_errors import errors_left_out, errors_outside_budget
 from torchrl_koap.evaluation.plan_errors import plan_errors
+from torchrl_koap.evaluation.training_data import hide_labels_again, load_training_data
 from torchrl_koap.tasks.units import thousandths
 from torchrl_koap.training.closed_form import likely_axes
-from torchrl_koap.training.datasets import load_demonstrations
-from torchrl_koap.training.run_directory import RunDirectoryError
 
 if TYPE_CHECKING:
     from torchrl_koap.evaluation.trained_run import TrainedRun
@@ -55,15 +53,8 @@ def evaluate_offline(
     Raises:
         RunDirectoryError: if the data set has moved, or is another one.
     """
-    task = trained.task
     data = load_training_data(trained, dataset)
-    labelled, report = trained.budget.apply(data, command=task.command_columns)
-    recorded = trained.directory.read_entry("summary.json", "labels")
-    if {name: report.as_dict().get(name) for name in recorded} != recorded:
-        raise RunDirectoryError(
-            f"the data set {dataset or trained.config['dataset']!r} is not the one that {trained.directory.path} was"
-            " trained on: its trajectories or labels differ"
-        )
+    labelled, _ = hide_labels_again(trained, data, dataset)
     plan = _plans(trained, data, samples=samples, plans=plans, seed=seed)
     action = _actions(trained, data, labelled, samples=samples, chunks=plans, seed=seed)
     split = next((name for name in SPLITS if "relative" in action[name]), None)
@@ -77,25 +68,6 @@ def evaluate_offline(
         "action_errors": action,
         "trajectory": _per_trajectory(plan, action),
     }
-
-
-def load_training_data(trained: TrainedRun, dataset: str | None = None) -> TensorDictBase:
-    """The demonstrations that a run was trained on, with all labels that there are.
-
-    Args:
-        trained (TrainedRun): the run.
-        dataset (str, optional): where they are now. Default: where they were.
-
-    Raises:
-        RunDirectoryError: if they are not there.
-    """
-    where = dataset or trained.config["dataset"]
-    if where != "scripted" and not Path(where).is_dir():
-        raise RunDirectoryError(
-            f"the data set {where!r} of {trained.directory.path} is not there (moved, or named relative to another"
-            " working directory?): say where it is with --dataset"
-        )
-    return load_demonstrations(where, trained.task, episodes=trained.config.get("episodes"))
 
 
 def _plans(trained: TrainedRun, data: TensorDictBase, **options: Any) -> dict[str, Any]:

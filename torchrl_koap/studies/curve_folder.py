@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 from torchrl_koap.studies.cell_options import OPTION_NAMES
@@ -78,7 +78,7 @@ def read_options(root: RunDirectory, kind: type) -> dict[str, Any]:
 
 def as_json(options: CurveConfig) -> dict[str, Any]:
     """The options as ``curve.json`` holds them."""
-    planner = None if options.planner_from is None else str(Path(options.planner_from).absolute())
+    planner = None if options.planner_from is None else os.path.abspath(options.planner_from)
     return asdict(options) | {"out": str(options.out), "dataset": dataset_of(options), "planner_from": planner}
 
 
@@ -107,4 +107,4 @@ def with_earlier_plugins(options: CurveConfig) -> CurveConfig:
 
 def dataset_of(options: CurveConfig) -> str:
     """The data set by its whole path: a cell may run in another working directory."""
-    return options.dataset if options.dataset == "scripted" else str(Path(options.dataset).absolute())
+    return options.dataset if options.dataset == "scripted" else os.path.abspath(options.dataset)

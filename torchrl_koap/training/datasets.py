@@ -24,6 +24,7 @@ def find_task_of(dataset: str, name: str | None = None) -> Task:
             the data set holds or names, else ``"avoiding"``.
 
     Raises:
+        FileNotFoundError: if there is no such folder.
         ValueError: if the name is unknown, or the data set holds the definition of another task.
         DamagedDataError: if the data set's task is damaged or names code.
 
@@ -33,6 +34,8 @@ def find_task_of(dataset: str, name: str | None = None) -> Task:
         ('avoiding', 'sorting')
     """
     folder = Path(dataset) / "ted"
+    if dataset != "scripted" and not Path(dataset).is_dir():
+        raise FileNotFoundError(f"dataset {dataset!r} is neither 'scripted' nor a folder of {Path.cwd()}")
     if dataset == "scripted" or not folder.is_dir():
         return get_task(DEFAULT_TASK if name is None else name)
     own = read_task(folder)

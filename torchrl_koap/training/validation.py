@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -77,7 +78,7 @@ def validation_of(planner_from: Path, dataset: str) -> list[int]:
         dataset (str): the data set it is to be judged on; on another one than its own nothing is known to be unseen.
     """
     config = RunDirectory(planner_from).read_json("config.json")
-    same = Path(str(config.get("dataset"))).absolute() == Path(dataset).absolute()
+    same = os.path.abspath(str(config.get("dataset"))) == os.path.abspath(dataset)
     return list(config.get("validation_episodes") or ()) if same else []
 
 

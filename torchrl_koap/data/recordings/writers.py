@@ -19,6 +19,7 @@ from torchrl_koap.data.recordings.minari import write_minari
 from torchrl_koap.data.recordings.recordings import Recordings, RecordingsError, make_recordings
 from torchrl_koap.data.ted import load_ted, read_about, read_task
 from torchrl_koap.lookup import lookup
+from torchrl_koap.tasks import Task, get_task
 
 _CHUNK = "chunk-000"
 
@@ -41,12 +42,7 @@ def recordings_of(folder: str | Path) -> Recordings:
         8112
     """
     folder = Path(folder) / "ted"
-    data, about = load_ted(folder), read_about(folder)
-    task = read_task(folder)
-    if task is None:
-        from torchrl_koap.tasks import get_task
-
-        task = get_task(about["task"])
+    data, task = load_ted(folder), stored_task(folder.parent)
     episode = data["episode"].numpy()
     starts = np.flatnonzero(np.diff(episode, prepend=episode[0] - 1))
     ends = [*starts[1:], len(episode)]
@@ -62,6 +58,26 @@ def recordings_of(folder: str | Path) -> Recordings:
         control_hz=task.control_hz,
         source=str(folder),
     )
+
+
+def stored_task(folder: str | Path) -> Task:
+    """The task of a data set of this library: the one that it holds, or the registered one that it names.
+
+    Args:
+        folder (str or Path): the folder that holds ``ted``.
+
+    Raises:
+        TEDError: if the data set is damaged.
+        ValueError: if nobody registered the task that it names.
+
+    Examples:
+        >>> from torchrl_koap.data.recordings.writers import stored_task
+        >>> stored_task("demos").name  # doctest: +SKIP
+        'avoiding'
+    """
+    folder = Path(folder) / "ted"
+    task = read_task(folder)
+    return get_task(read_about(folder)["task"]) if task is None else task
 
 
 def write_recordings(recordings: Recordings, out: str | Path, kind: str) -> Path:
