@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap.data import load_ted, read_task
+from torchrl_koap.data import load_ted, read_task, save_demonstrations
 from torchrl_koap.data.demonstrations import description_of
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
@@ -129,6 +129,14 @@ def test_options_of_which_nothing_would_be_kept_are_refused(run, tmp_path, optio
 def test_a_task_that_hides_columns_is_not_described_as_one_that_shows_them():
     with pytest.raises(ValueError, match="task 'po_sorting' hides red_1_tan_yaw"):
         description_of(get_task("po_sorting"))
+
+
+def test_validation_says_how_many_labels_there_are(run, tmp_path, capsys):
+    assert koap("validate", run.parent / "arm") == 0
+    assert re.search(r"labelled steps +58\b", capsys.readouterr().out)
+    save_demonstrations(tmp_path / "bare", [np.random.default_rng(0).normal(size=(9, 2))], control_hz=9, action_dim=1)
+    assert koap("validate", tmp_path / "bare") == 0
+    assert re.search(r"labelled steps +none: `koap train` needs a few", capsys.readouterr().out)
 
 
 def test_a_missing_data_set_is_named(run, tmp_path, capsys):

@@ -136,3 +136,7 @@ def test_a_folder_that_names_code_is_refused(tmp_path):
     (folder / "about.json").write_text(json.dumps(about))
     with pytest.raises(DamagedDataError, match="the task is damaged: .*'observation_parts' is missing"):
         read_task(folder)
+    del about["task"], about["lengths"]
+    (folder / "about.json").write_text(json.dumps(about))
+    with pytest.raises(DamagedDataError, match="about.json says nothing of task, lengths"):
+        read_task(folder)

@@ -31,6 +31,7 @@ from torchrl_koap.training.plugins import Plugins, load_plugins
 from torchrl_koap.training.precision import has_bfloat16_units
 from torchrl_koap.training.progress import count_up_to, progress_bar
 
+_NO_LABELS = "none: `koap train` needs a few"
 _LATER = (DIGESTS, "eval.json", "inspect.json", "suggestions.json")  # files that a run may have
 
 
@@ -84,6 +85,7 @@ class Validate(Command):
         return {
             "trajectories": str(len(lengths)),
             "steps": str(len(data)),
+            "labelled steps": str(int(data["has_action"].sum())) if data["has_action"].any() else _NO_LABELS,
             "shortest, longest": f"{int(lengths.min())}, {int(lengths.max())}",
             "observation, action columns": f"{data['observation'].shape[-1]}, {data['action'].shape[-1]}",
             **{f"doubt {number}": doubt for number, doubt in enumerate(doubts, 1)},

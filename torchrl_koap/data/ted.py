@@ -128,6 +128,9 @@ def read_about(folder: str | Path) -> dict[str, Any]:
         raise DamagedDataError(f"{path} cannot be read: {error}") from error
     if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("sha256"), dict):
         raise DamagedDataError(f"{path} is no description of a data set in format {FORMAT}")
+    missing = [name for name in ("task", "trajectories", "steps", "lengths", "labelled_steps") if name not in about]
+    if missing:
+        raise DamagedDataError(f"{path} says nothing of {', '.join(missing)}")
     return about
 
 

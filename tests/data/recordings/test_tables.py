@@ -68,6 +68,21 @@ def test_parquet_is_read_as_csv_is(tmp_path):
     np.testing.assert_allclose(recordings.states[0], FRAMES)
 
 
+def test_what_is_not_read_is_named(tmp_path):
+    extra = {"obs": np.ones((6, 3)), "reward": np.zeros(5)}
+    np.savez(tmp_path / "a.npz", states=FRAMES, actions=np.ones((5, 1)), control_hz=30.0, **extra)
+    recordings = read_tables(tmp_path)
+    assert recordings.skipped == ("obs", "reward") and recordings.states[0].shape == FRAMES.shape
+
+
+def test_columns_of_text_are_named(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    parquet.write_table(pyarrow.table(columns_of(action=[0.1] * 6, phase=["reach"] * 6)), tmp_path / "run.parquet")
+    recordings = read_tables(tmp_path)
+    assert recordings.skipped == ("phase",) and recordings.state_names == ("x", "y")
+
+
 def test_faults_of_all_files_are_named(tmp_path):
     np.savez(tmp_path / "a.npz", pictures=FRAMES)
     (tmp_path / "b.csv").write_text("x,y\n1,2\n3\n")

@@ -10,6 +10,7 @@
                           all others are states; an empty field is NaN
     folder/run_002.parquet  the same; columns may also be lists of numbers
 
+What is not read (further entries of an archive, parquet columns without numbers) is named in ``skipped``.
 """
 
 from __future__ import annotations
@@ -88,10 +89,10 @@ def read_tables(
             f" {' or '.join(map(repr, ACTIONS))}"
         )
     problems: list[str] = []
-    states, actions, sources, rates, named = [], [], [], [], []
+    states, actions, sources, rates, named, skipped = [], [], [], [], [], []
     for file in files:
         try:
-            found, names, hz = _READERS[file.suffix](file, action_columns)
+            found, names, hz, unused = _READERS[file.suffix](file, action_columns)
         except _UNREADABLE as error:
             problems.append(f"{file}: {error or type(error).__name__}")
             continue
@@ -100,6 +101,7 @@ def read_tables(
             actions.append(steps)
             sources.append(file.name if len(found) == 1 else f"{file.name}[{index}]")
         rates += [hz] if hz else []
+        skipped += unused
         named.append((file, names))
     problems += _other_columns(named)
     if control_hz is None and not problems:
@@ -116,6 +118,7 @@ def read_tables(
         sources=sources,
         control_hz=control_hz,
         source=str(folder),
+        skipped=skipped,
     )
 
 
@@ -131,13 +134,15 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None):
         raise ValueError(
             f"has no states: wanted one of {', '.join(STATES)}, it holds {', '.join(entries) or 'nothing'}"
         )
-    steps = next((entries[name] for name in ACTIONS if name in entries), None)
+    acting = next((name for name in ACTIONS if name in entries), None)
+    steps = None if acting is None else entries[acting]
     names = {
         kind: [str(name) for name in entries[f"{kind}_names"]] if f"{kind}_names" in entries else None
         for kind in ("state", "action")
     }
     hz = float(entries["control_hz"]) if "control_hz" in entries else None
-    return [(entries[key], steps)], names, hz
+    read = {key, acting, "state_names", "action_names", "control_hz"}
+    return [(entries[key], steps)], names, hz, [name for name in entries if name not in read]
 
 
 def _read_csv(file: Path, action_columns: Sequence[str] | None):
@@ -160,7 +165,7 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None):
                 values[number, column] = float(text) if text.strip() else np.nan
             except ValueError:
                 raise ValueError(f"row {number + 2}, column {header[column]!r}: {text!r} is no number") from None
-    return _split_columns({name: values[:, index] for index, name in enumerate(header)}, action_columns)
+    return *_split_columns({name: values[:, index] for index, name in enumerate(header)}, action_columns), []
 
 
 def _read_parquet(file: Path, action_columns: Sequence[str] | None):
@@ -174,6 +179,7 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None):
     except pyarrow.ArrowException as error:
         raise ValueError(f"cannot be read: {str(error).splitlines()[0]}") from error
     columns: dict[str, np.ndarray] = {}
+    unused = []
     for name in table.column_names:
         kind = table.schema.field(name).type
         values = table.column(name)
@@ -186,7 +192,9 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None):
             columns[name] = np.array([np.nan if value is None else value for value in values.to_pylist()], float)
         elif pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind):
             columns[name] = values.to_numpy().astype(np.float64)
-    return _split_columns(columns, action_columns)
+        else:  # text, dates, pictures
+            unused.append(name)
+    return *_split_columns(columns, action_columns), unused
 
 
 _READERS = {".npz": _read_npz, ".csv": _read_csv, ".parquet": _read_parquet}
