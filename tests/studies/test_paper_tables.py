@@ -97,6 +97,14 @@ def test_quick_is_small_but_what_is_asked_for_stays(asked, tmp_path):
     assert curve.planner_from is None  # a width was asked for: the planner is trained
 
 
+def test_a_table_has_the_method_that_a_task_is_trained_with(asked, tmp_path):
+    run_bench(BenchConfig(tmp_path / "t", table=1, tasks="aligning,stacking_unobserved_joints"))
+    aligning, stacking = (options.methods.split(",") for options in asked)
+    assert "koap_posture" not in aligning and stacking == [*aligning, "koap_posture"]
+    run_bench(BenchConfig(tmp_path / "u", table=1, tasks="stacking_unobserved_joints", methods="koap,dd"))
+    assert asked[-1].methods == "koap,dd"
+
+
 def test_quick_takes_the_planners_of_the_repository_unless_told_which_or_how(asked, tmp_path, monkeypatch):
     known = {"aligning": tmp_path / "aligning", "sorting": tmp_path / "sorting"}
     for module in (paper_tables, run_lookup):

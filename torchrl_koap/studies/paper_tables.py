@@ -113,7 +113,7 @@ class BenchConfig(CellOptions):
             labels, ten rollouts, and the planners that the repository holds (pretrained:TASK); a small one is trained
             where it holds none, or where an option says how planners are made.
         tasks: names with commas between, instead of the preset's.
-        methods: names with commas between, instead of the preset's.
+        methods: names with commas between, instead of the preset's (and the task's own, if it has another).
         levels: label levels (1: fewest labels) with commas between, instead of the preset's.
         units: what label levels are shares of: "window" (the first public code's unit) or "trajectory".
         dataset: "scripted", a folder for a single task, or task=FOLDER with commas between.
@@ -248,7 +248,7 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
     if config.denoiser is None and not config.released_settings:
         wide = SMALL_PLANNER if config.quick else WIDE_PLANNER
         own |= {name: value for name, value in wide.items() if own[name] is None}
-    methods = config.methods or ",".join(name for name in preset.methods.split(",") if name in METHODS)
+    common = [name for name in preset.methods.split(",") if name in METHODS]
     curves = []
     for task in tasks:
         once = ""
@@ -261,6 +261,8 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
                 once = _shares(task, [level for level in levels if level in preset.first_seed_only])
         planner = planners.get(task.name)
         share = paper_share(task.name) if config.data_share == "paper" else None
+        usual = [] if config.table is None else [task.defaults.method]  # what `koap train` takes
+        methods = config.methods or ",".join(dict.fromkeys([*common, *usual]))
         curves.append(
             CurveConfig(
                 out=config.out / task.name,
