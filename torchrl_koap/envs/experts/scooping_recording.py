@@ -39,8 +39,8 @@ class VideoReport:
 
     Examples:
         >>> from torchrl_koap.envs.experts.scooping_recording import VideoReport
-        >>> VideoReport("hand", episodes=2, attempts=3, frames=130, again=0).attempts
-        3
+        >>> print(VideoReport("hand", episodes=2, attempts=3, frames=130, again=1))
+        2 demonstrations by a hand, 130 frames; 3 were played to get them, 1 scoop more than once
     """
 
     embodiment: str
@@ -48,6 +48,10 @@ class VideoReport:
     attempts: int
     frames: int
     again: int
+
+    def __str__(self) -> str:
+        kept = f"{self.episodes} demonstrations by a {self.embodiment}, {self.frames} frames"
+        return f"{kept}; {self.attempts} were played to get them, {self.again} scoop more than once"
 
 
 def play_episodes(
