@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -49,20 +50,31 @@ def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
 
 
 def observation_table(name: str) -> str:
-    """A row per share of the trajectories that the controller knows, a column per method: success in percent.
+    """A row per share of the trajectories that is known, a column per method: success in percent, all seeds together.
 
     Args:
         name (str): file of cells without its ending.
     """
-    found: dict[float, dict[str, Mapping[str, Any]]] = {}
+    found: dict[float, dict[str, Counter[str]]] = {}
     for row in _done(name):
-        found.setdefault(row["observations"], {})[row["method"]] = row | {"n": row["episodes"]}
+        counts = found.setdefault(row["observations"], {}).setdefault(row["method"], Counter())
+        counts.update(successes=row["successes"], n=row["episodes"])
     methods = list(dict.fromkeys(method for own in found.values() for method in own))
     body = [
         [share(part), *(percent(own[method]) if method in own else "not run" for method in methods)]
         for part, own in sorted(found.items())
     ]
     return table(["demonstrations", *(f"`{method}`" for method in methods)], body)
+
+
+def bench_entropy(name: str, method: str, observations: float) -> str:
+    """Mean entropy of the modes over the seeds of a method with a share of the trajectories."""
+    found = [
+        row["mode_entropy"]
+        for row in _done(name)
+        if row["method"] == method and row["observations"] == observations and row["mode_entropy"] is not None
+    ]
+    return f"`{sum(found) / len(found):.2f}`"
 
 
 def paper_size() -> str:

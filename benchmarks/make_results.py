@@ -17,6 +17,7 @@ from pathlib import Path
 
 from bench_rows import (
     bench_cost,
+    bench_entropy,
     bench_means,
     bench_sentence,
     bench_size,
@@ -126,6 +127,7 @@ _PAPER = (
     paper_levels_table,
     paper_size,
     bench_table,
+    bench_entropy,
     observation_table,
     bench_sentence,
     bench_size,

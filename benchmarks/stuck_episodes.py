@@ -56,7 +56,7 @@ def way_out(task: Task, action: Tensor, tool: Tensor, objects: Tensor) -> str:
         ahead = tool[0] + action[:, :2].cumsum(0) - tool[1:]
         if ahead.abs().max() > RUNAWAY:
             return "runaway"
-    if task.gripper is not None and action[-STEPS // 5 :, task.gripper[0]].median() < EMPTY:
+    if "gripper" in task.actions and action[-STEPS // 5 :, task.action_names.index("gripper")].median() < EMPTY:
         return "fingers"
     if extent(tool[-STEPS:]) < PLACE and (not objects.shape[1] or extent(objects[-STEPS:]) < UNMOVED):
         return "one place"

@@ -20,8 +20,8 @@ def episode(task, speed=0.0, followed=1.0, width=0.08, pushed=0.0):
     """A tool that is told to go on, and follows in part; the object moves with it."""
     action = torch.zeros(STEPS, get_task(task).action_dim)
     action[:, 0] = speed
-    if get_task(task).gripper is not None:
-        action[:, get_task(task).gripper[0]] = width
+    if "gripper" in get_task(task).actions:
+        action[:, get_task(task).action_names.index("gripper")] = width
     tool = torch.zeros(STEPS + 1, 2)
     tool[1:, 0] = followed * speed * torch.arange(1, STEPS + 1)
     return action, tool, (pushed * tool).unsqueeze(1)
@@ -36,6 +36,7 @@ def episode(task, speed=0.0, followed=1.0, width=0.08, pushed=0.0):
         ("sorting", {"speed": 0.0002, "pushed": 1.0}, "moving"),
         ("stacking", {"width": 0.007}, "fingers"),
         ("stacking", {"width": 0.062}, "one place"),
+        ("stacking_unobserved_joints", {"width": 0.007}, "fingers"),
         ("stacking", {"speed": 0.002}, "moving"),  # its actions move joints: nothing runs away from the tool
     ],
 )
