@@ -55,16 +55,28 @@ def observation_table(name: str) -> str:
     Args:
         name (str): file of cells without its ending.
     """
-    found: dict[float, dict[str, Counter[str]]] = {}
-    for row in _done(name):
-        counts = found.setdefault(row["observations"], {}).setdefault(row["method"], Counter())
-        counts.update(successes=row["successes"], n=row["episodes"])
+    found = _by_observations(name)
     methods = list(dict.fromkeys(method for own in found.values() for method in own))
     body = [
         [share(part), *(percent(own[method]) if method in own else "not run" for method in methods)]
         for part, own in sorted(found.items())
     ]
     return table(["demonstrations", *(f"`{method}`" for method in methods)], body)
+
+
+def _by_observations(name: str) -> dict[float, dict[str, Counter[str]]]:
+    """Successes and rollouts of all seeds, by share of the trajectories and method."""
+    found: dict[float, dict[str, Counter[str]]] = {}
+    for row in _done(name):
+        counts = found.setdefault(row["observations"], {}).setdefault(row["method"], Counter())
+        counts.update(successes=row["successes"], n=row["episodes"])
+    return found
+
+
+def bench_share(name: str, method: str, observations: float) -> str:
+    """Success of a method with a share of the trajectories, all seeds together."""
+    counts = _by_observations(name)[observations][method]
+    return f"{percent(counts, 0)} of {counts['n']} rollouts"
 
 
 def bench_entropy(name: str, method: str, observations: float) -> str:
