@@ -11,7 +11,7 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.commands.demos import Demos
-from torchrl_koap.data.lerobot.images import read_image_episodes
+from torchrl_koap.data.lerobot.images import ImageDataError, read_image_episodes
 from torchrl_koap.envs import ScoopingEnv
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.experts.scooping import ScoopingExpert, start_joints
@@ -161,6 +161,12 @@ def test_an_interrupted_recording_goes_on(tmp_path):
         record(tmp_path / "parts", progress=interrupt)
     with pytest.raises(FileExistsError, match=r'holds an interrupted recording of .*"seed": 0.*, not of .*"seed": 1'):
         record(tmp_path / "parts", seed=1)
+    account = tmp_path / "parts" / "unfinished.json"
+    whole = account.read_text()
+    account.write_text(whole[:-9])
+    with pytest.raises(ImageDataError, match="unfinished.json cannot be read"):
+        record(tmp_path / "parts")
+    account.write_text(whole)
     seen = []
     report = record(tmp_path / "parts", progress=lambda number, total: seen.append(number))
     assert seen == [1, 2] and report.episodes == 2 and report.attempts >= 2

@@ -19,7 +19,7 @@ CAMERA = "observation.images.third_person"
 EMBODIMENT = "embodiment"
 _DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 LOCK = ".lock"  # a file that may lie in the folder of a recording
-_UNFINISHED = "unfinished.jsonl"  # what was asked for, then a line per episode
+_UNFINISHED = "unfinished.json"  # while recording: what was asked for, and an account of every episode so far
 
 
 class ImageDataError(ValueError):
@@ -81,6 +81,7 @@ class ImageEpisodeWriter:
     Raises:
         FileExistsError: if the folder holds a finished data set, an unfinished recording of another request, or
             anything else.
+        ImageDataError: if the account of an unfinished recording is damaged.
 
     Examples:
         >>> import tempfile
@@ -126,18 +127,21 @@ class ImageEpisodeWriter:
             if self.folder.exists() and any(entry.name != LOCK for entry in self.folder.iterdir()):
                 raise FileExistsError(f"{self.folder} is not empty; choose another folder")
             return
-        asked, *lines = read_bytes(path).decode().splitlines() or ["{}"]
-        if json.loads(asked) != self._request:
-            raise FileExistsError(
-                f"{self.folder} holds an interrupted recording of {asked}, not of {json.dumps(self._request)}:"
-                " ask for the same to go on, or remove it"
+        try:
+            known = json.loads(read_bytes(path))
+            asked, episodes = (
+                known["request"],
+                [(each["rows"], each["shape"], each["about"]) for each in known["episodes"]],
             )
-        for line in lines:
-            try:
-                known = json.loads(line)
-            except json.JSONDecodeError:  # the process ended while it wrote this line
-                break
-            self._count(known.pop("rows"), known.pop("shape"), known)
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            raise ImageDataError(f"{path} cannot be read: {error}") from error
+        if asked != self._request:
+            raise FileExistsError(
+                f"{self.folder} holds an interrupted recording of {json.dumps(asked)}, not of"
+                f" {json.dumps(self._request)}: ask for the same to go on, or remove it"
+            )
+        for episode in episodes:
+            self._count(*episode)
 
     def _count(self, rows: int, shape: list[int], account: dict[str, Any]) -> None:
         self._shape = shape
@@ -153,6 +157,8 @@ class ImageEpisodeWriter:
             **account: what shall be known about it if the recording is interrupted, as JSON can hold it.
         """
         pyarrow = _pyarrow()
+        if not self.accounts:
+            self._note()
         number, rows = len(self._lengths), len(episode.frames)
         frames = np.arange(rows)
         columns: dict[str, Any] = {
@@ -178,11 +184,10 @@ class ImageEpisodeWriter:
 
     def _note(self) -> None:
         """Writes down what there is, for a recording that is interrupted."""
-        lines: list[dict[str, Any]] = [self._request]
-        for rows, account in zip(self._lengths, self.accounts, strict=True):
-            lines.append(account | {"rows": rows, "shape": self._shape})
+        counted = zip(self._lengths, self.accounts, strict=True)
+        episodes = [{"rows": rows, "shape": self._shape, "about": account} for rows, account in counted]
         with replacing_file(self.folder / _UNFINISHED) as aside:
-            aside.write_text("".join(json.dumps(line) + "\n" for line in lines))
+            aside.write_text(json.dumps({"request": self._request, "episodes": episodes}))
 
     def close(self) -> Path:
         """Writes the description, which makes the data set a finished one."""
