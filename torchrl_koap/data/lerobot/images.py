@@ -77,6 +77,7 @@ class ImageEpisodeWriter:
     Attributes:
         accounts (list of dict): what :meth:`add` was told about every episode so far, those of an interrupted recording
             included.
+        num_frames (int): their frames.
 
     Raises:
         FileExistsError: if the folder holds a finished data set, an unfinished recording of another request, or
@@ -116,7 +117,7 @@ class ImageEpisodeWriter:
         _pyarrow()
         self._shape: list[int] = []
         self._lengths: list[int] = []
-        self._before = 0
+        self.num_frames = 0
         self.accounts: list[dict[str, Any]] = []
         self._go_on()
 
@@ -129,10 +130,8 @@ class ImageEpisodeWriter:
             return
         try:
             known = json.loads(read_bytes(path))
-            asked, episodes = (
-                known["request"],
-                [(each["rows"], each["shape"], each["about"]) for each in known["episodes"]],
-            )
+            asked = known["request"]
+            episodes = [(each["rows"], each["shape"], each["about"]) for each in known["episodes"]]
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise ImageDataError(f"{path} cannot be read: {error}") from error
         if asked != self._request:
@@ -146,7 +145,7 @@ class ImageEpisodeWriter:
     def _count(self, rows: int, shape: list[int], account: dict[str, Any]) -> None:
         self._shape = shape
         self._lengths.append(rows)
-        self._before += rows
+        self.num_frames += rows
         self.accounts.append(account)
 
     def add(self, episode: ImageEpisode, **account: Any) -> None:
@@ -174,7 +173,7 @@ class ImageEpisodeWriter:
             "timestamp": (frames / self._fps).astype(np.float32),
             "frame_index": frames,
             "episode_index": np.full(rows, number),
-            "index": self._before + frames,
+            "index": self.num_frames + frames,
             "task_index": np.zeros(rows, dtype=np.int64),
         }
         with replacing_file(self.folder / _DATA.format(episode_chunk=0, episode_index=number)) as aside:
@@ -215,7 +214,7 @@ class ImageEpisodeWriter:
             EMBODIMENT: self._embodiment,
             "fps": int(self._fps) if float(self._fps).is_integer() else self._fps,
             "total_episodes": len(self._lengths),
-            "total_frames": self._before,
+            "total_frames": self.num_frames,
             "total_tasks": 1,
             "total_videos": 0,
             "total_chunks": 1,

@@ -183,12 +183,13 @@ def record_videos(
         if progress is not None and done:
             progress(done, episodes)
         for episode, played, scooped in play_episodes(embodiment, episodes, seed, task=task.name, first=done):
-            writer.add(episode, frames=len(episode.frames), played=played, scooped=scooped)
+            writer.add(episode, played=played, scooped=scooped)
             if progress is not None:
                 progress(len(writer.accounts), episodes)
         writer.close()
-    played, frames = (sum(each[what] for each in writer.accounts) for what in ("played", "frames"))
-    return VideoReport(embodiment, episodes, played, frames, sum(each["scooped"] > 1 for each in writer.accounts))
+    attempts = sum(each["played"] for each in writer.accounts)
+    again = sum(each["scooped"] > 1 for each in writer.accounts)
+    return VideoReport(embodiment, episodes, attempts, writer.num_frames, again)
 
 
 @contextlib.contextmanager
