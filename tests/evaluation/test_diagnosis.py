@@ -24,6 +24,7 @@ from torchrl_koap.evaluation.diagnosis import (
     follow_recordings,
     imagine,
     imagined_success,
+    left_recordings,
     rate,
     recorded_futures,
     tracking_errors,
@@ -94,6 +95,12 @@ def test_distance_from_plan_to_execution_by_hand():
     assert errors["measured_xy"] == pytest.approx([math.sqrt((0.09 + 0.16) / 2)] * 4)
     assert tracking_errors(AVOIDING, [episode(0.3).exclude("remaining_plan_chunk")], 4) == {}
     assert executed_success([episode(0), episode(0, success=False)]) == [True, False]
+    stands = episode(0.3, steps=16)
+    stands["remaining_plan_chunk"][8:] += 9.0
+    stands["recorded"] = torch.arange(16)[:, None] < 8  # what comes after the recording's end is not held against it
+    assert tracking_errors(AVOIDING, [stands], 4)["measured_xy"] == pytest.approx([0.3] * 4)
+    episodes = [stands, episode(0.4), episode(0.5)]
+    assert [left_recordings(AVOIDING, episodes, 4, beyond=limit) for limit in (0.2, 0.35, 0.6)] == [3, 2, 0]
     half = rate([True, False])
     assert (half["rate"], half["episodes"]) == (0.5, 2) and 0 < half["low"] < 0.2 < 0.8 < half["high"] < 1
 
@@ -123,12 +130,13 @@ def test_verdicts(rates, words):
 
 
 @pytest.mark.parametrize(
-    ("off", "words"), [(0.007, "planner and controller work alone"), (0.04, "the controller leaves")]
+    ("left", "words"),
+    [(1, "planner and controller work alone"), (2, "the controller leaves 2 of 10 recorded tool paths by more than")],
 )
-def test_a_blind_push_is_not_held_against_the_controller(off, words):
+def test_a_blind_push_is_not_held_against_the_controller(left, words):
     rates = {"imagined": 1.0, "followed": 0.0, "closed_loop": 0.4}
     result = {name: {"rate": value} for name, value in rates.items()}
-    result |= {"distance_to_demonstrations": {}, "recording_to_execution": {"measured_xy": [0.001, off]}}
+    result |= {"distance_to_demonstrations": {}, "recordings_left": {"count": left, "episodes": 10}}
     assert verdict(result, get_task("sorting")).startswith(words)
 
 
@@ -170,6 +178,10 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_judged_without_a_
     assert plot_inspection(result, task, tmp_path / "inspect.png").exists()
     inspection.inspect(trained_run, replace(config, replan_interval=4))
     assert made[-1]["replan_interval"] == 4 and made[-1]["execution"] == "open_loop"
+    several = replace(trained, config=trained.config | {"candidates": 3})
+    monkeypatch.setattr(inspection, "load_run", lambda run: several)
+    inspection.inspect(trained_run, config)
+    assert policies[-2].candidates == 3  # the closed loop; a recording is one plan
 
 
 @pytest.mark.parametrize(
@@ -177,7 +189,7 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_judged_without_a_
 )
 def test_verdicts_without_a_judged_planner(followed, words):
     result = {"followed": {"rate": followed}, "closed_loop": {"rate": 0.4}, "distance_to_demonstrations": {}}
-    assert verdict(result | {"recording_to_execution": {}}, get_task("scooping")).startswith(words)
+    assert verdict(result, get_task("scooping")).startswith(words)
 
 
 def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
@@ -186,6 +198,13 @@ def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
     data = flatten_trajectories(states, actions)
     data["state"] = data["observation"][:, :2].clone()
     monkeypatch.setattr(diagnosis, "make_policy", lambda *_, **__: None)
-    monkeypatch.setattr(diagnosis, "roll_out", lambda *_, futures, **__: futures)
-    futures = follow_recordings(Straight(), None, AVOIDING, data, None, episodes=5)
-    assert futures[:, 0, 0, 0].tolist() == [4.0, 5.0]
+    plans = []
+
+    def noted(*_, futures, **__):
+        plans.append(futures)
+        return [episode(0.0, steps=24) for _ in futures]
+
+    monkeypatch.setattr(diagnosis, "roll_out", noted)
+    followed = follow_recordings(Straight(), None, AVOIDING, data, None, episodes=5)
+    assert plans[0][:, 0, 0, 0].tolist() == [4.0, 5.0]
+    assert [part["recorded"].sum().item() for part in followed] == [18, 18]  # frames of a path but its first

@@ -25,6 +25,8 @@ from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.policies.replay import RecordedPlanner
 from torchrl_koap.tasks import Task
 
+RECORDED = "recorded"  # steps whose next state the recording that is followed has, not the standing at its end
+
 
 @torch.no_grad()
 def imagine(planner: StatePlanner, start: Tensor, *, interval: int, max_steps: int, seed: int = 0) -> Tensor:
@@ -116,6 +118,9 @@ def follow_recordings(
     Keyword Args:
         episodes (int): demonstrations to follow, spread evenly over the data.
         **options: of :func:`~torchrl_koap.evaluation.rollouts.make_policy`.
+
+    Returns:
+        list: an episode each, with :data:`RECORDED` ``[T, 1]``.
     """
     lengths = trajectory_lengths(data).tolist()
     own = torch.arange(len(lengths))
@@ -126,7 +131,7 @@ def follow_recordings(
     paths = data["state"].split(lengths)
     starts = torch.stack([data[OBSERVATION].split(lengths)[index][0] for index in chosen])
     policy = make_policy(RecordedPlanner(planner), controller, state_columns=task.state_of, **options)
-    return roll_out(
+    followed = roll_out(
         policy,
         make_env,
         list(range(len(chosen))),
@@ -134,6 +139,9 @@ def follow_recordings(
         contexts=contexts_of(task, starts.double()).numpy() if task.objects else None,
         futures=recorded_futures([paths[index] for index in chosen], planner.horizon),
     )
+    for episode, index in zip(followed, chosen, strict=True):
+        episode[RECORDED] = (torch.arange(len(episode)) < len(paths[index]) - 1).unsqueeze(-1)
+    return followed
 
 
 def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -> dict[str, list[float]]:
@@ -141,7 +149,8 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
 
     Args:
         task (Task): tells the parts of the state.
-        episodes (sequence of TensorDict): rollouts ``[T]`` with the entry ``remaining_plan_chunk``.
+        episodes (sequence of TensorDict): rollouts ``[T]`` with the entry ``remaining_plan_chunk``; of those that
+            follow a recording the steps count that it has, not the standing at its end.
         interval (int): control steps per plan.
 
     Returns:
@@ -149,16 +158,36 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
     """
     errors: dict[str, list[Tensor]] = {name: [] for name in task.state_slices}
     for episode in episodes:
-        chunk = episode.get("remaining_plan_chunk", None)
-        if chunk is None:
+        if "remaining_plan_chunk" not in episode.keys():
             return {}
+        if RECORDED in episode.keys():
+            episode = episode[episode[RECORDED].squeeze(-1)]
         states = task.state_of(torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]))
+        chunk = episode["remaining_plan_chunk"]
         made = torch.arange(0, len(episode) - interval + 1, interval)
         steps = torch.arange(1, interval + 1)
         gap = states[made[:, None] + steps] - chunk[made, 0, :interval]
         for name, columns in task.state_slices.items():
             errors[name].append(gap[..., columns].square().sum(-1))
     return {name: torch.cat(parts).mean(0).sqrt().tolist() for name, parts in errors.items() if parts}
+
+
+def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *, beyond: float) -> int:
+    """How many recorded tool paths a controller leaves: one that runs away does not speak for the others.
+
+    Args:
+        task (Task): tells where the tool is in the state.
+        episodes (sequence of TensorDict): rollouts of :func:`follow_recordings`.
+        interval (int): control steps per plan.
+
+    Keyword Args:
+        beyond (float): root mean square distance ``interval`` steps after a plan from which on a path is left (m).
+
+    Returns:
+        int: of the episodes.
+    """
+    errors = [tracking_errors(task, [episode], interval) for episode in episodes]
+    return sum(error[task.position][-1] > beyond for error in errors if task.position in error)
 
 
 def nearest_distances(states: Tensor, others: Tensor, scale: Tensor) -> Tensor:
