@@ -103,9 +103,10 @@ def bench_sentence(name: str, method: str = "") -> str:
     return f"{above} of {both}"
 
 
-def first_successes(name: str, task: str, method: str) -> str:
-    """Successes of a method at the lowest label level of a task, of how many rollouts."""
-    row = min((r for r in _done(name) if (r["task"], r["method"]) == (task, method)), key=lambda r: r["fraction"])
+def first_successes(name: str, task: str, method: str, *, most_labels: bool = False) -> str:
+    """Successes of a method with one seed at the lowest (or highest) label level of a task, of how many rollouts."""
+    rows = [row for row in _done(name) if (row["task"], row["method"]) == (task, method)]
+    row = (max if most_labels else min)(rows, key=lambda row: row["fraction"])
     return f"{row['successes']} of {row['episodes']}"
 
 
