@@ -54,8 +54,10 @@ def study(benchmark_script, monkeypatch, tmp_path):
     monkeypatch.setattr(module, "embed_demonstrations", lambda out, *_, **__: (out / "ted").mkdir(parents=True))
     monkeypatch.setattr(module, "load_encoder", lambda projection, cache: None)
     monkeypatch.setattr(module, "TABLE", tmp_path / "scooping.csv")
-    for who in ("robot", "hand"):
-        (tmp_path / who).mkdir()
+    for who in ("robot", "hand"):  # recorded before
+        (tmp_path / who / "meta").mkdir(parents=True)
+        (tmp_path / who / "meta" / "info.json").touch()
+    monkeypatch.setattr(module, "record_videos", lambda folder, *_, **__: pytest.fail(f"{folder} is recorded again"))
     module.asked = asked
     return module
 
