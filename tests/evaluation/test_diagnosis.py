@@ -99,7 +99,9 @@ def test_distance_from_plan_to_execution_by_hand():
     stands["remaining_plan_chunk"][8:] += 9.0
     stands["recorded"] = torch.arange(16)[:, None] < 8  # what comes after the recording's end is not held against it
     assert tracking_errors(AVOIDING, [stands], 4)["measured_xy"] == pytest.approx([0.3] * 4)
-    episodes = [stands, episode(0.4), episode(0.5)]
+    brief = episode(9.0, steps=2)  # shorter than the interval between plans: there is nothing to judge
+    assert tracking_errors(AVOIDING, [brief, stands], 4)["measured_xy"] == pytest.approx([0.3] * 4)
+    episodes = [brief, stands, episode(0.4), episode(0.5)]
     assert [left_recordings(AVOIDING, episodes, 4, beyond=limit) for limit in (0.2, 0.35, 0.6)] == [3, 2, 0]
     half = rate([True, False])
     assert (half["rate"], half["episodes"]) == (0.5, 2) and 0 < half["low"] < 0.2 < 0.8 < half["high"] < 1

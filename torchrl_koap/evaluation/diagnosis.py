@@ -164,7 +164,7 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
             episode = episode[episode[RECORDED].squeeze(-1)]
         states = task.state_of(torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]))
         chunk = episode["remaining_plan_chunk"]
-        made = torch.arange(0, len(episode) - interval + 1, interval)
+        made = torch.arange(0, max(len(episode) - interval + 1, 0), interval)
         steps = torch.arange(1, interval + 1)
         gap = states[made[:, None] + steps] - chunk[made, 0, :interval]
         for name, columns in task.state_slices.items():

@@ -183,8 +183,8 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
     make_env = make_env_of(task, num_threads=config.threads)
     _, contexts = choose_contexts(task, config.episodes)
     with progress_bar(3, "experiments", unit="experiment") as bar:
-        candidates = trained.config.get("candidates") or 1
-        policy = make_policy(planner, controller, state_columns=task.state_of, candidates=candidates, **settings)
+        several = trained.candidates
+        policy = make_policy(planner, controller, state_columns=task.state_of, candidates=several, **settings)
         closed = roll_out(policy, make_env, seeds, max_steps=task.max_steps, contexts=contexts)
         bar.update()
         followed = follow_recordings(planner, controller, task, data, make_env, episodes=config.episodes, **settings)

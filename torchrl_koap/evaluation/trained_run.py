@@ -59,6 +59,11 @@ class TrainedRun:
     columns: tuple[int, ...]
 
     @property
+    def candidates(self) -> int:
+        """Plans (of dp: action chunks) sampled whenever one is due, one of which is taken."""
+        return self.config.get("candidates") or 1  # runs of before have none
+
+    @property
     def budget(self) -> LabelBudget:
         """The label budget it was trained with."""
         episodes = self.config.get("label_episodes")
@@ -167,7 +172,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
             trained.columns,
             tuple(trained.config.get("plugins") or ()),
         )
-        kept: dict[str, Any] = {"candidates": trained.config.get("candidates") or 1}
+        kept: dict[str, Any] = {"candidates": trained.candidates}
         policy = assemble_policy(
             trained.planner, trained.controller, description, **kept | options | execution_of(trained, config)
         )
@@ -213,7 +218,7 @@ def _oracle(trained: TrainedRun, options: dict[str, Any]) -> RecedingHorizonPoli
         raise ValueError(f"task {trained.task.name!r} has no environment, whose simulation the oracle controller reads")
     from torchrl_koap.evaluation.oracle import OracleControl
 
-    kept = {"candidates": trained.config.get("candidates") or 1}
+    kept = {"candidates": trained.candidates}
     history = max(trained.planner.history, getattr(trained.controller, "num_past", 0) + 1)
     rule = trained.task.action_rule if trained.task.gripper is not None else None
     leash = make_leash(trained.task, options.pop("command_lead"))
