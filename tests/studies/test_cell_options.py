@@ -7,7 +7,13 @@ import pytest
 import torch
 
 from torchrl_koap.data import flatten_trajectories
-from torchrl_koap.studies.cell_options import CellOptions, check_cell_options, evaluation_options, training_options
+from torchrl_koap.studies.cell_options import (
+    CellOptions,
+    check_cell_options,
+    evaluation_options,
+    planner_options,
+    training_options,
+)
 from torchrl_koap.studies.curve_data import thin
 from torchrl_koap.studies.label_efficiency import CurveConfig, _cells, check_curve
 from torchrl_koap.training.methods import get_method
@@ -33,6 +39,13 @@ def test_coefficients_reach_those_whose_loss_has_them():
     assert training_options(options, "dp") == {"denoiser": "mlp"}
 
 
+def test_what_is_said_of_policies_reaches_those_that_have_no_planner():
+    options = CellOptions(batch_size=64, policy_steps=900, policy_batch_size=16)
+    assert training_options(options, "dp") == training_options(options, "dp_relabel")
+    assert training_options(options, "dp") == {"steps": 900, "batch_size": 16}
+    assert training_options(options, "koap") == {"batch_size": 64} == planner_options(options)
+
+
 @pytest.mark.parametrize(
     ("options", "methods", "message"),
     [
@@ -44,6 +57,8 @@ def test_coefficients_reach_those_whose_loss_has_them():
         ({"action_coeff": -1.0}, "koap_paper", "action_coeff must be >= 0, got -1.0"),
         ({"controller_state": "arm"}, "koap", "unknown part of the state 'arm'"),
         ({"planner_seeds": 0}, "koap", "planner_seeds must be >= 1, got 0"),
+        ({"policy_steps": 0}, "dp", "policy_steps must be >= 1, got 0"),
+        ({"policy_batch_size": -1}, "dp", "policy_batch_size must be >= 1, got -1"),
     ],
 )
 def test_wrong_options_are_refused(options, methods, message):

@@ -97,6 +97,23 @@ def test_quick_is_small_but_what_is_asked_for_stays(asked, tmp_path):
     assert curve.planner_from is None  # a width was asked for: the planner is trained
 
 
+@pytest.mark.parametrize(
+    ("asked_for", "steps"),
+    [
+        ({}, [5000, 8000]),  # no longer than a planner of the task
+        ({"policy_steps": 900}, [900, 900]),
+        ({"steps": 700}, [700, 700]),
+        ({"steps": 700, "policy_steps": 900}, [900, 900]),
+        ({"quick": True}, [2000, 2000]),
+        ({"released_settings": True}, [None, None]),
+    ],
+    ids=str,
+)
+def test_dp_is_trained_no_longer_than_planners_unless_an_option_says_how(asked_for, steps, asked, tmp_path):
+    run_bench(BenchConfig(tmp_path / "t", table=1, tasks="avoiding,sorting", **asked_for))
+    assert [curve.policy_steps for curve in asked] == steps
+
+
 def test_a_table_has_the_method_that_a_task_is_trained_with(asked, tmp_path):
     run_bench(BenchConfig(tmp_path / "t", table=1, tasks="aligning,stacking_unobserved_joints"))
     aligning, stacking = (options.methods.split(",") for options in asked)

@@ -26,6 +26,8 @@ PLANNER = (
     "batch_size",
     "planner_learning_rate",
 )
+# options of methods that train a network of their own instead of sharing a planner, by what training calls them
+POLICY = {"steps": "policy_steps", "batch_size": "policy_batch_size"}
 
 
 @dataclass(kw_only=True)
@@ -50,6 +52,8 @@ class CellOptions:
             auto).
         batch_size: windows per update of planner and dp (default: 128).
         planner_learning_rate: peak learning rate of planner and dp (default: 3e-3).
+        policy_steps: updates of dp and dp_relabel (default: as many as a planner's; `koap bench`: at most 8,000).
+        policy_batch_size: windows per update of dp and dp_relabel (default: as a planner).
         planner_seeds: number of planners, trained with seeds 0, 1, ...; a cell of seed s has planner s modulo that.
 
     Examples:
@@ -71,6 +75,8 @@ class CellOptions:
     precision: str | None = None
     batch_size: int | None = None
     planner_learning_rate: float | None = None
+    policy_steps: int | None = None
+    policy_batch_size: int | None = None
     planner_seeds: int = 1
 
 
@@ -93,6 +99,8 @@ def training_options(options: CellOptions, method: str) -> dict[str, Any]:
     chosen = planner_options(options) | {
         name: getattr(options, name) for name in COEFFICIENTS if name in has and getattr(options, name) is not None
     }
+    if not get_method(method).has_planner:
+        chosen |= {name: getattr(options, own) for name, own in POLICY.items() if getattr(options, own) is not None}
     state = _chosen(options, method, "controller_state")
     return chosen if state is None else chosen | {"controller_state": state}
 
@@ -151,7 +159,7 @@ def check_cell_options(options: CellOptions, methods: list[Method]) -> None:
         )
     if options.joining is not None and not 0 <= options.joining < 1:
         raise ValueError(f"joining must be in [0, 1), got {options.joining}")
-    for name in ("candidates", "planner_seeds", "batch_size"):
+    for name in ("candidates", "planner_seeds", "batch_size", *POLICY.values()):
         if getattr(options, name) is not None and getattr(options, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
     for name in COEFFICIENTS:

@@ -194,7 +194,7 @@ def _check_method(name: str, options: CurveConfig, task: Task) -> None:
         "released_settings": options.released_settings,
         "planner_from": options.planner_from if method.has_planner else None,
     }
-    resolved = resolve(TrainConfig(**settings, **training_options(options, name)), task)
+    resolved = resolve(TrainConfig(**settings | training_options(options, name)), task)
     try:
         check_networks(resolved)
     except ValueError as error:

@@ -32,6 +32,7 @@ WIDE_PLANNER = {
     "batch_size": 256,
     "planner_learning_rate": 1e-3,
 }
+POLICY_STEPS = 8000  # at most: dp trains a network in every cell, planners are shared
 SMALL_PLANNER = WIDE_PLANNER | {"denoiser_width": 256, "denoiser_depth": 3, "batch_size": 128}
 # what --quick asks for where nothing else is: a table that can be read, not one to be cited
 QUICK = {"demonstrations": 48, "seeds": 1, "episodes": 10, "steps": 2000, "controller_steps": 200}
@@ -125,7 +126,7 @@ class BenchConfig(CellOptions):
         seeds: number of seeds of label choice and training; levels 3 and 4 of a table have the first alone.
         all_levels_alike: levels 3 and 4 have all seeds too.
         episodes: rollouts per cell.
-        steps: updates of planner and dp (default: that of the task).
+        steps: updates of planner and dp (default: that of the task, for dp at most 8,000).
         controller_steps: updates of every controller.
         released_settings: the unequal settings of the first public code.
         epochs: with released settings, epochs instead of the first code's.
@@ -236,13 +237,8 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
     quick = dict(QUICK) if config.quick else {}
     if config.study is not None:
         quick.pop("demonstrations", None)  # 1 % of fewer trajectories is none
-    values: dict[str, Any] = {
-        "seeds": 3,
-        "episodes": 60,
-        "controller_steps": 1000,
-        "demonstrations": None,
-        "steps": None,
-    } | quick
+    standard = {"seeds": 3, "episodes": 60, "controller_steps": 1000, "demonstrations": None, "steps": None}
+    values: dict[str, Any] = standard | quick
     values |= {name: getattr(config, name) for name in values if getattr(config, name) is not None}
     own = {name: getattr(config, name) for name in OPTION_NAMES}
     if config.denoiser is None and not config.released_settings:
@@ -260,6 +256,8 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
             if not config.all_levels_alike:
                 once = _shares(task, [level for level in levels if level in preset.first_seed_only])
         planner = planners.get(task.name)
+        if not config.released_settings and config.policy_steps is None:
+            own["policy_steps"] = values["steps"] or min(POLICY_STEPS, task.defaults.planner_steps)
         share = paper_share(task.name) if config.data_share == "paper" else None
         usual = [] if config.table is None else [task.defaults.method]  # what `koap train` takes
         methods = config.methods or ",".join(dict.fromkeys([*common, *usual]))
