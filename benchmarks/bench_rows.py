@@ -15,6 +15,7 @@ from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layo
 from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels
 from torchrl_koap.studies.paper_tables import PAPER_TASKS
 from torchrl_koap.studies.table import read_cells
+from torchrl_koap.tasks import get_task
 
 _PLURAL = {"window": "windows", "trajectory": "trajectories"}
 CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
@@ -103,9 +104,19 @@ def bench_sentence(name: str, method: str = "") -> str:
     return f"{above} of {both}"
 
 
+def bench_defaults(name: str) -> str:
+    """In how many cells the method that a task is trained with unless told otherwise is above the paper's KOAP."""
+    entries = paper_entries(read_cells(CELLS / f"{name}.csv"))
+    own = [entry for entry in entries if entry.method == get_task(entry.task).defaults.method]
+    named = [replace(entry, method="koap", paper=paper_cell(entry.task, "koap", entry.level)) for entry in own]
+    above, both = above_the_paper(named)
+    return f"{above} of {both}"
+
+
 def first_successes(name: str, task: str, method: str, *, most_labels: bool = False) -> str:
-    """Successes of a method with one seed at the lowest (or highest) label level of a task, of how many rollouts."""
-    rows = [row for row in _done(name) if (row["task"], row["method"]) == (task, method)]
+    """Successes of a method with seed 0 at the lowest (or highest) label level of a task, of how many rollouts."""
+    wanted = (task, method, 0)
+    rows = [row for row in _done(name) if (row["task"], row["method"], row["seed"]) == wanted]
     row = (max if most_labels else min)(rows, key=lambda row: row["fraction"])
     return f"{row['successes']} of {row['episodes']}"
 

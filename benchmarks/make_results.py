@@ -17,6 +17,7 @@ from pathlib import Path
 
 from bench_rows import (
     bench_cost,
+    bench_defaults,
     bench_entropy,
     bench_means,
     bench_sentence,
@@ -128,6 +129,7 @@ _PAPER = (
     paper_levels_table,
     paper_size,
     bench_table,
+    bench_defaults,
     bench_entropy,
     bench_share,
     observation_table,

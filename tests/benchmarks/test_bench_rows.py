@@ -45,6 +45,25 @@ def test_another_method_is_counted_against_the_papers_koap(rows, tmp_path):
     assert rows.bench_sentence("made", "pca") == "1 of 2"  # the paper's KOAP has 78.0 and 98.05 %
 
 
+def test_a_task_is_counted_by_the_method_it_is_trained_with(rows, tmp_path):
+    here = {"task": "stacking_unobserved_joints"}
+    cells = [cell("koap", 0.01, 60) | here, cell("koap_posture", 0.01, 6) | here, cell("koap_posture", 0.02, 30) | here]
+    write_cells(tmp_path / "made.csv", [cell("koap", 0.02, 60), cell("koap_posture", 0.02, 60), *cells])
+    assert rows.bench_defaults("made") == "2 of 3"  # koap_posture has 10 % in one, the paper's KOAP 27.2 %
+
+
+def test_a_cell_with_more_seeds_is_told_by_its_first(rows, tmp_path):
+    cells = [
+        cell("dp", 0.02, 20) | {"seed": 1},
+        cell("dp", 0.02, 30),
+        cell("dp", 0.5, 45),
+        cell("dp", 0.5, 9) | {"seed": 1},
+    ]
+    write_cells(tmp_path / "made.csv", cells)
+    assert rows.first_successes("made", "avoiding", "dp") == "30 of 60"
+    assert rows.first_successes("made", "avoiding", "dp", most_labels=True) == "45 of 60"
+
+
 def test_cells_of_another_comparison_stand_beside(rows, tmp_path):
     write_cells(tmp_path / "first.csv", [cell("koap", 0.02, 60), cell("koap", 0.05, 30), cell("pca", 0.02, 0)])
     write_cells(tmp_path / "made.csv", [cell("relabel", 0.02, 30)])

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from torchrl_koap.training.progress import progress_bar, without_progress_bars
+from torchrl_koap.training.progress import progress_bar, show_losses, without_progress_bars
 
 
 class Full(io.StringIO):
@@ -59,3 +59,26 @@ def test_bars_are_shown_on_stderr_unless_they_are_turned_off(capsys):
     with without_progress_bars():
         counted()
     assert not capsys.readouterr().err
+
+
+def test_in_a_file_a_bar_is_lines_not_carriage_returns(monkeypatch, tmp_path):
+    log = tmp_path / "log.txt"
+    with log.open("w") as file:
+        monkeypatch.setattr(sys, "stderr", file)
+        with progress_bar(3000, "updates", mininterval=0) as bar:
+            show = show_losses(bar)
+            for step in range(1, 3001):
+                show(step, {"loss_planner": 0.25})
+        with progress_bar(2, "gone", leave=False) as bar:
+            bar.update(2)
+    first, last, gone = log.read_bytes().decode().splitlines()
+    assert first.startswith("updates:   0%") and "3000/3000" in last and last.endswith("planner=0.2500]")
+    assert gone.startswith("gone:   0%")
+    assert "\r" not in log.read_bytes().decode()
+
+
+def test_a_bar_of_a_terminal_is_drawn_over_itself(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    counted()
+    assert stream.getvalue().count("\r") > 5 and stream.getvalue().count("\n") == 1

@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import os
+import stat
 import sys
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
@@ -11,6 +14,8 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
+FILE_INTERVAL = 30.0  # s between the lines of a bar in a file
+_UP = "\x1b[A"  # moves the cursor a line up
 _SHOWN: ContextVar[bool] = ContextVar("shown", default=True)
 
 
@@ -33,8 +38,27 @@ class _Forgiving:
             self._stream.flush()
 
 
+class _Lines(_Forgiving):
+    """A stream that gets a line whenever a bar is drawn, instead of a carriage return before it."""
+
+    def write(self, text: str) -> int:
+        if line := text.replace(_UP, "").strip("\r\n "):
+            super().write(line + "\n")
+        return len(text)
+
+
+def _is_on_disk(stream: TextIO) -> bool:
+    """Whether a stream is a file, in which all the states of a bar would be one endless line."""
+    try:
+        return isinstance(stream, io.TextIOWrapper) and stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
 def progress_bar(total: int | None, description: str, *, unit: str = "it", shown: bool = True, **options: Any) -> tqdm:
     """A bar on stderr that counts to ``total``; where stderr cannot be written to, there is none.
+
+    Where stderr is a file (the log of a cell, ``2> log.txt``), the bar is a line every half minute and at its end.
 
     Args:
         total (int, optional): where it ends.
@@ -53,7 +77,12 @@ def progress_bar(total: int | None, description: str, *, unit: str = "it", shown
         True
     """
     disable = not (shown and _SHOWN.get()) or sys.stderr is None
-    stream = None if disable else _Forgiving(sys.stderr)
+    stream: _Forgiving | None = None
+    if not disable and _is_on_disk(sys.stderr):
+        stream = _Lines(sys.stderr)
+        options |= {"mininterval": FILE_INTERVAL, "maxinterval": FILE_INTERVAL}
+    elif not disable:
+        stream = _Forgiving(sys.stderr)
     return tqdm(total=total, desc=description, unit=unit, disable=disable, file=stream, **options)
 
 
@@ -86,8 +115,7 @@ def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
     def update(step: int, values: dict[str, float]) -> None:
         bar.update(step - bar.n)
         if values and step % 50 == 0:
-            bar.set_postfix(
-                {key.removeprefix("loss_"): f"{value:.4f}" for key, value in values.items() if "loss" in key}
-            )
+            losses = {key.removeprefix("loss_"): f"{value:.4f}" for key, value in values.items() if "loss" in key}
+            bar.set_postfix(losses, refresh=False)  # shown when the bar is drawn next
 
     return update
