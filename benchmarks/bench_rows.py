@@ -121,6 +121,37 @@ def first_successes(name: str, task: str, method: str, *, most_labels: bool = Fa
     return f"{row['successes']} of {row['episodes']}"
 
 
+def longer_table(name: str, longer: str) -> str:
+    """Cells that were trained again with more updates, beside what they were and the task's default method.
+
+    Args:
+        name (str): file of cells without its ending.
+        longer (str): file of the same cells with more updates.
+    """
+    known: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in _done(name):
+        known.setdefault((row["task"], row["fraction"], row["method"]), []).append(row)
+    body = []
+    for row in _done(longer):
+        place = row["task"], row["fraction"]
+        (before,) = (other for other in known[(*place, row["method"])] if other["seed"] == row["seed"])
+        method = get_task(row["task"]).defaults.method
+        cells = [_pooled([before]), _updates(before), _pooled([row]), _updates(row), _pooled(known[(*place, method)])]
+        body.append([f"`{row['task']}`", share(row["fraction"]), *cells, f"`{method}`"])
+    return table(["task", "labelled", "success", "updates", "success", "updates", "success", "of"], body)
+
+
+def _updates(row: Mapping[str, Any]) -> str:
+    return f"{row['controller_updates']:,.0f}"
+
+
+def _pooled(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Success of all rollouts of some cells, with its interval."""
+    successes, trials = (sum(row[part] for row in rows) for part in ("successes", "episodes"))
+    low, high = wilson_interval(successes, trials)
+    return f"{100 * successes / trials:.1f} % ({100 * low:.0f}-{100 * high:.0f}) of {trials}"
+
+
 def bench_size(name: str) -> str:
     """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
     cells = _done(name)

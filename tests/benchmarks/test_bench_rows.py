@@ -64,6 +64,15 @@ def test_a_cell_with_more_seeds_is_told_by_its_first(rows, tmp_path):
     assert rows.first_successes("made", "avoiding", "dp", most_labels=True) == "45 of 60"
 
 
+def test_longer_training_stands_beside_the_cell_of_its_seed_and_the_tasks_method(rows, tmp_path):
+    short, longer = ({"controller_updates": updates} for updates in (5000, 15000))
+    others = [cell("dp", 0.02, 10) | short | {"seed": 1}, cell("koap", 0.02, 60), cell("koap", 0.02, 30) | {"seed": 1}]
+    write_cells(tmp_path / "made.csv", [*others, cell("dp", 0.02, 30) | short])
+    write_cells(tmp_path / "longer.csv", [cell("dp", 0.02, 45) | longer])
+    *_, line = rows.longer_table("made", "longer").splitlines()
+    assert "| 50.0 % (38-62) of 60 | 5,000 | 75.0 % (63-84) of 60 | 15,000 | 75.0 % (67-82) of 120 | `koap` |" in line
+
+
 def test_cells_of_another_comparison_stand_beside(rows, tmp_path):
     write_cells(tmp_path / "first.csv", [cell("koap", 0.02, 60), cell("koap", 0.05, 30), cell("pca", 0.02, 0)])
     write_cells(tmp_path / "made.csv", [cell("relabel", 0.02, 30)])
