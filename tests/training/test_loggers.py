@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import importlib.util
-import time
 
 import pytest
+from late_files import wait_for
 from PIL import Image
 
 from torchrl_koap.training.loggers import LOGGERS, check_logger, close_logger, log_evaluation, make_logger
@@ -40,16 +40,6 @@ def test_scalars_arrive_in_the_run_directory(name, tmp_path, monkeypatch):
         close_logger(logger)
     files = [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) > 50
-
-
-def wait_for(text, folder, seconds=30):
-    """Whether a file holds the text before long: wandb's process writes a little later than ``finish`` returns."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if any(path.is_file() and text in path.read_bytes() for path in folder.rglob("*")):
-            return True
-        time.sleep(0.2)
-    return False
 
 
 @pytest.mark.parametrize("name", ["wandb", "tensorboard", "mlflow"])

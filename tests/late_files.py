@@ -1,0 +1,16 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Files that another process writes a little later than it says."""
+
+from __future__ import annotations
+
+import time
+
+
+def wait_for(text, folder, seconds=30):
+    """Whether a file holds the text before long: wandb's process writes a little later than ``finish`` returns."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if any(path.is_file() and text in path.read_bytes() for path in folder.rglob("*")):
+            return True
+        time.sleep(0.2)
+    return False
