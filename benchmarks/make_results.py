@@ -95,7 +95,7 @@ from scooping_rows import (
     scooping_strokes_table,
     scooping_table,
 )
-from unlabelled_picture import REGIMES, draw_errors
+from unlabelled_picture import REGIMES, draw_unlabelled
 from unlabelled_rows import (
     followed,
     followed_rows,
@@ -104,6 +104,7 @@ from unlabelled_rows import (
     unlabelled_labels,
     unlabelled_missing,
     unlabelled_rows,
+    unlabelled_successes,
 )
 
 from torchrl_koap.evaluation.statistics import wilson_interval
@@ -262,7 +263,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     drawn = [draw_label_curves(curves(), ROOT / PICTURES / "success_and_entropy.png")]
     drawn += [draw_pipeline(ROOT / PICTURES / f"pipeline.{kind}") for kind in ("svg", "png")]
     drawn.append(draw_amounts(ROOT / PICTURES / "demonstrations.png"))
-    drawn.append(draw_errors({regime: unlabelled_cells(regime) for regime in REGIMES}, ROOT / PICTURES))
+    tables = ({regime: cells(regime) for regime in REGIMES} for cells in (unlabelled_cells, unlabelled_successes))
+    drawn.append(draw_unlabelled(*tables, ROOT / PICTURES))
     print("\n".join(f"wrote {path}" for path in [*stale, *(path.relative_to(ROOT) for path in drawn)]))
     return 0
 

@@ -153,6 +153,15 @@ def shuffled_trajectories(data: TensorDictBase, seed: int, played: int = 0) -> t
     return numbers[torch.cat([*shuffled, torch.randperm(count, generator=generator)])]
 
 
+def error_row(
+    controller: InverseDynamics, full: TensorDictBase, numbers: torch.Tensor, unit: str, fit: dict, updates: int
+) -> tuple[str, str, str, int]:
+    """What the table says of a controller: error of one decoded action, its unit, what was chosen, updates."""
+    predicted, true, _ = first_actions(controller, full, numbers[-JUDGED:])
+    shown = {"m": "mm", "rad": "mrad"}[unit]
+    return f"{rmse(predicted, true, unit):.4f}", shown, choice_of(controller, fit), updates
+
+
 def run_regime(data, unit, name, regime, options, write, done, bar) -> None:
     """All cells of one regime."""
     for seed in options.seeds:
@@ -163,9 +172,8 @@ def run_regime(data, unit, name, regime, options, write, done, bar) -> None:
         wanted = [cell for cell in cells if (str(name), label, str(cell[1]), str(seed), cell[0]) not in done]
         bar.update(len(cells) - len(wanted))
         for method, labels, controller, fit, updates in controllers(full, task, numbers, seed, wanted):
-            predicted, true, _ = first_actions(controller, full, numbers[-JUDGED:])
-            row = (str(name), label, str(labels), str(seed), method, f"{rmse(predicted, true, unit):.4f}")
-            write((*row, {"m": "mm", "rad": "mrad"}[unit], choice_of(controller, fit), updates))
+            row = error_row(controller, full, numbers, unit, fit, updates)
+            write((str(name), label, str(labels), str(seed), method, *row))
             bar.update()
 
 

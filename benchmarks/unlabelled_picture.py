@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The picture of docs/results/unlabelled_data.md: action error against labelled trajectories, a panel per regime."""
+"""The picture of docs/results/unlabelled_data.md: action error and success against labels, a column per regime."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
 
 REGIMES = {
     "plain": "positions as recorded",
@@ -26,48 +27,72 @@ CONTROLS = (
 )
 LOOKS = {
     "semi_supervised": ("#0b6e4f", "-", "o"),
+    "koap": ("#4ba3c3", "-", "v"),
     "koap_untrained": ("#7a7a7a", "--", "s"),
-    "linear_steps": ("#b0b0b0", ":", "^"),
+    "koap_labelled_only": ("#9b5de5", "--", "P"),
+    "koap_paper": ("#d4a017", "-", "X"),
     "pca": ("#c1440e", "-.", "D"),
+    "linear_steps": ("#b0b0b0", ":", "^"),
+    "dd_lookahead": ("#2f4b8f", ":", "*"),
 }
 
 Cells = Mapping[tuple[str, int], Mapping[int, float]]
 
 
-def draw_errors(regimes: Mapping[str, Cells], folder: Path) -> Path:
-    """Draws mean errors and their range over seeds.
+def draw_unlabelled(errors: Mapping[str, Cells], successes: Mapping[str, Cells], folder: Path) -> Path:
+    """Draws mean action errors above success in closed loop, a column per regime; a band is the range over seeds.
 
     Args:
-        regimes (mapping): for every regime, errors by method and number of labelled trajectories, then by seed.
+        errors (mapping): for every regime, action errors by method and number of labelled trajectories, then by seed.
+        successes (mapping): the same for the share of rollouts that succeed, where there are rollouts.
         folder (Path): where to.
 
     Returns:
         Path: the picture.
     """
-    regimes = {name: cells for name, cells in regimes.items() if cells}
-    figure, axes = plt.subplots(1, len(regimes), figsize=(3.0 * len(regimes), 3.1), squeeze=False)
-    for axis, (name, cells) in zip(axes[0], regimes.items(), strict=True):
-        labels = sorted({number for _, number in cells})
-        for method, (color, line, marker) in LOOKS.items():
-            points = [(x, list(cells[method, x].values())) for x in labels if cells.get((method, x))]
-            if not points:
-                continue
-            x = [number for number, _ in points]
-            axis.fill_between(x, *([end(e) for _, e in points] for end in (min, max)), color=color, alpha=0.12, lw=0)
-            mean = [statistics.fmean(errors) for _, errors in points]
-            axis.plot(x, mean, color=color, ls=line, marker=marker, ms=4, label=method)
-        axis.set_xscale("log", base=2)
-        axis.set_xticks(labels, [str(number) for number in labels])
-        axis.minorticks_off()
-        axis.set_ylim(bottom=0)
-        axis.set_title(REGIMES[name], fontsize=9)
-        axis.set_xlabel("labelled trajectories")
-        axis.spines[["top", "right"]].set_visible(False)
+    names = [name for name, cells in errors.items() if cells]
+    figure, axes = plt.subplots(2, len(names), figsize=(2.5 * len(names), 5.2), squeeze=False, sharex="col")
+    for column, name in enumerate(names):
+        top, bottom = axes[:, column]
+        _draw_lines(top, errors[name])
+        top.set_ylim(bottom=0)
+        top.set_title(REGIMES[name], fontsize=9)
+        rolled_out = {cell: _percent(seeds) for cell, seeds in successes.get(name, {}).items()}
+        _draw_lines(bottom, rolled_out)
+        bottom.set_ylim(-3, 103)
+        if not rolled_out:
+            bottom.text(0.5, 0.5, "not rolled out", transform=bottom.transAxes, ha="center", color="#7a7a7a")
+        bottom.set_xlabel("labelled trajectories")
+        labels = sorted({number for _, number in errors[name]})
+        bottom.set_xscale("log", base=2)
+        bottom.set_xticks(labels, [str(number) for number in labels])
+        bottom.minorticks_off()
     axes[0, 0].set_ylabel("action error (mm, mrad)")
-    handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, loc="lower center", ncols=4, frameon=False)
-    figure.tight_layout(rect=(0, 0.08, 1, 1))
+    axes[1, 0].set_ylabel("success (%)")
+    handles = {
+        label: handle for axis in axes[0] for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    shown = [method for method in LOOKS if method in handles]
+    figure.legend([handles[method] for method in shown], shown, loc="lower center", ncols=len(shown), frameon=False)
+    figure.tight_layout(rect=(0, 0.06, 1, 1))
     path = folder / "unlabelled_data.png"
     figure.savefig(path, dpi=130, metadata={"Software": None})
     plt.close(figure)
     return path
+
+
+def _draw_lines(axis: Axes, cells: Cells) -> None:
+    """A line per method; the range over seeds for the method itself alone, or they would hide each other."""
+    for method, (color, line, marker) in LOOKS.items():
+        points = sorted((number, list(seeds.values())) for (name, number), seeds in cells.items() if name == method)
+        if not points:
+            continue
+        x = [number for number, _ in points]
+        if method == "semi_supervised":
+            axis.fill_between(x, *([end(e) for _, e in points] for end in (min, max)), color=color, alpha=0.15, lw=0)
+        axis.plot(x, [statistics.fmean(e) for _, e in points], color=color, ls=line, marker=marker, ms=4, label=method)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _percent(seeds: Mapping[int, float]) -> dict[int, float]:
+    return {seed: 100 * share for seed, share in seeds.items()}

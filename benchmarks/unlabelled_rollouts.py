@@ -7,8 +7,9 @@
 The planner takes no part: at every step the plan is what the demonstration did next, as the sensor of the regime showed
 it (with its noise), bent towards the present observation as the library's policies do. The robot's own motion is
 simulated, and what the controller sees of it goes through the same sensor, with fresh noise: the same noise for every
-controller of a seed, whichever rows are run. Training, labels and seeds are those of ``unlabelled_data.py``. Judged are
-the last trajectories of a seed's order. Success is the task's. ``--labels-from play``: as there.
+controller of a seed, whichever rows are run. Training, labels and seeds are those of ``unlabelled_data.py``, whose rows
+``--errors`` writes as well: one training for both. Judged are the last trajectories of a seed's order. Success is the
+task's. ``--labels-from play``: as there.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from itertools import product
 from pathlib import Path
 
 import torch
+import unlabelled_data
 from resumable_table import open_table
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import step_mdp
@@ -29,6 +31,7 @@ from unlabelled_data import (
     add_play,
     as_own_data,
     controllers,
+    error_row,
     load_positions,
     shuffled_trajectories,
 )
@@ -123,14 +126,36 @@ def follow(
     }
 
 
+Cell = tuple[str, int]  # method, number of labelled trajectories
+
+
 def run_seed(
-    data: TensorDictBase, source: Task, regime: str, seed: int, wanted: list[tuple[str, int]], played: int, options
+    data: TensorDictBase,
+    source: Task,
+    regime: str,
+    seed: int,
+    follows: list[Cell],
+    judges: list[Cell],
+    played: int,
+    options,
 ):
     """Rolls out the controllers of one regime and seed; the last ``played`` trajectories are random play.
 
+    Args:
+        data (TensorDictBase): flat data with the recorded positions as ``state``.
+        source (Task): has the environment.
+        regime (str): its name.
+        seed (int): of labels, noise and training.
+        follows (list of tuple): methods and numbers of labelled trajectories that are rolled out.
+        judges (list of tuple): those whose action error is measured.
+        played (int): trajectories of random play.
+        options (Namespace): ``judged`` and ``blend_decay``.
+
     Yields:
-        tuple: method and number of labelled trajectories, and what :func:`follow` found.
+        tuple: method and number of labelled trajectories, what :func:`follow` found, or None, and what
+        :func:`unlabelled_data.error_row` says, or None.
     """
+    wanted = [cell for cell in product(options.methods, options.labels) if cell in {*follows, *judges}]
     if not wanted:
         return
     sensor = RegimeSensor(data, regime, seed=seed)
@@ -141,15 +166,20 @@ def run_seed(
     shown = seen.copy().set("observation", data["state"]).set("episode", places)
     if sensor.distractors is not None:
         shown["distractors"] = sensor.distractors
-    for method, labels, controller, _, _ in controllers(full, task, numbers, seed, wanted):
-        judged = numbers[-options.judged :]
-        found = follow(controller, sensor, shown, source, judged, options.blend_decay, NOISE_SEED + seed)
-        yield (method, labels), found | {"distance_mm": f"{found['distance_mm']:.2f}"}
+    for method, labels, controller, fit, updates in controllers(full, task, numbers, seed, wanted):
+        cell, found, error = (method, labels), None, None
+        if cell in judges:
+            error = error_row(controller, full, numbers, source.action_unit, fit, updates)
+        if cell in follows:
+            judged = numbers[-options.judged :]
+            found = follow(controller, sensor, shown, source, judged, options.blend_decay, NOISE_SEED + seed)
+            found |= {"distance_mm": f"{found['distance_mm']:.2f}"}
+        yield cell, found, error
 
 
-def _key(source: Task, regime: str, seed: int, cell: tuple[str, int], decay: float) -> tuple[str, ...]:
+def _key(source: Task, regime: str, seed: int, cell: Cell) -> tuple[str, ...]:
     method, labels = cell
-    return source.name, regime, str(labels), str(seed), method, str(decay)
+    return source.name, regime, str(labels), str(seed), method
 
 
 def main() -> None:
@@ -165,6 +195,8 @@ def main() -> None:
     parser.add_argument("--judged", type=int, default=60, help="demonstrations followed per seed")
     parser.add_argument("--blend-decay", type=float, default=BLEND_DECAY)
     parser.add_argument("--table", type=Path, default=TABLE)
+    errors = unlabelled_data.TABLE
+    parser.add_argument("--errors", type=Path, nargs="?", const=errors, help="write rows of unlabelled_data.py as well")
     options = parser.parse_args()
     warnings.filterwarnings("ignore", category=UserWarning)
     torch.set_num_threads(1)
@@ -177,14 +209,21 @@ def main() -> None:
         data = add_play(data, options.dataset)
     suffix = PLAY_SUFFIX if played else ""
     done, write = open_table(options.table, COLUMNS, COLUMNS[:6])
-    cells = list(product(options.methods, options.labels))
+    known, write_error = set(), None
+    if options.errors is not None:
+        known, write_error = open_table(options.errors, unlabelled_data.COLUMNS, unlabelled_data.COLUMNS[:5])
+    cells, decay = list(product(options.methods, options.labels)), str(options.blend_decay)
     with progress_bar(len(options.regimes) * len(options.seeds) * len(cells), "cells") as bar:
         for regime, seed in product(options.regimes, options.seeds):
-            keys = {cell: _key(source, regime + suffix, seed, cell, options.blend_decay) for cell in cells}
-            wanted = [cell for cell in cells if keys[cell] not in done]
-            bar.update(len(cells) - len(wanted))
-            for cell, found in run_seed(data, source, regime, seed, wanted, played, options):
-                write((*keys[cell], options.judged, *found.values()))
+            keys = {cell: _key(source, regime + suffix, seed, cell) for cell in cells}
+            follows = [cell for cell in cells if (*keys[cell], decay) not in done]
+            judges = [cell for cell in cells if write_error is not None and keys[cell] not in known]
+            bar.update(len(cells) - len({*follows, *judges}))
+            for cell, found, error in run_seed(data, source, regime, seed, follows, judges, played, options):
+                if found is not None:
+                    write((*keys[cell], decay, options.judged, *found.values()))
+                if error is not None:
+                    write_error((*keys[cell], *error))
                 bar.update()
 
 

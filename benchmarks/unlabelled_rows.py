@@ -21,6 +21,14 @@ def unlabelled_cells(regime: str) -> dict[tuple[str, int], dict[int, float]]:
     return found
 
 
+def unlabelled_successes(regime: str) -> dict[tuple[str, int], dict[int, float]]:
+    """Shares of rollouts of a regime that succeed, by method and number of labelled trajectories, then by seed."""
+    found: dict[tuple[str, int], dict[int, float]] = {}
+    for row in read_rows("unlabelled_rollouts", regime=regime):
+        found.setdefault((row["method"], int(row["labels"])), {})[int(row["seed"])] = _successes(row)
+    return found
+
+
 def unlabelled_rows(regime: str) -> list[list[str]]:
     """A row per method of a regime: mean error and range over seeds for every number of labelled trajectories."""
     cells = unlabelled_cells(regime)
@@ -82,7 +90,9 @@ def followed_rows(against: Sequence[str], *, played: bool = False) -> list[list[
     for (regime, labels), methods in sorted(
         found.items(), key=lambda item: (list(TITLES).index(item[0][0]), item[0][1])
     ):
-        own = methods["semi_supervised"]
+        own = methods.get("semi_supervised")
+        if not own:
+            continue
         row = [TITLES[regime], str(labels), _together(own)]
         for method in against:
             other = methods.get(method, {})

@@ -92,6 +92,27 @@ def test_rows_are_not_run_again(script, demonstrations, tmp_path, monkeypatch):
     assert len(table.read_text().splitlines()) == 2
 
 
+def test_errors_are_those_that_the_other_table_would_hold(script, demonstrations, tmp_path, monkeypatch):
+    study, tables = (
+        sys.modules["unlabelled_data"],
+        [tmp_path / name for name in ("rollouts.csv", "both.csv", "own.csv")],
+    )
+    common = ["--dataset", str(demonstrations), "--regimes", "noise", "--methods", "linear_steps", "--labels", "1", "2"]
+    common += ["--seeds", "1"]
+    both = [*common, "--judged", "2", "--table", str(tables[0]), "--errors", str(tables[1])]
+    monkeypatch.setattr(study, "JUDGED", 4)
+    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", *both])
+    script.main()
+    monkeypatch.setattr(sys, "argv", ["unlabelled_data.py", *common, "--trajectories", "6", "--table", str(tables[2])])
+    study.main()
+    assert tables[1].read_text() == tables[2].read_text()
+    assert [len(table.read_text().splitlines()) for table in tables] == [3, 3, 3]
+    tables[0].unlink()  # one of the two is missing: that alone is done again
+    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", *both])
+    script.main()
+    assert [len(table.read_text().splitlines()) for table in tables] == [3, 3, 3]
+
+
 def test_too_few_demonstrations_are_named(script, demonstrations, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", "--dataset", str(demonstrations)])
     with pytest.raises(SystemExit):
