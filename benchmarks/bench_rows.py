@@ -6,12 +6,22 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from result_rows import SOURCE, percent, read_rows, share, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.studies.paper_layout import above_the_paper, as_markdown, layout_rows, paper_entries
+from torchrl_koap.studies.paper_layout import (
+    DEFAULT,
+    above_the_paper,
+    as_markdown,
+    average_over_tasks,
+    default_entries,
+    layout_rows,
+    paper_entries,
+    plot_average,
+)
 from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels
 from torchrl_koap.studies.paper_tables import PAPER_TASKS
 from torchrl_koap.studies.table import read_cells
@@ -106,11 +116,23 @@ def bench_sentence(name: str, method: str = "") -> str:
 
 def bench_defaults(name: str) -> str:
     """In how many cells the method that a task is trained with unless told otherwise is above the paper's KOAP."""
-    entries = paper_entries(read_cells(CELLS / f"{name}.csv"))
-    own = [entry for entry in entries if entry.method == get_task(entry.task).defaults.method]
-    named = [replace(entry, method="koap", paper=paper_cell(entry.task, "koap", entry.level)) for entry in own]
-    above, both = above_the_paper(named)
+    above, both = above_the_paper(default_entries(paper_entries(read_cells(CELLS / f"{name}.csv"))), DEFAULT)
     return f"{above} of {both}"
+
+
+def bench_default_mean(name: str, level: int) -> str:
+    """Success of the tasks' default methods averaged over the tasks at a level, and the paper's KOAP."""
+    entries = [
+        entry for entry in default_entries(paper_entries(read_cells(CELLS / f"{name}.csv"))) if entry.level == level
+    ]
+    ((_, mean, low, high),) = average_over_tasks(entries)[DEFAULT]
+    paper = sum(entry.paper.success for entry in entries) / len(entries)
+    return f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f}), the paper's KOAP {100 * paper:.1f} %"
+
+
+def draw_bench_average(name: str, path: Path) -> Path:
+    """Draws the success of a comparison averaged over its tasks."""
+    return plot_average(paper_entries(read_cells(CELLS / f"{name}.csv")), path)
 
 
 def first_successes(name: str, task: str, method: str, *, most_labels: bool = False) -> str:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from bench_rows import (
     bench_cost,
+    bench_default_mean,
     bench_defaults,
     bench_entropy,
     bench_means,
@@ -24,6 +25,7 @@ from bench_rows import (
     bench_share,
     bench_size,
     bench_table,
+    draw_bench_average,
     first_successes,
     longer_table,
     noise_share,
@@ -131,6 +133,7 @@ _PAPER = (
     paper_levels_table,
     paper_size,
     bench_table,
+    bench_default_mean,
     bench_defaults,
     bench_entropy,
     bench_share,
@@ -262,6 +265,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     (ROOT / PICTURES).mkdir(parents=True, exist_ok=True)
     drawn = [draw_label_curves(curves(), ROOT / PICTURES / "success_and_entropy.png")]
     drawn += [draw_pipeline(ROOT / PICTURES / f"pipeline.{kind}") for kind in ("svg", "png")]
+    drawn.append(draw_bench_average("table_1", ROOT / PICTURES / "paper_average.png"))
     drawn.append(draw_amounts(ROOT / PICTURES / "demonstrations.png"))
     tables = ({regime: cells(regime) for regime in REGIMES} for cells in (unlabelled_cells, unlabelled_successes))
     drawn.append(draw_unlabelled(*tables, ROOT / PICTURES))

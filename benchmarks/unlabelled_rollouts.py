@@ -200,8 +200,10 @@ def main() -> None:
     options = parser.parse_args()
     warnings.filterwarnings("ignore", category=UserWarning)
     torch.set_num_threads(1)
-    data, _ = load_positions(options.dataset, 10**6)
     source = find_task_of(options.dataset)
+    if source.name != "avoiding":
+        parser.error(f"{options.dataset} holds demonstrations of {source.name}: Avoiding's alone need no objects")
+    data, _ = load_positions(options.dataset, 10**6)
     if len(data["episode"].unique()) < options.judged + max(options.labels):
         parser.error(f"{options.dataset} has fewer demonstrations than are judged and labelled")
     played = PLAYED if options.labels_from == "play" else 0

@@ -120,6 +120,16 @@ def test_too_few_demonstrations_are_named(script, demonstrations, monkeypatch, c
     assert "fewer demonstrations than are judged and labelled" in capsys.readouterr().err
 
 
+def test_other_tasks_are_refused_before_their_data_are_read(script, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "aligning"
+    assert koap("demos", "--out", folder, "--task", "aligning", "--episodes", 2, "--threads", 1, "--quiet") == 0
+    monkeypatch.setattr(script, "load_positions", None)
+    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", "--dataset", str(folder)])
+    with pytest.raises(SystemExit):
+        script.main()
+    assert "holds demonstrations of aligning" in capsys.readouterr().err
+
+
 def test_labels_from_play_are_of_no_demonstration(script, demonstrations):
     study = sys.modules["unlabelled_data"]
     data, _ = script.load_positions(str(demonstrations), 100)

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import pytest
 
+from torchrl_koap.studies import paper_layout
 from torchrl_koap.studies.paper_layout import (
+    DEFAULT,
     above_the_paper,
     average_over_tasks,
+    default_entries,
     layout_rows,
     paper_entries,
     plot_average,
@@ -62,3 +65,21 @@ def test_what_is_written(tmp_path):
     assert write_paper_layout(tmp_path, [cell("sorting", "koap", 0.01)])["picture"] is None
     with pytest.raises(ValueError, match="nothing to average"):
         plot_average(paper_entries([cell("sorting", "koap", 0.01)]), tmp_path / "a.png")
+
+
+def test_default_methods_are_one_line_where_tasks_differ(tmp_path, monkeypatch):
+    here = "stacking_unobserved_joints"
+    rows = [cell("avoiding", "koap", 0.02, 54), cell(here, "koap", 0.01, 0), cell(here, "koap_posture", 0.01, 30)]
+    entries = paper_entries(rows)
+    assert {(entry.task, entry.success) for entry in default_entries(entries)} == {("avoiding", 0.9), (here, 0.5)}
+    ((level, mean, *_),) = average_over_tasks(default_entries(entries))[DEFAULT]
+    assert (level, mean) == (1, pytest.approx(0.7))
+    drawn = {}
+    monkeypatch.setattr(paper_layout, "draw_lines", lambda axes, lines, **_: drawn.update({x.name: x for x in lines}))
+    monkeypatch.setattr(paper_layout, "name_lines", lambda *_: None)
+    plot_average(entries, tmp_path / "two.png")
+    assert {name: line.y for name, line in drawn.items()} == {DEFAULT: [pytest.approx(70.0)], "koap": [45.0]}
+    assert not drawn[DEFAULT].paper and drawn["koap"].paper
+    drawn.clear()
+    plot_average(paper_entries(ROWS), tmp_path / "one.png")  # both are trained with koap
+    assert set(drawn) == {"koap"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from torchrl_koap.studies.summary import Summary, percent, summarise
 from torchrl_koap.tasks.registry import find_task
 
 AVERAGE = "plots/average.png"
+DEFAULT = "task's default"  # what pictures call the method that a task is trained with unless told otherwise
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,25 @@ def above_the_paper(entries: Sequence[Entry], method: str = "koap") -> tuple[int
     return sum(entry.success > entry.paper.success for entry in both), len(both)
 
 
+def default_entries(entries: Sequence[Entry]) -> list[Entry]:
+    """Cells of the method that a task is trained with unless told otherwise, under one name, beside the paper's KOAP.
+
+    Args:
+        entries (sequence of Entry): of :func:`paper_entries`.
+
+    Returns:
+        list of Entry: with the method :data:`DEFAULT`; tasks that nobody registered have none.
+
+    Examples:
+        >>> from torchrl_koap.studies.paper_layout import Entry, default_entries
+        >>> cells = [Entry("avoiding", method, 1, 0.02, None, None) for method in ("koap", "dp")]
+        >>> [(entry.method, entry.text) for entry in default_entries(cells)]
+        [("task's default", 'not run [78.0 +- 8.6]')]
+    """
+    own = [entry for entry in entries if (task := find_task(entry.task)) and entry.method == task.defaults.method]
+    return [replace(entry, method=DEFAULT, paper=paper_cell(entry.task, "koap", entry.level)) for entry in own]
+
+
 def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Writes ``paper_table.md`` and the picture of success averaged over tasks into a folder.
 
@@ -143,9 +163,8 @@ def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) ->
     sentence = f"KOAP succeeds more often than the paper's KOAP in {above} of {both} cells." if both else ""
     with replacing_file(folder / "paper_table.md") as aside:
         aside.write_text(f"{as_markdown(table)}\n{sentence}\n", encoding="utf-8")
-    points = average_over_tasks(entries)
     picture = None
-    if points:
+    if average_over_tasks(entries):
         plot_average(entries, folder / AVERAGE)
         picture = AVERAGE
     return {"rows": table, "sentence": sentence, "picture": picture}
@@ -190,6 +209,8 @@ def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, fl
 def plot_average(entries: Sequence[Entry], path: str | Path) -> Path:
     """Success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
 
+    Where tasks are trained with different methods by default, these together have a line of their own.
+
     Args:
         entries (sequence of Entry): of :func:`paper_entries`.
         path (str or Path): png to write.
@@ -197,6 +218,8 @@ def plot_average(entries: Sequence[Entry], path: str | Path) -> Path:
     Raises:
         ValueError: if there is no level at which a method is done in every task.
     """
+    if len({entry.method for entry in entries if default_entries([entry])}) > 1:  # the paper's line is koap's own
+        entries = [*(replace(entry, paper=None) for entry in default_entries(entries)), *entries]
     averages = average_over_tasks(entries)
     if not averages:
         raise ValueError("there is nothing to average: no method is done at a level in every task")
