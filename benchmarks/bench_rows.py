@@ -23,11 +23,13 @@ from torchrl_koap.studies.paper_layout import (
     plot_average,
 )
 from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels
-from torchrl_koap.studies.paper_tables import PAPER_TASKS
+from torchrl_koap.studies.paper_tables import PAPER_TASKS, PRESETS
 from torchrl_koap.studies.table import read_cells
 from torchrl_koap.tasks import get_task
 
 _PLURAL = {"window": "windows", "trajectory": "trajectories"}
+SEEDS = 3  # of `koap bench` by default
+PARTS = ("planners", "demonstrations")  # of what comes before the cells
 CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
 
 
@@ -244,6 +246,32 @@ def posture_table() -> str:
         pull = row["pull"] if float(row["pull"]) else "none"
         body.append([words[row["gripper"]], words[row["motion"]], pull, f"{percent(row)} of {row['n']}"])
     return table(["gripper", "motion of the joints", "pull towards the posture", "success"], body)
+
+
+def protocol_cost(name: str) -> str:
+    """What the first table costs by default on two cores, all of it: cells, planners and demonstrations.
+
+    A cell costs what the measured ones of its task and method took on average.
+
+    Args:
+        name (str): file of cells that were measured on one machine, at least one of every task and method.
+    """
+    preset = PRESETS["table 1"]
+    measured: dict[tuple[str, str], list[float]] = {}
+    for row in _done(name):
+        measured.setdefault((row["task"], row["method"]), []).append(row["train_seconds"] + row["eval_seconds"])
+    methods = preset.methods.split(",")
+    wanted = [(task, method) for task in preset.tasks for method in {*methods, get_task(task).defaults.method}]
+    each = sum(1 if level in preset.first_seed_only else SEEDS for level in preset.levels)
+    cells = each * sum(sum(measured[pair]) / len(measured[pair]) for pair in wanted) / 3600
+    before = {
+        part: sum(float(row["seconds"]) for row in read_rows("bench_preparation", part=part)) / 3600 for part in PARTS
+    }
+    parts = ", ".join(f"{part} {hours:.1f}" for part, hours in before.items())
+    return (
+        f"{(cells + sum(before.values())) / 2:.1f} hours on two cores: {each * len(wanted)} cells take"
+        f" {cells:.1f} hours of one core ({3600 * cells / each / len(wanted):.0f} seconds each), {parts}"
+    )
 
 
 def bench_cost(name: str) -> str:
