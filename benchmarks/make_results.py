@@ -100,6 +100,7 @@ from scooping_rows import (
 from unlabelled_picture import REGIMES, draw_unlabelled
 from unlabelled_rows import (
     followed,
+    followed_beside,
     followed_rows,
     unlabelled_cells,
     unlabelled_gains,
@@ -149,7 +150,15 @@ _PAPER = (
     posture_table,
     worst_action,
 )
-_UNLABELLED = (followed, followed_rows, unlabelled_rows, unlabelled_labels, unlabelled_gains, unlabelled_missing)
+_UNLABELLED = (
+    followed,
+    followed_beside,
+    followed_rows,
+    unlabelled_rows,
+    unlabelled_labels,
+    unlabelled_gains,
+    unlabelled_missing,
+)
 _FAULTS = (ledger_rows, kill_rows, soak_rows, raw_rows, resume_rows, version_rows)
 _SCOOPING = (
     scooping_alignment_table,

@@ -4,28 +4,32 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from result_rows import percent, read_rows
 from scipy.stats import t as student
 from unlabelled_picture import CONTROLS, PLAYED, REGIMES
 
 TITLES = REGIMES | PLAYED
+LABELS = (1, 2, 4, 8, 16)  # labelled trajectories of the whole study
 
 
 def unlabelled_cells(regime: str) -> dict[tuple[str, int], dict[int, float]]:
     """Action errors of a regime by method and number of labelled trajectories, then by seed."""
-    found: dict[tuple[str, int], dict[int, float]] = {}
-    for row in read_rows("unlabelled_data", regime=regime):
-        found.setdefault((row["method"], int(row["labels"])), {})[int(row["seed"])] = float(row["error"])
-    return found
+    return _by_cell("unlabelled_data", regime, lambda row: float(row["error"]))
 
 
 def unlabelled_successes(regime: str) -> dict[tuple[str, int], dict[int, float]]:
     """Shares of rollouts of a regime that succeed, by method and number of labelled trajectories, then by seed."""
+    return _by_cell("unlabelled_rollouts", regime, _successes)
+
+
+def _by_cell(
+    name: str, regime: str, value: Callable[[Mapping[str, str]], float]
+) -> dict[tuple[str, int], dict[int, float]]:
     found: dict[tuple[str, int], dict[int, float]] = {}
-    for row in read_rows("unlabelled_rollouts", regime=regime):
-        found.setdefault((row["method"], int(row["labels"])), {})[int(row["seed"])] = _successes(row)
+    for row in read_rows(name, regime=regime):
+        found.setdefault((row["method"], int(row["labels"])), {})[int(row["seed"])] = value(row)
     return found
 
 
@@ -50,11 +54,17 @@ def unlabelled_labels(regime: str) -> list[str]:
 
 
 def unlabelled_missing() -> str:
-    """Regimes and controls of the study that the table has no row of."""
-    found = read_rows("unlabelled_data")
-    regimes = [REGIMES[name] for name in REGIMES if name not in {row["regime"] for row in found}]
-    methods = [f"`{name}`" for name in CONTROLS if name not in {row["method"] for row in found}]
-    return ", ".join(regimes + methods) or "nothing of the study's table"
+    """What the study's table has no row of: methods, and for each the regimes and numbers of labelled trajectories."""
+    missing: list[str] = []
+    for method in CONTROLS:
+        places: dict[str, list[str]] = {}  # regimes by the numbers that they lack
+        for regime, title in REGIMES.items():
+            lacks = [str(number) for number in LABELS if (method, number) not in unlabelled_cells(regime)]
+            if lacks:
+                places.setdefault("" if len(lacks) == len(LABELS) else f" ({', '.join(lacks)})", []).append(title)
+        found = [f"{'; '.join(titles)}{lacks}" for lacks, titles in places.items()]
+        missing += [f"* `{method}`: {'; '.join(found)}"] if found else []
+    return "\n".join(missing) or "* nothing"
 
 
 def unlabelled_gains(regimes: Sequence[str], against: Sequence[str]) -> list[list[str]]:
@@ -80,16 +90,9 @@ def followed_rows(against: Sequence[str], *, played: bool = False) -> list[list[
     Keyword Args:
         played (bool): where the labels are from random play, instead of from demonstrations.
     """
-    found: dict[tuple[str, int], dict[str, dict[int, dict]]] = {}
-    for row in read_rows("unlabelled_rollouts"):
-        if (row["regime"] in PLAYED) != played:
-            continue
-        cell = found.setdefault((row["regime"], int(row["labels"])), {})
-        cell.setdefault(row["method"], {})[int(row["seed"])] = row
+    found = _followed(played)
     body = []
-    for (regime, labels), methods in sorted(
-        found.items(), key=lambda item: (list(TITLES).index(item[0][0]), item[0][1])
-    ):
+    for (regime, labels), methods in found.items():
         own = methods.get("semi_supervised")
         if not own:
             continue
@@ -100,6 +103,28 @@ def followed_rows(against: Sequence[str], *, played: bool = False) -> list[list[
             row += [_together(other) if other else "not run", paired_gain(ahead, unit="points")]
         body.append(row)
     return body
+
+
+def followed_beside(methods: Sequence[str]) -> list[list[str]]:
+    """Successes alone, of methods that :func:`followed_rows` does not compare with.
+
+    Args:
+        methods (sequence of str): the methods.
+    """
+    return [
+        [TITLES[regime], str(labels), *(_together(own[name]) if name in own else "not run" for name in methods)]
+        for (regime, labels), own in _followed(played=False).items()
+    ]
+
+
+def _followed(played: bool) -> dict[tuple[str, int], dict[str, dict[int, dict]]]:
+    """Rows of rollouts by regime and number of labelled trajectories, then by method, then by seed."""
+    found: dict[tuple[str, int], dict[str, dict[int, dict]]] = {}
+    for row in read_rows("unlabelled_rollouts"):
+        if (row["regime"] in PLAYED) == played:
+            cell = found.setdefault((row["regime"], int(row["labels"])), {})
+            cell.setdefault(row["method"], {})[int(row["seed"])] = row
+    return dict(sorted(found.items(), key=lambda item: (list(TITLES).index(item[0][0]), item[0][1])))
 
 
 def followed(regime: str, labels: int, method: str) -> str:
