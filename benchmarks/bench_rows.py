@@ -248,30 +248,35 @@ def posture_table() -> str:
     return table(["gripper", "motion of the joints", "pull towards the posture", "success"], body)
 
 
-def protocol_cost(name: str) -> str:
+def protocol_cost(name: str, otherwise: str) -> str:
     """What the first table costs by default on two cores, all of it: cells, planners and demonstrations.
 
-    A cell costs what the measured ones of its task and method took on average.
+    A cell is taken to cost what the measured ones of its task and method did on average.
 
     Args:
-        name (str): file of cells that were measured on one machine, at least one of every task and method.
+        name (str): file of cells that were measured on one machine.
+        otherwise (str): file of cells for tasks and methods that it has none of.
     """
     preset = PRESETS["table 1"]
-    measured: dict[tuple[str, str], list[float]] = {}
-    for row in _done(name):
-        measured.setdefault((row["task"], row["method"]), []).append(row["train_seconds"] + row["eval_seconds"])
     methods = preset.methods.split(",")
     wanted = [(task, method) for task in preset.tasks for method in {*methods, get_task(task).defaults.method}]
+    seconds = _mean_seconds(otherwise) | _mean_seconds(name)
     each = sum(1 if level in preset.first_seed_only else SEEDS for level in preset.levels)
-    cells = each * sum(sum(measured[pair]) / len(measured[pair]) for pair in wanted) / 3600
-    before = {
-        part: sum(float(row["seconds"]) for row in read_rows("bench_preparation", part=part)) / 3600 for part in PARTS
-    }
-    parts = ", ".join(f"{part} {hours:.1f}" for part, hours in before.items())
+    cells = each * sum(seconds[pair] for pair in wanted)
+    before = {part: sum(float(row["seconds"]) for row in read_rows("bench_preparation", part=part)) for part in PARTS}
     return (
-        f"{(cells + sum(before.values())) / 2:.1f} hours on two cores: {each * len(wanted)} cells take"
-        f" {cells:.1f} hours of one core ({3600 * cells / each / len(wanted):.0f} seconds each), {parts}"
+        f"{(cells + sum(before.values())) / 7200:.1f} hours on two cores: {each * len(wanted)} cells of"
+        f" {cells / each / len(wanted):.0f} seconds on average, {before['planners'] / 60:.0f} minutes of one core for"
+        f" planners, {before['demonstrations'] / 60:.0f} for demonstrations"
     )
+
+
+def _mean_seconds(name: str) -> dict[tuple[str, str], float]:
+    """Seconds of training and rollouts of a cell on average, by task and method."""
+    found: dict[tuple[str, str], list[float]] = {}
+    for row in _done(name):
+        found.setdefault((row["task"], row["method"]), []).append(row["train_seconds"] + row["eval_seconds"])
+    return {pair: sum(seconds) / len(seconds) for pair, seconds in found.items()}
 
 
 def bench_cost(name: str) -> str:

@@ -34,6 +34,7 @@ from bench_rows import (
     paper_size,
     plan_error,
     posture_table,
+    protocol_cost,
     worst_action,
 )
 from fault_rows import kill_rows, ledger_rows, raw_rows, resume_rows, soak_rows, version_rows
@@ -148,6 +149,7 @@ _PAPER = (
     noise_share,
     plan_error,
     posture_table,
+    protocol_cost,
     worst_action,
 )
 _UNLABELLED = (

@@ -73,6 +73,20 @@ def test_longer_training_stands_beside_the_cell_of_its_seed_and_the_tasks_method
     assert "| 50.0 % (38-62) of 60 | 5,000 | 75.0 % (63-84) of 60 | 15,000 | 75.0 % (67-82) of 120 | `koap` |" in line
 
 
+def test_the_whole_table_costs_what_its_measured_cells_do(rows, monkeypatch, tmp_path):
+    preset = SimpleNamespace(methods="koap,dp", tasks=("avoiding",), levels=(1, 2, 3), first_seed_only=(3,))
+    monkeypatch.setattr(rows, "PRESETS", {"table 1": preset})
+    made = {"planners": [{"seconds": "600"}, {"seconds": "120"}], "demonstrations": [{"seconds": "360"}]}
+    monkeypatch.setattr(rows, "read_rows", lambda name, part: made[part])
+    write_cells(tmp_path / "here.csv", [cell("koap", 0.02, 60, seconds=10.0), cell("koap", 0.05, 60, seconds=30.0)])
+    write_cells(tmp_path / "there.csv", [cell("koap", 0.02, 60, seconds=900.0), cell("dp", 0.02, 60, seconds=270.0)])
+    # 7 cells of koap at 50 s and 7 of dp at 300 s, 1,080 s before them, two at a time
+    told = rows.protocol_cost("here", "there")
+    assert (
+        told.startswith("0.5 hours on two cores: 14 cells of 175 seconds") and "12 minutes" in told and "6 for" in told
+    )
+
+
 def test_cells_of_another_comparison_stand_beside(rows, tmp_path):
     write_cells(tmp_path / "first.csv", [cell("koap", 0.02, 60), cell("koap", 0.05, 30), cell("pca", 0.02, 0)])
     write_cells(tmp_path / "made.csv", [cell("relabel", 0.02, 30)])
