@@ -57,6 +57,7 @@ COLUMNS = (
     "collisions",
     "distance_mm",
 )
+Cell = tuple[str, int]  # method, number of labelled trajectories
 HORIZON = 14
 NOISE_SEED = 2000  # plus the seed: noise of the rollouts, apart from that of the demonstrations
 SPARE = 40  # control steps that a rollout may take longer than its demonstration
@@ -126,9 +127,6 @@ def follow(
     }
 
 
-Cell = tuple[str, int]  # method, number of labelled trajectories
-
-
 def run_seed(
     data: TensorDictBase,
     source: Task,
@@ -137,7 +135,7 @@ def run_seed(
     follows: list[Cell],
     judges: list[Cell],
     played: int,
-    options,
+    options: argparse.Namespace,
 ):
     """Rolls out the controllers of one regime and seed; the last ``played`` trajectories are random play.
 
@@ -155,7 +153,8 @@ def run_seed(
         tuple: method and number of labelled trajectories, what :func:`follow` found, or None, and what
         :func:`unlabelled_data.error_row` says, or None.
     """
-    wanted = [cell for cell in product(options.methods, options.labels) if cell in {*follows, *judges}]
+    asked = {*follows, *judges}
+    wanted = [cell for cell in product(options.methods, options.labels) if cell in asked]  # each is trained once
     if not wanted:
         return
     sensor = RegimeSensor(data, regime, seed=seed)
