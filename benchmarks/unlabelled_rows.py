@@ -61,9 +61,9 @@ def unlabelled_missing() -> str:
         for regime, title in REGIMES.items():
             lacks = [str(number) for number in LABELS if (method, number) not in unlabelled_cells(regime)]
             if lacks:
-                places.setdefault("" if len(lacks) == len(LABELS) else f" ({', '.join(lacks)})", []).append(title)
-        found = [f"{'; '.join(titles)}{lacks}" for lacks, titles in places.items()]
-        missing += [f"* `{method}`: {'; '.join(found)}"] if found else []
+                places.setdefault("" if len(lacks) == len(LABELS) else f"with {' or '.join(lacks)}: ", []).append(title)
+        found = [f"{numbers}{'; '.join(titles)}" for numbers, titles in sorted(places.items())]
+        missing += [f"* `{method}`: {'. '.join(found)}"] if found else []
     return "\n".join(missing) or "* nothing"
 
 

@@ -151,3 +151,17 @@ def test_tables_keep_labels_from_play_apart(benchmark_script):
     for played in (False, True):
         regimes = {row[0] for row in rows.followed_rows(["pca"], played=played)}
         assert regimes and all(("random play" in regime) == played for regime in regimes)
+
+
+def test_what_is_missing_is_named_by_method_regime_and_number(benchmark_script, monkeypatch):
+    rows = benchmark_script("unlabelled_rows")
+    monkeypatch.setattr(rows, "CONTROLS", ("pca", "koap"))
+    monkeypatch.setattr(rows, "REGIMES", {"plain": "positions", "noise": "noisy"})
+    whole = {("pca", number): {0: 1.0} for number in rows.LABELS}
+    known = {"plain": whole | {("koap", number): {0: 1.0} for number in (1, 2, 4)}, "noise": whole}
+    monkeypatch.setattr(rows, "unlabelled_cells", known.get)
+    assert rows.unlabelled_missing() == "* `koap`: noisy. with 8 or 16: positions"
+    monkeypatch.setattr(
+        rows, "unlabelled_cells", lambda regime: {(name, n): {} for name in rows.CONTROLS for n in rows.LABELS}
+    )
+    assert rows.unlabelled_missing() == "* nothing"
