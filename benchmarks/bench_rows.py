@@ -14,6 +14,7 @@ from result_rows import SOURCE, percent, read_rows, share, table
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper_layout import (
     DEFAULT,
+    Entry,
     above_the_paper,
     as_markdown,
     average_over_tasks,
@@ -36,6 +37,11 @@ CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
 def _done(name: str) -> list[dict[str, Any]]:
     """The finished cells of a comparison."""
     return [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
+
+
+def _entries(name: str) -> list[Entry]:
+    """The cells of a comparison beside the paper's, those that were not run included."""
+    return paper_entries(read_cells(CELLS / f"{name}.csv"))
 
 
 def paper_levels_table() -> str:
@@ -109,7 +115,7 @@ def paper_size() -> str:
 
 def bench_sentence(name: str, method: str = "") -> str:
     """In how many cells of a comparison KOAP is above the paper's, or another method above the paper's KOAP."""
-    entries = paper_entries(read_cells(CELLS / f"{name}.csv"))
+    entries = _entries(name)
     if method:
         entries = [replace(entry, paper=paper_cell(entry.task, "koap", entry.level)) for entry in entries]
     above, both = above_the_paper(entries, method or "koap")
@@ -118,15 +124,13 @@ def bench_sentence(name: str, method: str = "") -> str:
 
 def bench_defaults(name: str) -> str:
     """In how many cells the method that a task is trained with unless told otherwise is above the paper's KOAP."""
-    above, both = above_the_paper(default_entries(paper_entries(read_cells(CELLS / f"{name}.csv"))), DEFAULT)
+    above, both = above_the_paper(default_entries(_entries(name)), DEFAULT)
     return f"{above} of {both}"
 
 
 def bench_default_mean(name: str, level: int) -> str:
     """Success of the tasks' default methods averaged over the tasks at a level, and the paper's KOAP."""
-    entries = [
-        entry for entry in default_entries(paper_entries(read_cells(CELLS / f"{name}.csv"))) if entry.level == level
-    ]
+    entries = [entry for entry in default_entries(_entries(name)) if entry.level == level]
     ((_, mean, low, high),) = average_over_tasks(entries)[DEFAULT]
     paper = sum(entry.paper.success for entry in entries) / len(entries)
     return f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f}), the paper's KOAP {100 * paper:.1f} %"
@@ -134,7 +138,7 @@ def bench_default_mean(name: str, level: int) -> str:
 
 def draw_bench_average(name: str, path: Path) -> Path:
     """Draws the success of a comparison averaged over its tasks."""
-    return plot_average(paper_entries(read_cells(CELLS / f"{name}.csv")), path)
+    return plot_average(_entries(name), path)
 
 
 def first_successes(name: str, task: str, method: str, *, most_labels: bool = False) -> str:

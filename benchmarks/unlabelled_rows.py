@@ -56,10 +56,11 @@ def unlabelled_labels(regime: str) -> list[str]:
 def unlabelled_missing() -> str:
     """What the study's table has no row of: methods, and for each the regimes and numbers of labelled trajectories."""
     missing: list[str] = []
+    cells = {title: unlabelled_cells(regime) for regime, title in REGIMES.items()}
     for method in CONTROLS:
         places: dict[str, list[str]] = {}  # regimes by the numbers that they lack
-        for regime, title in REGIMES.items():
-            lacks = [str(number) for number in LABELS if (method, number) not in unlabelled_cells(regime)]
+        for title, known in cells.items():
+            lacks = [str(number) for number in LABELS if (method, number) not in known]
             if lacks:
                 places.setdefault("" if len(lacks) == len(LABELS) else f"with {' or '.join(lacks)}: ", []).append(title)
         found = [f"{numbers}{'; '.join(titles)}" for numbers, titles in sorted(places.items())]

@@ -153,6 +153,16 @@ def test_tables_keep_labels_from_play_apart(benchmark_script):
         assert regimes and all(("random play" in regime) == played for regime in regimes)
 
 
+def test_successes_of_all_seeds_stand_beside_and_what_was_played_does_not(benchmark_script, monkeypatch):
+    rows = benchmark_script("unlabelled_rows")
+    common = {"method": "koap", "labels": "2", "n": "60"}
+    found = [common | {"regime": "plain", "seed": str(seed), "successes": str(30 + 12 * seed)} for seed in (0, 1)]
+    found += [common | {"regime": "plain, play", "seed": "0", "successes": "0"}]
+    monkeypatch.setattr(rows, "read_rows", lambda name: found)
+    (row,) = rows.followed_beside(["koap", "pca"])
+    assert row == [rows.REGIMES["plain"], "2", "60 % (51-68) of 120", "not run"]
+
+
 def test_what_is_missing_is_named_by_method_regime_and_number(benchmark_script, monkeypatch):
     rows = benchmark_script("unlabelled_rows")
     monkeypatch.setattr(rows, "CONTROLS", ("pca", "koap"))
