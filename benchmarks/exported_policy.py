@@ -24,7 +24,7 @@ from torch import Tensor
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.evaluation.latency import time_calls
 from torchrl_koap.modules import PlanThenControl, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
-from torchrl_koap.modules.policies.export import SUFFIXES, Exportable, ExportError, export_part, exportable
+from torchrl_koap.modules.execution.export import SUFFIXES, Exportable, ExportError, export_part, exportable
 
 RESULTS = Path(__file__).resolve().parent / "results" / "exported_policy.csv"
 TOLERANCE = 1e-5

@@ -28,7 +28,7 @@ from torchrl_koap.envs.experts.scooping_recording import record_videos
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
+from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS
 from torchrl_koap.training import METHODS as KNOWN
 from torchrl_koap.training import TrainConfig, train

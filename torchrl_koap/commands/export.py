@@ -14,7 +14,7 @@ from torchrl_koap.evaluation import EvalConfig, load_policy, load_run
 from torchrl_koap.evaluation.latency import time_calls
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PlanThenControl
-from torchrl_koap.modules.policies.export import PARTS, SUFFIXES, export_part, exportable
+from torchrl_koap.modules.execution.export import PARTS, SUFFIXES, export_part, exportable
 from torchrl_koap.training.builders import set_up_torch
 from torchrl_koap.training.pretrained import writable_folder
 from torchrl_koap.training.progress import progress_bar

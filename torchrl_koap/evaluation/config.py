@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
+from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
 from torchrl_koap.training.plugins import Plugins
 
 CONTROLLERS = ("learned", "oracle")

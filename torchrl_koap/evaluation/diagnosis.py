@@ -22,7 +22,7 @@ from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import StatePlanner
-from torchrl_koap.modules.policies.replay import RecordedPlanner
+from torchrl_koap.modules.execution.replay import RecordedPlanner
 from torchrl_koap.tasks import Task
 
 RECORDED = "recorded"  # steps whose next state the recording that is followed has, not the standing at its end

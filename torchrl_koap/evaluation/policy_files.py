@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ChunkedPolicy, RecedingHorizonPolicy, StatePlanner
-from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
+from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task, get_task
 from torchrl_koap.tasks.json_format import import_strings_of, plain_task_from_json
 from torchrl_koap.training.builders import build_controller, method_named

@@ -20,12 +20,12 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_koap.evaluation.scores import OUTCOMES, outcome_of
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion.planner import StatePlanner
-from torchrl_koap.modules.policies.command_leash import CommandLeash
-from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
-from torchrl_koap.modules.policies.posture_tracking import PostureTracking
-from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
-from torchrl_koap.modules.policies.receding_horizon import policy_transforms
-from torchrl_koap.modules.policies.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
+from torchrl_koap.modules.execution.command_leash import CommandLeash
+from torchrl_koap.modules.execution.plan_then_control import PlanThenControl
+from torchrl_koap.modules.execution.posture_tracking import PostureTracking
+from torchrl_koap.modules.execution.predictive_tracking import PredictiveTracking
+from torchrl_koap.modules.execution.receding_horizon import policy_transforms
+from torchrl_koap.modules.execution.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import ActionRule
 from torchrl_koap.training.response import tracked_columns
@@ -180,7 +180,7 @@ def roll_out(
             bounded. Outcomes do not depend on it.
         contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
         futures (Tensor, optional): recorded futures ``[E, steps, H, d]`` for a policy whose planner is a
-            :class:`~torchrl_koap.modules.policies.replay.RecordedPlanner`.
+            :class:`~torchrl_koap.modules.execution.replay.RecordedPlanner`.
         progress (callable, optional): called with the number of episodes finished.
 
     Returns:

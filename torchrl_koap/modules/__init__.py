@@ -14,6 +14,17 @@ from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.diffusion.policy import DiffusionPolicy
 from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.unet import TemporalUnet
+from torchrl_koap.modules.execution.action_chunks import ChunkedPolicy
+from torchrl_koap.modules.execution.agent import Agent
+from torchrl_koap.modules.execution.asynchronous import AsynchronousAgent
+from torchrl_koap.modules.execution.command_leash import CommandLeash
+from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
+from torchrl_koap.modules.execution.plan_then_control import PlanThenControl, blend_plan
+from torchrl_koap.modules.execution.policy_env import PolicyEnv, SeededNoise
+from torchrl_koap.modules.execution.posture_tracking import PostureTracking
+from torchrl_koap.modules.execution.predictive_tracking import PredictiveTracking
+from torchrl_koap.modules.execution.receding_horizon import RecedingHorizonPolicy, policy_transforms
+from torchrl_koap.modules.execution.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
 from torchrl_koap.modules.koopman.command_posture import CommandPosture
@@ -28,16 +39,6 @@ from torchrl_koap.modules.koopman.latent_action import (
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.modules.normalizer import Normalizer
-from torchrl_koap.modules.policies.action_chunks import ChunkedPolicy
-from torchrl_koap.modules.policies.agent import Agent
-from torchrl_koap.modules.policies.asynchronous import AsynchronousAgent
-from torchrl_koap.modules.policies.command_leash import CommandLeash
-from torchrl_koap.modules.policies.plan_then_control import PlanThenControl, blend_plan
-from torchrl_koap.modules.policies.policy_env import PolicyEnv, SeededNoise
-from torchrl_koap.modules.policies.posture_tracking import PostureTracking
-from torchrl_koap.modules.policies.predictive_tracking import PredictiveTracking
-from torchrl_koap.modules.policies.receding_horizon import RecedingHorizonPolicy, policy_transforms
-from torchrl_koap.modules.policies.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
 from torchrl_koap.modules.time_alignment import FrameGatherer
 
 __all__ = [
@@ -50,6 +51,8 @@ __all__ = [
     "CommandResponse",
     "DiffusionPolicy",
     "EpisodeNoise",
+    "Execution",
+    "ExecutionConfig",
     "FiniteScalarQuantizer",
     "FrameGatherer",
     "InverseDynamics",

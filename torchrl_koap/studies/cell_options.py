@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.policies.plan_then_control import EXECUTIONS
+from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
 from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
 from torchrl_koap.training.methods import get_method
 

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from torchrl_koap.keys import ACTION
-from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY
+from torchrl_koap.modules.execution.receding_horizon import OBSERVATION_HISTORY
 
 
 class CommandLeash(TensorDictModuleBase):

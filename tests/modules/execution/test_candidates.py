@@ -10,7 +10,7 @@ from torch import nn
 from toy_policies import EchoController
 
 from torchrl_koap.modules import ChunkedPolicy, DiffusionPolicy, EpisodeNoise, PlanThenControl, TemporalUnet
-from torchrl_koap.modules.policies.candidates import (
+from torchrl_koap.modules.execution.candidates import (
     MOST_CANDIDATES,
     choose,
     paths_apart,

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Policies as files that run without this library: ``torch.export``, ONNX, AOTInductor.
 
-What is exported is :meth:`~torchrl_koap.modules.policies.receding_horizon.RecedingHorizonPolicy.plan_and_decode`:
+What is exported is :meth:`~torchrl_koap.modules.execution.receding_horizon.RecedingHorizonPolicy.plan_and_decode`:
 observations and start noise in, the next actions out, the solver's loop unrolled inside. Whoever calls it keeps the
 last observations and counts steps.
 """
@@ -20,8 +20,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
-from torchrl_koap.modules.policies.receding_horizon import RecedingHorizonPolicy
+from torchrl_koap.modules.execution.plan_then_control import PlanThenControl
+from torchrl_koap.modules.execution.receding_horizon import RecedingHorizonPolicy
 
 SUFFIXES = {"torch": ".pt2", "onnx": ".onnx", "aoti": ".aoti.pt2"}
 PARTS = ("policy", "controller", "denoiser")
@@ -65,7 +65,7 @@ class Exportable:
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules.policies.export import Exportable
+        >>> from torchrl_koap.modules.execution.export import Exportable
         >>> part = Exportable(torch.nn.Linear(2, 1), {"states": torch.zeros(1, 2)}, "actions")
         >>> part.module(*part.inputs.values()).shape
         torch.Size([1, 1])
@@ -91,7 +91,7 @@ def exportable(policy: RecedingHorizonPolicy, part: str = "policy", *, observati
 
     Examples:
         >>> from torchrl_koap.modules import PlanThenControl, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
-        >>> from torchrl_koap.modules.policies.export import exportable
+        >>> from torchrl_koap.modules.execution.export import exportable
         >>> policy = PlanThenControl(
         ...     StatePlanner(TemporalUnet(2, 4), state_dim=2), make_koopman_inverse_dynamics(2, 3),
         ...     state_columns=(2, 3), history=5)

@@ -16,7 +16,7 @@ from torchrl_koap.modules import (
     TemporalUnet,
     make_koopman_inverse_dynamics,
 )
-from torchrl_koap.modules.policies.export import SUFFIXES, ExportError, export_part, exportable
+from torchrl_koap.modules.execution.export import SUFFIXES, ExportError, export_part, exportable
 
 
 def policy():

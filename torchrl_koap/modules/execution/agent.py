@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_koap.modules.policies.receding_horizon import IS_INIT, RecedingHorizonPolicy
+from torchrl_koap.modules.execution.receding_horizon import IS_INIT, RecedingHorizonPolicy
 
 
 class Agent:

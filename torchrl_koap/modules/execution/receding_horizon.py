@@ -14,10 +14,10 @@ from torchrl.envs.transforms import CatFrames, Compose, InitTracker, UnsqueezeTr
 from torchrl.modules import MultiStepActorWrapper
 
 from torchrl_koap.keys import ACTION, OBSERVATION
-from torchrl_koap.modules.policies.candidates import check_candidates
+from torchrl_koap.modules.execution.candidates import check_candidates
 
 if TYPE_CHECKING:
-    from torchrl_koap.modules.policies.command_leash import CommandLeash
+    from torchrl_koap.modules.execution.command_leash import CommandLeash
 
 OBSERVATION_HISTORY = "observation_history"
 STATE_HISTORY = "state_history"
@@ -79,7 +79,7 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         chunk_key (NestedKey): the chunk.
         reader (str): what reads the last frames, in error messages.
         candidates (int): plans or chunks sampled whenever one is due, of which one is taken that goes on with the one
-            in force (:mod:`torchrl_koap.modules.policies.candidates`).
+            in force (:mod:`torchrl_koap.modules.execution.candidates`).
         choice (str): the rule by which it is taken.
         kept_steps (int, optional): entries of a chunk that are kept. Default: those that are executed.
 

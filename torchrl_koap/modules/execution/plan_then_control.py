@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrl_koap.keys import ACTION
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.diffusion.planner import StatePlanner
-from torchrl_koap.modules.policies.candidates import paths_apart, sample_coherent
-from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
+from torchrl_koap.modules.execution.candidates import paths_apart, sample_coherent
+from torchrl_koap.modules.execution.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
 
 EXECUTIONS = ("feedback", "open_loop")
 
@@ -56,7 +56,7 @@ class PlanThenControl(RecedingHorizonPolicy):
             word on the actions of a window of observed and planned states; such as the gripper's number, which is read
             off the planned widths (:func:`~torchrl_koap.tasks.gripper.command_gripper`).
         candidates (int): plans sampled whenever one is due, of which one that goes on with the plan in force is taken
-            (:mod:`torchrl_koap.modules.policies.candidates`). Defaults to ``1``.
+            (:mod:`torchrl_koap.modules.execution.candidates`). Defaults to ``1``.
         choice (str): the rule by which it is taken. Defaults to ``"quarter"``.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.

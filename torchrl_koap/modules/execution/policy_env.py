@@ -12,8 +12,8 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.transforms import Compose
 
 from torchrl_koap.keys import OBSERVATION
-from torchrl_koap.modules.policies.receding_horizon import RecedingHorizonPolicy, policy_transforms
-from torchrl_koap.modules.policies.replay import NOISE
+from torchrl_koap.modules.execution.receding_horizon import RecedingHorizonPolicy, policy_transforms
+from torchrl_koap.modules.execution.replay import NOISE
 
 
 class SeededNoise(Transform):

@@ -10,8 +10,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import torch
 from torch import Tensor
 
-from torchrl_koap.modules.policies.agent import Agent
-from torchrl_koap.modules.policies.plan_then_control import PlanThenControl
+from torchrl_koap.modules.execution.agent import Agent
+from torchrl_koap.modules.execution.plan_then_control import PlanThenControl
 
 
 class AsynchronousAgent(Agent):

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchrl_koap.keys import ACTION
 from torchrl_koap.modules.diffusion.policy import ACTION_CHUNK, DiffusionPolicy
-from torchrl_koap.modules.policies.candidates import sample_coherent
-from torchrl_koap.modules.policies.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
+from torchrl_koap.modules.execution.candidates import sample_coherent
+from torchrl_koap.modules.execution.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
 
 
 class ChunkedPolicy(RecedingHorizonPolicy):
@@ -40,7 +40,7 @@ class ChunkedPolicy(RecedingHorizonPolicy):
         controller_columns (sequence of int, optional): columns of the state that the Diffusion Policy reads: its mask.
             Default: all.
         candidates (int): chunks sampled whenever one is due, of which one that goes on with the chunk in force is taken
-            (:mod:`torchrl_koap.modules.policies.candidates`). Defaults to ``1``.
+            (:mod:`torchrl_koap.modules.execution.candidates`). Defaults to ``1``.
         choice (str): the rule by which it is taken. Defaults to ``"quarter"``.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.

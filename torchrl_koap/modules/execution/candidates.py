@@ -156,7 +156,7 @@ def choose(
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules.policies.candidates import choose
+        >>> from torchrl_koap.modules.execution.candidates import choose
         >>> plans = torch.tensor([[0.0, 0.0], [5.0, 9.0], [5.0, 6.0], [1.0, 1.0]]).unsqueeze(-1)
         >>> choose(plans, torch.tensor([[5.0]]), None, "quarter").item()
         1

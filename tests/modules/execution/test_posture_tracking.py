@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl_koap.evaluation.rollouts import make_policy
 from torchrl_koap.modules import CommandPosture, MLPDenoiser, PostureTracking, StatePlanner
 from torchrl_koap.modules import make_koopman_inverse_dynamics as make_controller
-from torchrl_koap.modules.policies.posture_tracking import PULL
+from torchrl_koap.modules.execution.posture_tracking import PULL
 from torchrl_koap.tasks.action_rules import ActionRule
 
 

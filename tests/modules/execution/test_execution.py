@@ -1,0 +1,46 @@
+import dataclasses
+
+import pytest
+
+from torchrl_koap.modules import Execution, ExecutionConfig
+
+
+def test_what_is_asked_for_replaces_and_none_does_not():
+    own = Execution(blend=0.5, lead=0.1)
+    assert own.replaced(strategy="open_loop", blend=0.0, lead=None) == Execution("open_loop", blend=0.0, lead=0.1)
+    assert own.replaced() == own
+    assert Execution(**dataclasses.asdict(own)) == own
+
+
+def test_what_is_not_asked_for_is_the_defaults():
+    default = Execution(strategy="open_loop", replan_interval=8, blend=0.0)
+    assert ExecutionConfig().on(default) == default
+    assert ExecutionConfig(blend=0.4, gain=1.5).on(default) == dataclasses.replace(default, blend=0.4, gain=1.5)
+
+
+@pytest.mark.parametrize("kind", [Execution, ExecutionConfig])
+@pytest.mark.parametrize(
+    "asked, problem",
+    [
+        ({"strategy": "open-loop"}, "unknown strategy 'open-loop'; did you mean 'open_loop'?"),
+        ({"replan_interval": 0}, "replan_interval must be an integer >= 1, got 0"),
+        ({"replan_interval": 2.5}, "replan_interval must be an integer >= 1, got 2.5"),
+        ({"blend": 1.0}, r"blend must be in \[0, 1\), got 1.0"),
+        ({"blend": float("nan")}, "blend must be in"),
+        ({"lead": -0.1}, "lead must be a number >= 0, got -0.1"),
+        ({"lead": float("inf")}, "lead must be a number >= 0"),
+        ({"gain": 0.0}, "gain must be a number above 0, got 0.0"),
+        ({"gain": float("nan")}, "gain must be a number above 0"),
+        ({"candidates": 0}, r"candidates must be an integer in 1..256, got 0"),
+        ({"candidates": True}, "candidates must be an integer"),
+        ({"candidates": 257}, "candidates must be an integer"),
+    ],
+)
+def test_numbers_out_of_range_are_refused_by_name(kind, asked, problem):
+    with pytest.raises(ValueError, match=problem):
+        kind(**asked)
+
+
+def test_an_unknown_field_suggests_the_nearest():
+    with pytest.raises(ValueError, match="unknown option of an execution 'blent'; did you mean 'blend'?"):
+        Execution().replaced(blent=0.0)

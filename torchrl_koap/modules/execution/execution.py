@@ -1,0 +1,123 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""How plans become actions, as one value that is saved with a run and handed on unread."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+from torchrl_koap.lookup import lookup
+
+STRATEGIES = ("feedback", "open_loop", "oracle")
+MOST_CANDIDATES = 256
+
+
+@dataclass(frozen=True)
+class Execution:
+    """How plans become actions.
+
+    ::
+
+        step            0          1          2          3          4
+        plan made at    0                                           4
+        feedback        a(x_0,P)   a(x_1,P)   a(x_2,P)   a(x_3,P)   a(x_4,P')
+        open_loop       a_0(x_0,P) a_1(x_0,P) a_2(x_0,P) a_3(x_0,P) a_0(x_4,P')
+
+    Args:
+        strategy (str): ``"feedback"`` decodes at every step from the history observed by then and the current plan,
+            ``"open_loop"`` (the paper) decodes a chunk of actions once per plan; ``"oracle"`` takes, instead of a
+            learned controller, the simulator's own inverse map.
+        replan_interval (int): control steps per plan.
+        blend (float): share of the distance between robot and plan that remains after each step; 0 leaves plans as
+            they are.
+        lead (float): farthest that the command may be ahead of the robot along each axis, in the units of the actions;
+            0 sets no limit.
+        gain (float): factor of actions that are changes of a command: above 1 the robot is quicker than planned.
+        candidates (int): plans (of a Diffusion Policy: action chunks) sampled whenever one is due, of which one that
+            goes on with the current one is taken.
+
+    Raises:
+        ValueError: for an unknown strategy, or a number out of range.
+
+    Examples:
+        >>> from torchrl_koap.modules import Execution
+        >>> Execution().replaced(strategy="open_loop", blend=None)
+        Execution(strategy='open_loop', replan_interval=4, blend=0.8, lead=0.0, gain=1.0, candidates=1)
+    """
+
+    strategy: str = "feedback"
+    replan_interval: int = 4
+    blend: float = 0.8
+    lead: float = 0.0
+    gain: float = 1.0
+    candidates: int = 1
+
+    def __post_init__(self):
+        lookup(STRATEGIES, self.strategy, "strategy")
+        if not _is_integer(self.replan_interval) or self.replan_interval < 1:
+            raise ValueError(f"replan_interval must be an integer >= 1, got {self.replan_interval!r}")
+        if not 0 <= self.blend < 1:
+            raise ValueError(f"blend must be in [0, 1), got {self.blend}")
+        if not 0 <= self.lead < math.inf:
+            raise ValueError(f"lead must be a number >= 0, got {self.lead}")
+        if not 0 < self.gain < math.inf:
+            raise ValueError(f"gain must be a number above 0, got {self.gain}")
+        if not _is_integer(self.candidates) or not 1 <= self.candidates <= MOST_CANDIDATES:
+            raise ValueError(f"candidates must be an integer in 1..{MOST_CANDIDATES}, got {self.candidates!r}")
+
+    def replaced(self, **asked: Any) -> Execution:
+        """The same with what was asked for; ``None`` leaves a field as it is.
+
+        Args:
+            **asked: fields by name.
+
+        Raises:
+            ValueError: for an unknown field, which suggests the nearest, or as for the class.
+        """
+        for name in asked:
+            lookup(asdict(self), name, "option of an execution")
+        return replace(self, **{name: value for name, value in asked.items() if value is not None})
+
+
+@dataclass(frozen=True)
+class ExecutionConfig:
+    """What is asked of an :class:`Execution`; what is not asked for is the method's, the task's or the library's.
+
+    Attributes:
+        strategy: "feedback" (decode at every step), "open_loop" (decode once per plan) or "oracle" (the simulator's own
+            inverse map, which takes the tool where the plan says: what fails then is the planner's).
+        replan_interval: control steps per plan.
+        blend: share of the distance between robot and plan that remains after each step; 0: plans as they are.
+        lead: farthest that the command may be ahead of the robot along each axis, in the units of the actions; 0: any
+            distance.
+        gain: factor of actions that are changes of a command: above 1 the robot is quicker than planned.
+        candidates: plans (of dp: action chunks) sampled whenever one is due, of which one that goes on with the current
+            one is taken.
+
+    Raises:
+        ValueError: as :class:`Execution`.
+
+    Examples:
+        >>> from torchrl_koap.modules import Execution, ExecutionConfig
+        >>> ExecutionConfig(replan_interval=8).on(Execution(strategy="open_loop")).replan_interval
+        8
+    """
+
+    strategy: str | None = None
+    replan_interval: int | None = None
+    blend: float | None = None
+    lead: float | None = None
+    gain: float | None = None
+    candidates: int | None = None
+
+    def __post_init__(self):
+        self.on(Execution())
+
+    def on(self, default: Execution) -> Execution:
+        """A default with what is asked for."""
+        return default.replaced(**asdict(self))
+
+
+def _is_integer(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
