@@ -83,7 +83,7 @@ def shares(env: ManipulationEnv, steps: int) -> dict[str, float]:
     if env.task.tool_kinematics is not None:
         return {}
     rows = np.arange(env.batch_size[0])
-    substeps = steps * env.substeps
+    substeps = steps * env.SUBSTEPS
     start = time.perf_counter()
     env.sims.track_pose(rows, env.commands, substeps)
     both = (time.perf_counter() - start) / (len(rows) * substeps)

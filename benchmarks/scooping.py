@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
-from torchrl_koap.envs.experts.scooping_recording import record_videos
+from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.lookup import lookup

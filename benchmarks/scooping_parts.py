@@ -22,8 +22,8 @@ from scooping_alignment import spoon_reader
 from tensordict import TensorDict
 
 from torchrl_koap.data import load_ted
-from torchrl_koap.envs.experts.scooping import ScoopingExpert, start_joints
-from torchrl_koap.envs.mujoco.scooping_simulation import LEFT_BOWL, ScoopingSimulations
+from torchrl_koap.envs.scooping.expert import ScoopingExpert, start_joints
+from torchrl_koap.envs.scooping.simulation import LEFT_BOWL, ScoopingSimulations
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, STARTS

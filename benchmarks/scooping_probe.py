@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from torchrl_koap.data.lerobot.images import ImageEpisode, read_image_episodes
-from torchrl_koap.envs.experts.scooping_recording import play_episodes
+from torchrl_koap.envs.scooping.recording import play_episodes
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS, IMAGE_SIZE
 from torchrl_koap.vision.backbones import load_backbone
 from torchrl_koap.vision.encoder import BATCH

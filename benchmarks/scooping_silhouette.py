@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from torchrl_koap.data.lerobot.images import read_image_episodes
 from torchrl_koap.envs.mujoco.rendering import Renderer
-from torchrl_koap.envs.mujoco.scooping_scene import scooping_model
+from torchrl_koap.envs.scooping.scene import scooping_model
 from torchrl_koap.tasks.scooping import IMAGE_SIZE
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -31,7 +31,7 @@ import torchrl_koap
 from torchrl_koap.data import LabelBudget, load_ted
 from torchrl_koap.envs import ScoopingEnv
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.experts.scooping_recording import record_videos
+from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.tasks import get_task

@@ -250,7 +250,7 @@ def test_partial_reset_and_step_leave_the_others_alone():
     out = env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
     for row in (0, 2):
         np.testing.assert_array_equal(env.sims.data[row].qpos, before[row])
-    np.testing.assert_allclose(out["observation"][1, :7], env._start_joints, atol=1e-6)
+    np.testing.assert_allclose(out["observation"][1, :7], env.START_JOINTS, atol=1e-6)
     held = act(env, STILL_CLOSED)["observation"]
     before = [data.qpos.copy() for data in env.sims.data]
     out = act(env, [0.01] * 7 + [0.08], mask=[True, False, False])

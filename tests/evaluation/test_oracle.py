@@ -71,7 +71,7 @@ def test_wrong_uses():
     policy = OracleControl(planner, TASK, history=2)
     with pytest.raises(RuntimeError, match="call attach"):
         policy.act(torch.zeros(1, 2, 2), torch.zeros(1, 14, 2))
-    with pytest.raises(ValueError, match="needs an environment that foresees, object does not"):
+    with pytest.raises(ValueError, match="needs an environment that simulates actions, object does not"):
         policy.attach(object())
 
 

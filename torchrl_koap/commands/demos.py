@@ -12,7 +12,7 @@ from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE
 from torchrl_koap.envs.experts.recording import expert_of
 from torchrl_koap.envs.experts.recording_report import RecordingReport
-from torchrl_koap.envs.experts.scooping_recording import VideoReport, record_videos
+from torchrl_koap.envs.scooping.recording import VideoReport, record_videos
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.plugins import Plugins, load_plugins

@@ -3,24 +3,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
-from torchrl_koap.envs.mujoco.scene import compile_scene, scene
-from torchrl_koap.tasks import get_task
+from torchrl_koap.envs.mujoco.scene import scene
 from torchrl_koap.tasks.aligning import BASE_HALF, DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 
-START_JOINTS = (
-    -0.39275835987073354,
-    0.32177812339570716,
-    -0.21250285252375792,
-    -1.843581356712203,
-    0.0831488803864002,
-    2.160344058282072,
-    0.144795218196799,
-)
 INSIDE_REACH = 0.051  # m; the rod is inside the tray if nearer to its centre than this
 # name, direction from the centre, colour
 WALLS = (
@@ -29,7 +21,6 @@ WALLS = (
     ("wall_left", (-1, 0), (1, 0, 0, 1)),
     ("wall_near", (0, -1), (0, 1, 1, 1)),
 )
-ACTION_BOUND = 0.012
 
 
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
@@ -64,21 +55,7 @@ class AligningEnv(ManipulationEnv):
     control step back. There is no failure. Unlike the original, exact alignment counts (its rotation distance has no
     clipping and becomes NaN).
 
-    Args:
-        num_envs (int): number of environments, the batch size.
-        num_threads (int): threads that advance them; results do not depend on it.
-        max_steps (int): control steps (35 ms each) after which an episode is truncated.
-        seed (int, optional): seed of the random contexts.
-        device (torch.device, optional): device of the tensors handed out.
-        dtype (torch.dtype): floating type of observation, action and reward.
-
-    Keyword Args:
-        contexts (array, optional): table of contexts [C, 2, 3] to take in turn, for example
-            ``evaluation_contexts("aligning")``; random ones by default.
-        arm_alpha (float): opacity of the arm in pictures.
-
-    Raises:
-        ValueError: for sizes below 1, contexts out of range, actions of a wrong shape or that are not finite.
+    Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
     Examples:
         >>> from torchrl_koap.envs import AligningEnv
@@ -87,33 +64,17 @@ class AligningEnv(ManipulationEnv):
         torch.Size([2, 3, 20])
     """
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        num_threads: int = 1,
-        max_steps: int = 400,
-        seed: int | None = None,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype = torch.float32,
-        *,
-        contexts=None,
-        arm_alpha: float = 0.3,
-    ):
-        super().__init__(
-            get_task("aligning"),
-            compile_scene(aligning_scene(arm_alpha=arm_alpha)),
-            start_joints=START_JOINTS,
-            num_mode_flags=1,
-            mode_values=2,
-            action_bound=ACTION_BOUND,
-            num_envs=num_envs,
-            num_threads=num_threads,
-            max_steps=max_steps,
-            seed=seed,
-            device=device,
-            dtype=dtype,
-            contexts=contexts,
-        )
+    TASK, MAX_STEPS = "aligning", 400
+    START_JOINTS = (
+        -0.39275835987073354,
+        0.32177812339570716,
+        -0.21250285252375792,
+        -1.843581356712203,
+        0.0831488803864002,
+        2.160344058282072,
+        0.144795218196799,
+    )
+    MODE_VALUES = 2
 
     def _place(self, rows: np.ndarray) -> np.ndarray:
         return poses_of(self._contexts[rows, :1], height=0.0)
@@ -156,17 +117,8 @@ class AligningEnv(ManipulationEnv):
         """Poses of tray and target as D3IL's recorder logs them."""
         return super().raw_objects() | {"target": self.targets}
 
-
-def aligning_scene(*, arm_alpha: float = 0.3):
-    """Scene of Aligning: table, arm with rod, tray, drawn target.
-
-    Args:
-        arm_alpha (float): opacity of the arm when drawn.
-
-    Returns:
-        mjcf.RootElement: the scene; the target is the mocap body ``target``.
-    """
-    return scene(rod=True, arm_alpha=arm_alpha, add_objects=_add_tray_and_target)
+    def _scene(self, arm_alpha: float) -> Any:
+        return scene(rod=True, arm_alpha=arm_alpha, add_objects=_add_tray_and_target)
 
 
 def _add_tray_and_target(root) -> None:

@@ -3,25 +3,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.mujoco.scene import PANDA, compile_scene, scene
-from torchrl_koap.tasks import get_task
+from torchrl_koap.envs.mujoco.scene import PANDA, scene
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROW_Y
 
-START_JOINTS = (
-    -0.3564086847191448,
-    0.42944545403685397,
-    -0.13501059530077486,
-    -2.0546518930206963,
-    0.0935782229157612,
-    2.4807179407013367,
-    0.23250675884944516,
-)
 ROW_REACH = 0.03
-ACTION_BOUND = 0.012
 
 
 def mode_index(flags: torch.Tensor) -> torch.Tensor:
@@ -83,17 +74,7 @@ class AvoidingEnv(ManipulationEnv):
     Human demonstrators move the command by at most 0.012 m per axis and step. The action spec has this range for
     random actions; larger actions are executed as they are, never clipped.
 
-    Args:
-        num_envs (int): number of environments, the batch size.
-        num_threads (int): threads that advance them; results do not depend on it.
-        max_steps (int): control steps (35 ms each) after which an episode is truncated.
-        seed (int, optional): seed of the environments' random generator (Avoiding draws nothing from it).
-        device (torch.device, optional): device of the tensors handed out.
-        dtype (torch.dtype): floating type of observation, action and reward.
-        arm_alpha (float): opacity of the arm in pictures.
-
-    Raises:
-        ValueError: for sizes below 1, actions of a wrong shape or actions that are not finite.
+    Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
     Examples:
         >>> import torch
@@ -104,30 +85,20 @@ class AvoidingEnv(ManipulationEnv):
         [15.0, 15.0]
     """
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        num_threads: int = 1,
-        max_steps: int = 250,
-        seed: int | None = None,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype = torch.float32,
-        *,
-        arm_alpha: float = 0.3,
-    ):
-        super().__init__(
-            get_task("avoiding"),
-            compile_scene(avoiding_scene(arm_alpha=arm_alpha)),
-            start_joints=START_JOINTS,
-            num_mode_flags=9,
-            action_bound=ACTION_BOUND,
-            num_envs=num_envs,
-            num_threads=num_threads,
-            max_steps=max_steps,
-            seed=seed,
-            device=device,
-            dtype=dtype,
-        )
+    TASK, MAX_STEPS = "avoiding", 250
+    START_JOINTS = (
+        -0.3564086847191448,
+        0.42944545403685397,
+        -0.13501059530077486,
+        -2.0546518930206963,
+        0.0935782229157612,
+        2.4807179407013367,
+        0.23250675884944516,
+    )
+    MODE_ENTRIES, COLLIDES = 9, True
+
+    def __init__(self, *args: Any, **options: Any):
+        super().__init__(*args, **options)
         model = self.sims.model
         self._rod = model.geom(f"{PANDA}rod").id
         self._obstacles = np.array([model.geom(name).id for name, *_ in OBSTACLES])
@@ -165,20 +136,11 @@ class AvoidingEnv(ManipulationEnv):
         mode[:, 8] |= at & (x > 0.35) & ~mode[:, 5:8].any(1)
         self._mode[rows] = mode
 
-
-def avoiding_scene(*, arm_alpha: float = 0.3):
-    """Scene of Avoiding: table, arm with rod, six red cylinders, green finish line.
-
-    Args:
-        arm_alpha (float): opacity of the arm when drawn.
-
-    Returns:
-        mjcf.RootElement: the scene; geoms of the cylinders carry the names of ``OBSTACLES``.
-    """
-    root = scene(rod=True, image_size=1024, arm_alpha=arm_alpha)
-    for name, x, y, radius, half_height in OBSTACLES:
-        body = root.worldbody.add("body", name=name, pos=(x, y, 0))
-        body.add("geom", name=name, type="cylinder", size=(radius, half_height), rgba=(1, 0, 0, 1))
-    line = {"type": "box", "size": (0.5, 0.01, 0.005), "pos": (0.4, FINISH_Y, 0), "rgba": (0, 1, 0, 1)}
-    root.worldbody.add("geom", name="finish_line", contype=0, conaffinity=0, **line)
-    return root
+    def _scene(self, arm_alpha: float) -> Any:
+        root = scene(rod=True, image_size=1024, arm_alpha=arm_alpha)
+        for name, x, y, radius, half_height in OBSTACLES:
+            body = root.worldbody.add("body", name=name, pos=(x, y, 0))
+            body.add("geom", name=name, type="cylinder", size=(radius, half_height), rgba=(1, 0, 0, 1))
+        line = {"type": "box", "size": (0.5, 0.01, 0.005), "pos": (0.4, FINISH_Y, 0), "rgba": (0, 1, 0, 1)}
+        root.worldbody.add("geom", name="finish_line", contype=0, conaffinity=0, **line)
+        return root

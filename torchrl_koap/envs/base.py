@@ -16,7 +16,6 @@ from __future__ import annotations
 import abc
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -25,53 +24,61 @@ from torchrl.envs import EnvBase
 
 from torchrl_koap import keys
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
-from torchrl_koap.envs.foresight import Foresight
+from torchrl_koap.envs.episode_state import EpisodeState
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.rendering import Renderer
+from torchrl_koap.envs.mujoco.scene import compile_scene
 from torchrl_koap.envs.mujoco.simulation import SimulationBatch
-from torchrl_koap.envs.raw_log import RawLog
-from torchrl_koap.envs.saved_state import SavedState
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Task, get_task
 
 
-class ManipulationEnv(RawLog, Foresight, SavedState, EnvBase):
-    """Base of the D3IL tasks: a batch of simulations, outcome bookkeeping, partial resets and partial steps.
+class ManipulationEnv(EpisodeState, EnvBase):
+    """Simulates a batch of episodes of one of D3IL's tasks, with partial resets and partial steps.
 
-    A task implements four hooks; each receives ``rows``, the indices of the environments concerned:
-    :meth:`_command`, :meth:`_observe`, :meth:`_check`, :meth:`_update_mode`. Where objects are placed is one more,
-    :meth:`_place`; :meth:`_advance` and :meth:`_begin` differ where joints are commanded.
+    A task declares the class attributes below and implements the hooks :meth:`_scene`, :meth:`_command`,
+    :meth:`_observe`, :meth:`_check`, :meth:`_update_mode` and, with objects, :meth:`_place`. Hooks receive ``rows``,
+    the indices of the environments concerned.
+
+    ================ ========================================================================================
+    attribute        meaning
+    ================ ========================================================================================
+    ``TASK``         name of the task
+    ``START_JOINTS`` arm joints [7] after a reset (rad)
+    ``ACTION_BOUND`` half range of random actions, or least and greatest values; actions outside are executed
+    ``MODE_ENTRIES`` entries of the leaf ``mode``; None: one per object
+    ``MODE_VALUES``  entries are -1 (undecided) to ``MODE_VALUES - 1``, int64; None: they are flags, bool
+    ``COLLIDES``     an episode can end by a collision
+    ``MAX_STEPS``    control steps after which an episode is truncated
+    ``SUBSTEPS``     physics steps (1 ms) per control step
+    ``COMMAND_DIM``  numbers that make up a command
+    ``RESET_WIDTH``  finger target during the reset's substep (m)
+    ``ARM_ALPHA``    opacity of the arm in pictures
+    ================ ========================================================================================
 
     A task with objects has *contexts*, the poses in which an episode starts
-    (:mod:`torchrl_koap.envs.contexts`): drawn at random at every reset, or taken from a table in turn, or handed over
-    by ``reset(contexts=...)``. The leaf ``context`` ``[n, objects, 3]`` (x, y in m, yaw in rad) tells them.
+    (:mod:`torchrl_koap.envs.contexts`): drawn at random at every reset, taken from a table in turn, or handed over
+    by ``reset(contexts=...)``. The leaf ``context`` ``[n, objects, 3]`` holds them (x, y in m, yaw in rad).
 
     Success and collision are *latched*: whichever is seen first is the outcome of the episode, and at most one of them
     is ever True. They become True in the frame that also carries ``terminated``, and stay until the reset.
 
     Args:
-        task (Task): layout of the observation.
-        model (mujoco.MjModel): compiled scene.
-        start_joints (sequence): arm joints [7] after a reset (rad).
-        num_mode_flags (int): number of entries of the leaf ``mode``.
-        mode_values (int, optional): entries of ``mode`` are -1 (not decided yet) to ``mode_values - 1``, int64. By
-            default they are flags, bool.
-        action_bound (float or tuple): half range of random actions, or their least and greatest values (numbers or
-            one per entry); actions outside are executed unchanged.
         num_envs (int): number of environments, the batch size.
-        num_threads (int): threads that advance them.
-        max_steps (int): control steps after which an episode is truncated.
-        substeps (int): physics steps (1 ms) per control step.
-        seed (int, optional): seed of the environments' own random generator.
+        num_threads (int): threads that advance them; results do not depend on it.
+        max_steps (int, optional): control steps after which an episode is truncated. Default: ``MAX_STEPS``.
+        seed (int, optional): seed of the random contexts.
         device (torch.device, optional): device of the tensors handed out; the physics runs on the CPU.
         dtype (torch.dtype): floating type of observation, action and reward.
+
+    Keyword Args:
         contexts (array, optional): table ``[C, objects, 3]``; the ``j``-th reset of environment ``i`` takes row
             ``(i + j num_envs) mod C``. Default: random ones.
-        reset_width (float): finger target (m) during the reset's substep.
-        command_dim (int): numbers that make up a command.
-        simulations (optional): what is simulated instead of ``model``, where another arm than D3IL's moves.
+        arm_alpha (float, optional): opacity of the arm in pictures.
+        task (Task, optional): a variant of the class's own task.
 
     Raises:
-        ValueError: for sizes below 1, a non-floating dtype, or contexts of a wrong shape or out of range.
+        ValueError: for sizes below 1, a non-floating dtype, contexts of a wrong shape or out of range, and actions of
+            a wrong shape or that are not finite.
 
     Examples:
         >>> from torchrl_koap.envs import AvoidingEnv  # a task of this base
@@ -80,77 +87,93 @@ class ManipulationEnv(RawLog, Foresight, SavedState, EnvBase):
         ('avoiding', [False, False])
     """
 
+    TASK: str
+    START_JOINTS: tuple[float, ...] = (0.0,) * 7
+    ACTION_BOUND: Any = 0.012
+    MODE_ENTRIES: int | None = 1
+    MODE_VALUES: int | None = None
+    COLLIDES = False
+    MAX_STEPS = 400
+    SUBSTEPS = 35
+    COMMAND_DIM = 7
+    RESET_WIDTH = controller.FINGER_RESET
+    ARM_ALPHA = 0.3
+
     def __init__(
         self,
-        task: Task,
-        model: mujoco.MjModel | None,
-        *,
-        start_joints,
-        num_mode_flags: int,
-        mode_values: int | None = None,
-        action_bound,
-        num_envs: int,
-        num_threads: int,
-        max_steps: int,
-        substeps: int = 35,
+        num_envs: int = 1,
+        num_threads: int = 1,
+        max_steps: int | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
         dtype: torch.dtype = torch.float32,
+        *,
         contexts=None,
-        reset_width: float = controller.FINGER_RESET,
-        command_dim: int = 7,
-        simulations: Any = None,
+        arm_alpha: float | None = None,
+        task: Task | None = None,
     ):
+        max_steps = self.MAX_STEPS if max_steps is None else max_steps
         for name, value in (("num_envs", num_envs), ("num_threads", num_threads), ("max_steps", max_steps)):
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
             raise ValueError(f"dtype must be a floating torch.dtype, got {dtype!r}")
         super().__init__(device=device, batch_size=[num_envs])
-        self.task = task
+        self.task = get_task(self.TASK) if task is None else task
         self.max_steps = max_steps
-        self.substeps = substeps
-        self.sims: Any = SimulationBatch(model, num_envs, num_threads) if simulations is None else simulations
-        self._start_joints = np.asarray(start_joints, dtype=np.float64)
+        self.sims: Any = self._simulations(num_envs, num_threads, self.ARM_ALPHA if arm_alpha is None else arm_alpha)
         self._dtype = dtype
-        self._observation = np.zeros((num_envs, task.observation_dim))
-        self._commands = np.zeros((num_envs, command_dim))
-        self._mode_values = mode_values
-        self._mode = np.zeros((num_envs, num_mode_flags), dtype=bool if mode_values is None else np.int64)
-        self._contexts = np.zeros((num_envs, len(task.objects), 3))
-        self._context_table = None if contexts is None else check_contexts(task, contexts)
+        self._context_table = None if contexts is None else check_contexts(self.task, contexts)
         self._num_resets = np.zeros(num_envs, dtype=np.int64)
-        self._reset_width = reset_width
-        self._success = np.zeros(num_envs, dtype=bool)
-        self._collision = np.zeros(num_envs, dtype=bool)
-        self._seen = np.zeros((num_envs, 2), dtype=bool)  # success, failure of the present state, told a step later
-        self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._ready = np.zeros(num_envs, dtype=bool)
+        self._episode = episode = self._episode_arrays(num_envs)
+        self._observation, self._commands, self._mode = episode["observation"], episode["commands"], episode["mode"]
+        self._success, self._collision, self._seen = episode["success"], episode["collision"], episode["seen"]
+        self._steps, self._ready, self._contexts = episode["steps"], episode["ready"], episode["contexts"]
         self._renderer: Renderer | None = None
-        self._make_specs(action_bound)
+        self._make_specs()
         self._set_seed(seed)
 
-    def _make_specs(self, action_bound) -> None:
+    def _simulations(self, num_envs: int, num_threads: int, arm_alpha: float) -> Any:
+        """What is simulated; differs where another arm than D3IL's moves."""
+        return SimulationBatch(compile_scene(self._scene(arm_alpha)), num_envs, num_threads)
+
+    def _episode_arrays(self, num_envs: int) -> dict[str, np.ndarray]:
+        """What an episode in progress consists of beside the simulation, a row per environment."""
+        entries = len(self.task.objects) if self.MODE_ENTRIES is None else self.MODE_ENTRIES
+        return {
+            "observation": np.zeros((num_envs, self.task.observation_dim)),
+            "commands": np.zeros((num_envs, self.COMMAND_DIM)),
+            "mode": np.zeros((num_envs, entries), dtype=bool if self.MODE_VALUES is None else np.int64),
+            "contexts": np.zeros((num_envs, len(self.task.objects), 3)),
+            "success": np.zeros(num_envs, dtype=bool),
+            "collision": np.zeros(num_envs, dtype=bool),
+            "seen": np.zeros((num_envs, 2), dtype=bool),  # success and failure of the present state, reported next step
+            "steps": np.zeros(num_envs, dtype=np.int64),
+            "ready": np.zeros(num_envs, dtype=bool),
+        }
+
+    def _make_specs(self) -> None:
         shape, device = self.batch_size, self.device
         flag = {"n": 1, "shape": (*shape, 1), "device": device, "dtype": torch.bool}
         flags = self._mode.shape[1]
-        if self._mode_values is None:
+        if self.MODE_VALUES is None:
             mode = Binary(n=flags, shape=(*shape, flags), device=device, dtype=torch.bool)
         else:
-            mode = Bounded(-1, self._mode_values - 1, (*shape, flags), device=device, dtype=torch.int64)
+            mode = Bounded(-1, self.MODE_VALUES - 1, (*shape, flags), device=device, dtype=torch.int64)
         leaves = {
             keys.OBSERVATION: Unbounded((*shape, self.task.observation_dim), device=device, dtype=self._dtype),
             keys.SUCCESS: Binary(**flag),
             keys.MODE: mode,
         }
-        if self.task.collides:
+        if self.COLLIDES:
             leaves[keys.COLLISION] = Binary(**flag)
         if self.task.objects:
             size = (*shape, *self._contexts.shape[1:])
             leaves[keys.CONTEXT] = Unbounded(size, device=device, dtype=self._dtype)
         self.observation_spec = Composite(leaves, shape=shape)
         size = (*shape, self.task.action_dim)
-        bounds = action_bound if isinstance(action_bound, tuple) else (-action_bound, action_bound)
+        bound = self.ACTION_BOUND
+        bounds = bound if isinstance(bound, tuple) else (-bound, bound)
         low, high = (torch.as_tensor(bound, dtype=self._dtype, device=device).expand(size) for bound in bounds)
         self.action_spec = Bounded(low, high, size, device=device, dtype=self._dtype)
         self.reward_spec = Bounded(0.0, 1.0, (*shape, 1), device=device, dtype=self._dtype)
@@ -163,6 +186,10 @@ class ManipulationEnv(RawLog, Foresight, SavedState, EnvBase):
         """Writes the first command into ``self._commands[rows]`` after a reset: stay, hand straight down."""
         self._commands[rows, :3] = self.sims.tcp_position[rows]
         self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
+
+    def _scene(self, arm_alpha: float) -> Any:
+        """Scene of the task, an ``mjcf.RootElement``."""
+        raise NotImplementedError
 
     @abc.abstractmethod
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
@@ -186,7 +213,7 @@ class ManipulationEnv(RawLog, Foresight, SavedState, EnvBase):
 
     def _advance(self, rows: np.ndarray) -> None:
         """Runs the physics of one control step under ``self._commands[rows]``."""
-        self.sims.track_pose(rows, self._commands, self.substeps)
+        self.sims.track_pose(rows, self._commands, self.SUBSTEPS)
 
     def _set_seed(self, seed: int | None) -> None:
         self.generator = np.random.default_rng(seed)
@@ -200,7 +227,7 @@ class ManipulationEnv(RawLog, Foresight, SavedState, EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, *, contexts=None, **kwargs) -> TensorDictBase:
         rows = self._rows(tensordict, "_reset")
         self._draw_contexts(rows, contexts)
-        self.sims.reset(rows, self._start_joints, self._place(rows), width=self._reset_width)
+        self.sims.reset(rows, np.asarray(self.START_JOINTS), self._place(rows), width=self.RESET_WIDTH)
         self.sims.widths[rows] = controller.FINGER_OPEN
         self._begin_episode(rows)
         return self._leaves(np.zeros(self.batch_size[0], dtype=bool))
@@ -222,7 +249,7 @@ class ManipulationEnv(RawLog, Foresight, SavedState, EnvBase):
 
     def _begin_episode(self, rows: np.ndarray) -> None:
         self._success[rows] = self._collision[rows] = False
-        self._mode[rows] = False if self._mode_values is None else -1
+        self._mode[rows] = False if self.MODE_VALUES is None else -1
         self._steps[rows] = 0
         self._ready[rows] = True
         self._begin(rows)
@@ -279,7 +306,7 @@ class ManipulationEnv(RawLog, Foresight, SavedState, EnvBase):
             "truncated": self._tensor(truncated[:, None]),
             "done": self._tensor((terminated | truncated)[:, None]),
         }
-        if self.task.collides:
+        if self.COLLIDES:
             leaves[keys.COLLISION] = self._tensor(self._collision[:, None])
         if self.task.objects:
             leaves[keys.CONTEXT] = self._tensor(self._contexts, self._dtype)
@@ -329,3 +356,33 @@ class ManipulationEnv(RawLog, Foresight, SavedState, EnvBase):
             self._renderer = None
         self.sims.close()
         super().close(**kwargs)
+
+    def raw_log(self) -> dict[str, np.ndarray]:
+        """What D3IL's recorder logs for the last control step, one row per environment (docs/d3il.md, Recordings).
+
+        The recorder looks after the *first* substep, so ``c_pos`` (m) is the TCP at the start of the step and
+        ``des_c_pos`` the command of that step. Joints in rad, velocities in rad/s and m/s, ``time_stamp`` in s.
+
+        Returns:
+            dict: ``j_pos, j_vel, des_j_pos, des_j_vel, des_j_acc`` [n, 7], ``c_pos, c_vel, des_c_pos`` [n, 3],
+            ``c_quat, des_c_quat`` [n, 4], ``gripper_width, sim_step, time_stamp`` [n].
+        """
+        row = {name: self.sims.log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
+        row["gripper_width"] = row["gripper_width"][:, 0]
+        row |= self.logged_command()
+        row["time_stamp"] = self.sims.log_time.copy()
+        row["sim_step"] = np.rint(self.sims.log_time / controller.TIMESTEP).astype(np.int64)
+        return row
+
+    def logged_command(self) -> dict[str, np.ndarray]:
+        """The command as the recorder names it, where the controller's log does not hold it."""
+        return {"des_c_pos": self.commands[:, :3], "des_c_quat": self.commands[:, 3:7]}
+
+    def raw_objects(self) -> dict[str, np.ndarray]:
+        """Poses of the task's objects as D3IL's recorder logs them, after the first substep of the last control step.
+
+        Returns:
+            dict: pose [n, 7] (m, quaternion) per object, in the order and with the names of ``task.objects``.
+        """
+        poses = self.sims.log[:, controller.LOG_WIDTH :].reshape(len(self.sims), -1, 7)
+        return {name: poses[:, index].copy() for index, name in enumerate(self.task.objects[: poses.shape[1]])}

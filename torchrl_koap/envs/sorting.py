@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
-from torchrl_koap.envs.mujoco.scene import compile_scene, scene
+from torchrl_koap.envs.mujoco.scene import scene
 from torchrl_koap.tasks.features import tan_yaw
 from torchrl_koap.tasks.sorting import (
     BIN_HALF,
@@ -22,19 +24,9 @@ from torchrl_koap.tasks.sorting import (
     sorting_task,
 )
 
-START_JOINTS = (
-    -0.32682662579052857,
-    0.24562566192918364,
-    -0.20325276715633386,
-    -1.952193734596577,
-    0.06315052037105527,
-    2.1955061347936957,
-    0.22457584505012435,
-)
 RED, BLUE = 0, 1
 PLATFORM_TOP = 0.1  # (m)
 START_HEIGHT = 0.05  # m; inside the platform, as in the original: the first steps push the boxes up
-ACTION_BOUND = 0.012
 _COLOURS = {RED: (1, 0, 0, 1), BLUE: (0, 0, 1, 1)}
 
 
@@ -126,23 +118,7 @@ class SortingEnv(ManipulationEnv):
     original asks with four boxes for a third one of each colour too and is told (0, -0.0085); such a box is farther
     from its bin than any box that is inside, so it changes nothing and is left out here.
 
-    Args:
-        num_envs (int): number of environments, the batch size.
-        num_threads (int): threads that advance them; results do not depend on it.
-        max_steps (int): control steps (35 ms each) after which an episode is truncated.
-        seed (int, optional): seed of the random contexts.
-        device (torch.device, optional): device of the tensors handed out.
-        dtype (torch.dtype): floating type of observation, action and reward.
-
-    Keyword Args:
-        num_boxes (int): 2, 4 or 6, half of them red.
-        contexts (array, optional): table of contexts [C, num_boxes, 3] to take in turn, for example
-            ``evaluation_contexts("sorting")``; random ones by default.
-        arm_alpha (float): opacity of the arm in pictures.
-
-    Raises:
-        ValueError: for another number of boxes, sizes below 1, contexts out of range, actions of a wrong shape or that
-            are not finite.
+    Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
     Examples:
         >>> from torchrl_koap.envs import SortingEnv
@@ -151,38 +127,26 @@ class SortingEnv(ManipulationEnv):
         torch.Size([2, 3, 16])
     """
 
-    _EPISODE = (*ManipulationEnv._EPISODE, "_noted")
+    MAX_STEPS = 700
+    START_JOINTS = (
+        -0.32682662579052857,
+        0.24562566192918364,
+        -0.20325276715633386,
+        -1.952193734596577,
+        0.06315052037105527,
+        2.1955061347936957,
+        0.22457584505012435,
+    )
+    MODE_ENTRIES, MODE_VALUES = None, 2
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        num_threads: int = 1,
-        max_steps: int = 700,
-        seed: int | None = None,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype = torch.float32,
-        *,
-        num_boxes: int = 4,
-        contexts=None,
-        arm_alpha: float = 0.3,
-    ):
-        super().__init__(
-            sorting_task(num_boxes),
-            compile_scene(sorting_scene(num_boxes=num_boxes, arm_alpha=arm_alpha)),
-            start_joints=START_JOINTS,
-            num_mode_flags=num_boxes,
-            mode_values=2,
-            action_bound=ACTION_BOUND,
-            num_envs=num_envs,
-            num_threads=num_threads,
-            max_steps=max_steps,
-            seed=seed,
-            device=device,
-            dtype=dtype,
-            contexts=contexts,
-        )
+    def __init__(self, *args: Any, num_boxes: int = 4, **options: Any):
         self._colours = box_colours(num_boxes)
-        self._noted = np.full((num_envs, num_boxes), -1)  # boxes in order of arrival
+        super().__init__(*args, task=sorting_task(num_boxes), **options)
+        self._noted = self._episode["noted"]
+
+    def _episode_arrays(self, num_envs: int) -> dict[str, np.ndarray]:
+        noted = np.full((num_envs, len(self._colours)), -1)  # boxes in order of arrival
+        return super()._episode_arrays(num_envs) | {"noted": noted}
 
     def _place(self, rows: np.ndarray) -> np.ndarray:
         return poses_of(self._contexts[rows], height=START_HEIGHT)
@@ -230,36 +194,21 @@ class SortingEnv(ManipulationEnv):
                 noted[count] = nearest
                 self._mode[rows[index], count] = self._colours[nearest]
 
+    def _scene(self, arm_alpha: float) -> Any:
+        def add_boxes(root) -> None:
+            for name, colour in zip(self.task.objects, self._colours.tolist(), strict=True):
+                box = root.worldbody.add("body", name=name)
+                box.add("freejoint", name=name)
+                box.add("geom", name=name, type="box", size=(BOX_HALF,) * 3, mass=0.05, rgba=_COLOURS[colour])
 
-def sorting_scene(*, num_boxes: int = 4, arm_alpha: float = 0.3):
-    """Scene of Sorting: table, arm with rod, platform, two bins, boxes.
-
-    Args:
-        num_boxes (int): 2, 4 or 6, half of them red.
-        arm_alpha (float): opacity of the arm when drawn.
-
-    Returns:
-        mjcf.RootElement: the scene.
-
-    Raises:
-        ValueError: for another number of boxes.
-    """
-    colours = box_colours(num_boxes)
-
-    def add_boxes(root) -> None:
-        for name, colour in zip(sorting_task(num_boxes).objects, colours.tolist(), strict=True):
-            box = root.worldbody.add("body", name=name)
-            box.add("freejoint", name=name)
-            box.add("geom", name=name, type="box", size=(BOX_HALF,) * 3, mass=0.05, rgba=_COLOURS[colour])
-
-    root = scene(rod=True, arm_alpha=arm_alpha, link_collisions=True, add_objects=add_boxes)
-    # bodies of their own, after the boxes: MuJoCo lists contacts in the order of bodies, and the original has this one
-    platform = root.worldbody.add("body", name="platform", pos=((PLATFORM_X[0] + PLATFORM_X[1]) / 2, -0.1, 0))
-    size, friction = (0.3, 0.3, PLATFORM_TOP), (0.3, 0.001, 0.0001)
-    platform.add("geom", type="box", size=size, friction=friction, priority=1, rgba=(0.5, 0.5, 0.5, 0.5))
-    for colour, name in ((RED, "red"), (BLUE, "blue")):
-        bin_ = root.worldbody.add("body", name=f"{name}_bin", pos=(BIN_X[colour], BIN_Y, 0))
-        for across, along, width, depth in BIN_WALLS:  # far, left, right, near
-            wall = {"pos": (across, along, 0), "size": (width, depth, 0.1), "rgba": (*_COLOURS[colour][:3], 0.5)}
-            bin_.add("geom", type="box", **wall)
-    return root
+        root = scene(rod=True, arm_alpha=arm_alpha, link_collisions=True, add_objects=add_boxes)
+        # bodies of their own, after the boxes: contacts are listed in the order of bodies, as in the original
+        platform = root.worldbody.add("body", name="platform", pos=((PLATFORM_X[0] + PLATFORM_X[1]) / 2, -0.1, 0))
+        size, friction = (0.3, 0.3, PLATFORM_TOP), (0.3, 0.001, 0.0001)
+        platform.add("geom", type="box", size=size, friction=friction, priority=1, rgba=(0.5, 0.5, 0.5, 0.5))
+        for colour, name in ((RED, "red"), (BLUE, "blue")):
+            bin_ = root.worldbody.add("body", name=f"{name}_bin", pos=(BIN_X[colour], BIN_Y, 0))
+            for across, along, width, depth in BIN_WALLS:  # far, left, right, near
+                wall = {"pos": (across, along, 0), "size": (width, depth, 0.1), "rgba": (*_COLOURS[colour][:3], 0.5)}
+                bin_.add("geom", type="box", **wall)
+        return root

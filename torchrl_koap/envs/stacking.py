@@ -3,26 +3,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco import controller
-from torchrl_koap.envs.mujoco.scene import compile_scene, scene
+from torchrl_koap.envs.mujoco.scene import scene
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.features import tan_yaw
 from torchrl_koap.tasks.stacking import BOXES, HEIGHT_GAP, TARGET, TARGET_HALF, ZONE_RADIUS
 
-START_JOINTS = (
-    -1.1708457375867388e-08,
-    -0.043618586668494642,
-    1.3201479763146580e-08,
-    -2.1884211669990354,
-    -5.9465223596397744e-09,
-    2.1499041610538185,
-    0.78539816721171052,
-)
 OPEN_ABOVE = 0.075  # a greater gripper number opens the fingers, any other closes them
 COLOURS = {"red": (1, 0, 0, 1), "green": (0, 1, 0, 1), "blue": (0, 0, 1, 1)}
 JOINT_BOUND = 0.03  # rad per control step
@@ -100,23 +93,7 @@ class StackingEnv(ManipulationEnv):
     with 1 or 2: so many boxes have arrived. There is no failure. The order of events is that of
     :class:`~torchrl_koap.envs.base.ManipulationEnv`: what is observed and told lies one control step back.
 
-    Args:
-        num_envs (int): number of environments, the batch size.
-        num_threads (int): threads that advance them; results do not depend on it.
-        max_steps (int): control steps (30 ms each) after which an episode is truncated.
-        seed (int, optional): seed of the random contexts.
-        device (torch.device, optional): device of the tensors handed out.
-        dtype (torch.dtype): floating type of observation, action and reward.
-
-    Keyword Args:
-        num_boxes (int): how many boxes make a success, 1 to 3; the scene always holds three.
-        contexts (array, optional): table of contexts [C, 3, 3] to take in turn, for example
-            ``evaluation_contexts("stacking")``; random ones by default.
-        arm_alpha (float): opacity of the arm in pictures.
-
-    Raises:
-        ValueError: for sizes below 1, another number of boxes, contexts out of range, actions of a wrong shape or that
-            are not finite.
+    Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
     Examples:
         >>> from torchrl_koap.envs import StackingEnv
@@ -125,38 +102,23 @@ class StackingEnv(ManipulationEnv):
         torch.Size([2, 3, 31])
     """
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        num_threads: int = 1,
-        max_steps: int = 1000,
-        seed: int | None = None,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype = torch.float32,
-        *,
-        num_boxes: int = 3,
-        contexts=None,
-        arm_alpha: float = 1.0,
-    ):
+    MAX_STEPS, SUBSTEPS = 1000, 30
+    START_JOINTS = (
+        -1.1708457375867388e-08,
+        -0.043618586668494642,
+        1.3201479763146580e-08,
+        -2.1884211669990354,
+        -5.9465223596397744e-09,
+        2.1499041610538185,
+        0.78539816721171052,
+    )
+    ACTION_BOUND = ((-JOINT_BOUND,) * 7 + (0.0,), (JOINT_BOUND,) * 7 + (GRIPPER_BOUND,))
+    MODE_ENTRIES, MODE_VALUES = None, 3
+    COMMAND_DIM, RESET_WIDTH, ARM_ALPHA = 8, controller.FINGER_OPEN, 1.0
+
+    def __init__(self, *args: Any, num_boxes: int = 3, **options: Any):
         _check_num_boxes(num_boxes)
-        super().__init__(
-            get_task("stacking_1" if num_boxes == 1 else "stacking"),
-            compile_scene(stacking_scene(arm_alpha=arm_alpha)),
-            start_joints=START_JOINTS,
-            num_mode_flags=3,
-            mode_values=3,
-            action_bound=((-JOINT_BOUND,) * 7 + (0.0,), (JOINT_BOUND,) * 7 + (GRIPPER_BOUND,)),
-            num_envs=num_envs,
-            num_threads=num_threads,
-            max_steps=max_steps,
-            substeps=30,
-            seed=seed,
-            device=device,
-            dtype=dtype,
-            contexts=contexts,
-            reset_width=controller.FINGER_OPEN,
-            command_dim=8,
-        )
+        super().__init__(*args, task=get_task("stacking_1" if num_boxes == 1 else "stacking"), **options)
         self.num_boxes = num_boxes
 
     def _place(self, rows: np.ndarray) -> np.ndarray:
@@ -175,7 +137,7 @@ class StackingEnv(ManipulationEnv):
         self.sims.grasping[rows] = ~opens
 
     def _advance(self, rows: np.ndarray) -> None:
-        self.sims.track_joints(rows, self._commands[:, :7], self.substeps)
+        self.sims.track_joints(rows, self._commands[:, :7], self.SUBSTEPS)
 
     def _observe(self, rows: np.ndarray) -> np.ndarray:
         poses = self.sims.object_poses[rows]
@@ -209,17 +171,8 @@ class StackingEnv(ManipulationEnv):
         """Nothing: joints are commanded."""
         return {}  # the log holds them already
 
-
-def stacking_scene(*, arm_alpha: float = 1.0):
-    """Scene of Stacking: table, arm with gripper, three boxes, drawn target zone.
-
-    Args:
-        arm_alpha (float): opacity of the arm when drawn.
-
-    Returns:
-        mjcf.RootElement: the scene.
-    """
-    return scene(rod=False, arm_alpha=arm_alpha, link_collisions=True, add_objects=_add_boxes_and_target)
+    def _scene(self, arm_alpha: float) -> Any:
+        return scene(rod=False, arm_alpha=arm_alpha, link_collisions=True, add_objects=_add_boxes_and_target)
 
 
 def _add_boxes_and_target(root) -> None:

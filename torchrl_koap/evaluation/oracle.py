@@ -96,9 +96,9 @@ class OracleControl(PlanThenControl):
             ValueError: if it cannot be looked ahead in.
         """
         base = env.base_env if isinstance(env, TransformedEnv) else env
-        if not hasattr(base, "foresee"):
+        if not hasattr(base, "simulate_actions"):
             raise ValueError(
-                f"the oracle controller needs an environment that foresees, {type(base).__name__} does not"
+                f"the oracle controller needs an environment that simulates actions, {type(base).__name__} does not"
             )
         count, size = base.batch_size[0], len(self._changes)
         self._env, self._time, self._last = base, 0, np.zeros((count, size))
@@ -138,7 +138,7 @@ class OracleControl(PlanThenControl):
         tries = np.tile(held[None, :, None], (1 + size * refresh, 1, steps, 1))
         for entry in range(size * refresh):
             tries[1 + entry, :, 0, self._changes[entry]] += self._pushes[entry]
-        seen = self._env.foresee(tries, rows)
+        seen = self._env.simulate_actions(tries, rows)
         moved = self.task.state_of(torch.from_numpy(seen))[..., self._moved].numpy()  # [1 + a, n, k, a]
         if refresh:
             response = (moved[1:] - moved[0]) / self._pushes[:, None, None, None]  # to a step of one entry

@@ -88,7 +88,7 @@ _SCOOPING = register_task(
         bodies=(Body("spoon", "spoon", color="grey", half=(0.02, 0.02)),),
         start_regions=StartRegions(_START_REGIONS, dealt=True, yaw=(-180.0, 180.0)),
         env="torchrl_koap.envs.scooping:ScoopingEnv",
-        expert="torchrl_koap.envs.experts.scooping:ScoopingExpert",
+        expert="torchrl_koap.envs.scooping.expert:ScoopingExpert",
         scene=Scene(
             shapes=(Shape("circle", BOWL, (RIM_RADIUS, RIM_RADIUS), "zone", label="bowl"),),
             x=(0.25, 0.7),

@@ -12,7 +12,7 @@ from torchrl_koap.envs import StackingEnv
 from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
 from torchrl_koap.envs.experts.stacking import ORDERS, StackingExpert
 from torchrl_koap.envs.mujoco.inverse_kinematics import follow_pose, tcp_pose
-from torchrl_koap.envs.stacking import START_JOINTS, mode_index
+from torchrl_koap.envs.stacking import mode_index
 
 LIMIT = 1000
 
@@ -87,7 +87,7 @@ def test_a_box_that_was_taken_away_is_fetched_again():
 
 def test_inverse_kinematics_reaches_poses():
     generator = np.random.default_rng(0)
-    joints = np.array([START_JOINTS] * 5)
+    joints = np.array([StackingEnv.START_JOINTS] * 5)
     position, quaternion = tcp_pose(joints)
     position = position + generator.uniform(-0.02, 0.02, (5, 3))
     half = generator.uniform(-0.03, 0.03, 5)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from shared_data import SHARED
 
-from torchrl_koap.envs.avoiding import START_JOINTS
+from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.mujoco import controller, kinematics
 from torchrl_koap.envs.mujoco.linear_algebra import solve_clipped
 from torchrl_koap.envs.mujoco.scene import compile_scene, scene
@@ -88,7 +88,7 @@ def test_clipped_solve_equals_svd(generator, smallest, largest):
 
 
 def test_inverse_kinematics_equal_the_numpy_version(generator):
-    start = np.array(START_JOINTS)
+    start = np.array(AvoidingEnv.START_JOINTS)
     pose = np.concatenate([pose_of(start)[2], [0, 1, 0, 0]])
     for index in range(60):
         # far commands, both signs of the quaternion, and postures near singularities and joint limits
@@ -102,7 +102,7 @@ def test_inverse_kinematics_equal_the_numpy_version(generator):
 
 
 def test_inverse_kinematics_converge_and_respect_the_bound_of_joint_3():
-    q = np.array(START_JOINTS)
+    q = np.array(AvoidingEnv.START_JOINTS)
     target = np.concatenate([pose_of(q)[2] + [0.05, 0.1, 0.02], [0, 1, 0, 0]])
     for _ in range(1000):
         q = compiled_inverse_kinematics(target, q)
@@ -131,7 +131,7 @@ def test_finger_forces(positions, velocities, width, grasping, wanted):
 
 def drive(model, num_sims, num_threads, steps=6):
     sims = SimulationBatch(model, num_sims, num_threads)
-    sims.reset(np.arange(num_sims), np.array(START_JOINTS))
+    sims.reset(np.arange(num_sims), np.array(AvoidingEnv.START_JOINTS))
     commands = np.zeros((num_sims, 7))
     commands[:, :3], commands[:, 4] = sims.tcp_position, 1.0
     for _ in range(steps):
@@ -151,7 +151,7 @@ def test_threads_and_batch_size_change_nothing(model):
 
 def test_state_round_trip_continues_bit_for_bit(model):
     sims = SimulationBatch(model, 2)
-    sims.reset(np.array([0]), np.array(START_JOINTS))
+    sims.reset(np.array([0]), np.array(AvoidingEnv.START_JOINTS))
     command = np.tile([0.55, -0.2, 0.12, 0, 1, 0, 0], (2, 1))
     sims.track_pose(np.array([0]), command, 20)
     sims.set_state(1, sims.get_state(0))
@@ -163,7 +163,7 @@ def test_state_round_trip_continues_bit_for_bit(model):
 
 def test_logged_velocity_is_jacobian_times_joint_velocity(model):
     sims = SimulationBatch(model, 1)
-    sims.reset(np.array([0]), np.array(START_JOINTS))
+    sims.reset(np.array([0]), np.array(AvoidingEnv.START_JOINTS))
     command = np.array([[0.55, -0.2, 0.12, 0, 1, 0, 0]])
     sims.track_pose(np.array([0]), command, 10)
     sims.track_pose(np.array([0]), command, 1)

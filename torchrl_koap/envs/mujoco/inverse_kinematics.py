@@ -43,8 +43,8 @@ def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Examples:
         >>> from torchrl_koap.envs.mujoco.inverse_kinematics import tcp_pose
-        >>> from torchrl_koap.envs.stacking import START_JOINTS
-        >>> abs(tcp_pose([START_JOINTS])[0]).round(3).tolist()
+        >>> from torchrl_koap.envs import StackingEnv
+        >>> abs(tcp_pose([StackingEnv.START_JOINTS])[0]).round(3).tolist()
         [[0.525, 0.0, 0.302]]
     """
     joints = _rows(joints, "joints")
@@ -71,8 +71,8 @@ def follow_pose(joints: np.ndarray, poses: np.ndarray, substeps: int = 30) -> np
     Examples:
         >>> import numpy as np
         >>> from torchrl_koap.envs.mujoco.inverse_kinematics import follow_pose, tcp_pose
-        >>> from torchrl_koap.envs.stacking import START_JOINTS
-        >>> joints = follow_pose([START_JOINTS], [[0.53, 0.01, 0.29, 0, 1, 0, 0]])
+        >>> from torchrl_koap.envs import StackingEnv
+        >>> joints = follow_pose([StackingEnv.START_JOINTS], [[0.53, 0.01, 0.29, 0, 1, 0, 0]])
         >>> tcp_pose(joints)[0].round(4).tolist()
         [[0.53, 0.01, 0.29]]
     """

@@ -14,11 +14,11 @@ from torchrl_koap.commands.demos import Demos
 from torchrl_koap.data.lerobot.images import ImageDataError, read_image_episodes
 from torchrl_koap.envs import ScoopingEnv
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.experts.scooping import ScoopingExpert, start_joints
-from torchrl_koap.envs.experts.scooping_recording import record_videos
 from torchrl_koap.envs.mujoco.rendering import Renderer
-from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations, settled_layouts
-from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics, rotation_of
+from torchrl_koap.envs.scooping.expert import ScoopingExpert, start_joints
+from torchrl_koap.envs.scooping.kinematics import SpoonKinematics, rotation_of
+from torchrl_koap.envs.scooping.recording import record_videos
+from torchrl_koap.envs.scooping.simulation import ScoopingSimulations, settled_layouts
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import BOWL, PIECE_RADIUS, RIM_RADIUS, START_HEIGHT, STARTS, start_of
 

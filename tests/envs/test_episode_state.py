@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Looking ahead: what is foreseen comes true, and the present is left as it was."""
+"""Simulated actions come true, and the present is left as it was."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def started(make, task, steps, **options):
 @pytest.mark.parametrize(
     ("make", "task"), [(AvoidingEnv, "avoiding"), (AligningEnv, "aligning"), (StackingEnv, "stacking")]
 )
-def test_what_is_foreseen_comes_true(make, task):
+def test_simulated_actions_come_true(make, task):
     env, data = started(make, task, 4)
     actions = 0.3 * torch.stack([env.action_spec.rand() for _ in range(3)], 1)  # [2, 3, act]
     before = [env.get_state(row) for row in range(2)]
-    foreseen = env.foresee(np.stack([np.zeros(actions.shape), actions.numpy()]))[1]
+    simulated = env.simulate_actions(np.stack([np.zeros(actions.shape), actions.numpy()]))[1]
     for row, state in enumerate(before):
         after = env.get_state(row)
         assert all(np.array_equal(state["simulation"][name], after["simulation"][name]) for name in state["simulation"])
@@ -38,19 +38,19 @@ def test_what_is_foreseen_comes_true(make, task):
         data = env.step(data.set("action", actions[:, min(step, 2)]))["next"]
         seen.append(data["observation"].numpy())
     hidden = env.task.command_columns.stop if env.task.command else 0  # the command is not a step late
-    assert np.allclose(foreseen[..., hidden:], np.stack(seen[1:], 1)[..., hidden:], atol=1e-12)
+    assert np.allclose(simulated[..., hidden:], np.stack(seen[1:], 1)[..., hidden:], atol=1e-12)
 
 
 def test_some_environments_alone():
     env, _ = started(AvoidingEnv, "avoiding", 2)
-    both = env.foresee(np.full((1, 2, 2, 2), 0.01))
-    assert np.array_equal(env.foresee(np.full((1, 1, 2, 2), 0.01), np.array([1]))[:, 0], both[:, 1])
+    both = env.simulate_actions(np.full((1, 2, 2, 2), 0.01))
+    assert np.array_equal(env.simulate_actions(np.full((1, 1, 2, 2), 0.01), np.array([1]))[:, 0], both[:, 1])
 
 
 def test_a_wrong_shape():
     env, _ = started(AvoidingEnv, "avoiding", 0)
     with pytest.raises(ValueError, match=r"actions must be \[m, 2, k, 2\].*got shape \[1, 3, 2, 2\]"):
-        env.foresee(np.zeros((1, 3, 2, 2)))
+        env.simulate_actions(np.zeros((1, 3, 2, 2)))
 
 
 def test_episodes_that_are_over():

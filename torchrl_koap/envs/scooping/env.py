@@ -11,10 +11,10 @@ from tensordict import TensorDictBase
 from torchrl.data import Unbounded
 
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.experts.scooping import start_joints
 from torchrl_koap.envs.mujoco.rendering import Renderer
-from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
-from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics
+from torchrl_koap.envs.scooping.expert import start_joints
+from torchrl_koap.envs.scooping.kinematics import SpoonKinematics
+from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE
 from torchrl_koap.vision.encoder import FrozenImageEncoder
@@ -76,11 +76,13 @@ class ScoopingEnv(ManipulationEnv):
         torch.Size([2, 3, 99])
     """
 
+    MAX_STEPS = 120
+
     def __init__(
         self,
         num_envs: int = 1,
         num_threads: int = 1,
-        max_steps: int = 120,
+        max_steps: int | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
         dtype: torch.dtype = torch.float32,
@@ -105,26 +107,20 @@ class ScoopingEnv(ManipulationEnv):
         self._pixels = np.zeros((num_envs, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8) if embed or pixels else None
         self._hand_out = pixels
         self._camera: Renderer | None = None
-        super().__init__(
-            get_task(task),
-            None,
-            start_joints=np.zeros(7),
-            num_mode_flags=1,
-            action_bound=(tuple(self._arm.low), tuple(self._arm.high)),
-            num_envs=num_envs,
-            num_threads=num_threads,
-            max_steps=max_steps,
-            seed=seed,
-            device=device,
-            dtype=dtype,
-            contexts=contexts,
-            simulations=ScoopingSimulations("robot", num_envs, num_threads),
-        )
+        super().__init__(num_envs, num_threads, max_steps, seed, device, dtype, contexts=contexts, task=get_task(task))
         self._encoder = chosen
         if pixels:
             self.observation_spec[PIXELS] = Unbounded(self._pixels.shape, dtype=torch.uint8, device=self.device)
         if self._pixels is not None:
             self._camera = Renderer(self.sims.model, IMAGE_SIZE, IMAGE_SIZE, shadows=False)
+
+    @property
+    def ACTION_BOUND(self) -> tuple:
+        """Range of the joints (rad)."""
+        return tuple(self._arm.low), tuple(self._arm.high)
+
+    def _simulations(self, num_envs: int, num_threads: int, arm_alpha: float) -> ScoopingSimulations:
+        return ScoopingSimulations("robot", num_envs, num_threads)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, contexts=None, **kwargs) -> TensorDictBase:
         rows = self._rows(tensordict, "_reset")

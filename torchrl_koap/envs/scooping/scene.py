@@ -41,7 +41,7 @@ def scooping_model(embodiment: str = "robot", *, pieces: bool = True) -> mujoco.
         ValueError: for another embodiment.
 
     Examples:
-        >>> from torchrl_koap.envs.mujoco.scooping_scene import scooping_model
+        >>> from torchrl_koap.envs.scooping.scene import scooping_model
         >>> [scooping_model(name, pieces=False).nu for name in ("robot", "hand")]
         [7, 6]
     """

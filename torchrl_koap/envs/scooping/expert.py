@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
-from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics, rotation_of
+from torchrl_koap.envs.scooping.kinematics import SpoonKinematics, rotation_of
+from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks.scooping import FRAME_HZ, START_HEIGHT, STARTS
 
@@ -28,7 +28,7 @@ class Habits:
         above (float): height at which it comes over the bowl (m).
 
     Examples:
-        >>> from torchrl_koap.envs.experts.scooping import HABITS
+        >>> from torchrl_koap.envs.scooping.expert import HABITS
         >>> HABITS["hand"].speed > HABITS["robot"].speed
         True
     """
@@ -62,8 +62,8 @@ class ScoopingExpert:
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.scooping import ScoopingExpert
-        >>> from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
+        >>> from torchrl_koap.envs.scooping.expert import ScoopingExpert
+        >>> from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
         >>> sims = ScoopingSimulations("hand", 1)
         >>> sims.reset(np.arange(1), np.array([[0.33, 0.0, 0.2, 0.0, 0.0, 0.0]]), [0.0])
         >>> expert = ScoopingExpert(sims, 0, start=1, seed=0)

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import mujoco
 import numpy as np
 
-from torchrl_koap.envs.mujoco.scooping_scene import SPOON_HALF, TIMESTEP, scooping_model
+from torchrl_koap.envs.scooping.scene import SPOON_HALF, TIMESTEP, scooping_model
 from torchrl_koap.tasks.scooping import (
     BOWL,
     CONTROL_HZ,
@@ -40,7 +40,7 @@ class ScoopingSimulations:
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
+        >>> from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
         >>> sims = ScoopingSimulations("hand", 2)
         >>> target = np.array([[0.45, 0.0, 0.2, 0.0, 0.0, 0.0]] * 2)
         >>> sims.reset(np.arange(2), target, turns=[0.0, 1.0])

@@ -12,10 +12,10 @@ import numpy as np
 
 from torchrl_koap.data.lerobot.images import LOCK, ImageEpisode, ImageEpisodeWriter
 from torchrl_koap.envs.contexts import draw_contexts
-from torchrl_koap.envs.experts.scooping import HABITS, ScoopingExpert, start_joints
 from torchrl_koap.envs.mujoco.rendering import Renderer
-from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
-from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics
+from torchrl_koap.envs.scooping.expert import HABITS, ScoopingExpert, start_joints
+from torchrl_koap.envs.scooping.kinematics import SpoonKinematics
+from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.files import one_at_a_time
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task, get_task
@@ -38,7 +38,7 @@ class VideoReport:
         again (int): how many of those scooped more than once.
 
     Examples:
-        >>> from torchrl_koap.envs.experts.scooping_recording import VideoReport
+        >>> from torchrl_koap.envs.scooping.recording import VideoReport
         >>> print(VideoReport("hand", episodes=2, attempts=3, frames=130, again=1))
         2 demonstrations by a hand, 130 frames; 3 were played to get them, 1 scoop more than once
     """

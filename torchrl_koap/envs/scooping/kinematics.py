@@ -6,7 +6,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from torchrl_koap.envs.mujoco.scooping_scene import scooping_model
+from torchrl_koap.envs.scooping.scene import scooping_model
 
 REST = np.array([0.0, 0.1, 0.0, -2.3, 0.0, 2.4, 0.785])  # rad; the pose that is kept near to
 _DAMPING, _PULL = 1e-4, 0.05
@@ -21,7 +21,7 @@ def rotation_of(yaw: float, pitch: float, roll: float = 0.0) -> np.ndarray:
         roll (float): about the turned x (rad).
 
     Examples:
-        >>> from torchrl_koap.envs.mujoco.spoon_kinematics import rotation_of
+        >>> from torchrl_koap.envs.scooping.kinematics import rotation_of
         >>> rotation_of(0.0, 0.3)[2, 0] < 0
         np.True_
     """
@@ -37,7 +37,7 @@ class SpoonKinematics:
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_koap.envs.mujoco.spoon_kinematics import SpoonKinematics, rotation_of
+        >>> from torchrl_koap.envs.scooping.kinematics import SpoonKinematics, rotation_of
         >>> arm = SpoonKinematics()
         >>> joints = arm.solve(np.array([0.5, 0.1, 0.15]), rotation_of(0.3, 0.1))
         >>> np.abs(arm.position(joints) - (0.5, 0.1, 0.15)).max() < 1e-3

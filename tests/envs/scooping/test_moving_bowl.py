@@ -12,10 +12,10 @@ from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.data.lerobot.images import read_image_episodes
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
-from torchrl_koap.envs.experts.scooping import ScoopingExpert, start_joints
-from torchrl_koap.envs.experts.scooping_recording import record_videos
-from torchrl_koap.envs.mujoco.scooping_simulation import ScoopingSimulations
 from torchrl_koap.envs.registry import make_env
+from torchrl_koap.envs.scooping.expert import ScoopingExpert, start_joints
+from torchrl_koap.envs.scooping.recording import record_videos
+from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scene import StartRegions
 from torchrl_koap.tasks.scooping import BOWL, BOWL_REACH, RIM_RADIUS, START_HALF, STARTS, start_of

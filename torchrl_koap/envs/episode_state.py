@@ -1,0 +1,125 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The state of an episode in progress: saved, restored, and advanced by trial actions."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchrl_koap.envs.mujoco import controller
+from torchrl_koap.tasks import Task
+
+
+class EpisodeState(abc.ABC):
+    """Saves, restores and tries out episodes; base of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.envs import AvoidingEnv
+        >>> env = AvoidingEnv(num_envs=2)
+        >>> _ = env.rollout(3)
+        >>> env.set_state(1, env.get_state(0))
+        >>> bool((env.commands[0] == env.commands[1]).all())
+        True
+        >>> held, pushed = env.simulate_actions(np.array([np.zeros((2, 6, 2)), np.full((2, 6, 2), 0.01)]))
+        >>> held.shape, bool((pushed[:, -1, 2:] > held[:, -1, 2:] + 0.005).all())
+        ((2, 6, 4), True)
+    """
+
+    sims: Any
+    task: Task
+    batch_size: torch.Size
+    _episode: dict[str, np.ndarray]  # everything about the episodes in progress, a row per environment
+
+    @abc.abstractmethod
+    def _begin_episode(self, rows: np.ndarray) -> None: ...
+
+    @abc.abstractmethod
+    def _command(self, rows: np.ndarray, action: np.ndarray) -> None: ...
+
+    @abc.abstractmethod
+    def _advance(self, rows: np.ndarray) -> None: ...
+
+    @abc.abstractmethod
+    def _observe(self, rows: np.ndarray) -> np.ndarray: ...
+
+    def get_state(self, index: int) -> dict:
+        """Full state of one environment: simulation, controller, command, mode, outcome and step count.
+
+        Args:
+            index (int): which environment.
+
+        Returns:
+            dict: arrays for :meth:`set_state`; also valid in another environment of the same task.
+        """
+        rows = {name: array[index].copy() for name, array in self._episode.items()}
+        return {"simulation": self.sims.get_state(index)} | rows
+
+    def set_state(self, index: int, state: dict) -> None:
+        """Restores what :meth:`get_state` returned; the episode then continues bit for bit.
+
+        Args:
+            index (int): which environment.
+            state (dict): from :meth:`get_state`, of any environment of the same task.
+        """
+        self.sims.set_state(index, state["simulation"])
+        for name, array in self._episode.items():
+            array[index] = state[name]
+
+    def set_physics(self, index: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
+        """Starts a fresh episode of one environment from a given physics state.
+
+        Args:
+            index (int): which environment; its context stays.
+            qpos (array): positions [nq] (m, rad).
+            qvel (array, optional): velocities [nv]; zero if not given.
+            qacc_warmstart (array, optional): warm start of the solver [nv].
+            ctrl (array, optional): motor commands of the substep before [nu].
+            time (float): clock (s).
+
+        Raises:
+            ValueError: if a size is wrong.
+        """
+        self.sims.set_physics(index, qpos, qvel, qacc_warmstart=qacc_warmstart, ctrl=ctrl, time=time)
+        self.sims.widths[index] = controller.FINGER_OPEN
+        self._begin_episode(np.array([index]))
+
+    def simulate_actions(self, actions: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Simulates action sequences from the present state and restores it.
+
+        Entry ``k`` is the state that the actions 0 to ``k`` lead to; :meth:`step` observes it one control step later.
+
+        Args:
+            actions (np.ndarray): sequences to try ``[m, len(rows), k, act]``.
+            rows (np.ndarray, optional): which environments. Default: all.
+
+        Returns:
+            np.ndarray: observations ``[m, len(rows), k, obs]``.
+
+        Raises:
+            ValueError: if the shape is wrong.
+        """
+        rows = np.arange(self.batch_size[0]) if rows is None else np.asarray(rows, dtype=np.int64)
+        actions = np.asarray(actions, dtype=np.float64)
+        if actions.ndim != 4 or actions.shape[1] != len(rows) or actions.shape[3] != self.task.action_dim:
+            raise ValueError(
+                f"actions must be [m, {len(rows)}, k, {self.task.action_dim}] [sequences, environments, control steps,"
+                f" action], got shape {list(actions.shape)}"
+            )
+        present = [self.get_state(row) for row in rows]
+        observations = np.empty((*actions.shape[:3], self.task.observation_dim))
+        try:
+            for sequence, observed in zip(actions, observations, strict=True):
+                for row, state in zip(rows, present, strict=True):
+                    self.set_state(row, state)
+                for step in range(actions.shape[2]):
+                    self._command(rows, sequence[:, step])
+                    self._advance(rows)
+                    observed[:, step] = self._observe(rows)
+        finally:
+            for row, state in zip(rows, present, strict=True):
+                self.set_state(row, state)
+        return observations
