@@ -19,10 +19,10 @@ import torch
 from scipy.stats import t as student
 
 from torchrl_koap.data import LabelBudget, controller_view
+from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import RunDirectory, TrainConfig, load_demonstrations, resolve
 from torchrl_koap.training.action_errors import UNITS, hidden_action_errors, rmse_mm
-from torchrl_koap.training.builders import set_up_torch
 from torchrl_koap.training.controller import train_controller
 
 

@@ -20,7 +20,7 @@ import torch
 from torchrl_koap.envs.avoiding import OBSTACLES
 from torchrl_koap.envs.experts.avoiding import ROD_RADIUS
 from torchrl_koap.evaluation.scores import OUTCOMES
-from torchrl_koap.training.checkpoints import load_tensors
+from torchrl_koap.runs.weights import load_tensors
 
 
 def clearance(path: np.ndarray, centre: np.ndarray, radius: float) -> float:

@@ -20,7 +20,7 @@ from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation import EvalConfig, evaluate, load_run
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.training.checkpoints import save_weights
+from torchrl_koap.runs.weights import save_weights
 from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
 from torchrl_koap.training.datasets import load_demonstrations
 

@@ -26,9 +26,10 @@ from torchrl_koap.evaluation.active_labelling import CRITERIA, rank_trajectories
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.modules import KoopmanInverseDynamics, Normalizer
 from torchrl_koap.objectives import KOAPLoss
+from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.tasks import WINDOW, Task, get_task
 from torchrl_koap.training.action_errors import rmse_mm
-from torchrl_koap.training.builders import NORMALIZATION, build_controller, set_up_torch
+from torchrl_koap.training.builders import NORMALIZATION, build_controller
 from torchrl_koap.training.closed_form import DEFAULT_PENALTY, fit_closed_form
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.loop import train_phase

@@ -22,8 +22,8 @@ from torchrl_koap.evaluation.config import CONTROLLERS
 from torchrl_koap.evaluation.policy_files import BLEND_DECAY
 from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
 from torchrl_koap.files import replacing_file
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.run_directory import RunDirectory
 
 TABLE = Path(__file__).parent / "results" / "planner_ablations.csv"
 SIZES = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay")

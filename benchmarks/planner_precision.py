@@ -19,7 +19,7 @@ from tensordict import TensorDict
 
 from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner
 from torchrl_koap.objectives import PlannerLoss
-from torchrl_koap.training.precision import has_bfloat16_units
+from torchrl_koap.runs.device import has_bfloat16_units
 
 TABLE = Path(__file__).parent / "results" / "planner_precision.csv"
 COLUMNS = ("processor", "units", "width", "depth", "batch", "float32", "bfloat16", "ratio")

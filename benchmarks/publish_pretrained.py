@@ -15,9 +15,13 @@ from pathlib import Path
 from planner_ablations import row_of
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
-from torchrl_koap.training.pretrained import publish
-from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.runs.pretrained import copy_run
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import compact, load_tensors, save_tensors
+from torchrl_koap.training.digests import write_digests
 
+WEIGHTS = ("planner.safetensors", "controller.safetensors")
+PLACES = ("out", "dataset", "planner_from")
 ROOT = Path(__file__).resolve().parents[1] / "pretrained"
 CARD = """# {name}
 
@@ -45,6 +49,41 @@ Made by
     {command}
     python benchmarks/publish_pretrained.py RUN {name} --candidates {candidates}
 """
+
+
+def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int | None = None) -> Path:
+    """Writes a trained policy as the repository holds it: compact weights, options, a model card.
+
+    Of the places where the run, its data and a planner that it took over were, the last part of the path is kept: where
+    they were on another machine tells nobody anything.
+
+    Args:
+        run (str or Path): run directory of ``koap train``.
+        folder (str or Path): folder to write, new or that of an earlier policy; its name is that of the policy.
+        card (str): text of the ``README.md``: data, updates, success, command.
+
+    Keyword Args:
+        candidates (int, optional): plans sampled whenever one is due, unless told otherwise. Default: as trained.
+
+    Returns:
+        Path: the folder.
+    """
+    folder = Path(folder)
+    (folder / "config.json").unlink(missing_ok=True)  # another policy of that name gives way
+    folder = copy_run(run, folder)
+    published = RunDirectory(folder)
+    config = published.read_json("config.json")
+    places = {name: Path(config[name]).name for name in PLACES if config.get(name) is not None}
+    published.write_json("config.json", config | places | ({"candidates": candidates} if candidates else {}))
+    for name in WEIGHTS:
+        if (folder / name).exists():
+            tensors, about = load_tensors(folder / name)
+            # a closed-form decoder was fitted to features of exactly these frequencies: of them nothing is rounded
+            only = ("covariance_root",) if name == "controller.safetensors" and (folder / WEIGHTS[0]).exists() else ()
+            save_tensors(folder / name, compact(tensors, only=only), about)
+    write_digests(published)
+    (folder / "README.md").write_text(card)
+    return folder
 
 
 def main() -> None:

@@ -37,9 +37,9 @@ from torchrl_koap.envs.registry import make_env_of
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.files import replacing_file
+from torchrl_koap.runs.pretrained import find_run
+from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.progress import count_up_to, progress_bar
-from torchrl_koap.training.run_lookup import find_run
 
 COLUMNS = ("process", "episodes", "seconds", "in_use_mb", "resident_mb", "largest_mb")
 RAW_COLUMNS = ("files", "steps", "seconds", "data_mb", "convert_mb", "validate_mb")

@@ -25,9 +25,9 @@ from resumable_table import open_table
 from torch import Tensor
 
 from torchrl_koap.data.gripper_recovery import EMPTY
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import Task, get_task
-from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.run_directory import RunDirectory
 
 TABLE = Path(__file__).parent / "results" / "stuck_episodes.csv"
 WAYS = ("runaway", "fingers", "one place", "moving")

@@ -31,12 +31,12 @@ from torchrl_koap.data import controller_view, make_demonstrations, select_state
 from torchrl_koap.data.regimes import REGIMES, Regime, apply_regime
 from torchrl_koap.envs.experts.random_play import record_random_play
 from torchrl_koap.modules import InverseDynamics, Normalizer
+from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.training import fit_controller
 from torchrl_koap.training.action_errors import first_actions, rmse
 from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
-from torchrl_koap.training.progress import progress_bar
 
 TABLE = Path(__file__).parent / "results" / "unlabelled_data.csv"
 COLUMNS = ("dataset", "regime", "labels", "seed", "method", "error", "unit", "choice", "updates")

@@ -40,9 +40,9 @@ from torchrl_koap.data.regimes import REGIMES, RegimeSensor
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.policy_files import BLEND_DECAY
 from torchrl_koap.modules import InverseDynamics, blend_plan
+from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.datasets import find_task_of
-from torchrl_koap.training.progress import progress_bar
 
 TABLE = Path(__file__).parent / "results" / "unlabelled_rollouts.csv"
 COLUMNS = (

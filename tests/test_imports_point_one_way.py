@@ -13,7 +13,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "torchrl_koap"
 BASE = {"keys", "lookup", "files"}
-TRAINING = {*BASE, "tasks", "data", "modules", "objectives", "training"}
+TRAINING = {*BASE, "tasks", "data", "modules", "objectives", "runs", "training"}
 MAY_IMPORT = {
     "keys": set(),
     "lookup": set(),
@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "envs": {*BASE, "tasks", "data", "vision", "envs"},
     "modules": {"keys", "lookup", "modules"},
     "objectives": {"keys", "lookup", "modules", "objectives"},
+    "runs": {*BASE, "tasks", "modules", "runs"},
     "training": TRAINING,
     "evaluation": {*TRAINING, "envs", "evaluation"},
     "reports": {*TRAINING, "envs", "evaluation", "reports"},

@@ -26,7 +26,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchrl_koap import EvalConfig, TrainConfig, evaluate, save_demonstrations, train
-from torchrl_koap.training.checkpoints import load_tensors
+from torchrl_koap.runs.weights import load_tensors
 
 gymnasium.register_envs(gymnasium_robotics)
 NAMES = ("x", "y", "speed_x", "speed_y", "goal_x", "goal_y")

@@ -33,8 +33,8 @@ from torchrl_koap import EvalConfig, Task, TrainConfig, evaluate, register_task,
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.reports.scenes import draw_scene
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import Body, Defaults, Modes, Scene, Shape, StartRegions
-from torchrl_koap.training.checkpoints import load_tensors
 
 GOAL, GOAL_RADIUS = (0.5, 0.4), 0.05  # m
 POST = (0.5, 0.2)

@@ -38,7 +38,7 @@ def write_command_pages() -> None:
         "commands/index",
         heading("Every command and option"),
         "What ``koap COMMAND --help`` prints, but for defaults that are ``None``. Fields of a configuration in Python "
-        "have the same names, with underscores, as in :class:`~torchrl_koap.training.config.TrainConfig`.",
+        "have the same names, with underscores, as in :class:`~torchrl_koap.runs.config.TrainConfig`.",
         table(("command", "what it does"), [(f":doc:`{name}`", summary(kind)) for name, kind in commands.items()]),
         toctree(commands, hidden=True),
     )

@@ -11,8 +11,8 @@ from typing import Any
 
 from pages import escape, execution, heading, planner_rows, read_rows, success, table, toctree, write_page
 
+from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.resolved import resolve

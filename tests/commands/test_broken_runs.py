@@ -12,8 +12,8 @@ from command_calls import contents, fails
 from tiny_runs import koap
 
 from torchrl_koap.commands.cli import HINT
-from torchrl_koap.training import checkpoints
-from torchrl_koap.training.checkpoints import load_tensors, save_tensors
+from torchrl_koap.runs import weights
+from torchrl_koap.runs.weights import load_tensors, save_tensors
 
 
 def edit_json(path, **entries):
@@ -109,7 +109,7 @@ def full_disk(*arguments, **options):
 @pytest.mark.parametrize("place", ["weights", "rename"])
 def test_a_full_disk_damages_no_earlier_result_of_a_training(place, copied_run, monkeypatch, capsys):
     before = contents(copied_run)
-    monkeypatch.setattr(*((checkpoints, "save_file") if place == "weights" else (os, "replace")), full_disk)
+    monkeypatch.setattr(*((weights, "save_file") if place == "weights" else (os, "replace")), full_disk)
     assert koap("train", "--out", copied_run, "--resume") == 1
     err = capsys.readouterr().err
     assert err.strip().splitlines()[-1].startswith("koap: ") and "No space left on device" in err

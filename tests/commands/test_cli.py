@@ -18,7 +18,7 @@ from tiny_runs import TINY, koap
 
 import torchrl_koap
 from torchrl_koap.commands.cli import HINT
-from torchrl_koap.training.run_directory import RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory
 
 
 @pytest.mark.parametrize(

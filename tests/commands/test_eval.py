@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny_runs import koap
 
-from torchrl_koap.training.checkpoints import load_tensors
+from torchrl_koap.runs.weights import load_tensors
 
 
 def test_what_an_evaluation_writes(copied_run, capsys):

@@ -13,11 +13,11 @@ from command_calls import contents
 from tiny_runs import TINY, grid, koap, write_demonstrations
 
 from torchrl_koap.data import LabelBudget
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.builders import build_controller
-from torchrl_koap.training.checkpoints import load_tensors
 from torchrl_koap.training.datasets import load_demonstrations
-from torchrl_koap.training.run_directory import RunDirectory
 
 TASK = get_task("avoiding")
 WEIGHTS = ("planner.safetensors", "controller.safetensors")

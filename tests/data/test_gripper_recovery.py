@@ -8,12 +8,12 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import GripperRecovery
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.gripper import PLANNED_OPEN_ABOVE, gripper_number
 from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.planner import augmentation
 from torchrl_koap.training.resume import started_with
-from torchrl_koap.training.run_directory import RunDirectory
 
 OPEN, HELD = 0.08, 0.0617
 

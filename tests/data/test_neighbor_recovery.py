@@ -6,11 +6,11 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import NeighborRecovery
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.planner import augmentation
 from torchrl_koap.training.resume import started_with
-from torchrl_koap.training.run_directory import RunDirectory
 
 
 def moved(windows, share, **options):

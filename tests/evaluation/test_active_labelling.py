@@ -13,7 +13,7 @@ from tiny_runs import TINY, koap
 from torchrl_koap.evaluation import active_labelling, training_data
 from torchrl_koap.evaluation.active_labelling import SuggestConfig, rank_trajectories, suggest
 from torchrl_koap.modules import LinearActionDecoder
-from torchrl_koap.training.run_directory import RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectoryError
 
 EPISODE = torch.arange(7).repeat_interleave(torch.tensor([5, 3, 6, 4, 5, 2, 5]))
 KNOWN = EPISODE == 2

@@ -14,7 +14,7 @@ from toy_gym import NAMES, demonstrations
 from torchrl_koap import Agent, EvalConfig, TrainConfig, evaluate, load_policy, save_demonstrations, train
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.modules import EpisodeNoise
-from torchrl_koap.training.checkpoints import load_tensors
+from torchrl_koap.runs.weights import load_tensors
 
 
 @pytest.fixture(scope="module")

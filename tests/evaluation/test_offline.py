@@ -16,8 +16,8 @@ from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, ev
 from torchrl_koap.evaluation.label_errors import summarise_errors
 from torchrl_koap.evaluation.offline import find_faults
 from torchrl_koap.reports.run_report import write_report
+from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.tasks import Task
-from torchrl_koap.training import RunDirectoryError
 
 FEW = EvalConfig(samples=4, threads=1)
 

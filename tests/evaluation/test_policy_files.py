@@ -16,8 +16,8 @@ from torchrl_koap.data import make_demonstrations
 from torchrl_koap.evaluation.policy_files import PolicyDescription
 from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.modules import ChunkedPolicy, PlanThenControl
+from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 from torchrl_koap.tasks import REPLAN_INTERVAL, get_task
-from torchrl_koap.training.checkpoints import CheckpointError, load_tensors, save_tensors
 
 PATH = np.random.default_rng(0).normal(size=(9, 4)) / 100 + np.array([0.5, -0.2, 0.5, -0.2])
 

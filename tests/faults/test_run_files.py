@@ -13,7 +13,7 @@ from fault_damage import DAMAGE, flip
 from fault_ledger import Fault, Place, check, edit_json, meet, table
 from safetensors.torch import save_file
 
-from torchrl_koap.training.checkpoints import load_tensors, save_tensors
+from torchrl_koap.runs.weights import load_tensors, save_tensors
 
 JSON = ("config.json", "digests.json")
 WEIGHTS = ("planner.safetensors", "controller.safetensors")

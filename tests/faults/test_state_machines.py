@@ -17,9 +17,9 @@ from tensordict import TensorDict
 from torch import nn
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories
-from torchrl_koap.training.checkpoints import CheckpointError
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import CheckpointError
 from torchrl_koap.training.loop import train_phase
-from torchrl_koap.training.run_directory import RunDirectory
 
 STEPS = 24
 UNITS = ("trajectory", "window", "transition")

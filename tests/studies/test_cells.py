@@ -14,13 +14,13 @@ import pytest
 import torch
 
 from torchrl_koap.evaluation import EvalConfig
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies import cells
 from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
 from torchrl_koap.studies.table import CELL_COLUMNS
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import run
 from torchrl_koap.training.datasets import load_demonstrations
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 CELL = Cell("linear", 0.25, 1.0, 0)
 ROW = {"task": "avoiding", "label_unit": "trajectory"}

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_koap.runs import pretrained
+from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.studies import paper_tables
 from torchrl_koap.studies.paper_tables import PRESETS, BenchConfig, run_bench
 from torchrl_koap.studies.table import read_cells, write_cells
 from torchrl_koap.tasks import TASKS, get_task
-from torchrl_koap.training import run_lookup
 from torchrl_koap.training.methods import METHODS
-from torchrl_koap.training.run_directory import RunDirectoryError
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def test_a_table_has_the_method_that_a_task_is_trained_with(asked, tmp_path):
 
 def test_quick_takes_the_planners_of_the_repository_unless_told_which_or_how(asked, tmp_path, monkeypatch):
     known = {"aligning": tmp_path / "aligning", "sorting": tmp_path / "sorting"}
-    for module in (paper_tables, run_lookup):
+    for module in (paper_tables, pretrained):
         monkeypatch.setattr(module, "pretrained_folders", lambda: known)
     mine = tmp_path / "mine"
     mine.mkdir()

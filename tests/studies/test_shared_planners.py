@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from tiny_runs import TINY, koap
 
+from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.studies import label_efficiency
 from torchrl_koap.studies.label_efficiency import CurveConfig, run_curve
-from torchrl_koap.training.run_directory import RunDirectoryError
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.action_errors import AFTER, BEFORE, hidden_action_errors, rmse_mm, write_analysis
 from torchrl_koap.training.builders import build_controller
-from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.run_directory import RunDirectory
 
 LENGTHS = (25, 18, 31, 13, 22)
 

@@ -17,13 +17,12 @@ from torchrl_koap.envs.registry import make_env_of, mode_index_of
 from torchrl_koap.keys import validate
 from torchrl_koap.modules import PRESETS
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
+from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.builders import (
     NORMALIZATION,
     build_controller,
-    set_up_torch,
 )
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.diffusion_builders import DENOISERS, build_planner
 from torchrl_koap.training.methods import METHODS
@@ -168,21 +167,6 @@ def test_environments_and_modes_of_a_task():
     env.close()
     flags = torch.tensor([[0, 1, 0, 0, 1, 0, 0, 0, 1], [0] * 9], dtype=torch.bool)
     assert mode_index_of(TASK)(flags).tolist() == [23, -1]
-
-
-@pytest.mark.parametrize(
-    ("threads", "device", "message"),
-    [(0, "cpu", "threads must be >= 1, got 0"), (1, "gpu", "device must be 'cpu' or 'cuda', got 'gpu'")],
-)
-def test_threads_and_device_are_checked(threads, device, message):
-    with pytest.raises(ValueError, match=message):
-        set_up_torch(threads, device)
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_missing_gpu_is_said():
-    with pytest.raises(ValueError, match="'cuda:1' was asked for, but torch finds no CUDA here"):
-        set_up_torch(1, "cuda:1")
 
 
 def test_sizes_of_the_denoiser_are_options():

@@ -8,8 +8,8 @@ import shutil
 import pytest
 from tiny_runs import koap
 
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.training.digests import DIGESTS, changed_files, check_digests, forget_digests, write_digests
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 
 @pytest.fixture

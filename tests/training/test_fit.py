@@ -13,9 +13,9 @@ from tensordict import TensorDict
 from torchrl_koap.data import LabelBudget, cut_windows, load_ted, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.keys import LayoutError
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import WINDOW, get_task
 from torchrl_koap.training import Recipe, TrainConfig, fit_controller, fit_planner, train
-from torchrl_koap.training.checkpoints import load_tensors
 from torchrl_koap.training.resolved import resolve
 
 NAMES = ["q1", "q2", "goal_1", "goal_2"]

@@ -13,9 +13,9 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
-from torchrl_koap.training.checkpoints import CheckpointError, load_tensors
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import CheckpointError, load_tensors
 from torchrl_koap.training.loop import DivergedError, phase_finished, train_phase, warmup_cosine
-from torchrl_koap.training.run_directory import RunDirectory
 
 
 class Interrupt(KeyboardInterrupt):

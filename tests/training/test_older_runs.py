@@ -13,9 +13,9 @@ from offline_runs import save_arm, train_arm
 from tiny_runs import koap
 
 from torchrl_koap.evaluation import load_run
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.training import TrainConfig, train
-from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.run_directory import RunDirectory
 
 # every run had these columns, whatever was logged
 COLUMNS = (

@@ -8,10 +8,10 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.training import loop
 from torchrl_koap.training.loop import train_phase
 from torchrl_koap.training.outlier_gradients import SETTLED, limit_outlier
-from torchrl_koap.training.run_directory import RunDirectory
 
 
 class Regression(nn.Module):

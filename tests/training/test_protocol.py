@@ -13,9 +13,9 @@ from tiny_runs import TINY, koap
 from torchrl_koap.data import flatten_trajectories, load_ted, save_ted
 from torchrl_koap.evaluation import load_run
 from torchrl_koap.modules import SupervisedInverseDynamics, WindowVariationalInverseDynamics
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.resolved import resolve

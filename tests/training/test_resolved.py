@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.resolved import resolve
 
 

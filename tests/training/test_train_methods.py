@@ -14,14 +14,14 @@ from tiny_runs import koap, write_demonstrations
 
 from torchrl_koap.commands.cli import HINT
 from torchrl_koap.data import LabelBudget
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import loop
-from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.methods import METHODS
 from torchrl_koap.training.run import train
-from torchrl_koap.training.run_directory import RunDirectory
 
 TASK = get_task("avoiding")
 TINY = {"steps": 4, "controller_steps": 4, "batch_size": 8, "controller_batch_size": 8, "channels": (8, 16)}

@@ -103,7 +103,7 @@ def _commands() -> tuple[Any, Any, Any]:
             import tyro
 
             from torchrl_koap.commands.subcommands import Subcommand
-            from torchrl_koap.training.progress import without_progress_bars
+            from torchrl_koap.runs.progress import without_progress_bars
         except (ImportError, AttributeError) as error:
             graphics = os.environ.get("MUJOCO_GL")
             hint = f"; is MUJOCO_GL={graphics} possible on this machine?" if graphics else ""

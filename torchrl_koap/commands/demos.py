@@ -14,9 +14,9 @@ from torchrl_koap.envs.experts.recording import expert_of
 from torchrl_koap.envs.experts.recording_report import RecordingReport
 from torchrl_koap.envs.scooping.recording import VideoReport, record_videos
 from torchrl_koap.lookup import lookup
+from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import Task, get_task
-from torchrl_koap.training.plugins import Plugins, load_plugins
-from torchrl_koap.training.progress import count_up_to, progress_bar
 
 
 @dataclass(kw_only=True)

@@ -22,14 +22,14 @@ from torchrl_koap.data.doubts import find_doubts
 from torchrl_koap.data.lerobot.files import is_lerobot
 from torchrl_koap.evaluation import load_run
 from torchrl_koap.keys import validate
+from torchrl_koap.runs.device import has_bfloat16_units
+from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.progress import count_up_to, progress_bar
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import Task
-from torchrl_koap.training import RunDirectory, RunDirectoryError
-from torchrl_koap.training.checkpoints import load_tensors
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.digests import DIGESTS
-from torchrl_koap.training.plugins import Plugins, load_plugins
-from torchrl_koap.training.precision import has_bfloat16_units
-from torchrl_koap.training.progress import count_up_to, progress_bar
 
 _NO_LABELS = "none: `koap train` needs a few"
 _LATER = (DIGESTS, "eval.json", "inspect.json", "suggestions.json")  # files that a run may have

@@ -12,11 +12,8 @@ import tyro
 from torchrl_koap.commands.command import Command, Options
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.offline import KIND, describe_offline
-from torchrl_koap.reports.pictures import FOLDER
 from torchrl_koap.reports.run_report import write_report
-from torchrl_koap.training.loggers import check_logger, close_logger, log_evaluation, make_logger
-
-FILMS = ("rollouts.gif", "film.gif")
+from torchrl_koap.runs.progress import check_logger, log_scores, open_logger
 
 
 @dataclass(kw_only=True)
@@ -28,8 +25,8 @@ class Eval(Command):
         config: all options of the rollouts.
         report: draw the pictures and write the report.
         animate: make an animation of the rollouts for the report.
-        logger: where figures and films go besides the run directory: wandb (offline unless WANDB_MODE says otherwise),
-            tensorboard or mlflow; each needs its extra.
+        logger: where scores go besides the run directory: wandb (offline unless WANDB_MODE says otherwise) or
+            tensorboard; each needs its extra.
     """
 
     run: tyro.conf.Positional[str]
@@ -45,15 +42,7 @@ class Eval(Command):
         folder = Path(self.run) if self.config.out is None else self.config.out
         if self.report:
             write_report(folder, animation=self.animate)
-        logger = make_logger(self.logger, folder)
-        if logger is not None:
-            films = [
-                film
-                for film in map((folder / FOLDER).joinpath, FILMS)
-                if self.report and self.animate and film.is_file()
-            ]
-            try:
-                log_evaluation(logger, result, films)
-            finally:
-                close_logger(logger)
+        with open_logger(self.logger, folder) as logger:
+            if logger is not None:
+                log_scores(logger, result)
         return describe_offline(result) if result.get("kind") == KIND else result

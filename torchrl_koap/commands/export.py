@@ -15,9 +15,9 @@ from torchrl_koap.evaluation.latency import time_calls
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PlanThenControl
 from torchrl_koap.modules.execution.export import PARTS, SUFFIXES, export_part, exportable
-from torchrl_koap.training.builders import set_up_torch
-from torchrl_koap.training.pretrained import writable_folder
-from torchrl_koap.training.progress import progress_bar
+from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.pretrained import writable_folder
+from torchrl_koap.runs.progress import progress_bar
 
 
 @dataclass(kw_only=True)

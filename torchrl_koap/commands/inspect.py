@@ -14,7 +14,7 @@ from torchrl_koap.reports.diagnosis_plot import plot_inspection
 from torchrl_koap.reports.latent_plot import plot_latent
 from torchrl_koap.reports.pictures import FOLDER
 from torchrl_koap.reports.run_report import write_report
-from torchrl_koap.training import RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory
 
 
 @dataclass(kw_only=True)

@@ -10,7 +10,7 @@ import tyro
 
 from torchrl_koap.commands.command import Command, Options
 from torchrl_koap.evaluation import SuggestConfig, SuggestedLabels, suggest
-from torchrl_koap.training import RunDirectory
+from torchrl_koap.runs.run_directory import RunDirectory
 
 
 @dataclass(kw_only=True)

@@ -24,8 +24,8 @@ from torchrl_koap.evaluation.training_data import hide_labels_again, load_traini
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.training.builders import set_up_torch
-from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.plugins import Plugins, load_plugins
 
 _FEW = 5  # suggestions that are made unasked
 _MEAN_SPREAD = 30.0  # prior deviation of a fitted mean against that of what the latent actions explain: nearly free

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
-from torchrl_koap.training.plugins import Plugins
+from torchrl_koap.runs.plugins import Plugins
 
 CONTROLLERS = ("learned", "oracle")
 MOST_EPISODES = 100_000  # kept in memory

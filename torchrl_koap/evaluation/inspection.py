@@ -30,12 +30,12 @@ from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy,
 from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_run
 from torchrl_koap.evaluation.training_data import load_training_data
 from torchrl_koap.modules import KoopmanInverseDynamics
+from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.pretrained import writable_folder
+from torchrl_koap.runs.progress import progress_bar
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import Task
-from torchrl_koap.training.builders import set_up_torch
-from torchrl_koap.training.plugins import Plugins, load_plugins
-from torchrl_koap.training.pretrained import writable_folder
-from torchrl_koap.training.progress import progress_bar
-from torchrl_koap.training.run_directory import RunDirectory
 
 _NEAR = 0.015  # m; recorded tool paths followed within this are followed well
 

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from torchrl_koap.evaluation.trained_run import load_policy, load_run
 from torchrl_koap.modules import Agent, AsynchronousAgent
-from torchrl_koap.training.builders import set_up_torch
-from torchrl_koap.training.plugins import Plugins, load_plugins
+from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.plugins import Plugins, load_plugins
 
 
 @dataclass

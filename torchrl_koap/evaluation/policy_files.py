@@ -18,14 +18,14 @@ from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ChunkedPolicy, RecedingHorizonPolicy, StatePlanner
 from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
+from torchrl_koap.runs.plugins import load_plugins
+from torchrl_koap.runs.weights import CheckpointError, check_weights, load_tensors, save_tensors
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task, get_task
 from torchrl_koap.tasks.json_format import import_strings_of, plain_task_from_json
 from torchrl_koap.training.builders import build_controller, method_named
-from torchrl_koap.training.checkpoints import CheckpointError, check_weights, load_tensors, save_tensors
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.fit import Recipe
 from torchrl_koap.training.method import Method
-from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.provenance import versions
 
 FORMAT, VERSION = "torchrl_koap policy", 1

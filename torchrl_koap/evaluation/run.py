@@ -15,11 +15,11 @@ from torchrl_koap.evaluation.places import choose_contexts, place_of
 from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_policy, load_run
-from torchrl_koap.training.builders import set_up_torch
-from torchrl_koap.training.checkpoints import save_tensors
-from torchrl_koap.training.plugins import load_plugins
-from torchrl_koap.training.pretrained import writable_folder
-from torchrl_koap.training.progress import count_up_to, progress_bar
+from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.plugins import load_plugins
+from torchrl_koap.runs.pretrained import writable_folder
+from torchrl_koap.runs.progress import count_up_to, progress_bar
+from torchrl_koap.runs.weights import save_tensors
 
 
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:

@@ -20,14 +20,14 @@ from torchrl_koap.evaluation.policy_files import (
 )
 from torchrl_koap.evaluation.rollouts import make_gain, make_leash
 from torchrl_koap.modules import RecedingHorizonPolicy, StatePlanner
+from torchrl_koap.runs.plugins import load_plugins
+from torchrl_koap.runs.pretrained import find_run
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.weights import CheckpointError, load_weights
 from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
 from torchrl_koap.training.builders import method_named
-from torchrl_koap.training.checkpoints import CheckpointError, load_weights
 from torchrl_koap.training.digests import check_digests
 from torchrl_koap.training.method import Method
-from torchrl_koap.training.plugins import load_plugins
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.training.run_lookup import find_run
 
 
 @dataclass(frozen=True)

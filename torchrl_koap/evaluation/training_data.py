@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import LabelReport
+from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.training.datasets import load_demonstrations
-from torchrl_koap.training.run_directory import RunDirectoryError
 
 if TYPE_CHECKING:
     from torchrl_koap.evaluation.trained_run import TrainedRun

@@ -13,7 +13,7 @@ from torchrl_koap.reports.html import bar, duration, number, write_page
 from torchrl_koap.reports.mode_plots import even_entropy
 from torchrl_koap.reports.pictures import FOLDER, all_pictures, draw_pictures, run_facts
 from torchrl_koap.reports.style import thousandths
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
 ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
 _SIMULATED = ("rollouts.safetensors", "inspect.json")

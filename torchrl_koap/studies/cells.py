@@ -14,8 +14,9 @@ from typing import Any
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.offline import KIND
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks.units import thousandths
-from torchrl_koap.training import RunDirectory, RunDirectoryError, TrainConfig, get_method, train
+from torchrl_koap.training import TrainConfig, get_method, train
 from torchrl_koap.training.run import train_shared_planner
 
 DONE = "cell.json"

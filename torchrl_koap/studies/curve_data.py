@@ -12,12 +12,12 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, read_task, save_ted, subsample_trajectories
 from torchrl_koap.data.label_budget import Unit
+from torchrl_koap.runs.progress import count_up_to, progress_bar
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.studies.cells import Cell
 from torchrl_koap.studies.curve_folder import dataset_of
 from torchrl_koap.tasks import HISTORY, WINDOW, Task, get_task
 from torchrl_koap.training.datasets import load_demonstrations
-from torchrl_koap.training.progress import count_up_to, progress_bar
-from torchrl_koap.training.run_directory import RunDirectory
 
 if TYPE_CHECKING:
     from torchrl_koap.studies.label_efficiency import CurveConfig

@@ -7,9 +7,9 @@ import os
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, get_type_hints
 
+from torchrl_koap.runs.config_files import check_types
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.cell_options import OPTION_NAMES
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.training.saved_options import check_types
 
 if TYPE_CHECKING:
     from torchrl_koap.studies.label_efficiency import CurveConfig

@@ -10,6 +10,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.pretrained import find_run
+from torchrl_koap.runs.progress import progress_bar
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.studies.cell_options import (
     CellOptions,
     check_cell_options,
@@ -25,16 +30,11 @@ from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.tasks import Task
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.methods import get_method
-from torchrl_koap.training.plugins import Plugins, load_plugins
-from torchrl_koap.training.progress import progress_bar
 from torchrl_koap.training.released_settings import get_released
 from torchrl_koap.training.resolved import resolve
 from torchrl_koap.training.run import check_networks
-from torchrl_koap.training.run_directory import RunDirectory
-from torchrl_koap.training.run_lookup import find_run
 
 ALL = "koap,koap_labelled_only,linear,dd,vae,lapo,dp,relabel,nonlinear,pretrain"
 

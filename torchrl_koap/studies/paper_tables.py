@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_koap.lookup import lookup
+from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.pretrained import PREFIX, pretrained_folders
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.cell_options import OPTION_NAMES, PLANNER, CellOptions
 from torchrl_koap.studies.label_efficiency import CurveConfig, check_curve, run_curve
 from torchrl_koap.studies.paper_layout import write_paper_layout
@@ -17,9 +20,6 @@ from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.studies.table import read_cells, write_cells
 from torchrl_koap.tasks import TASKS, Task, get_task
 from torchrl_koap.training.methods import METHODS
-from torchrl_koap.training.plugins import Plugins, load_plugins
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.training.run_lookup import PREFIX, pretrained_folders
 
 PAPER_TASKS = tuple(name for name, task in TASKS.items() if task.in_paper)
 # a planner of these is as good as any that was tried (docs/results/planners.md)

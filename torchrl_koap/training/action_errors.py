@@ -12,11 +12,11 @@ from torch import Tensor, nn
 
 from torchrl_koap.data import controller_view, cut_windows
 from torchrl_koap.modules import LinearInverseDynamics
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.units import thousandths
-from torchrl_koap.training.checkpoints import save_tensors
 from torchrl_koap.training.closed_form import fit_closed_form
-from torchrl_koap.training.run_directory import RunDirectory
 
 # frames of the evaluation windows: enough history and look-ahead for every controller compared
 BEFORE, AFTER = 8, 11

@@ -1,12 +1,11 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Builds controllers from the plain options that a run directory keeps in ``config.json``, and sets up torch."""
+"""Builds controllers from the plain options that a run directory keeps in ``config.json``."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from torch import nn
 
@@ -15,8 +14,6 @@ from torchrl_koap.modules import Normalizer
 from torchrl_koap.training.method import Method, normalizers_of
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.released_settings import get_released
-
-_MOST_THREADS = 1024
 
 # what every preset was designed with: how states and actions are normalised
 NORMALIZATION = {
@@ -77,31 +74,3 @@ def method_named(options: Mapping[str, Any]) -> Method:
         return get_released(options["method"]).method
     method = get_method(options["method"], options.get("decoder"))
     return get_method(method.earlier) if method.earlier and not options.get("revised") else method
-
-
-def set_up_torch(threads: int, device: str) -> None:
-    """Sets the number of threads and checks that the device is there.
-
-    Args:
-        threads (int): number of torch threads, at least 1.
-        device (str): ``"cpu"`` or ``"cuda"``, with an index or not.
-
-    Raises:
-        ValueError: if the number is below 1, or this machine has no such device.
-    """
-    if threads < 1:
-        raise ValueError(f"threads must be >= 1, got {threads}")
-    kind, colon, index = device.partition(":")
-    if kind not in ("cpu", "cuda") or (colon and not index.isdecimal()):
-        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
-    if kind == "cpu" and int(index or 0) > 0:
-        raise ValueError(
-            f"device must be 'cpu' or 'cuda', got {device!r}: there is one processor, as far as torch knows"
-        )
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device {device!r} was asked for, but torch finds no CUDA here (see `koap doctor`)")
-    if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
-        raise ValueError(f"device {device!r} was asked for, but there are {torch.cuda.device_count()}, counted from 0")
-    if threads > _MOST_THREADS:
-        raise ValueError(f"threads must be at most {_MOST_THREADS}, got {threads}")
-    torch.set_num_threads(threads)

@@ -1,10 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Weights as safetensors with a JSON header, and training states from which a run goes on bit for bit."""
+"""Training states from which a run goes on bit for bit: parameters, optimiser, random numbers."""
 
 from __future__ import annotations
 
-import errno
-import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -12,159 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from torchrl_koap.files import replacing_file
-from torchrl_koap.modules import Normalizer
-from torchrl_koap.training.compact_weights import expand
-
-_LENGTH = 64  # digits of a checksum
-_SHA256 = "sha256"  # among the facts of a file: the checksum of its tensors and of the other facts
-
+from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
 
 _MOMENTS = {"step", "exp_avg", "exp_avg_sq"}  # what AdamW keeps of a parameter
-
-
-class CheckpointError(ValueError):
-    """A file of weights that cannot be used: damaged, of another task, or without its statistics."""
-
-
-def save_weights(path: str | Path, module: nn.Module, about: Mapping[str, Any]) -> None:
-    """Writes the state dict of a module, normaliser statistics included, in one go.
-
-    Args:
-        path (str or Path): file to write.
-        module (nn.Module): the module.
-        about (mapping): JSON-serialisable facts kept in the header; ``task`` is checked by :func:`load_weights`.
-    """
-    save_tensors(path, module.state_dict(), about)
-
-
-def load_weights(path: str | Path, module: nn.Module, *, task: str) -> dict[str, Any]:
-    """Loads weights into a module of the same architecture.
-
-    Args:
-        path (str or Path): the file.
-        module (nn.Module): receives the weights.
-        task (str): name of the task that they must have been trained on.
-
-    Returns:
-        dict: the facts in the header.
-
-    Raises:
-        CheckpointError: if the file is missing or damaged, belongs to another task, lacks entries (a normaliser's
-            statistics, say) or has entries of other shapes.
-    """
-    tensors, about = load_tensors(path)
-    if about.get("task") != task:
-        raise CheckpointError(f"{path} was trained on task {about.get('task')!r}, not on {task!r}")
-    try:
-        module.load_state_dict(expand(tensors))
-    except RuntimeError as error:
-        problems = " ".join(str(error).split("\n", 1)[-1].split())
-        raise CheckpointError(f"{path} does not fit the model: {problems}") from error
-    check_weights(path, module)
-    return about
-
-
-def check_weights(path: str | Path, module: nn.Module) -> None:
-    """Refuses weights with which nothing can be computed.
-
-    Args:
-        path (str or Path): the file they are from, for the message.
-        module (nn.Module): the module that has received them.
-
-    Raises:
-        CheckpointError: naming an entry that is NaN or infinite, or a normaliser whose scale is not positive.
-    """
-    for name, value in module.named_parameters():  # of a buffer that nobody has fitted NaN says just that
-        if not value.isfinite().all():
-            raise CheckpointError(f"{path} is damaged: {name} is NaN or infinite")
-    for name, part in module.named_modules():
-        if not isinstance(part, Normalizer) or not part.is_fitted:
-            continue
-        if not part.offset.isfinite().all() or not part.scale.isfinite().all() or not (part.scale > 0).all():
-            raise CheckpointError(
-                f"{path} is damaged: {name} needs a finite offset and a finite, positive scale,"
-                f" got {part.offset.tolist()} and {part.scale.tolist()}"
-            )
-
-
-def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
-    """Writes tensors and facts to one safetensors file, aside and renamed.
-
-    Args:
-        path (str or Path): the file; it is complete or not there.
-        tensors (mapping): tensors by name, on any device.
-        about (mapping, optional): facts for the header, plain JSON types.
-    """
-    tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    with replacing_file(path) as aside:
-        try:
-            # one entry alone: of several the order in the file would be another one every time
-            facts = dict(about or {})
-            save_file(tensors, aside, metadata={"about": json.dumps(facts | {_SHA256: _digest(tensors, facts)})})
-        except SafetensorError as error:  # it has no errno
-            raise OSError(errno.EIO, str(error)) from error
-
-
-def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Reads what :func:`save_tensors` wrote.
-
-    Raises:
-        CheckpointError: if the file is missing or damaged.
-
-    Examples:
-        >>> import tempfile, torch
-        >>> from torchrl_koap.training.checkpoints import load_tensors, save_tensors
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save_tensors(f"{folder}/a.safetensors", {"x": torch.ones(2)}, {"task": "avoiding"})
-        ...     load_tensors(f"{folder}/a.safetensors")
-        ({'x': tensor([1., 1.])}, {'task': 'avoiding'})
-    """
-    if not Path(path).is_file():
-        raise CheckpointError(f"{path} is missing")
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {"about": "{}"}
-        if "about" not in metadata:
-            raise ValueError(f"its header has {', '.join(metadata)} instead of facts")
-        about = json.loads(metadata["about"])
-        if not isinstance(about, dict):
-            raise ValueError(f"its facts are no object but {type(about).__name__}")
-        tensors = load_file(path)
-    except (SafetensorError, ValueError, RecursionError, OSError) as error:
-        raise CheckpointError(f"{path} is damaged: {error}") from error
-    facts = {name: value for name, value in about.items() if name != _SHA256}
-    if not _is_as_written(tensors, facts, about, metadata["about"]):
-        raise CheckpointError(f"{path} is damaged: its content is not what was written (checksum)")
-    return tensors, facts
-
-
-def _is_as_written(
-    tensors: Mapping[str, Tensor], facts: Mapping[str, Any], about: Mapping[str, Any], text: str
-) -> bool:
-    """Whether tensors and facts have their checksum; in files of before that is of the tensors alone, or missing."""
-    if _SHA256 not in about:
-        called = [name for name, value in facts.items() if isinstance(value, str) and len(value) == _LENGTH]
-        rests = [{name: value for name, value in facts.items() if name != other} for other in called]
-        return not any(facts[name] == _digest(tensors, rest) for name, rest in zip(called, rests, strict=True))
-    if about[_SHA256] == _digest(tensors, facts):
-        return json.dumps(about) == text
-    return about[_SHA256] == _digest(tensors)
-
-
-def _digest(tensors: Mapping[str, Tensor], facts: Mapping[str, Any] | None = None) -> str:
-    digest = hashlib.sha256()
-    if facts is not None:
-        digest.update(json.dumps(facts).encode())
-    for name in sorted(tensors):
-        value = tensors[name].detach().cpu().contiguous()
-        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
-        digest.update(value.reshape(-1).view(torch.uint8).numpy())
-    return digest.hexdigest()
 
 
 def save_training_state(

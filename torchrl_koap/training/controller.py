@@ -17,21 +17,21 @@ from torchrl_koap.data import WindowTable, cut_windows, extrapolate_ends, make_w
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.compact_lifting import UNFOLD_UPDATES
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.device import training_dtype
+from torchrl_koap.runs.progress import count_up_to, progress_bar, show_losses
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import save_tensors, save_weights
 from torchrl_koap.tasks import HORIZON, WINDOW
 from torchrl_koap.training import released_settings
 from torchrl_koap.training.builders import build_controller
-from torchrl_koap.training.checkpoints import save_tensors, save_weights
 from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.method import COEFFICIENTS, LABELLED_SHARES, Method, Phase
 from torchrl_koap.training.planner import augmentation, planner_weight_decay
 from torchrl_koap.training.posture import POSTURE_SHARE, UPDATES, fit_posture
-from torchrl_koap.training.precision import training_dtype
-from torchrl_koap.training.progress import count_up_to, progress_bar, show_losses
 from torchrl_koap.training.resolved import ResolvedConfig
 from torchrl_koap.training.response import fit_response
-from torchrl_koap.training.run_directory import RunDirectory
 
 _KEYS = ["state", "action", "has_action"]
 

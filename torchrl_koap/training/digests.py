@@ -11,8 +11,8 @@ import hashlib
 import json
 
 from torchrl_koap.files import sha256_of
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.training.resume import FREE
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
 
 DIGESTS = "digests.json"
 OF = ("config.json", "planner.safetensors", "controller.safetensors", "eigenvalues.safetensors")
@@ -51,7 +51,7 @@ def changed_files(run: RunDirectory) -> list[str]:
     Examples:
         >>> import tempfile
         >>> from torchrl_koap.training.digests import changed_files, write_digests
-        >>> from torchrl_koap.training.run_directory import RunDirectory
+        >>> from torchrl_koap.runs.run_directory import RunDirectory
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     run = RunDirectory(folder)
         ...     run.write_json("config.json", {"steps": 3, "threads": 1})

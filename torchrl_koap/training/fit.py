@@ -20,12 +20,12 @@ from torchrl_koap import keys
 from torchrl_koap.data import mark_labels, select_state
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import InverseDynamics, StatePlanner
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.progress import without_progress_bars
 from torchrl_koap.tasks import Task
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.controller import learn_actions
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.planner import learn_states
-from torchrl_koap.training.progress import without_progress_bars
 from torchrl_koap.training.resolved import ResolvedConfig, resolve
 
 PLANNER_OPTIONS = (

@@ -15,9 +15,10 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.objectives import SoftUpdate
 
-from torchrl_koap.training.checkpoints import CheckpointError, load_training_state, save_training_state
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import CheckpointError
+from torchrl_koap.training.checkpoints import load_training_state, save_training_state
 from torchrl_koap.training.outlier_gradients import limit_outlier
-from torchrl_koap.training.run_directory import RunDirectory
 
 
 def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:

@@ -47,9 +47,9 @@ from torchrl_koap.objectives import (
     QuantizedDynamicsLoss,
     VariationalLoss,
 )
+from torchrl_koap.runs.plugins import load_entry_points
 from torchrl_koap.training.diffusion_builders import build_diffusion_policy
 from torchrl_koap.training.method import Method, Phase
-from torchrl_koap.training.plugins import load_entry_points
 from torchrl_koap.training.posture import build_posture
 
 LOOK_AHEAD = (1, 2, 3, 4, 5)

@@ -21,15 +21,15 @@ from torchrl_koap.data import (
 )
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.objectives import PlannerLoss
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.device import training_dtype
+from torchrl_koap.runs.progress import progress_bar, show_losses
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_weights, save_weights
 from torchrl_koap.tasks import HISTORY, Task
-from torchrl_koap.training.checkpoints import load_weights, save_weights
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.loop import moving_average, phase_finished, train_phase
-from torchrl_koap.training.precision import training_dtype
-from torchrl_koap.training.progress import progress_bar, show_losses
 from torchrl_koap.training.resolved import ResolvedConfig
-from torchrl_koap.training.run_directory import RunDirectory
 
 
 def train_planner(

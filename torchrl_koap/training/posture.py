@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, STATE
 from torchrl_koap.modules import CommandPosture
+from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
-from torchrl_koap.training.progress import progress_bar
 
 LABEL_COMMAND = "label_command"  # commands in force at labelled steps [N, J], NaN elsewhere
 POSTURE_SHARE = 16  # updates of a posture for each of the controller's, up to UPDATES

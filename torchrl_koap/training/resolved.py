@@ -13,17 +13,17 @@ from torchrl_koap.data import LabelBudget, controller_view
 from torchrl_koap.data.label_budget import Unit
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.device import PRECISIONS
+from torchrl_koap.runs.progress import check_logger
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
-from torchrl_koap.training.config import TrainConfig
 from torchrl_koap.training.datasets import find_task_of
-from torchrl_koap.training.loggers import check_logger
 from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.posture import posture_columns
-from torchrl_koap.training.precision import PRECISIONS
 from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.response import tracked_columns
-from torchrl_koap.training.run_directory import RunDirectory
 from torchrl_koap.training.validation import default_fraction
 
 # defaults for data that lack labels or came without an environment, and for all others

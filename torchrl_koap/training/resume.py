@@ -10,8 +10,8 @@ from typing import Any
 
 from torchrl._utils import logger
 
-from torchrl_koap.training.config import TrainConfig
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
 # with which a run may be resumed differently; with other threads sums are rounded differently
 FREE = frozenset(

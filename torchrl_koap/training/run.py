@@ -12,24 +12,24 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import WindowTable, subsample_trajectories
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.plugins import load_plugins
+from torchrl_koap.runs.progress import count_up_to, open_logger, progress_bar
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_weights
 from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training.action_errors import AFTER, BEFORE, error_entry, write_analysis
-from torchrl_koap.training.builders import build_controller, set_up_torch
-from torchrl_koap.training.checkpoints import load_weights
-from torchrl_koap.training.config import TrainConfig
+from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.controller import train_controller
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.digests import forget_digests, write_digests
-from torchrl_koap.training.loggers import close_logger, make_logger
 from torchrl_koap.training.planner import train_planner
-from torchrl_koap.training.plugins import load_plugins
 from torchrl_koap.training.posture import with_label_commands
-from torchrl_koap.training.progress import count_up_to, progress_bar
 from torchrl_koap.training.provenance import fingerprint, to_json
 from torchrl_koap.training.resolved import ResolvedConfig, resolve
 from torchrl_koap.training.resume import begun_by, check_data, check_resume, started_with
-from torchrl_koap.training.run_directory import RunDirectory
 from torchrl_koap.training.validation import choose_validation, validation_of, without_validation
 
 
@@ -108,8 +108,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         run.write_json("config.json", content)  # not before the data are known to be good: a wrong call leaves nothing
 
         began = time.perf_counter()
-        logger = make_logger(options.logger, options.out)
-        try:
+        with open_logger(options.logger, options.out) as logger:
             torch.manual_seed(options.seed)
             planner, planner_values = None, dict[str, Any]()
             if resolved.method.has_planner:
@@ -117,8 +116,6 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
             planned = time.perf_counter()
             torch.manual_seed(options.seed)  # the controller does not depend on where the planner is from
             controller, fit, controller_values = train_controller(run, resolved, labelled, logger)
-        finally:
-            close_logger(logger)
         summary = {
             "labels": report.as_dict(),
             "trajectories_used": len(labelled["episode"].unique()),

@@ -12,8 +12,8 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import trajectory_lengths
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import Task
-from torchrl_koap.training.run_directory import RunDirectory
 
 WITHOUT_ENVIRONMENT = 0.1  # share that is held out by default where no rollout can tell what a planner is worth
 

@@ -16,8 +16,8 @@ from torchrl_koap.evaluation import EvalConfig
 from torchrl_koap.evaluation.rollouts import make_gain
 from torchrl_koap.evaluation.trained_run import execution_of
 from torchrl_koap.modules import ChunkedPolicy, CommandLeash, DiffusionPolicy, PlanThenControl, TemporalUnet
+from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.run_lookup import find_run
 
 GAINS = torch.tensor([1.0, 2.0, 3.0, 4.0])
 

@@ -13,8 +13,8 @@ from torchrl_koap import load_policy, save_policy
 from torchrl_koap.evaluation import EvalConfig
 from torchrl_koap.evaluation.rollouts import make_leash
 from torchrl_koap.modules import CommandLeash, PlanThenControl
+from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.run_lookup import find_run
 
 COLUMNS = {"commands": [0, 1], "positions": [2, 3], "actions": [0, 1]}
 

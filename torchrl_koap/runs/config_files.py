@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from torchrl_koap.training.run_directory import RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectoryError
 
 # what `config.json` holds besides the options: how planner and controller are built
 PLANNER = {
@@ -58,7 +58,7 @@ def check_config(path: str | Path, content: Mapping[str, Any]) -> None:
         RunDirectoryError: naming file, entry, the type that was wanted and what is there.
 
     Examples:
-        >>> from torchrl_koap.training.saved_options import check_config
+        >>> from torchrl_koap.runs.config_files import check_config
         >>> check_config("config.json", {"seed": 3, "planner": {"channels": [8, 16]}})
         >>> try:
         ...     check_config("config.json", {"planner": {"channels": 8.5}})
@@ -66,7 +66,7 @@ def check_config(path: str | Path, content: Mapping[str, Any]) -> None:
         ...     print(error)
         config.json is damaged: entry 'planner.channels' must be a list of int, got 8.5
     """
-    from torchrl_koap.training.config import TrainConfig  # it reads run directories itself
+    from torchrl_koap.runs.config import TrainConfig  # it reads run directories itself
 
     kinds = get_type_hints(TrainConfig)
     kinds |= {"task": str, "planner": dict, "controller": dict, "validation_episodes": tuple[int, ...], "data": dict}

@@ -8,7 +8,7 @@ import os
 
 import pytest
 
-from torchrl_koap.training.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
 
 @pytest.fixture

@@ -7,15 +7,16 @@ import json
 
 import pytest
 import torch
+from publish_pretrained import publish
 from tiny_runs import TINY, koap, write_demonstrations
 
 from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.studies.paper_tables import PRESETS, BenchConfig, _curves
-from torchrl_koap.training import run_lookup
-from torchrl_koap.training.checkpoints import load_tensors
-from torchrl_koap.training.pretrained import copy_run, publish
-from torchrl_koap.training.run_directory import RunDirectoryError
-from torchrl_koap.training.run_lookup import find_run
+from torchrl_koap.runs import pretrained
+from torchrl_koap.runs.weights import load_tensors
+from torchrl_koap.runs.pretrained import copy_run
+from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.runs.pretrained import find_run
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def policies(run, tmp_path, monkeypatch):
 
 
 def test_names(policies):
-    assert find_run("runs/mine") == run_lookup.Path("runs/mine")
+    assert find_run("runs/mine") == pretrained.Path("runs/mine")
     assert find_run("pretrained:avoiding").resolve() == policies / "avoiding"
     with pytest.raises(ValueError, match="unknown pretrained policy 'algning'; did you mean 'aligning'"):
         find_run("pretrained:algning")
@@ -46,7 +47,7 @@ def test_names(policies):
 
 def test_an_installed_wheel_has_none(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_lookup, "__file__", str(tmp_path / "site-packages" / "torchrl_koap" / "training" / "x.py"))
+    monkeypatch.setattr(pretrained, "__file__", str(tmp_path / "site-packages" / "torchrl_koap" / "training" / "x.py"))
     with pytest.raises(RunDirectoryError, match="no folder 'pretrained' here or beside the package"):
         find_run("pretrained:aligning")
 
@@ -140,35 +141,3 @@ def test_another_run_is_not_overwritten(run, tmp_path):
     with pytest.raises(RunDirectoryError, match="holds another run than"):
         copy_run(run, tmp_path / "mine")
     assert json.loads((tmp_path / "mine" / "config.json").read_text())["seed"] == 9
-
-
-def test_options_of_the_planner_are_written_and_trained_with(tmp_path):
-    data = write_demonstrations(tmp_path / "data")
-    arguments = ("--task", "avoiding", "--dataset", data, "--controller-steps", "5", "--no-analysis", *TINY)
-    sizes = ("--denoiser", "film", "--denoiser-width", "32", "--denoiser-depth", "2", "--condition-octaves", "1")
-    ways = (
-        "--dropout",
-        "0.1",
-        "--planner-weight-decay",
-        "1e-3",
-        "--first-steps-weight",
-        "4",
-        "--precision",
-        "bfloat16",
-    )
-    assert koap("train", "--out", tmp_path / "run", *arguments, *sizes, *ways) == 0
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
-    chosen = {name: config["planner"][name] for name in ("width", "depth", "frequencies", "dropout")}
-    assert chosen == {"width": 32, "depth": 2, "frequencies": 1, "dropout": 0.1}
-    planner = load_run(tmp_path / "run").planner
-    assert planner.denoiser.film is not None and not planner.training
-    assert koap("train", "--out", tmp_path / "no", *arguments, "--precision", "float8") == 1
-    assert koap("train", "--out", tmp_path / "run", "--resume") == 0  # with all of these options, none named again
-
-
-def test_a_run_from_before_these_options_can_be_resumed(run):
-    config = json.loads((run / "config.json").read_text())
-    new = ("denoiser_width", "denoiser_depth", "condition_octaves", "dropout", "precision", "candidates")
-    assert all(config.pop(name) is None for name in new) and not set(config["planner"]) & {"width", "depth", "dropout"}
-    (run / "config.json").write_text(json.dumps(config))
-    assert koap("train", "--out", run, "--resume") == 0

@@ -6,8 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from torchrl_koap.training.plugins import Plugins
-from torchrl_koap.training.run_lookup import find_run
+from torchrl_koap.runs.plugins import Plugins
+from torchrl_koap.runs.pretrained import find_run
 
 
 @dataclass
@@ -88,8 +88,8 @@ class TrainConfig:
         checkpoint_every: updates between two checkpoints, from which --resume goes on.
         resume: go on with an interrupted run; options left at their defaults are those it was started with.
         force_data: resume although the demonstrations, or the version of this package, are others than at the start.
-        logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise), "tensorboard"
-            or "mlflow" (in the run directory unless MLFLOW_TRACKING_URI says otherwise).
+        logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise) or
+            "tensorboard".
         analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
         plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
             reads the run.

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrl_koap.studies.paper_tables import SMALL_PLANNER, WIDE_PLANNER
-from torchrl_koap.training.precision import has_bfloat16_units, training_dtype
+from torchrl_koap.runs.device import has_bfloat16_units, set_up_torch, training_dtype
 
 
 @pytest.fixture(params=["amx_bf16", "avx512_bf16", None])
@@ -42,3 +42,18 @@ def test_another_precision_is_refused_by_name():
 
 def test_comparisons_train_planners_with_what_the_machine_is_quick_at():
     assert WIDE_PLANNER["precision"] == SMALL_PLANNER["precision"] == "auto"
+
+
+@pytest.mark.parametrize(
+    ("threads", "device", "message"),
+    [(0, "cpu", "threads must be >= 1, got 0"), (1, "gpu", "device must be 'cpu' or 'cuda', got 'gpu'")],
+)
+def test_threads_and_device_are_checked(threads, device, message):
+    with pytest.raises(ValueError, match=message):
+        set_up_torch(threads, device)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_missing_gpu_is_said():
+    with pytest.raises(ValueError, match="'cuda:1' was asked for, but torch finds no CUDA here"):
+        set_up_torch(1, "cuda:1")

@@ -1,14 +1,23 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Bars: shown, not shown, and never in the way of the work."""
+"""Bars are never in the way of the work; loggers write into the run directory, and what is missing is named before."""
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import sys
 
 import pytest
+from late_files import wait_for
 
-from torchrl_koap.training.progress import progress_bar, show_losses, without_progress_bars
+from torchrl_koap.runs.progress import (
+    check_logger,
+    log_scores,
+    open_logger,
+    progress_bar,
+    show_losses,
+    without_progress_bars,
+)
 
 
 class Full(io.StringIO):
@@ -82,3 +91,38 @@ def test_a_bar_of_a_terminal_is_drawn_over_itself(monkeypatch):
     monkeypatch.setattr(sys, "stderr", stream)
     counted()
     assert stream.getvalue().count("\r") > 5 and stream.getvalue().count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["wandb", "tensorboard"])
+def test_a_missing_package_names_the_extra(name, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda *args: None)
+    with pytest.raises(ValueError, match=rf"--logger {name} needs an extra: pip install 'torchrl_koap\[{name}\]'"):
+        check_logger(name)
+
+
+def test_unknown_loggers_suggest_the_nearest():
+    with pytest.raises(ValueError, match="unknown logger 'tensorbord'; did you mean 'tensorboard'"):
+        check_logger("tensorbord")
+
+
+def test_metrics_csv_needs_no_logger(tmp_path):
+    with open_logger("csv", tmp_path) as logger:
+        assert logger is None
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["wandb", "tensorboard"])
+def test_losses_and_scores_arrive_in_the_run_directory(name, tmp_path, monkeypatch):
+    pytest.importorskip(name)
+    for variable in ("WANDB_MODE", "WANDB_DIR"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "run"
+    with open_logger(name, run) as logger:
+        logger.log_scalar("planner/loss_planner", 0.5, step=1)
+        log_scores(logger, {"success_rate": 0.625, "episodes": 8, "kind": "closed loop", "entropy": float("nan")})
+    assert wait_for(b"eval/success_rate", tmp_path)
+    written = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not any(b"eval/entropy" in path.read_bytes() for path in written)
+    assert all(run in path.parents for path in written), written

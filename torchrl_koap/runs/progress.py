@@ -1,18 +1,25 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Progress bars, which can be turned off for a while and never end what they are the bar of."""
+"""Progress bars, which never end what they are the bar of, and loggers beside ``metrics.csv``."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import io
+import math
 import os
 import stat
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
+from pathlib import Path
 from typing import Any, TextIO
 
 from tqdm import tqdm
+
+from torchrl_koap.lookup import lookup
+
+LOGGERS = ("csv", "wandb", "tensorboard")  # csv: metrics.csv, which there always is
 
 FILE_INTERVAL = 30.0  # s between the lines of a bar in a file
 _UP = "\x1b[A"  # moves the cursor a line up
@@ -55,7 +62,7 @@ def _is_on_disk(stream: TextIO) -> bool:
         return False
 
 
-def progress_bar(total: int | None, description: str, *, unit: str = "it", shown: bool = True, **options: Any) -> tqdm:
+def progress_bar(total: int | None, description: str, *, unit: str = "it", **options: Any) -> tqdm:
     """A bar on stderr that counts to ``total``; where stderr cannot be written to, there is none.
 
     Where stderr is a file (the log of a cell, ``2> log.txt``), the bar is a line every half minute and at its end.
@@ -66,17 +73,16 @@ def progress_bar(total: int | None, description: str, *, unit: str = "it", shown
 
     Keyword Args:
         unit (str): the name of one of them.
-        shown (bool): no bar if False.
         **options: of ``tqdm``.
 
     Examples:
-        >>> from torchrl_koap.training.progress import progress_bar, without_progress_bars
+        >>> from torchrl_koap.runs.progress import progress_bar, without_progress_bars
         >>> with without_progress_bars(), progress_bar(2, "updates") as bar:
         ...     bar.update(2)
         ...     bar.disable
         True
     """
-    disable = not (shown and _SHOWN.get()) or sys.stderr is None
+    disable = not _SHOWN.get() or sys.stderr is None
     stream: _Forgiving | None = None
     if not disable and _is_on_disk(sys.stderr):
         stream = _Lines(sys.stderr)
@@ -119,3 +125,60 @@ def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
             bar.set_postfix(losses, refresh=False)  # shown when the bar is drawn next
 
     return update
+
+
+def check_logger(name: str) -> None:
+    """Refuses a logger that is unknown or whose package is not installed, before any work is done.
+
+    Args:
+        name (str): a name in ``LOGGERS``.
+
+    Raises:
+        ValueError: naming the nearest logger, or the extra to install.
+
+    Examples:
+        >>> from torchrl_koap.runs.progress import check_logger
+        >>> check_logger("csv")
+        >>> check_logger("wandbb")
+        Traceback (most recent call last):
+        ...
+        ValueError: unknown logger 'wandbb'; did you mean 'wandb'?
+    """
+    lookup(LOGGERS, name, "logger")
+    if name != "csv" and importlib.util.find_spec(name) is None:
+        raise ValueError(f"--logger {name} needs an extra: pip install 'torchrl_koap[{name}]'")
+
+
+@contextlib.contextmanager
+def open_logger(name: str, out: Path) -> Iterator[Any | None]:
+    """Yields a logger of TorchRL that writes into the run directory, and closes it at the end of the block.
+
+    Args:
+        name (str): a name in ``LOGGERS``; None is yielded for ``"csv"``. wandb stays offline unless ``WANDB_MODE`` says
+            otherwise.
+        out (Path): the run directory.
+    """
+    check_logger(name)
+    if name == "csv":
+        yield None
+        return
+    from torchrl.record.loggers import get_logger
+
+    title = out.name if name == "wandb" else name
+    options = {"project": "koap", "mode": os.environ.get("WANDB_MODE", "offline")}
+    logger = get_logger(name, str(out), title, wandb_kwargs=options)
+    try:
+        yield logger
+    finally:
+        logger.close()
+
+
+def log_scores(logger: Any, scores: Mapping[str, Any]) -> None:
+    """Logs the scores of an evaluation that are finite numbers, as ``eval/NAME``.
+
+    Args:
+        logger: what :func:`open_logger` yielded.
+        scores (mapping): name to value.
+    """
+    numbers = {name: value for name, value in scores.items() if isinstance(value, (int, float)) and math.isfinite(value)}
+    logger.log_metrics({f"eval/{name}": float(value) for name, value in numbers.items()}, step=0)

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Number type of the matrix products in a planner's training."""
+"""Threads and device of a process, and the number type of a planner's matrix products."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from torchrl_koap.lookup import lookup
 
 PRECISIONS = ("float32", "bfloat16", "auto")
+_MOST_THREADS = 1024
 _BFLOAT16 = ("amx_bf16", "avx512_bf16")  # what processors that multiply bfloat16 matrices say of themselves
 
 
@@ -32,7 +33,7 @@ def training_dtype(precision: str | None, device: str | torch.device = "cpu") ->
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.training.precision import training_dtype
+        >>> from torchrl_koap.runs.device import training_dtype
         >>> training_dtype("float32") is None, training_dtype("auto") in (None, torch.bfloat16)
         (True, True)
     """
@@ -57,7 +58,7 @@ def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
         device (str or torch.device, optional): ``"cpu"`` or ``"cuda"``. Default: "cpu".
 
     Examples:
-        >>> from torchrl_koap.training.precision import has_bfloat16_units
+        >>> from torchrl_koap.runs.device import has_bfloat16_units
         >>> isinstance(has_bfloat16_units(), bool)
         True
     """
@@ -65,3 +66,31 @@ def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
         return torch.cuda.is_bf16_supported(including_emulation=False)
     features = torch.cpu.get_capabilities()
     return any(features.get(name, False) for name in _BFLOAT16)
+
+
+def set_up_torch(threads: int, device: str) -> None:
+    """Sets the number of threads and checks that the device is there.
+
+    Args:
+        threads (int): number of torch threads, at least 1.
+        device (str): ``"cpu"`` or ``"cuda"``, with an index or not.
+
+    Raises:
+        ValueError: if the number is below 1, or this machine has no such device.
+    """
+    if threads < 1:
+        raise ValueError(f"threads must be >= 1, got {threads}")
+    kind, colon, index = device.partition(":")
+    if kind not in ("cpu", "cuda") or (colon and not index.isdecimal()):
+        raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
+    if kind == "cpu" and int(index or 0) > 0:
+        raise ValueError(
+            f"device must be 'cpu' or 'cuda', got {device!r}: there is one processor, as far as torch knows"
+        )
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device {device!r} was asked for, but torch finds no CUDA here (see `koap doctor`)")
+    if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"device {device!r} was asked for, but there are {torch.cuda.device_count()}, counted from 0")
+    if threads > _MOST_THREADS:
+        raise ValueError(f"threads must be at most {_MOST_THREADS}, got {threads}")
+    torch.set_num_threads(threads)

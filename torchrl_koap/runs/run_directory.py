@@ -29,7 +29,7 @@ class RunDirectory:
 
     Examples:
         >>> import tempfile
-        >>> from torchrl_koap.training.run_directory import RunDirectory
+        >>> from torchrl_koap.runs.run_directory import RunDirectory
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     run = RunDirectory(folder)
         ...     run.write_json("config.json", {"task": "avoiding"})
@@ -69,7 +69,7 @@ class RunDirectory:
         if not isinstance(content, dict):
             raise RunDirectoryError(f"{path} is damaged: expected an object, got {type(content).__name__}")
         if name == "config.json":
-            from torchrl_koap.training.saved_options import check_config  # knows the options, and with them TorchRL
+            from torchrl_koap.runs.config_files import check_config  # knows the options, and with them TorchRL
 
             check_config(path, content)
         return content

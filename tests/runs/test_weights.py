@@ -1,0 +1,170 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Weights: complete, refused when they do not fit, never damaged by a failed save, small when published."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+import torch
+from torch import nn
+
+from torchrl_koap.modules import Normalizer
+from torchrl_koap.runs import weights
+from torchrl_koap.runs.weights import (
+    CheckpointError,
+    compact,
+    expand,
+    load_tensors,
+    load_weights,
+    save_tensors,
+    save_weights,
+)
+
+
+class Model(nn.Module):
+    """A network with a normaliser that brings its statistics, or waits for them."""
+
+    def __init__(self, *, fitted=True, width=4, seed=0):
+        super().__init__()
+        torch.manual_seed(seed)
+        self.normalizer = Normalizer.fit(torch.randn(20, 3)) if fitted else Normalizer()
+        self.layer = nn.Linear(3, width)
+
+    def forward(self, x):
+        return self.layer(self.normalizer(x)).square().mean()
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "model.safetensors"
+    model = Model()
+    save_weights(path, model, {"task": "avoiding", "kind": "planner"})
+    return path, model
+
+
+def test_weights_bring_their_statistics(saved):
+    path, model = saved
+    other = Model(fitted=False, seed=1)
+    assert load_weights(path, other, task="avoiding") == {"task": "avoiding", "kind": "planner"}
+    x = torch.randn(5, 3)
+    assert torch.equal(model(x), other(x))
+
+
+def test_parts_of_one_storage_and_odd_layouts_are_saved(tmp_path):
+    base = torch.arange(12.0).reshape(3, 4)
+    save_tensors(tmp_path / "a", {"row": base[1], "transposed": base.T, "same": base, "empty": base[:0]})
+    tensors, about = load_tensors(tmp_path / "a")
+    assert torch.equal(tensors["row"], base[1]) and torch.equal(tensors["transposed"], base.T)
+    assert tensors["empty"].shape == (0, 4) and about == {}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.pop("normalizer.offset"), r"does not fit the model: Missing key\(s\).*\"normalizer.offset\""),
+        (lambda t: t.update(extra=torch.ones(1)), 'does not fit the model: Unexpected key.*"extra"'),
+        (lambda t: t.update({"layer.bias": torch.ones(7)}), r"size mismatch for layer.bias.*\[7\]"),
+    ],
+)
+def test_weights_that_do_not_fit_are_refused_in_one_line(saved, change, message):
+    path, _ = saved
+    tensors, about = load_tensors(path)
+    change(tensors)
+    save_tensors(path, tensors, about)
+    with pytest.raises(CheckpointError, match=message) as error:
+        load_weights(path, Model(fitted=False), task="avoiding")
+    assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
+
+
+def test_another_task_or_none_is_refused(saved):
+    path, model = saved
+    with pytest.raises(CheckpointError, match="trained on task 'avoiding', not on 'sorting'"):
+        load_weights(path, model, task="sorting")
+    save_tensors(path, model.state_dict())
+    with pytest.raises(CheckpointError, match="trained on task None, not on 'avoiding'"):
+        load_weights(path, model, task="avoiding")
+
+
+@pytest.mark.parametrize("length", [0, 4, 40, -1])
+def test_truncated_files_are_named(saved, length):
+    path, model = saved
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(CheckpointError, match=f"{path} is damaged"):
+        load_weights(path, model, task="avoiding")
+
+
+def test_missing_and_foreign_files_are_named(tmp_path):
+    with pytest.raises(CheckpointError, match="nothing.safetensors is missing"):
+        load_tensors(tmp_path / "nothing.safetensors")
+    with pytest.raises(CheckpointError, match="is missing"):
+        load_tensors(tmp_path)
+    (tmp_path / "text").write_text("no weights at all, but long enough for a header")
+    with pytest.raises(CheckpointError, match="is damaged"):
+        load_tensors(tmp_path / "text")
+    weights.save_file({"x": torch.ones(1)}, tmp_path / "facts", metadata={"about": "[1]"})
+    with pytest.raises(CheckpointError, match="its facts are no object"):
+        load_tensors(tmp_path / "facts")
+
+
+@pytest.mark.parametrize("place", ["writing", "renaming"])
+def test_a_full_disk_leaves_what_was_there(saved, monkeypatch, place):
+    path, _ = saved
+    before = path.read_bytes()
+
+    def half_written(tensors, file, metadata):
+        with open(file, "wb") as stream:
+            stream.write(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device", str(file))
+
+    def no_rename(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    if place == "writing":
+        monkeypatch.setattr(weights, "save_file", half_written)
+    else:
+        monkeypatch.setattr(os, "replace", no_rename)
+    with pytest.raises(OSError, match="No space left"):
+        save_weights(path, Model(seed=3), {"task": "avoiding"})
+    assert path.read_bytes() == before
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_no_bit_of_the_header_can_change_unseen(tmp_path):
+    """The facts, a training's step among them, are as precious as the tensors."""
+    path = tmp_path / "a.safetensors"
+    save_tensors(path, {"x": torch.ones(1)}, {"step": 24, "lr": [1e-05, 0.5], "phase": "planner"})
+    whole = path.read_bytes()
+    for place in range(len(whole)):
+        broken = bytearray(whole)
+        broken[place] ^= 1 << (place % 7)
+        path.write_bytes(broken)
+        with pytest.raises(CheckpointError, match="a.safetensors"):
+            load_tensors(path)
+
+
+def test_matrices_become_bytes_and_the_rest_stays():
+    torch.manual_seed(0)
+    tensors = {
+        "a.weight": torch.randn(64, 128) * torch.logspace(-3, 3, 64)[:, None],
+        "conv.weight": torch.randn(32, 16, 9),
+        "plan_normalizer.scale": torch.rand(5000),
+        "small.weight": torch.rand(8, 8),
+        "steps": torch.arange(8192).reshape(2, -1),
+    }
+    small = compact(tensors)
+    assert {name for name, tensor in small.items() if tensor.dtype == torch.int8} == {"a.weight", "conv.weight"}
+    assert all(small[name] is tensors[name] for name in ("plan_normalizer.scale", "small.weight", "steps"))
+    restored = expand(small)
+    assert list(restored) == list(tensors)
+    for name in ("a.weight", "conv.weight"):
+        largest = tensors[name].flatten(1).abs().amax(1)
+        worst = (restored[name] - tensors[name]).flatten(1).abs().amax(1)
+        assert (worst <= 0.5001 * largest / 127).all() and restored[name].dtype == torch.float32
+
+
+def test_rows_of_zeros_and_plain_state_dicts():
+    assert (expand(compact({"w": torch.zeros(64, 64)}))["w"] == 0).all()
+    plain = {"w": torch.randn(3, 3), "scale": torch.ones(3)}
+    assert all(expand(plain)[name] is plain[name] for name in plain)
