@@ -35,7 +35,7 @@ from torchrl_koap.training import TrainConfig, train
 from torchrl_koap.vision.backbones import load_backbone
 from torchrl_koap.vision.demonstrations import Source, embed_demonstrations, fit_projection
 from torchrl_koap.vision.encoder import FrozenImageEncoder
-from torchrl_koap.vision.projections import SCOOPING, load_encoder, projection_of, save_encoder
+from torchrl_koap.vision.projection import SCOOPING, load_encoder, projection_of, save_encoder
 
 TABLE = Path(__file__).parent / "results" / "scooping.csv"
 TASKS = ("scooping", "scooping_moving_bowl")
@@ -57,9 +57,8 @@ def data_set(folder: Path, unlabelled: str, labels: int, task: str = "scooping")
         robot, hand = Source(folder / "robot", embodiment="robot"), Source(folder / "hand", embodiment="hand")
         robots = [Source(folder / "robot", labels) if unlabelled in FEW_ROBOTS else robot]
         sources = robots if unlabelled in ("robot", "none") else [*robots, hand]
-        align_to = "robot" if unlabelled == "hand_aligned" else None
-        encoder = load_encoder(projection_of(task), cache=folder / "cache")
-        embed_demonstrations(out, sources, encoder, mixed=len(sources) > 1, align_to=align_to, task=task)
+        encoder = load_encoder(projection_of(task))
+        embed_demonstrations(out, sources, encoder, mixed=len(sources) > 1, task=task)
     return out
 
 
@@ -193,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not (options.folder / who / "meta" / "info.json").exists():
             record_videos(options.folder / who, who, options.demonstrations, task=options.task)
     if options.fit_projection:
-        encoder = FrozenImageEncoder(load_backbone(), pooling="grid", cache=options.folder / "cache")
+        encoder = FrozenImageEncoder(load_backbone())
         sources = [Source(options.folder / who) for who in EMBODIMENTS]
         encoder.projection = fit_projection(encoder, sources, EMBEDDING_DIM)
         fitted_on = "unlabelled frames of robot and hand, koap demos, seed 0"

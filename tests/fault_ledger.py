@@ -35,7 +35,7 @@ WORK = (
 )
 # a call of `koap embed` that would do, without the weights of an extra
 EMBED = (
-    *("{frames}", "--out", "{out}", "--weights", "{network}/resnet18.pth"),
+    *("{frames}", "--out", "{out}", "--network", "tiny_network:random_layer"),
     *("--projection", "{network}/projection.safetensors"),
 )
 
@@ -181,21 +181,18 @@ def make_template(root: Path) -> Path:
 
 
 def make_camera_template(root: Path) -> None:
-    """Demonstrations that a camera saw, a network as torchvision saves one, and a projection fitted behind it."""
+    """Demonstrations that a camera saw, and a projection fitted behind a network of one's own."""
     import numpy as np
     import torch
 
     from torchrl_koap.data.lerobot.images import ImageEpisode, ImageEpisodeWriter
     from torchrl_koap.tasks import get_task
-    from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone
-    from torchrl_koap.vision.projections import save_encoder
-    from torchrl_koap.vision.resnet import ResNet
+    from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone, save_encoder
 
     task, (network, width) = get_task("scooping"), (root / "network", 32)
     network.mkdir()
     torch.manual_seed(0)
-    torch.save(ResNet("resnet18").state_dict(), network / "resnet18.pth")
-    backbone = load_backbone(network / "resnet18.pth")
+    backbone = load_backbone("tiny_network:random_layer")
     about = {"state_names": "xyz", "action_names": task.action_names, "embodiment": "robot", "task": "scoop"}
     writer = ImageEpisodeWriter(root / "frames", fps=10, **about)
     generator = np.random.default_rng(0)
@@ -204,8 +201,9 @@ def make_camera_template(root: Path) -> None:
         action = generator.normal(size=(length, task.action_dim))
         writer.add(ImageEpisode(frames, generator.normal(size=(length + 1, 3)), action, "robot"))
     writer.close()
-    fitted = Projection.fit(torch.randn(200, 128), task.observation_dim - 3)
-    encoder = FrozenImageEncoder(backbone, pooling="average", projection=fitted, size=width)
+    fitted = Projection.fit(torch.randn(200, 4 * 36), task.observation_dim - 3)
+    encoder = FrozenImageEncoder(backbone, projection=fitted, size=width)
+    torch.save({"conv.weight": torch.zeros(3)}, network / "weights.pth")
     save_encoder(encoder, network / "projection.safetensors", stride=8, fitted_on="noise")
 
 

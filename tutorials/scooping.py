@@ -55,11 +55,10 @@ for embodiment in ("robot", "hand"):
 # position tells what they keep of it: it is fitted on three quarters of the robot's videos and judged on the others.
 # The policy has no part in that; it never sees the position.
 
-encoder = FrozenImageEncoder(backbone, pooling="grid", cache=folder / "cache")
 sources = [Source(folder / embodiment) for embodiment in ("robot", "hand")]
-encoder.projection = fit_projection(encoder, sources, EMBEDDING_DIM)
+components = fit_projection(FrozenImageEncoder(backbone), sources, EMBEDDING_DIM)
+encoder = FrozenImageEncoder(backbone, projection=components)
 stored = load_ted(embed_demonstrations(folder / "data", sources, encoder, mixed=True) / "ted")
-encoder.cache = None
 
 robots = stored["episode"] < EACH
 seen = stored["observation"][robots, :EMBEDDING_DIM].double()
@@ -67,7 +66,7 @@ seen, spoon = torch.cat([seen, torch.ones(len(seen), 1)], 1), stored["observatio
 fitted = stored["episode"][robots] < 0.75 * EACH
 probe = torch.linalg.lstsq(seen[fitted], spoon[fitted]).solution
 off = 1000 * (seen[~fitted] @ probe - spoon[~fitted]).norm(dim=1).mean()
-print(f"{len(encoder.projection.mean)} features, {EMBEDDING_DIM} components: the spoon's place within {off:.0f} mm")
+print(f"{len(components.mean)} features, {EMBEDDING_DIM} components: the spoon's place within {off:.0f} mm")
 
 # %%
 # A planner of all videos, controllers of five demonstrations

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 from collections.abc import Callable, Iterator
@@ -18,8 +17,9 @@ from fault_ledger import Fault, Place, check, edit_json, meet, table
 pytest.importorskip("pyarrow")
 
 EMBED = ("embed", *WORDS)
+OWN_WEIGHTS = (*EMBED, "--network", "{network}/weights.pth")
 INFO, FIRST = "meta/info.json", "data/chunk-000/episode_000000.parquet"
-WEIGHTS, PROJECTION = "resnet18.pth", "projection.safetensors"
+WEIGHTS, PROJECTION = "weights.pth", "projection.safetensors"
 
 
 def damaged(part: str, file: str, damage: Callable[[Path], object]) -> Callable[[Place], None]:
@@ -83,20 +83,12 @@ def projection(change: Callable[[dict[str, Any], dict[str, str]], Any]) -> Calla
     return do
 
 
-def cache(content: str | None) -> Callable[[Place], None]:
-    def do(place: Place) -> None:
-        folder = place.root / "cache"
-        folder.mkdir()
-        (folder / ("other.txt" if content is None else "cache.json")).write_text(content or "")
-
-    return do
-
-
 def faults() -> Iterator[Fault]:
     for name, damage in DAMAGE.items():
         for part, file in (("frames", INFO), ("frames", FIRST), ("network", WEIGHTS), ("network", PROJECTION)):
             stem = Path(file).name
-            yield Fault(f"{stem} {name}", EMBED, stem.replace(".", r"\."), damaged(part, file, damage))
+            words = OWN_WEIGHTS if file == WEIGHTS else EMBED
+            yield Fault(f"{stem} {name}", words, stem.replace(".", r"\."), damaged(part, file, damage))
     for name in ("codebase_version", "data_path"):
         yield Fault(f"info.json without {name}", EMBED, damage=info(without(name)), accepted=True)
     for name in ("features", "total_episodes"):
@@ -124,18 +116,21 @@ def faults() -> Iterator[Fault]:
         "no rows", EMBED, "row|frame", columns(lambda content: [content.update({k: content[k][:0]}) for k in content])
     )
 
-    yield Fault("weights are code", EMBED, "weights", lambda place: _write(place, WEIGHTS, pickle.dumps(os.system)))
-    for name, content in {"a list": [1], "a number": 3, "numbers by name": {"conv1.weight": 3}, "nothing": {}}.items():
-        yield Fault(f"weights are {name}", EMBED, "weights|state_dict", torch_file(content))
+    yield Fault(
+        "weights are code", OWN_WEIGHTS, "weights", lambda place: _write(place, WEIGHTS, pickle.dumps(os.system))
+    )
+    for name, content in {
+        "a list": [1],
+        "a number": 3,
+        "numbers by name": {"conv1.weight": 3},
+    }.items():
+        yield Fault(f"weights are {name}", OWN_WEIGHTS, "weights|state_dict", torch_file(content))
     yield Fault(
         "projection of other weights", EMBED, "other|fitted", projection(lambda _, a: a.update(weights="0" * 64))
     )
-    for name in ("weights", "stride", "size", "pooling", "network"):
-        needed = name != "network"
-        yield Fault(
-            f"projection without {name}", EMBED, name, projection(lambda _, a, n=name: a.pop(n)), accepted=not needed
-        )
-    for name, value in {"stride": "9", "size": "-1", "pooling": "n0nsense"}.items():
+    for name in ("weights", "stride", "size"):
+        yield Fault(f"projection without {name}", EMBED, name, projection(lambda _, a, n=name: a.pop(n)))
+    for name, value in {"stride": "9", "size": "-1"}.items():
         yield Fault(
             f"projection {name} {value}",
             EMBED,
@@ -157,10 +152,6 @@ def faults() -> Iterator[Fault]:
             projection(lambda t, _, n=name: t.update({n: t[n][:9].clone()})),
         )
         yield Fault(f"projection {name} NaN", EMBED, "NaN", projection(lambda t, _, n=name: t[n].fill_(float("nan"))))
-    words = (*EMBED, "--cache", "cache")
-    yield Fault("cache is another folder", words, "no cache", cache(None))
-    for name, content in {"text": "{", "a list": "[]", "other weights": json.dumps({"weights": "x"})}.items():
-        yield Fault(f"cache.json is {name}", words, "cache", cache(content))
 
 
 _CAMERA = "observation.images.third_person"

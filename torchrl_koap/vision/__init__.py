@@ -1,32 +1,17 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Frozen image encoders: camera frames in, embeddings that keep where things are out."""
 
-from torchrl_koap.lookup import exports
+from torchrl_koap.vision.backbones import Backbone, WeightsError, load_backbone
+from torchrl_koap.vision.encoder import FrozenImageEncoder
+from torchrl_koap.vision.projection import Projection, load_encoder, projection_of, save_encoder
 
-_LAZY = {
-    "Alignment": "torchrl_koap.vision.alignment",
-    "CacheError": "torchrl_koap.vision.cache",
-    "EmbeddingCache": "torchrl_koap.vision.cache",
-    "FrozenImageEncoder": "torchrl_koap.vision.encoder",
-    "Projection": "torchrl_koap.vision.pooling",
-    "WeightsError": "torchrl_koap.vision.backbones",
-    "fit_alignment": "torchrl_koap.vision.alignment",
-    "load_backbone": "torchrl_koap.vision.backbones",
-}
-
-__all__ = [  # noqa: F822 - __getattr__ finds them
-    "Alignment",
-    "CacheError",
-    "EmbeddingCache",
+__all__ = [
+    "Backbone",
     "FrozenImageEncoder",
     "Projection",
     "WeightsError",
-    "fit_alignment",
     "load_backbone",
+    "load_encoder",
+    "projection_of",
+    "save_encoder",
 ]
-
-__getattr__ = exports(__name__, _LAZY)
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})

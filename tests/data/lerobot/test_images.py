@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
@@ -15,7 +13,6 @@ from torchrl_koap.data import load_ted, read_about
 from torchrl_koap.data.lerobot.any_robot import read_lerobot_recordings
 from torchrl_koap.data.lerobot.images import ImageDataError, ImageEpisode, ImageEpisodeWriter, read_image_episodes
 from torchrl_koap.tasks import get_task
-from torchrl_koap.vision.alignment import fit_alignment
 from torchrl_koap.vision.demonstrations import Source, embed_demonstrations, fit_projection
 
 
@@ -77,37 +74,6 @@ def test_labels_of_a_mixed_data_set_are_the_robot_s(tmp_path):
     first = torch.from_numpy(episode("robot").frames).float().mean((1, 2))
     torch.testing.assert_close(data["observation"][:6, :3], first[:6])
     assert fit_projection(Mean(), sources, 2).dim == 2
-
-
-def test_the_hand_s_embeddings_are_moved_to_the_robot_s_and_nothing_else_is(tmp_path):
-    sources = [Source(write(tmp_path / who, who, first=first)) for first, who in enumerate(("hand", "robot"))]
-    plain, moved = (
-        embed_demonstrations(tmp_path / name, sources, Mean(), mixed=True, align_to=to) / "ted"
-        for name, to in (("plain", None), ("moved", "robot"))
-    )
-    before, after = load_ted(plain, task="scooping"), load_ted(moved, task="scooping")
-    hand, size = before["episode"] < 2, get_task("scooping").state_dim
-    robot = ~hand
-    torch.testing.assert_close(after["observation"][robot], before["observation"][robot])
-    torch.testing.assert_close(after["observation"][:, size:], before["observation"][:, size:])  # the spoon's place
-    alignment = fit_alignment(*([Mean().embed(e.frames) for e in who] for who in _tensors(sources)))
-    wanted = alignment(before["observation"][hand][:, :size])
-    torch.testing.assert_close(after["observation"][hand][:, :size], wanted)
-    assert not torch.allclose(wanted, before["observation"][hand][:, :size], atol=1)
-    assert read_about(moved)["notes"]["aligned_to"] == "robot" and "aligned_to" not in read_about(plain)["notes"]
-
-
-def _tensors(sources):
-    """The episodes of sources with their frames as tensors."""
-    return [[dataclasses.replace(e, frames=torch.from_numpy(e.frames)) for e in source.read()] for source in sources]
-
-
-@pytest.mark.parametrize(("who", "to"), [(("robot", "hand"), "foot"), (("robot",), "robot"), (("hand",), "robot")])
-def test_there_must_be_something_to_align(tmp_path, who, to):
-    sources = [Source(write(tmp_path / name, name)) for name in who]
-    with pytest.raises(ImageDataError, match=f"aligned to the embodiment '{to}': the sources have {who[0]}|hand and"):
-        embed_demonstrations(tmp_path / "out", sources, Mean(), mixed=True, align_to=to)
-    assert not (tmp_path / "out").exists()
 
 
 def test_bad_data_sets_are_refused(tmp_path):

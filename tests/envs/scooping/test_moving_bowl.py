@@ -19,7 +19,7 @@ from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scene import StartRegions
 from torchrl_koap.tasks.scooping import BOWL, BOWL_REACH, RIM_RADIUS, START_HALF, STARTS, start_of
-from torchrl_koap.vision.projections import projection_of
+from torchrl_koap.vision import projection_of
 
 TASK = get_task("scooping_moving_bowl")
 CORNERS = [(BOWL[0] + i * BOWL_REACH[0], BOWL[1] + j * BOWL_REACH[1]) for i in (-1, 1) for j in (-1, 1)]
