@@ -38,8 +38,8 @@ def refitted(source: Path, folder: Path, noise: float) -> dict:
     task = trained.task
     data = load_demonstrations(trained.config["dataset"], task, episodes=trained.config["episodes"])
     labelled, _ = trained.budget.apply(data, command=task.command_columns)
-    view = controller_view(labelled, trained.columns, action_targets=task.action_targets)
-    axes = {"shared_axes": task.actuated, "guessed_axes": likely_axes(task, trained.columns)}
+    view = controller_view(labelled, trained.columns, action_targets=task.targets)
+    axes = {"shared_axes": task.moved_columns(), "guessed_axes": likely_axes(task, trained.columns)}
     fit = fit_closed_form(trained.controller, view, input_noise=noise, **axes)
     save_weights(folder / "controller.safetensors", trained.controller, {"task": task.name})
     (folder / "digests.json").unlink(missing_ok=True)  # of the weights before

@@ -66,7 +66,7 @@ def error_of(
     """Action error on the steps ``test`` (:func:`infer_steps`) of a decoder fitted to labelled data."""
     normalizer = Normalizer.fit(labelled["action"], mode=mode, mask=labelled["has_action"])
     controller.action_normalizer.load_state_dict(normalizer.state_dict())
-    fit_closed_form(controller, labelled, shared_axes=task.actuated)
+    fit_closed_form(controller, labelled, shared_axes=task.moved_columns())
     with torch.no_grad():
         return rmse_mm(controller.decode(test["latent_action"]), test["action"])
 

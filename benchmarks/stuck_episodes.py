@@ -52,7 +52,7 @@ def way_out(task: Task, action: Tensor, tool: Tensor, objects: Tensor) -> str:
     Returns:
         str: one of :data:`WAYS`.
     """
-    if len(task.actuated) >= 2:
+    if len(task.moved_columns()) >= 2:
         ahead = tool[0] + action[:, :2].cumsum(0) - tool[1:]
         if ahead.abs().max() > RUNAWAY:
             return "runaway"

@@ -34,7 +34,7 @@ def made_up(task, lengths=(5, 8), seed=0):
     """Random observations of a task whose command follows from the actions."""
     generator = torch.Generator().manual_seed(seed)
     facts = get_task(task)
-    size, frames_of, steps_of = facts.num_delta_actions, [], []
+    size, frames_of, steps_of = len(facts.delta_actions), [], []
     command = facts.observation[facts.command] if facts.command else slice(0, facts.action_dim)
     for length in lengths:
         frames = torch.randn(length, facts.observation_dim, generator=generator, dtype=torch.float64)

@@ -7,13 +7,16 @@ A full disk or an interrupt in the middle of a save leaves what was there before
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import hashlib
 import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+import types
+import typing
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import filelock
@@ -245,3 +248,56 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+_Made = typing.TypeVar("_Made")
+
+
+def dataclass_from_json(kind: type[_Made], entries: object, what: str) -> _Made:
+    """Builds a dataclass, and those that its fields hold, from what ``json`` read of ``dataclasses.asdict``.
+
+    Args:
+        kind (type): the dataclass.
+        entries (object): what was read; lists become tuples.
+        what (str): what it is; messages begin with it.
+
+    Raises:
+        ValueError: if the entries are no object, or one of them is unknown or missing.
+
+    Examples:
+        >>> from torchrl_koap.files import dataclass_from_json
+        >>> from torchrl_koap.tasks import Body
+        >>> dataclass_from_json(Body, {"name": "mug", "position": "mug_xy", "half": [0.1, 0.2]}, "body").half
+        (0.1, 0.2)
+        >>> dataclass_from_json(Body, {"name": "mug", "colour": "red"}, "body")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        ValueError: body: unknown entry 'colour'; known: color, ...
+    """
+    if not isinstance(entries, dict):
+        raise ValueError(f"{what}: wanted an object, got {type(entries).__name__}")
+    fields = {field.name: field for field in dataclasses.fields(typing.cast("typing.Any", kind))}
+    unknown = [name for name in entries if name not in fields]
+    if unknown:
+        raise ValueError(f"{what}: unknown entry {unknown[0]!r}; known: {', '.join(sorted(fields))}")
+    for name, field in fields.items():
+        if name not in entries and field.default is field.default_factory is dataclasses.MISSING:
+            raise ValueError(f"{what}: entry {name!r} is missing")
+    hints = typing.get_type_hints(kind)
+    return kind(**{name: _as_hinted(hints[name], value, f"{what}.{name}") for name, value in entries.items()})
+
+
+def _as_hinted(hint: typing.Any, value: typing.Any, what: str) -> typing.Any:
+    """A value of JSON as the type hint of its field has it: dataclasses, tuples of them, and mappings to them."""
+    inner = typing.get_args(hint)
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        hint = next((one for one in inner if dataclasses.is_dataclass(one)), None)
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint) and value is not None:
+        return dataclass_from_json(hint, value, what)
+    if isinstance(value, dict):
+        each = inner[1] if typing.get_origin(hint) in (dict, Mapping) else None
+        return {name: _as_hinted(each, entry, what) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        each = inner[0] if typing.get_origin(hint) is tuple else None
+        return tuple(_as_hinted(each, entry, what) for entry in value)
+    return value

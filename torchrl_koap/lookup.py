@@ -1,9 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Looking a name up in a table; the error for an unknown one suggests the nearest."""
+"""Looking names up: in a table, where an unknown one suggests the nearest, and behind import strings."""
 
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
@@ -35,6 +36,40 @@ def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) 
     near = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5) if isinstance(name, str) else []
     hint = f"did you mean {lowered[near[0]]!r}?" if near else f"known: {', '.join(table)}"
     raise ValueError(f"unknown {what} {name!r}; {hint}")
+
+
+def resolve(reference: Any, what: str) -> Any:
+    """Imports the object that an import string names; anything that is no string is returned as it is.
+
+    Args:
+        reference (str or object): ``"package.module:name"``, dots in ``name`` reach into a class.
+        what (str): what the object is for; the error begins with it.
+
+    Raises:
+        ValueError: if the string has no colon, the module cannot be imported, or it has no such name.
+
+    Examples:
+        >>> from torchrl_koap.lookup import resolve
+        >>> resolve("math:hypot", "goal of task 'toy'")(3, 4)
+        5.0
+        >>> resolve("math:hypotenuse", "goal of task 'toy'")
+        Traceback (most recent call last):
+        ...
+        ValueError: goal of task 'toy': module 'math' has no 'hypotenuse' (asked for as 'math:hypotenuse')
+    """
+    if not isinstance(reference, str):
+        return reference
+    module, colon, name = reference.partition(":")
+    if not (module and colon and name):
+        raise ValueError(f"{what}: wanted an import string 'package.module:name', got {reference!r}")
+    try:
+        found = importlib.import_module(module)
+    except ImportError as error:
+        raise ValueError(f"{what}: module {module!r} cannot be imported: {error}") from error
+    try:
+        return functools.reduce(getattr, name.split("."), found)
+    except AttributeError:
+        raise ValueError(f"{what}: module {module!r} has no {name!r} (asked for as {reference!r})") from None
 
 
 def exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:

@@ -72,7 +72,7 @@ for _ in range(200):
 # %%
 # The labels are spent last: the linear decoder is fitted to them in closed form.
 
-fit = fit_closed_form(inverse_dynamics, data, shared_axes=task.actuated)
+fit = fit_closed_form(inverse_dynamics, data, shared_axes=task.moved_columns())
 print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
 
 # %%

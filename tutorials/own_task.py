@@ -34,7 +34,7 @@ from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.reports.scenes import draw_scene
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.tasks import Body, Defaults, Modes, Scene, Shape, StartRegions
+from torchrl_koap.tasks import Action, Body, Defaults, Modes, Scene, Shape, StartRegions
 
 GOAL, GOAL_RADIUS = (0.5, 0.4), 0.05  # m
 POST = (0.5, 0.2)
@@ -57,11 +57,10 @@ task = register_task(
     Task(
         name="push_past_a_post",
         observation_parts={"robot_xy": ("x", "y"), "puck_xy": ("puck_x", "puck_y")},
-        actions={"x": "m", "y": "m"},
+        actions={"x": Action("m", column=0), "y": Action("m", column=1)},
         position="robot_xy",
         max_steps=200,
         control_hz=20.0,
-        actuated=(0, 1),
         robot=(0, 1),
         relative_positions=(("robot_xy", "puck_xy"),),
         goal=f"{HERE}:goal_reached",

@@ -21,8 +21,8 @@ from pages import (
     write_page,
 )
 
+from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.import_strings import resolve
 from torchrl_koap.tasks.registry import TASKS
 
 UNITS = {"quaternion": "1 (quaternion w, x, y, z)", "tan_yaw": "1 (tangent of the yaw)"}
@@ -43,7 +43,9 @@ def write_task_pages() -> None:
         (
             f":doc:`{name}`",
             f"{task.observation_dim} / {task.state_dim}",
-            ", ".join(f"{column} ({unit or '1'})" for column, unit in task.actions.items()),
+            ", ".join(
+                f"{column} ({unit or '1'})" for column, unit in zip(task.actions, task.action_units, strict=True)
+            ),
             task.num_modes,
             f"{task.max_steps} steps, {task.max_steps / task.control_hz:.0f} s",
         )
@@ -118,8 +120,8 @@ def action_rows(task: Task) -> list[tuple[str, ...]]:
     """Column, unit, least and greatest value that the environment takes, and whether it is a change."""
     low, high = action_limits(task)
     rows = []
-    for index, (name, unit) in enumerate(task.actions.items()):
-        kind = "command itself" if name in task.absolute_actions else "change of the command"
+    for index, (name, unit) in enumerate(zip(task.actions, task.action_units, strict=True)):
+        kind = "command itself" if index not in task.delta_actions else "change of the command"
         bounded = low is not None and math.isfinite(low[index]) and math.isfinite(high[index])
         limits = f"{low[index]:.4g} to {high[index]:.4g}" if bounded else "not bounded"
         rows.append((f"``{name}``", unit or "1", limits, kind))
@@ -129,7 +131,7 @@ def action_rows(task: Task) -> list[tuple[str, ...]]:
 def action_limits(task: Task) -> tuple[list[float] | None, list[float] | None]:
     """Bounds of the environment's actions, as its specification says."""
     from torchrl_koap.envs.registry import make_env
-    from torchrl_koap.tasks.import_strings import resolve
+    from torchrl_koap.lookup import resolve
 
     known = inspect.signature(resolve(task.env, "env").__init__).parameters
     blind = {"embed": False} if "embed" in known else {}  # what is commanded is known without a camera

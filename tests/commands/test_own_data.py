@@ -15,7 +15,7 @@ from torchrl_koap.data import load_ted, read_task, save_demonstrations
 from torchrl_koap.data.demonstrations import description_of
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Action, get_task
 
 TINY = ("--steps", 20, "--batch-size", 8, "--controller-batch-size", 8, "--channels", 8, 16)
 
@@ -49,7 +49,7 @@ def run(arrays, tmp_path_factory):
 
 def test_the_task_comes_with_the_data(run):
     task = read_task(run.parent / "arm" / "ted")
-    assert task.name == "arm" and task.robot == (0, 1) and task.actions == {"dq1": "rad", "dq2": "rad"}
+    assert task.name == "arm" and task.robot == (0, 1) and task.actions == {"dq1": Action("rad"), "dq2": Action("rad")}
     config, summary = (json.loads((run / name).read_text()) for name in ("config.json", "summary.json"))
     assert config["task"] == "arm" and config["label_fraction"] == 1.0
     assert summary["labels"]["labelled_transitions"] == 58 and summary["labels"]["selected_units"] == 2

@@ -20,6 +20,7 @@ from torchrl_koap.data import (
     select_state,
 )
 from torchrl_koap.keys import validate
+from torchrl_koap.tasks import Action
 from torchrl_koap.training import TrainConfig, resolve
 
 RANDOM = np.random.default_rng(0)
@@ -45,7 +46,7 @@ def test_a_folder_holds_data_and_task(tmp_path):
     assert data["has_action"].sum() == 29 and read_about(folder / "ted")["labelled_steps"] == 29
     assert task.name == "my_arm" and task.control_hz == 20 and task.max_steps == 45
     assert task.observation_names == tuple(NAMES) and task.observation_units == ("rad", "rad", "m", "m")
-    assert task.actions == {"dq1": "rad", "dq2": "rad"} and task.robot == (0, 1)
+    assert task.actions == {"dq1": Action("rad"), "dq2": Action("rad")} and task.robot == (0, 1)
     assert task.observation_parts == {"robot": ("q1", "q2"), "surroundings": ("cup_x", "cup_y")}
     torch.testing.assert_close(data["observation"][:29], torch.from_numpy(STATES[0][:29]).float())
 
@@ -63,9 +64,9 @@ def test_columns_of_one_role_may_lie_apart():
 
 def test_absolute_actions_are_targets_of_columns():
     _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, robot=["state_0", "state_1"], action_kind="absolute")
-    assert task.action_targets == (0, 1)
+    assert task.targets == (0, 1)
     _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind="absolute", targets=[1, 0])
-    assert task.action_targets == (1, 0)
+    assert task.targets == (1, 0)
 
 
 def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):

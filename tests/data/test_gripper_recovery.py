@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl_koap.data import GripperRecovery
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.gripper import PLANNED_OPEN_ABOVE, gripper_number
+from torchrl_koap.tasks.action_rules import PLANNED_OPEN_ABOVE, gripper_command
 from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.planner import augmentation
 from torchrl_koap.training.resume import started_with
@@ -28,7 +28,7 @@ def test_open_fingers_are_seen_closed_and_open_again():
     widths = changed([OPEN] * 16)[:, 1]
     assert widths[0] == widths[1] < 0.05  # both observed frames
     assert (widths[1:].diff() > 0).all() and widths[6] > 0.075 and widths[-1] <= OPEN
-    numbers = gripper_number(widths, open_above=PLANNED_OPEN_ABOVE)
+    numbers = gripper_command(widths, open_above=PLANNED_OPEN_ABOVE)
     assert (numbers[1:] >= OPEN).all()  # the number that opens, from the present step on
 
 

@@ -11,9 +11,11 @@ from torchrl.envs import check_env_specs
 from toy_gym import NAMES, Reach
 
 from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Action, Task
 
-TASK = Task(name="arm", observation_parts={"arm": NAMES}, actions={"a": "rad", "b": "rad"}, position="arm")
+TASK = Task(
+    name="arm", observation_parts={"arm": NAMES}, actions={"a": Action("rad"), "b": Action("rad")}, position="arm"
+)
 PUSH = 0.1
 
 
@@ -78,7 +80,9 @@ def test_refusals():
         GymnasiumBatch("NoSuch-v0", TASK)
     with pytest.raises(ValueError, match="environment 'no_such_package:Reach-v0' cannot be made: "):
         GymnasiumBatch("no_such_package:Reach-v0", TASK)
-    wide = Task(name="wide", observation_parts={"arm": 5}, actions={"a": "rad", "b": "rad"}, position="arm")
+    wide = Task(
+        name="wide", observation_parts={"arm": 5}, actions={"a": Action("rad"), "b": Action("rad")}, position="arm"
+    )
     with pytest.raises(
         ValueError, match=r"observation of environment 'ToyReach-v0' is Box\(.*\(4,\).*, task 'wide' has 5 columns"
     ):

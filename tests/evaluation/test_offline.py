@@ -17,7 +17,7 @@ from torchrl_koap.evaluation.label_errors import summarise_errors
 from torchrl_koap.evaluation.offline import find_faults
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.run_directory import RunDirectoryError
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Action, Task
 
 FEW = EvalConfig(samples=4, threads=1)
 
@@ -158,7 +158,7 @@ def test_a_data_set_that_has_moved_or_changed(tmp_path):
 
 
 def test_a_controller_worse_than_the_mean_is_a_fault():
-    task = Task("arm", {"q": 2}, {"a": "rad", "b": "rad"}, "q")
+    task = Task(name="arm", observation_parts={"q": 2}, actions={"a": Action("rad"), "b": Action("rad")}, position="q")
     true = torch.tensor([[1.0, 1.0], [-1.0, -1.0]])
     models = {"controller": true * torch.tensor([0.5, -1.0]), "mean_action": torch.zeros(2, 2)}
     found = summarise_errors(models, true, torch.tensor([4, 5]), task)

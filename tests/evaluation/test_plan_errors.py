@@ -9,9 +9,15 @@ from torch import nn
 
 from torchrl_koap.data import flatten_trajectories
 from torchrl_koap.evaluation.plan_errors import energy_score, plan_errors
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Action, Task
 
-TASK = Task("arm", {"joint": ("q",), "force": ("f",)}, {"dq": "rad"}, "joint", observation_units=("rad", "N"))
+TASK = Task(
+    name="arm",
+    observation_parts={"joint": ("q",), "force": ("f",)},
+    observation_units=("rad", "N"),
+    actions={"dq": Action("rad")},
+    position="joint",
+)
 
 
 class Planner(nn.Module):

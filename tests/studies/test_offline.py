@@ -90,10 +90,10 @@ def test_damaged_errors_are_named(tmp_path):
 
 
 def test_a_curve_needs_data_where_it_has_no_environment(tmp_path, curve):
-    from torchrl_koap.tasks import Task, register_task
+    from torchrl_koap.tasks import Action, Task, register_task
     from torchrl_koap.tasks.registry import TASKS
 
-    register_task(Task("bare_arm", {"q": 2}, {"dq": "rad"}, "q"))
+    register_task(Task(name="bare_arm", observation_parts={"q": 2}, actions={"dq": Action("rad")}, position="q"))
     try:
         with pytest.raises(ValueError, match="task 'bare_arm' has no environment to record demonstrations in"):
             run_curve(CurveConfig(out=tmp_path / "out", task="bare_arm"))

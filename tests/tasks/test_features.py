@@ -89,8 +89,8 @@ def test_facts_fit_each_other(name):
     assert set(task.plotted.values()) <= set(task.observation)
     command = set() if task.command is None else {task.command}
     assert {*task.state, *task.hidden, *command, task.position} <= set(task.observation)
-    assert all(0 <= column < task.state_dim for column in (*task.actuated, *task.robot))
-    assert len(task.actuated) in (0, task.action_dim)
+    assert all(0 <= column < task.state_dim for column in (*task.moved_columns(or_robot=True), *task.robot))
+    assert len(task.moved_columns()) in (0, task.action_dim)
     assert get_task(task.source).observation == task.observation
     assert WINDOW == 16
 
@@ -111,5 +111,5 @@ def test_stacking_without_joints_shows_and_commands_what_the_paper_does():
     assert torch.equal(state[:, 3:4], observation[:, task.observation["gripper_width"]])
     assert torch.equal(state[:, 4:], whole.state_of(observation)[:, whole.state_slices["red_position"].start :])
     # joints and gripper are commanded, and the controller decodes both
-    assert task.actions == whole.actions and task.action_rule is None and whole.action_rule is not None
+    assert task.action_units == whole.action_units and task.action_rule is None and whole.action_rule is not None
     assert task.controller_columns("robot") == (0, 1, 2, 3) and task.source == "stacking"

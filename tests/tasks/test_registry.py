@@ -12,7 +12,7 @@ import sys
 import pytest
 
 import torchrl_koap
-from torchrl_koap.tasks import TASKS, Modes, Task, get_task, register_task
+from torchrl_koap.tasks import TASKS, Action, Modes, Task, get_task, register_task
 from torchrl_koap.tasks import registry as registry_module
 
 
@@ -44,7 +44,7 @@ def test_hidden_parts_are_no_state():
         observation_parts={"desired": 1, "measured": 2, "yaw": 1, "box": 2},
         command="desired",
         position="measured",
-        actions={"x": "m"},
+        actions={"x": Action("m")},
         hidden=("yaw",),
     )
     assert task.state_columns == (1, 2, 4, 5)
@@ -69,7 +69,7 @@ def test_tasks_cannot_be_changed():
 TOY = {
     "name": "toy",
     "observation_parts": {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1},
-    "actions": {"x": "m", "y": "m"},
+    "actions": {"x": Action("m"), "y": Action("m")},
     "position": "tool",
     "command": "command",
 }
@@ -148,9 +148,15 @@ def test_a_broken_entry_point_is_named(tasks, monkeypatch):
         ({"state": {"tool": "plan"}}, "state: part 'tool' has an unknown feature 'plan'; known: plain, plane"),
         ({"state": {"command": "plain"}}, "'command' repeats the command, which gives hidden actions away"),
         ({"hidden": ("tool", "box_xy", "box_tan_yaw")}, "state: nothing remains"),
-        ({"actuated": (0,)}, "actuated: wanted a state column for each of 2 actions"),
+        ({"actions": {"x": "m"}}, r"actions: wanted 'x': Action\('m'\), got 'm'"),
+        (
+            {"actions": {"x": Action(kind="change")}},
+            "actions: 'x' is of kind 'change'; known: delta, absolute, gripper",
+        ),
+        ({"actions": {"x": Action(column=5)}}, "actions: the state has 5 columns, got 5"),
+        ({"actions": {"x": Action("m", "absolute", 0), "y": Action()}}, "name the column .* or none names one"),
+        ({"actions": {"x": Action("m", "gripper"), "y": Action("m", "gripper")}}, "at most one is a gripper"),
         ({"robot": (0, 9)}, "robot: the state has 5 columns, got 9"),
-        ({"absolute_actions": ("x",)}, r"absolute_actions: wanted the last of x, y, got \('x',\)"),
         ({"interchangeable": (("box",),)}, "interchangeable: no body 'box'"),
         ({"relative_positions": (("tool", "command"),)}, "'command' is no part of the state"),
         ({"observation_parts": {**TOY["observation_parts"], "more": ("tool_0",)}}, "columns named twice: tool_0"),
@@ -176,9 +182,10 @@ def test_columns_have_names():
 
 
 def test_units_decide_nothing_but_which_errors_are_averaged():
-    task = Task(**(TOY | {"actions": {"a": "rad", "grip": "N", "b": "rad"}, "absolute_actions": ("b",)}))
+    actions = {"a": Action("rad"), "grip": Action("N"), "b": Action("rad", "absolute")}
+    task = Task(**(TOY | {"actions": actions}))
     assert task.action_columns() == [0, 2] and task.action_columns("N") == [1] and task.action_columns("m") == []
-    assert task.num_delta_actions == 2 and task.tool_columns is None and task.gripper is None
+    assert task.delta_actions == (0, 1) and task.tool_columns is None and task.gripper is None
 
 
 def test_a_feature_of_ones_own_is_an_import_string():
@@ -215,10 +222,10 @@ def test_json_of_another_kind_is_refused():
         Task(**TOY, goal=len).to_json()
 
 
-def test_the_package_alone_loads_neither_torch_nor_a_simulator():
+def test_the_package_loads_no_task_and_a_task_no_simulator():
     code = (
         "import sys, torchrl_koap; assert torchrl_koap.__version__; assert 'torchrl_koap.tasks' not in sys.modules;"
-        "torchrl_koap.get_task('stacking').state_dim; print([m for m in ('torch', 'mujoco') if m in sys.modules])"
+        "torchrl_koap.get_task('stacking').state_dim; print([m for m in ('mujoco', 'gymnasium') if m in sys.modules])"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert found.stdout.strip() == "[]", found.stderr
@@ -229,4 +236,4 @@ def test_the_package_alone_loads_neither_torch_nor_a_simulator():
 @pytest.mark.parametrize("name", ["../x", "a/b", "a\\b", ".."])
 def test_names_that_would_lead_out_of_a_folder_are_refused(name):
     with pytest.raises(ValueError, match="part of the names of files"):
-        Task(name=name, observation_parts={"xy": 2}, actions={"x": "m"}, position="xy")
+        Task(name=name, observation_parts={"xy": 2}, actions={"x": Action("m")}, position="xy")

@@ -14,7 +14,7 @@ from torchrl_koap.data import LabelBudget, cut_windows, load_ted, make_demonstra
 from torchrl_koap.keys import LayoutError
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.tasks import WINDOW, get_task
+from torchrl_koap.tasks import WINDOW, Action, get_task
 from torchrl_koap.training import Recipe, TrainConfig, fit_controller, fit_planner, train
 from torchrl_koap.training.resolved import resolve
 
@@ -120,7 +120,9 @@ def test_a_guess_about_axes_is_dropped_where_it_predicts_worse():
     guessed = fit_controller(data, task, steps=0, progress=False)
     without = fit_controller(data, replace(task, env="none:at_all"), steps=0, progress=False)
     assert same_weights(guessed, without)
-    tied = fit_controller(data, replace(task, actuated=(0, 1)), steps=0, progress=False)
+    tied = fit_controller(
+        data, replace(task, actions={"x": Action("m", column=0), "y": Action("m", column=1)}), steps=0, progress=False
+    )
     assert tied.recipe.results["held_out_error"] > guessed.recipe.results["held_out_error"]
 
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.modules import CommandResponse
-from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks import Action, Task, get_task
 from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.response import fit_response, labelled_steps, tracked_columns
 
@@ -123,6 +123,8 @@ def test_columns_of_the_tasks():
 
 
 def test_a_task_without_commands_is_refused_before_any_work():
-    task = Task("arm", {"joints": 2}, {"a": "rad", "b": "rad"}, position="joints")
+    task = Task(
+        name="arm", observation_parts={"joints": 2}, actions={"a": Action("rad"), "b": Action("rad")}, position="joints"
+    )
     with pytest.raises(ValueError, match=r"task 'arm' .* repeats the last command \(Task.command\)"):
         resolve(TrainConfig(out="", method="koap_mpc"), task)

@@ -18,9 +18,10 @@ from torchrl_koap.data.recordings import Recordings, RecordingsError, make_recor
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories
 from torchrl_koap.lookup import lookup
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Action, Task
+from torchrl_koap.tasks.action_rules import ActionKind
 
-ACTION_KINDS = ("delta", "absolute")
+ACTION_KINDS: tuple[ActionKind, ...] = ("delta", "absolute")
 _SLACK = 1.5  # episodes may be that much longer than the longest demonstration
 
 
@@ -76,7 +77,7 @@ def make_demonstrations(
     action_dim: int | None = None,
     robot: Sequence[str | int] | None = None,
     command: Sequence[str | int] = (),
-    action_kind: str = "delta",
+    action_kind: ActionKind = "delta",
     targets: Sequence[str | int] | None = None,
     max_steps: int | None = None,
 ) -> tuple[TensorDict, Task]:
@@ -161,18 +162,21 @@ def make_demonstrations(
         [torch.from_numpy(steps) for steps in recordings.actions],
     )
     state_column = {column: index for index, column in enumerate(c for c in range(len(names)) if c not in commanded)}
+    moved = [state_column[column] for column in reached]
     parts = _parts(names, set(own), set(commanded))
     task = Task(
         name=name,
         observation_parts=parts,
         observation_units=own_units,
-        actions=dict(zip(acting, units, strict=True)),
+        actions={
+            name: Action(unit, action_kind, column)
+            for name, unit, column in zip(acting, units, moved or (None,) * len(acting), strict=True)
+        },
         position=next(part for part in parts if part != _COMMAND),
         max_steps=max_steps or round(_SLACK * max(len(frames) for frames in recordings.states)),
         control_hz=float(rate),
         command=_COMMAND if commanded else None,
         robot=tuple(state_column[column] for column in own),
-        action_targets=tuple(state_column[column] for column in reached),
     )
     return data, task
 
@@ -206,9 +210,9 @@ def description_of(task: Task) -> dict[str, Any]:
         "control_hz": task.control_hz,
         "robot": tuple(own[column] for column in task.robot) or None,
         "command": names[task.command_columns] if task.command_columns is not None else (),
-        "action_kind": "absolute" if task.action_targets else "delta",
-        "targets": tuple(own[column] for column in task.action_targets) or None,
-        "action_units": tuple(task.actions.values()),
+        "action_kind": "absolute" if task.targets else "delta",
+        "targets": tuple(own[column] for column in task.targets) or None,
+        "action_units": task.action_units,
         "state_units": task.observation_units or "",
         "max_steps": task.max_steps,
     }

@@ -26,8 +26,7 @@ from torchrl_koap.data.ted_guard import steps_problem
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import read_bytes, replacing_folder, sha256_of
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.json_format import plain_task_from_json
-from torchrl_koap.tasks.registry import find_task
+from torchrl_koap.tasks.registry import find_task, plain_task
 
 FORMAT = 1
 _ABOUT = "about.json"
@@ -162,7 +161,7 @@ def read_task(folder: str | Path) -> Task | None:
     if definition is None:
         return None
     try:
-        return plain_task_from_json(definition)
+        return plain_task(definition)
     except ValueError as error:
         raise DamagedDataError(f"{Path(folder) / _ABOUT}: {error}") from error
 

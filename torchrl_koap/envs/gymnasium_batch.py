@@ -42,8 +42,8 @@ class GymnasiumBatch(EnvBase):
 
     Examples:
         >>> from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
-        >>> from torchrl_koap.tasks import Task
-        >>> task = Task(name="swing", observation_parts={"pole": 3}, actions={"torque": "N m"}, position="pole")
+        >>> from torchrl_koap.tasks import Action, Task
+        >>> task = Task(name="swing", observation_parts={"pole": 3}, actions={"torque": Action("N m")}, position="pole")
         >>> env = GymnasiumBatch("Pendulum-v1", task, 2)
         >>> env.seed_episodes([7, 8])
         >>> env.reset()["observation"].shape, env.max_steps

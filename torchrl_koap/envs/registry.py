@@ -26,8 +26,8 @@ import torch
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_koap.envs.transforms import EndEffectorNoise
+from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task, get_task
-from torchrl_koap.tasks.import_strings import resolve
 
 
 def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:

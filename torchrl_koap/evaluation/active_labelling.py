@@ -287,7 +287,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
         )
     data = load_training_data(trained, config.dataset)
     data, report = hide_labels_again(trained, data, config.dataset)
-    steps = infer_steps(controller, controller_view(data, trained.columns, action_targets=task.action_targets))
+    steps = infer_steps(controller, controller_view(data, trained.columns, action_targets=task.targets))
     left = int(steps[EPISODE][~steps[HAS_ACTION]].unique().numel())
     count = max(1, min(_FEW, left)) if config.count is None else config.count
     choices = rank_trajectories(

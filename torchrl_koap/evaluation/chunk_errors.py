@@ -46,7 +46,7 @@ def errors_of_chunks(
         score and best of all sampled chunks (:func:`~torchrl_koap.evaluation.plan_errors.score_sequences`), where every
         step of them has a label. Or a ``note`` why there is none.
     """
-    history, targets = policy.history, list(task.action_targets)
+    history, targets = policy.history, list(task.targets)
     episodes = episodes_outside(data, labelled)
     keys = ["state", "action", "has_action", "episode"]
     windows = cut_windows(data, history - 1 + policy.horizon, select=keys, pad_before=history - 1).cpu()
@@ -81,7 +81,7 @@ def errors_of_chunks(
     if not whole.any():
         return errors
     sequences = {"policy": sampled[:, whole], "mean_action": mean.expand_as(true[whole])[None]}
-    rows, _ = score_sequences(sequences, true[whole], task.action_names, list(task.actions.values()))
+    rows, _ = score_sequences(sequences, true[whole], task.action_names, list(task.action_units))
     return errors | {"chunk": {"situations": int(whole.sum()), "samples": samples, "unit": rows}}
 
 

@@ -90,7 +90,7 @@ def errors_left_out(
         fold["has_action"] = labelled["has_action"] & ~hidden.unsqueeze(-1)
         fold["action"] = torch.where(fold["has_action"], labelled["action"], math.nan)
         again = copy.deepcopy(controller)
-        fit_closed_form(again, fold, shared_axes=task.actuated, guessed_axes=guessed_axes)
+        fit_closed_form(again, fold, shared_axes=task.moved_columns(), guessed_axes=guessed_axes)
         ridge = LinearInverseDynamics(labelled["state"].shape[-1], task.action_dim).to(labelled["state"].dtype)
         fit_closed_form(ridge, fold)
         predicted, true, episode = first_actions(again, labelled, [int(number)])
@@ -131,7 +131,7 @@ def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, t
         0.5
     """
     square = {name: (predicted - true).square() for name, predicted in models.items()}
-    units, names = list(task.actions.values()), task.action_names
+    units, names = list(task.action_units), task.action_names
 
     def root(columns: Sequence[int]) -> dict[str, float]:
         return {name: part[:, columns].mean().sqrt().item() for name, part in square.items()}

@@ -89,9 +89,7 @@ def _actions(trained: TrainedRun, data: TensorDictBase, labelled: TensorDictBase
         note = f"method {trained.config['method']!r} would have to be trained again without each trajectory"
         hint = "; train it on fewer labels than there are (--label-count): the others tell how good it is"
         return {"outside_budget": outside, "left_out": {"note": note + (hint if "note" in outside else "")}}
-    view, seen = (
-        controller_view(part, trained.columns, action_targets=task.action_targets) for part in (data, labelled)
-    )
+    view, seen = (controller_view(part, trained.columns, action_targets=task.targets) for part in (data, labelled))
     controller = trained.controller.cpu()
     return {
         "outside_budget": errors_outside_budget(controller, view, seen, task),

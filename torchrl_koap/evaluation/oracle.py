@@ -78,11 +78,10 @@ class OracleControl(PlanThenControl):
             raise ValueError(f"look_ahead must be 1 to {planner.horizon - 1}, below the plan's, got {look_ahead}")
         super().__init__(planner, nn.Identity(), state_columns=task.state_of, history=history, **options)
         self.task, self.look_ahead, self.smoothness = task, look_ahead, smoothness
-        self._changes = list(range(task.num_delta_actions))
-        self._moved = list(task.actuated or task.robot[: len(self._changes)])
-        if len(self._moved) != len(self._changes):
-            raise ValueError(f"task {task.name!r} does not say which state columns its actions move (Task.actuated)")
-        units = list(task.actions.values())
+        self._changes, self._moved = list(task.delta_actions), list(task.moved_columns(or_robot=True))
+        if not self._changes or len(self._moved) != len(self._changes):
+            raise ValueError(f"task {task.name!r} does not say which state columns its actions move (Action.column)")
+        units = task.action_units
         self._pushes = np.array([_PUSH.get(units[i], 0.01) for i in self._changes])
         self._env: EnvBase | None = None
 

@@ -21,7 +21,7 @@ from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.weights import CheckpointError, check_weights, load_tensors, save_tensors
 from torchrl_koap.tasks import REPLAN_INTERVAL, Task, get_task
-from torchrl_koap.tasks.json_format import import_strings_of, plain_task_from_json
+from torchrl_koap.tasks.registry import plain_task
 from torchrl_koap.training.builders import build_controller, method_named
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.fit import Recipe
@@ -235,7 +235,7 @@ def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
         "format": FORMAT,
         "version": VERSION,
         "task": made.task.name,
-        "task_definition": None if import_strings_of(made.task) else made.task.to_json(),
+        "task_definition": None if made.task.import_strings() else made.task.to_json(),
         "planner": made.planner | {"solver": policy.planner.solver, "solver_steps": policy.planner.num_steps},
         "controller": made.controller,
         "columns": list(made.columns),
@@ -259,7 +259,7 @@ def _one_gain(gain: Tensor, task: Task) -> float:
     """The factor that all changes of a command have in common."""
     factor = float(gain[0])
     whole = torch.ones_like(gain)
-    whole[: task.num_delta_actions] = factor
+    whole[list(task.delta_actions)] = factor
     if not torch.equal(gain, whole):
         raise ValueError(f"a file holds one action_gain for all changes of a command, the policy has {gain.tolist()}")
     return factor
@@ -310,7 +310,7 @@ def read_policy(path: str | Path, *, plugins: Sequence[str] = (), **options: Any
 def _description(about: dict[str, Any]) -> PolicyDescription:
     definition = about["task_definition"]
     return PolicyDescription(
-        task=get_task(about["task"]) if definition is None else plain_task_from_json(definition),
+        task=get_task(about["task"]) if definition is None else plain_task(definition),
         planner=dict(about["planner"]),
         controller=dict(about["controller"]),
         columns=tuple(about["columns"]),

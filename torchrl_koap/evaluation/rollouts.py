@@ -115,9 +115,9 @@ def make_gain(task: Task, gain: float) -> Tensor | None:
         raise ValueError(f"action_gain must be a number above 0, got {gain}")
     if gain == 1:
         return None
-    if task.action_targets or not task.num_delta_actions:
+    if not task.delta_actions:
         raise ValueError(f"action_gain was given, but no action of task {task.name!r} is a change of a command")
-    return torch.tensor([gain] * task.num_delta_actions + [1.0] * len(task.absolute_actions))
+    return torch.tensor([gain if index in task.delta_actions else 1.0 for index in range(task.action_dim)])
 
 
 def make_leash(task: Task, lead: float) -> CommandLeash | None:
@@ -138,7 +138,7 @@ def make_leash(task: Task, lead: float) -> CommandLeash | None:
     """
     if not lead:
         return None
-    if task.command is None or task.action_targets:
+    if task.command is None or task.targets:
         raise ValueError(
             f"command_lead was given, but the actions of task {task.name!r} are no changes of a command that it"
             " observes (Task.command)"

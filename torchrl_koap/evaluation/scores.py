@@ -17,8 +17,8 @@ from torch import Tensor
 
 from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, mode_entropy, wilson_interval
 from torchrl_koap.keys import COLLISION, MODE, SUCCESS
+from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.import_strings import resolve
 
 OUTCOMES = ("timeout", "success", "collision")
 

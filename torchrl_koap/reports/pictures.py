@@ -255,7 +255,7 @@ def run_facts(run_dir: Path) -> dict[str, Any]:
         task = None
     columns, offline = None, task is not None and task.env is None
     if task is not None:
-        columns = [(column, unit, column in task.absolute_actions) for column, unit in task.actions.items()]
+        columns = [(name, action.unit, action.kind != "delta") for name, action in task.actions.items()]
     return {
         "task": task.name if task else None,
         "num_modes": task.num_modes if task else 24,

@@ -1,6 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a task is: columns, goal, modes, looks, and the names of the code that simulates it; no simulator, no torch."""
+"""What a task is: columns, goal, modes, looks, and the names of the code that simulates it; no simulator."""
 
+from torchrl_koap.tasks.action_rules import Action
+from torchrl_koap.tasks.columns import Columns
 from torchrl_koap.tasks.registry import TASKS, adopt_task, get_task, register_task, task_of
 from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
 from torchrl_koap.tasks.task import CONTROL_HZ, HISTORY, HORIZON, REPLAN_INTERVAL, WINDOW, Defaults, Modes, Task
@@ -14,7 +16,9 @@ __all__ = [
     "REPLAN_INTERVAL",
     "TASKS",
     "WINDOW",
+    "Action",
     "Body",
+    "Columns",
     "Defaults",
     "Modes",
     "Scene",

@@ -1,14 +1,49 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What has the last word on the actions that a controller decodes: grippers and absolute targets."""
+"""What an action means, and how decoded numbers become actions: absolute targets and grippers.
+
+D3IL's data hold no gripper command: their action is the next measured width, and the environment opens above 0.075 m.
+While the fingers open, the next widths are numbers that mean "close" when sent, so a policy that sends them never
+opens. The command of a gripper is therefore 0.08 m as long as the fingers are on the way to open, and the next width
+otherwise.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
+import torch
 from torch import Tensor
 
-from torchrl_koap.tasks.gripper import command_gripper
+OPEN_ABOVE = 0.075  # m; greater numbers open
+PLANNED_OPEN_ABOVE = 0.07  # m; half way from a box held to fingers open: plans err by some millimetres
+OPEN = 0.08
+OPENING = 5  # control steps that the fingers need to open
+_MOVES = 1e-4
+ActionKind = Literal["delta", "absolute", "gripper"]
+
+
+@dataclass(frozen=True)
+class Action:
+    """Meaning of one action column.
+
+    Args:
+        unit (str): such as ``"m"``, ``"rad"``, ``"N"`` or ``""``; errors are averaged over columns of one unit.
+        kind (str): ``"delta"``: a change of a command, a velocity or an effort, small where the robot stands still;
+            ``"absolute"``: a command itself; ``"gripper"``: an absolute one that is read off planned widths.
+        column (int, optional): state column that a ``"delta"`` moves, that an ``"absolute"`` action is the target of
+            (controllers then decode the distance to it), or in which a ``"gripper"`` tells its width.
+
+    Examples:
+        >>> from torchrl_koap.tasks import Action
+        >>> Action("rad", "absolute", column=3).unit
+        'rad'
+    """
+
+    unit: str = ""
+    kind: ActionKind = "delta"
+    column: int | None = None
 
 
 @dataclass(frozen=True)
@@ -16,8 +51,8 @@ class ActionRule:
     """Turns decoded actions into those that the robot takes.
 
     Args:
-        gripper (tuple of int, optional): action column and state column of a gripper whose number is read off the
-            widths (:func:`~torchrl_koap.tasks.gripper.command_gripper`).
+        gripper (tuple of int, optional): action column and state column of a gripper whose command is read off the
+            widths (:func:`command_gripper`).
         targets (sequence of int): for absolute actions the state column that each is the target of: the controller has
             decoded the distance to it.
 
@@ -39,3 +74,47 @@ class ActionRule:
         if self.gripper is not None:
             actions = command_gripper(states, actions, entry=self.gripper[0], column=self.gripper[1])
         return actions
+
+
+def gripper_command(width: Tensor, *, open_above: float = OPEN_ABOVE) -> Tensor:
+    """Computes gripper commands from a sequence of widths.
+
+    Args:
+        width (Tensor): ``[*B, T]`` (m).
+
+    Keyword Args:
+        open_above (float): widths above it count as open (m).
+
+    Returns:
+        Tensor: ``[*B, T - 1]`` (m), for all steps but the last: above 0.075 opens, anything else closes.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.tasks.action_rules import gripper_command
+        >>> gripper_command(torch.tensor([0.0, 0.03, 0.06, 0.08, 0.08, 0.07, 0.06, 0.06]))
+        tensor([0.0800, 0.0800, 0.0800, 0.0800, 0.0700, 0.0600, 0.0600])
+    """
+    now, following = width[..., :-1], width[..., 1:]
+    padded = torch.cat([following, width[..., -1:].expand(*width.shape[:-1], OPENING - 1)], -1)
+    soon = padded.unfold(-1, OPENING, 1).amax(-1)
+    opening = (following > now + _MOVES) & (soon > open_above)
+    return torch.where(opening | (following > open_above), following.clamp_min(OPEN), following)
+
+
+def command_gripper(states: Tensor, actions: Tensor, *, entry: int, column: int) -> Tensor:
+    """Replaces the gripper's entry of actions by the command read off the planned widths.
+
+    Args:
+        states (Tensor): observed and planned states ``[*B, T, d]``.
+        actions (Tensor): actions of the same frames ``[*B, T, act]``; not changed.
+
+    Keyword Args:
+        entry (int): the gripper's entry of an action.
+        column (int): the state column of its width (m).
+
+    Returns:
+        Tensor: ``[*B, T, act]``; the last frame, which nothing follows, stays as it is.
+    """
+    actions = actions.clone()
+    actions[..., :-1, entry] = gripper_command(states[..., column], open_above=PLANNED_OPEN_ABOVE)
+    return actions

@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
+from torch import Tensor
+
+from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
 from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 DISTANCE_TOLERANCE = 0.018  # m, between the centres, height included
 ROTATION_TOLERANCE = 0.048  # of half a turn
@@ -32,8 +33,6 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
         Tensor: bool ``[*B]``: within :data:`ALIGNED_DISTANCE` of the target, and the quaternions' cosine above that of
         :data:`ROTATION_TOLERANCE` half turns.
     """
-    import torch
-
     part = {name: state[..., columns] for name, columns in task.state_slices.items()}
     distance = (part["box_position"] - part["target_position"]).norm(dim=-1)
     cosine = torch.nn.functional.cosine_similarity(part["box_quaternion"], part["target_quaternion"], dim=-1)
@@ -76,9 +75,8 @@ register_task(
         },
         command="desired_xyz",
         position="measured_xyz",
-        actions={"x": "m", "y": "m", "z": "m"},
+        actions={axis: Action("m", column=column) for column, axis in enumerate("xyz")},
         max_steps=400,
-        actuated=(0, 1, 2),
         robot=(0, 1, 2),
         state={
             "measured_xyz": "plain",

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from torch import Tensor
+
+from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Scene, Shape
 from torchrl_koap.tasks.task import Defaults, Modes, Task
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 FINISH_Y = 0.35  # m
 ROD_RADIUS = 0.01  # m
@@ -71,9 +71,8 @@ register_task(
         observation_parts={"desired_xy": 2, "measured_xy": 2},
         command="desired_xy",
         position="measured_xy",
-        actions={"x": "m", "y": "m"},
+        actions={"x": Action("m", column=0), "y": Action("m", column=1)},
         max_steps=250,
-        actuated=(0, 1),
         robot=(0, 1),
         collides=True,
         goal="torchrl_koap.tasks.avoiding:goal_reached",

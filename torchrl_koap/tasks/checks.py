@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
-from torchrl_koap.tasks.state_parts import FEATURE_COLUMNS
+from torchrl_koap.tasks.action_rules import Action, ActionKind
+from torchrl_koap.tasks.features import FEATURES
 
 if TYPE_CHECKING:
     from torchrl_koap.tasks.task import Task
@@ -23,8 +24,8 @@ def check_task(task: Task) -> None:
         ValueError: with all faults, one a line, each naming the field.
 
     Examples:
-        >>> from torchrl_koap.tasks import Task
-        >>> Task(name="toy", observation_parts={"xy": 2}, actions={"x": "m"}, position="yx")
+        >>> from torchrl_koap.tasks import Action, Task
+        >>> Task(name="toy", observation_parts={"xy": 2}, actions={"x": Action("m")}, position="yx")
         Traceback (most recent call last):
         ...
         ValueError: 1 fault(s) in task 'toy':
@@ -35,14 +36,32 @@ def check_task(task: Task) -> None:
         faults.append(f"name: part of the names of files, it may hold no / or \\, got {task.name!r}")
     if not task.observation_parts:
         faults.append("observation_parts: none")
-    if not task.actions:
-        faults.append("actions: none")
+    faults += _action_faults(task)
     faults += _part_faults(task) or _column_faults(task)
     faults += _body_faults(task)
     if task.modes.entropy not in ENTROPIES:
         faults.append(f"modes.entropy: wanted one of {', '.join(ENTROPIES)}, got {task.modes.entropy!r}")
     if faults:
         raise ValueError(f"{len(faults)} fault(s) in task {task.name!r}:\n  - " + "\n  - ".join(faults))
+
+
+def _action_faults(task: Task) -> list[str]:
+    if not task.actions:
+        return ["actions: none"]
+    faults = []
+    for name, action in task.actions.items():
+        if not isinstance(action, Action):
+            faults.append(f"actions: wanted {name!r}: Action({action!r}), got {action!r}")
+        elif action.kind not in get_args(ActionKind):
+            faults.append(f"actions: {name!r} is of kind {action.kind!r}; known: {', '.join(get_args(ActionKind))}")
+    if faults:
+        return faults
+    with_target = [action.kind == "absolute" and action.column is not None for action in task.actions.values()]
+    if any(with_target) and not all(with_target):
+        faults.append("actions: all are absolute and name the column that they are the target of, or none names one")
+    if sum(action.kind == "gripper" for action in task.actions.values()) > 1:
+        faults.append("actions: at most one is a gripper")
+    return faults
 
 
 def _part_faults(task: Task) -> list[str]:
@@ -60,10 +79,9 @@ def _part_faults(task: Task) -> list[str]:
         for part in names
         if part not in parts
     ]
-    known = {"plain", *FEATURE_COLUMNS}
     for part, kind in task.state.items():
-        if isinstance(kind, str) and kind not in known and ":" not in kind:
-            faults.append(f"state: part {part!r} has an unknown feature {kind!r}; known: {', '.join(sorted(known))}")
+        if isinstance(kind, str) and kind not in FEATURES and ":" not in kind:
+            faults.append(f"state: part {part!r} has an unknown feature {kind!r}; known: {', '.join(sorted(FEATURES))}")
     if task.command is not None and task.command in task.state:
         faults.append(f"state: {task.command!r} repeats the command, which gives hidden actions away")
     return faults
@@ -77,20 +95,15 @@ def _column_faults(task: Task) -> list[str]:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         faults.append(f"observation_parts: columns named twice: {', '.join(twice)}")
-    if all(kind in ("plain", *FEATURE_COLUMNS) for kind in task.state_parts.values()):
-        for field in ("actuated", "robot", "action_targets"):
-            wrong = [column for column in getattr(task, field) if not 0 <= column < task.state_dim]
+    if all(kind in FEATURES for kind in task.state_parts.values()):
+        moved = [action.column for action in task.actions.values() if isinstance(action, Action)]
+        for field, columns in {"actions": moved, "robot": task.robot}.items():
+            wrong = [column for column in columns if column is not None and not 0 <= column < task.state_dim]
             if wrong:
                 faults.append(f"{field}: the state has {task.state_dim} columns, got {wrong[0]}")
-    for field in ("actuated", "action_targets"):
-        if len(getattr(task, field)) not in (0, task.action_dim):
-            wanted = f"a state column for each of {task.action_dim} actions"
-            faults.append(f"{field}: wanted {wanted}, got {getattr(task, field)}")
     if len(task.observation_units) not in (0, task.observation_dim):
         wanted = f"one for each of {task.observation_dim} columns"
         faults.append(f"observation_units: wanted {wanted}, got {len(task.observation_units)}")
-    if tuple(task.actions)[task.num_delta_actions :] != tuple(task.absolute_actions):
-        faults.append(f"absolute_actions: wanted the last of {', '.join(task.actions)}, got {task.absolute_actions}")
     missing = [name for group in task.relative_positions for name in group if name not in task.state_parts]
     missing += [name for name in task.planar_parts if name not in task.state_parts]
     faults += [f"relative_positions or planar_parts: {name!r} is no part of the state" for name in missing]

@@ -72,5 +72,7 @@ def tan_yaw(quaternion: np.ndarray) -> np.ndarray:
     return np.tan(np.arctan2(2 * (w * z - x * y), 1 - 2 * (y**2 + z**2)))
 
 
-# a feature of one's own is named by its import string; StateParts names the columns of these
+# names that a feature gives to its columns; those of a plain part, and of a feature of one's own, are numbered
+FEATURE_COLUMNS = {"plane": ("x", "y"), "tan_yaw": ("cos_2yaw", "sin_2yaw"), "quaternion": ("cos_yaw", "sin_yaw")}
+# a feature of one's own is named by its import string
 FEATURES = {"plain": plain, "plane": plane, "tan_yaw": double_yaw, "quaternion": yaw_of}

@@ -34,9 +34,9 @@ def register_task(task: Task) -> Task:
         ValueError: if another task has the name.
 
     Examples:
-        >>> from torchrl_koap.tasks import Task, get_task, register_task
+        >>> from torchrl_koap.tasks import Action, Task, get_task, register_task
         >>> arm = Task(
-        ...     name="doctest_arm", observation_parts={"joints": 2}, actions={"a": "rad", "b": "rad"}, position="joints"
+        ...     name="doctest_arm", observation_parts={"joints": 2}, actions={"a": Action("rad")}, position="joints"
         ... )
         >>> register_task(arm) is get_task("doctest_arm")
         True
@@ -104,10 +104,10 @@ def adopt_task(task: Task) -> Task:
         ValueError: if a package has registered another task of that name.
 
     Examples:
-        >>> from torchrl_koap.tasks import Task, get_task
+        >>> from torchrl_koap.tasks import Action, Task, get_task
         >>> from torchrl_koap.tasks.registry import adopt_task
-        >>> for joints in (6, 7):
-        ...     arm = Task(name="my_arm", observation_parts={"joints": joints}, actions={"a": "rad"}, position="joints")
+        >>> for n in (6, 7):
+        ...     arm = Task(name="my_arm", observation_parts={"q": n}, actions={"a": Action("rad")}, position="q")
         ...     adopted = adopt_task(arm)
         >>> get_task("my_arm").observation_dim
         7
@@ -145,9 +145,36 @@ def task_of(config: Mapping[str, Any]) -> Task:
     definition = config.get("task_definition")
     if definition is None:
         return get_task(config["task"])
-    from torchrl_koap.tasks.json_format import plain_task_from_json
+    return adopt_task(plain_task(definition))
 
-    return adopt_task(plain_task_from_json(definition))
+
+def plain_task(entries: object) -> Task:
+    """Reads the task that a data set or run brings along: plain facts, no code.
+
+    A folder that somebody sent must not decide what is run.
+
+    Args:
+        entries (dict): as :meth:`Task.to_json` wrote them.
+
+    Raises:
+        ValueError: if the entries are damaged, or name code to import.
+
+    Examples:
+        >>> from torchrl_koap.tasks import get_task
+        >>> from torchrl_koap.tasks.registry import plain_task
+        >>> plain_task(get_task("avoiding").to_json())  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        ValueError: task 'avoiding' names code in env, expert, ...; register it by --plugin instead
+    """
+    try:
+        task = Task.from_json(entries)
+        code = task.import_strings()
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        raise ValueError(f"the task is damaged: {error}") from error
+    if code:
+        raise ValueError(f"task {task.name!r} names code in {', '.join(code)}; register it by --plugin instead")
+    return task
 
 
 def load_entry_points() -> None:

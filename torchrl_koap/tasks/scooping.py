@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
 from torchrl_koap.tasks.task import Defaults, Task
@@ -80,8 +81,7 @@ _SCOOPING = register_task(
         observation_units=("",) * EMBEDDING_DIM + ("m",) * 3,
         position="spoon",
         hidden=("spoon",),
-        actions={f"joint {joint}": "rad" for joint in range(1, 8)},
-        absolute_actions=tuple(f"joint {joint}" for joint in range(1, 8)),
+        actions={f"joint {joint}": Action("rad", "absolute") for joint in range(1, 8)},
         max_steps=120,
         control_hz=FRAME_HZ,
         score="torchrl_koap.tasks.scooping:scores",

@@ -10,14 +10,15 @@ from __future__ import annotations
 import functools
 import itertools
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import torch
+from torch import Tensor
+
+from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
 from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 # of PO-Sorting, where time is short: noise makes decoded actions too small, and plans are followed from behind; chosen
 # on one trained planner (docs/results/planners.md)
@@ -57,8 +58,6 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
     Returns:
         Tensor: bool ``[*B]``.
     """
-    import torch
-
     done = torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
     for box in task.objects:
         x, y = state[..., task.state_slices[f"{box}_xy"]].unbind(-1)
@@ -123,9 +122,8 @@ def _sorting(num_boxes: int) -> Task:
         observation_parts={"desired_xy": 2, "measured_xy": 2} | columns,
         command="desired_xy",
         position="measured_xy",
-        actions={"x": "m", "y": "m"},
+        actions={"x": Action("m", column=0), "y": Action("m", column=1)},
         max_steps=700,
-        actuated=(0, 1),
         robot=(0, 1),
         state={"measured_xy": "plain"} | {name: "tan_yaw" if size == 1 else "plain" for name, size in columns.items()},
         relative_positions=tuple(("measured_xy", f"{box}_xy") for box in boxes),

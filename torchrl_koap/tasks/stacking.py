@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+import torch
+from torch import Tensor
+
+from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
 from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 TARGET = (0.5, 0.2)  # centre of the target zone (m)
 TARGET_HALF = 0.05  # half its width (m)
@@ -21,12 +21,11 @@ HEIGHT_GAP = 0.03  # m; boxes lie on top of each other if all their heights diff
 # name, half sizes (m)
 BOXES = (("red", (0.03, 0.03, 0.03)), ("green", (0.03, 0.03, 0.03)), ("blue", (0.03, 0.05, 0.03)))
 NAMES = tuple(name for name, _ in BOXES)
+_JOINTS = {f"joint {joint}": Action("rad") for joint in range(1, 8)}
 
 
 def _boxes_of(task: Task, state: Tensor) -> tuple[Tensor, Tensor]:
     """Positions of the boxes ``[*B, 3, 3]``, and whether each is in the zone."""
-    import torch
-
     boxes = torch.stack([state[..., task.state_slices[f"{box}_position"]] for box in task.objects], -2)
     return boxes, (boxes[..., :2] - boxes.new_tensor(TARGET)).norm(dim=-1) <= ZONE_RADIUS
 
@@ -67,13 +66,11 @@ _STACKING = register_task(
         | {"measured_joints": 7, "gripper_width": 1, "tcp_position": 3},
         command="desired_joints_and_gripper",
         position="tcp_position",
-        actions={f"joint {joint}": "rad" for joint in range(1, 8)} | {"gripper": "m"},
-        absolute_actions=("gripper",),
+        actions=_JOINTS | {"gripper": Action("m", "gripper", column=7)},
         max_steps=1000,
         control_hz=1 / 0.03,
         robot=tuple(range(8)),
         tool_kinematics="torchrl_koap.tasks.panda_kinematics:tool_position",
-        gripper=(7, 7),
         state={"measured_joints": "plain", "gripper_width": "plain", "tcp_position": "plain"}
         | {part: kind for box in NAMES for part, kind in ((f"{box}_position", "plain"), (f"{box}_tan_yaw", "tan_yaw"))},
         interchangeable=(("red", "green"),),
@@ -140,7 +137,7 @@ register_task(
         hidden=("measured_joints",),
         robot=tuple(range(4)),  # position of the tool, width of the gripper
         tool_kinematics=None,
-        gripper=None,
+        actions=_JOINTS | {"gripper": Action("m", "absolute")},
         defaults=replace(_STACKING.defaults, method="koap_posture"),  # what the commands move is not seen
         in_paper=True,
     )

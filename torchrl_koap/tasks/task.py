@@ -2,28 +2,27 @@
 """What a task *is*: observation and action columns, goal, modes, how it looks, and which code simulates it.
 
 Environments, readers of recorded data, training and reports share these facts, so they live in none of them. Code is
-named by import strings (``"package.module:name"``), so that a task is plain data: it can be written to JSON beside a
-data set, and neither simulator nor torch is imported before they are used.
+named by import strings (``"package.module:name"``), so that a task is plain data, which can be written to JSON beside a
+data set, and no simulator is imported before it is used.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from torchrl_koap.lookup import lookup
+from torch import Tensor
+
+from torchrl_koap.files import dataclass_from_json
+from torchrl_koap.lookup import lookup, resolve
+from torchrl_koap.tasks.action_rules import Action, ActionRule
 from torchrl_koap.tasks.checks import check_task
-from torchrl_koap.tasks.import_strings import resolve
+from torchrl_koap.tasks.columns import Columns
+from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
 from torchrl_koap.tasks.scene import Body, Scene, StartRegions
-from torchrl_koap.tasks.state_parts import StateParts
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from torchrl_koap.tasks.relative_positions import RelativePositionFeatures
 
 CONTROL_HZ = 1 / 0.035
 # what wins on the tasks with objects: capacity and many samples (docs/results/planners.md)
@@ -109,40 +108,26 @@ class Defaults:
     execution: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Task(StateParts):
+@dataclass(frozen=True, kw_only=True)
+class Task(Columns):
     """Facts of one task (lengths in m, angles in rad, unless a column says otherwise).
 
     Args:
         name (str): name used on the command line and in files.
-        observation_parts (dict): parts of the observation in the order of the columns: a number of columns, or their
-            names. Numbered ones are called as the part, with a number if it has several.
-        actions (dict): unit of every action column, such as ``"m"``, ``"rad"``, ``"N"`` or ``""``.
+        observation_parts (dict): and the other columns, see :class:`~torchrl_koap.tasks.Columns`.
+        actions (dict): name of every action column to its :class:`~torchrl_koap.tasks.Action`.
         position (str): the part that pictures draw, ``x, y`` first.
         max_steps (int): control steps after which an episode is truncated.
         control_hz (float): control steps per second.
-        command (str, optional): the part that repeats the last command. Its differences *are* the actions, so it is
-            never shown to planner or controller. None: the observation holds no command.
-        observation_units (tuple of str): unit of every observation column; empty: m for positions, rad for angles.
-        action_targets (tuple of int): for absolute actions the state column that each one is the target of: controllers
-            then decode the distance to it. Empty: actions are changes, velocities or efforts.
-        absolute_actions (tuple of str): trailing action columns that are commands themselves, not changes of one.
-        state (dict): part of the observation to name of its feature (:mod:`torchrl_koap.tasks.features`) or its import
-            string, in the order of the state. Empty: every part but the command and the hidden ones, unchanged.
-        hidden (tuple of str): further parts that planner and controller must not see.
-        actuated (tuple of int): for every action column the state column that it moves, by the same filter for all;
-            empty if there is none.
         robot (tuple of int): state columns of the robot itself: the recovery augmentation shifts them, and the
             controller reads them (see :meth:`controller_columns`).
         tool_kinematics (str, optional): import string of the function from the robot's joints ``[*B, J]`` to the
             position of the tool ``[*B, 3]``, where joints are commanded; ``position`` then follows them.
-        gripper (tuple of int, optional): action column of the gripper and state column of its width: its number is read
-            off the planned widths (:mod:`torchrl_koap.tasks.gripper`), not decoded.
         planar_parts (tuple of str): parts whose positions and yaws may be moved and turned together for training;
             empty if the place on the table matters.
         interchangeable (tuple): groups of bodies that may be permuted for training.
         relative_positions (tuple): what the planner is told besides the state: ``(part, seen from part, in the frame of
-            part, yaw of part)``, the last two optional (:mod:`torchrl_koap.tasks.relative_positions`).
+            part, yaw of part)``, the last two optional (see :meth:`relative_columns`).
         goal (str, optional): import string of the function of the task and a state ``[*B, d]`` that says where it is
             done, bool ``[*B]``.
         modes (Modes): the ways in which the task can be done.
@@ -170,33 +155,23 @@ class Task(StateParts):
         ValueError: with every fault found: a part, column or body that does not exist, columns out of range.
 
     Examples:
-        >>> from torchrl_koap.tasks import Task
+        >>> from torchrl_koap.tasks import Action, Task
         >>> arm = Task(
         ...     name="arm",
         ...     observation_parts={"joints": 7, "cup_xy": ("cup_x", "cup_y")},
-        ...     actions={f"joint_{joint}": "rad" for joint in range(1, 8)},
+        ...     actions={f"joint_{joint}": Action("rad", column=joint - 1) for joint in range(1, 8)},
         ...     position="cup_xy",
         ... )
         >>> arm.action_dim, arm.state_names[-2:], Task.from_json(arm.to_json()) == arm
         (7, ('cup_x', 'cup_y'), True)
     """
 
-    name: str
-    observation_parts: Mapping[str, int | tuple[str, ...]]
-    actions: dict[str, str]
+    actions: Mapping[str, Action]
     position: str
     max_steps: int = 400
     control_hz: float = CONTROL_HZ
-    command: str | None = None
-    observation_units: tuple[str, ...] = ()
-    action_targets: tuple[int, ...] = ()
-    absolute_actions: tuple[str, ...] = ()
-    state: dict[str, str] = field(default_factory=dict)
-    hidden: tuple[str, ...] = ()
-    actuated: tuple[int, ...] = ()
     robot: tuple[int, ...] = ()
     tool_kinematics: str | None = None
-    gripper: tuple[int, int] | None = None
     planar_parts: tuple[str, ...] = ()
     interchangeable: tuple[tuple[str, ...], ...] = ()
     relative_positions: tuple[tuple[str, ...], ...] = ()
@@ -208,9 +183,9 @@ class Task(StateParts):
     collides: bool = False
     noise: float = 0.0
     env: str | None = None
-    env_options: dict[str, Any] = field(default_factory=dict)
+    env_options: Mapping[str, Any] = field(default_factory=dict)
     expert: str | None = None
-    expert_options: dict[str, Any] = field(default_factory=dict)
+    expert_options: Mapping[str, Any] = field(default_factory=dict)
     gym_id: str = ""
     data: str = ""
     converter: str | None = None
@@ -233,9 +208,14 @@ class Task(StateParts):
         return tuple(self.actions)
 
     @property
+    def action_units(self) -> tuple[str, ...]:
+        """Units of the action columns."""
+        return tuple(action.unit for action in self.actions.values())
+
+    @property
     def action_unit(self) -> str:
         """Unit of the first action column: that of the columns :meth:`action_columns` returns by default."""
-        return next(iter(self.actions.values()))
+        return self.action_units[0]
 
     def action_columns(self, unit: str | None = None) -> list[int]:
         """Action columns in one unit, whose errors may be averaged.
@@ -244,21 +224,44 @@ class Task(StateParts):
             unit (str, optional): the unit. Default: that of the first column.
         """
         unit = self.action_unit if unit is None else unit
-        return [index for index, own in enumerate(self.actions.values()) if own == unit]
+        return [index for index, own in enumerate(self.action_units) if own == unit]
+
+    @cached_property
+    def delta_actions(self) -> tuple[int, ...]:
+        """Action columns that are changes of a command, velocities or efforts."""
+        return tuple(index for index, action in enumerate(self.actions.values()) if action.kind == "delta")
+
+    @cached_property
+    def targets(self) -> tuple[int, ...]:
+        """State column that each action is the target of, where all are absolute and name one; else empty."""
+        columns = [action.column for action in self.actions.values() if action.kind == "absolute"]
+        known = tuple(column for column in columns if column is not None)
+        return known if len(known) == self.action_dim else ()
+
+    @cached_property
+    def gripper(self) -> tuple[int, int] | None:
+        """Action column of the gripper and state column of its width, None where no width commands one."""
+        for index, action in enumerate(self.actions.values()):
+            if action.kind == "gripper" and action.column is not None:
+                return index, action.column
+        return None
+
+    def moved_columns(self, *, or_robot: bool = False) -> tuple[int, ...]:
+        """State column that each action moves, by the same filter for all; empty where one of them names none.
+
+        Keyword Args:
+            or_robot (bool): take the first columns of the robot instead, one for each change of a command, where the
+                actions name none.
+        """
+        columns = [action.column for action in self.actions.values() if action.column is not None]
+        if len(columns) == self.action_dim and not self.targets:
+            return tuple(columns)
+        return self.robot[: len(self.delta_actions)] if or_robot else ()
 
     @property
-    def num_delta_actions(self) -> int:
-        """Number of leading action columns that are changes of a command."""
-        return self.action_dim - len(self.absolute_actions)
-
-    @property
-    def action_rule(self) -> Callable[[Tensor, Tensor], Tensor] | None:
-        """What has the last word on decoded actions (:mod:`torchrl_koap.tasks.action_rules`), None if nothing has."""
-        if self.gripper is None and not self.action_targets:
-            return None
-        from torchrl_koap.tasks.action_rules import ActionRule
-
-        return ActionRule(self.gripper, self.action_targets)
+    def action_rule(self) -> ActionRule | None:
+        """What has the last word on decoded actions, None if nothing has."""
+        return ActionRule(self.gripper, self.targets) if self.gripper or self.targets else None
 
     @property
     def num_modes(self) -> int:
@@ -285,8 +288,66 @@ class Task(StateParts):
         """The function from joints to the position of the tool, None where the tool itself is commanded."""
         return resolve(self.tool_kinematics, f"tool_kinematics of task {self.name!r}")
 
+    @property
+    def tool_columns(self) -> tuple[int, ...] | None:
+        """State columns of a tool position that follows the joints, None where the tool itself is commanded."""
+        if self.tool_kinematics is None:
+            return None
+        part = self.state_slices[self.position]
+        return tuple(range(part.start, part.stop))
+
+    @property
+    def plans_position(self) -> bool:
+        """Whether the state begins with the position that pictures draw."""
+        return next(iter(self.state_parts.items())) == (self.position, "plain")
+
+    def controller_columns(self, part: str) -> tuple[int, ...]:
+        """State columns that a controller reads.
+
+        Args:
+            part (str): ``"robot"``: the robot's own, whose motion the actions command; ``"all"``: the whole state, as
+                KOAP's configurations have it.
+
+        Raises:
+            ValueError: for another part.
+        """
+        everything = tuple(range(self.state_dim))
+        return lookup({"robot": self.robot or everything, "all": everything}, part, "part of the state")
+
+    def relative_columns(self) -> list[tuple[slice, ...]]:
+        """State columns of ``relative_positions``: a position, the one it is seen from, a yaw and another one."""
+        return [tuple(self.state_slices[name] for name in names) for names in self.relative_positions]
+
+    def planner_features(self) -> RelativePositionFeatures | None:
+        """The task's relative positions as a module, None if it has none."""
+        pairs = [RelativePosition(*columns) for columns in self.relative_columns()]
+        return RelativePositionFeatures(pairs) if pairs else None
+
+    def interchangeable_columns(self) -> list[list[list[int]]]:
+        """State columns of the bodies that may be permuted, by group and body."""
+        return [
+            [
+                [
+                    column
+                    for part, place in self.state_slices.items()
+                    if part.startswith(f"{name}_")
+                    for column in range(place.start, place.stop)
+                ]
+                for name in group
+            ]
+            for group in self.interchangeable
+            if len(group) > 1
+        ]
+
+    def planar_columns(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """State columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` that move together."""
+        columns = self.state_slices
+        pairs = {name: (columns[name].start, columns[name].start + 1) for name in self.planar_parts}
+        yaws = [name for name in self.planar_parts if self.state_parts[name] == "quaternion"]
+        return [pair for name, pair in pairs.items() if name not in yaws], [pairs[name] for name in yaws]
+
     def goal_reached(self, state: Tensor) -> Tensor:
-        """Which states, planned or recorded, are ones in which the task is done.
+        """Says which states, planned or recorded, are ones in which the task is done.
 
         Environments judge the physics; this judges states as planner and controller see them, so that a plan can be
         judged without executing it.
@@ -312,39 +373,41 @@ class Task(StateParts):
             raise ValueError(f"a state of task {self.name!r} has {self.state_dim} columns, got {state.shape[-1]}")
         return resolve(self.goal, f"goal of task {self.name!r}")(self, state)
 
-    def controller_columns(self, part: str) -> tuple[int, ...]:
-        """State columns that a controller reads.
-
-        Args:
-            part (str): ``"robot"``: the robot's own, whose motion the actions command; ``"all"``: the whole state, as
-                KOAP's configurations have it.
-
-        Raises:
-            ValueError: for another part.
-        """
-        everything = tuple(range(self.state_dim))
-        return lookup({"robot": self.robot or everything, "all": everything}, part, "part of the state")
-
-    def planner_features(self) -> RelativePositionFeatures | None:
-        """The task's relative positions as a module, None if it has none."""
-        if not self.relative_positions:
-            return None
-        from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
-
-        columns = self.state_slices
-        return RelativePositionFeatures(
-            [RelativePosition(*(columns[name] for name in names)) for names in self.relative_positions]
-        )
+    def import_strings(self) -> dict[str, str]:
+        """Import strings by the field that has them: the code that using the task may run."""
+        named = {field: getattr(self, field) for field in ("env", "expert", "goal", "score", "converter")}
+        named |= {"tool_kinematics": self.tool_kinematics, "modes.index": self.modes.index}
+        named |= {f"state.{part}": kind for part, kind in self.state.items() if ":" in kind}
+        return {place: value for place, value in named.items() if value}
 
     def to_json(self) -> dict[str, Any]:
-        """The task as plain JSON types (:func:`~torchrl_koap.tasks.json_format.task_to_json`)."""
-        from torchrl_koap.tasks.json_format import task_to_json
+        """The task as dictionaries, lists, strings and numbers.
 
-        return task_to_json(self)
+        Raises:
+            TypeError: if a field holds an object instead of its import string.
+
+        Examples:
+            >>> from torchrl_koap.tasks import get_task
+            >>> get_task("avoiding").to_json()["actions"]["y"]
+            {'unit': 'm', 'kind': 'delta', 'column': 1}
+        """
+        return {name: _plain(value, name) for name, value in asdict(self).items()}
 
     @classmethod
-    def from_json(cls, entries: dict[str, Any]) -> Task:
-        """The task that :meth:`to_json` wrote (:func:`~torchrl_koap.tasks.json_format.task_from_json`)."""
-        from torchrl_koap.tasks.json_format import task_from_json
+    def from_json(cls, entries: object) -> Task:
+        """The task that :meth:`to_json` wrote.
 
-        return task_from_json(entries)
+        Raises:
+            ValueError: for an unknown or missing entry, or facts that do not fit each other.
+        """
+        return dataclass_from_json(cls, entries, "task")
+
+
+def _plain(value: Any, place: str) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(entry, f"{place}.{key}") for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry, place) for entry in value]
+    if value is None or isinstance(value, (str, int, float, bool)):
+        return value
+    raise TypeError(f"{place} cannot be written to JSON: wanted an import string, got {value!r}")

@@ -142,8 +142,8 @@ def write_analysis(
         dict: ``controller`` and ``ridge``, root mean squared errors in mm or mrad, and ``analysis_labels_read``; a
         ``note`` alone where no hidden trajectory has labels.
     """
-    labelled = controller_view(labelled.cpu(), columns, action_targets=task.action_targets)
-    viewed = controller_view(data, columns, action_targets=task.action_targets)
+    labelled = controller_view(labelled.cpu(), columns, action_targets=task.targets)
+    viewed = controller_view(data, columns, action_targets=task.targets)
     predicted, true = hidden_action_errors(controller, viewed, labelled)
     # trajectories that the training does not use have no label
     has_action = torch.zeros(len(data), dtype=torch.bool)

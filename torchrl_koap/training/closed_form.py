@@ -39,7 +39,7 @@ def fit_closed_form(
         data (TensorDictBase): flat data after the label budget was applied.
 
     Keyword Args:
-        shared_axes (sequence of int): the state column that each action entry moves (``Task.actuated``); used by
+        shared_axes (sequence of int): the state column that each action entry moves (``Task.moved_columns()``); used by
             Fourier latent actions (:meth:`KoopmanInverseDynamics.fit_decoder`).
         guessed_axes (sequence of int): the same where it is only likely; used if labels left out are predicted better
             by it. On a robot of seven joints with five labelled trajectories that is a fifth of the error.
@@ -137,13 +137,14 @@ def likely_axes(task: Task, columns: Sequence[int]) -> list[int]:
         list of int: a column of those read for every action; empty where there is nothing to guess.
 
     Examples:
-        >>> from torchrl_koap.tasks import Task, get_task
+        >>> from torchrl_koap.tasks import Action, Task, get_task
         >>> from torchrl_koap.training.closed_form import likely_axes
-        >>> arm = Task("arm", {"goal": 2, "q": 2}, {"a": "rad", "b": "rad"}, "q", robot=(2, 3))
+        >>> parts, actions = {"goal": 2, "q": 2}, {"a": Action("rad"), "b": Action("rad")}
+        >>> arm = Task(name="arm", observation_parts=parts, actions=actions, position="q", robot=(2, 3))
         >>> likely_axes(arm, (2, 3)), likely_axes(get_task("avoiding"), (0, 1))
         ([0, 1], [])
     """
-    moved = task.action_targets or task.robot
+    moved = task.targets or task.robot
     if task.env is not None or len(moved) != task.action_dim or not set(moved) <= set(columns):
         return []
     return [list(columns).index(column) for column in moved]

@@ -181,7 +181,9 @@ def _train_network(
         controller.fit_unlabelled(windows["state"])
     if method.closed_form:
         columns = task.controller_columns(options.controller_state)
-        fit = fit_closed_form(controller, data, shared_axes=task.actuated, guessed_axes=likely_axes(task, columns))
+        fit = fit_closed_form(
+            controller, data, shared_axes=task.moved_columns(), guessed_axes=likely_axes(task, columns)
+        )
     return controller, fit, values
 
 
@@ -241,6 +243,6 @@ def _relabelled(train_one: _Training, resolved: ResolvedConfig, data: TensorDict
     view = resolved.controller_view(data)
     controller, _, _ = _train_network(train_one, replace(teacher, phases=phases), entry, view)
     labelled = relabel(controller, view, window=max(WINDOW, controller.num_window_frames))
-    if resolved.task.action_targets:
-        labelled["action"] = labelled["action"] + data["state"][..., list(resolved.task.action_targets)]
+    if resolved.task.targets:
+        labelled["action"] = labelled["action"] + data["state"][..., list(resolved.task.targets)]
     return data.copy().update(labelled.select("action", "has_action"))

@@ -22,7 +22,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import InverseDynamics, StatePlanner
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.progress import without_progress_bars
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Action, Task
 from torchrl_koap.training.controller import learn_actions
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.planner import learn_states
@@ -226,7 +226,7 @@ def _task_of_columns(data: TensorDictBase) -> Task:
     """A task about which nothing is known but the number of columns."""
     seen = data.get(keys.STATE, None)
     width = (data[keys.OBSERVATION] if seen is None else seen).shape[-1]
-    actions = {f"action_{column}": "" for column in range(data[keys.ACTION].shape[-1])}
+    actions = {f"action_{column}": Action() for column in range(data[keys.ACTION].shape[-1])}
     return Task(name="robot", observation_parts={"robot": width}, actions=actions, position="robot")
 
 

@@ -134,9 +134,9 @@ def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> 
 
     Keyword Args:
         actions (bool): the windows hold actions, which have to fit the states afterwards. Scenes are then moved, and
-            the robot displaced, only in tasks that say which state column every action moves (``Task.actuated``).
+            the robot displaced, only where every action names the state column that it moves.
     """
-    moved_by = list(task.actuated) if actions else None
+    moved_by = list(task.moved_columns()) if actions else None
     steps = []
     if options.exchange and task.interchangeable_columns():
         steps.append(ObjectPermutation(task.interchangeable_columns()))

@@ -43,13 +43,11 @@ def posture_columns(task: Task) -> dict[str, Any]:
             f"task {task.name!r} cannot keep a posture: its observation has no part that repeats the last command"
             " (Task.command)"
         )
-    actions = list(range(task.num_delta_actions))
-    if not actions or task.action_targets:
+    actions = list(task.delta_actions)
+    if not actions:
         raise ValueError(f"task {task.name!r} needs no posture: its actions are commands, not changes of them")
     commands = list(range(task.observation_dim))[task.command_columns]
-    features = task.planner_features()
-    pairs = () if features is None else features.pairs
-    relative = [[_ends(part) for part in (pair.place, pair.origin, pair.yaw, pair.other_yaw)] for pair in pairs]
+    relative = [[_ends(part) for part in (*pair, None, None)[:4]] for pair in task.relative_columns()]
     return {
         "state_dim": task.state_dim,
         "commands": [commands[i] for i in actions],

@@ -68,7 +68,7 @@ class ResolvedConfig:
 
     def controller_view(self, data: TensorDictBase) -> TensorDictBase:
         """Flat data ``[N]`` as the controller sees them: its columns, and actions as distances to their targets."""
-        return controller_view(data, self.columns, action_targets=self.task.action_targets)
+        return controller_view(data, self.columns, action_targets=self.task.targets)
 
     def with_labels_of(self, data: TensorDictBase) -> ResolvedConfig:
         """The same with the share of labels that is the default for these data, if none was asked for."""
@@ -139,7 +139,7 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         controller["tracking"] = tracked_columns(task)
     if method.keeps_posture:
         controller["posture"] = posture_columns(task)
-    if len(task.absolute_actions) == task.action_dim and not task.action_targets:
+    if not task.delta_actions and not task.targets:
         controller["absolute"] = True
     return ResolvedConfig(
         options=options,

@@ -34,9 +34,9 @@ def tracked_columns(task: Task) -> dict[str, Any]:
         >>> tracked_columns(get_task("avoiding"))
         {'states': [0, 1], 'commands': [0, 1], 'actions': [0, 1], 'absolute': False}
     """
-    absolute = bool(task.action_targets)
-    actions = list(range(task.action_dim if absolute else task.num_delta_actions))
-    moved = list(task.action_targets or task.actuated or task.robot[: len(actions)])
+    absolute = bool(task.targets)
+    actions = list(range(task.action_dim) if absolute else task.delta_actions)
+    moved = list(task.targets or task.moved_columns(or_robot=True))
     if task.command is None:
         raise ValueError(
             f"task {task.name!r} cannot follow plans by prediction: its observation has no part that repeats the last"
@@ -46,7 +46,7 @@ def tracked_columns(task: Task) -> dict[str, Any]:
     if not len(actions) == len(moved) == len(commands):
         raise ValueError(
             f"task {task.name!r} cannot follow plans by prediction: {len(actions)} actions, {len(commands)} commands"
-            f" ({task.command!r}) and {len(moved)} state columns that they move (Task.actuated or Task.robot)"
+            f" ({task.command!r}) and {len(moved)} state columns that they move (Action.column or Task.robot)"
         )
     return {"states": moved, "commands": commands, "actions": actions, "absolute": absolute}
 

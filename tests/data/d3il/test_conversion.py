@@ -210,7 +210,7 @@ def test_every_task_gets_its_columns(tmp_path, task):
     assert data["observation"].shape == (12, facts.observation_dim) and data["action"].shape == (12, facts.action_dim)
     assert torch.equal(data["state"], facts.state_of(data["observation"]))
     # the command and the action give the next command
-    command, size = facts.observation[facts.command], facts.num_delta_actions
+    command, size = facts.observation[facts.command], len(facts.delta_actions)
     reached = data["observation"][:, command][:, :size] + data["action"][:, :size]
     torch.testing.assert_close(reached, data["next", "observation"][:, command][:, :size], rtol=0, atol=1e-6)
     seen = load_demonstrations(str(tmp_path / "raw"), facts)["state"]  # measured with noise, for a task that has some

@@ -107,7 +107,7 @@ def test_unknown_names_are_told(tmp_path, recorded, warnings):
 @pytest.mark.parametrize("task", ["avoiding", "stacking"])
 def test_absolute_actions(tmp_path, task, own_row):
     data = made_up(task)
-    command, size = get_task(task).observation[get_task(task).command], get_task(task).num_delta_actions
+    command, size = get_task(task).observation[get_task(task).command], len(get_task(task).delta_actions)
     positions = torch.cat([frames[:, command] if own_row else frames[1:, command] for frames, _ in episodes_of(data)])
     rows = iter(positions.tolist())
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from torchrl_koap import Task, register_task
-from torchrl_koap.tasks import Body, Defaults, Modes, Scene, Shape, StartRegions
+from torchrl_koap.tasks import Action, Body, Defaults, Modes, Scene, Shape, StartRegions
 
 GOAL, GOAL_RADIUS = (0.5, 0.4), 0.05  # m
 POST, GATE_Y = (0.5, 0.2), 0.2  # where the side is decided (m)
@@ -31,11 +31,10 @@ TASK = register_task(
     Task(
         name="puck",
         observation_parts={"robot_xy": ("x", "y"), "puck_xy": ("puck_x", "puck_y")},
-        actions={"x": "m", "y": "m"},
+        actions={"x": Action("m", column=0), "y": Action("m", column=1)},
         position="robot_xy",
         max_steps=200,
         control_hz=20.0,
-        actuated=(0, 1),
         robot=(0, 1),
         relative_positions=(("robot_xy", "puck_xy"),),
         goal="puck.task:goal_reached",

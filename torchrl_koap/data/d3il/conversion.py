@@ -19,10 +19,10 @@ from tensordict import TensorDictBase
 from torchrl_koap.data.d3il.raw import RawEpisode, RawEpisodeError, read_raw_episode
 from torchrl_koap.data.d3il.unpickling import load_pickle
 from torchrl_koap.data.trajectories import flatten_trajectories
+from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import TASKS, get_task
+from torchrl_koap.tasks.action_rules import gripper_command
 from torchrl_koap.tasks.features import tan_yaw
-from torchrl_koap.tasks.gripper import gripper_number
-from torchrl_koap.tasks.import_strings import resolve
 
 SPLITS = ("train", "eval")
 _NO_EPISODES = ("*_files.pkl", "*_files_*.pkl", "*_contexts.pkl", "*_mode_prob.pkl")
@@ -88,7 +88,7 @@ def _stacking(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
         position, quat = _pose(episode, name)
         columns += [position, tan_yaw(quat)[:, None]]
     columns += [_robot(episode, "j_pos"), width, _robot(episode, "c_pos")]
-    number = gripper_number(torch.from_numpy(width[:, 0])).numpy()[:, None]
+    number = gripper_command(torch.from_numpy(width[:, 0])).numpy()[:, None]
     actions = np.concatenate([np.diff(desired, axis=0), number], axis=1)
     return np.concatenate(columns, axis=1), actions
 

@@ -149,7 +149,7 @@ def _checked_actions(task: Task, frames: np.ndarray, actions: np.ndarray, kind: 
         raise ValueError(f"column 'action' has {actions.shape[1]} entries, task {task.name!r} has {task.action_dim}")
     if task.command is None:
         return actions[:-1]  # no command is observed that they could be compared with
-    desired, size = frames[:, task.command_columns], task.num_delta_actions
+    desired, size = frames[:, task.command_columns], len(task.delta_actions)
     changes = np.concatenate([np.diff(desired[:, :size], axis=0), desired[1:, size:]], 1)
     gaps = {
         "delta": np.abs(actions[:-1] - changes).max(),

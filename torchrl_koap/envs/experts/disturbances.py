@@ -146,12 +146,11 @@ def disturbed_columns(task: Task) -> np.ndarray:
         >>> [len(disturbed_columns(get_task(name))) for name in ("avoiding", "aligning", "stacking")]
         [2, 2, 7]
     """
-    changes = {name: unit for name, unit in task.actions.items() if name not in task.absolute_actions}
-    if not changes or task.action_targets:
+    changes = task.delta_actions
+    if not changes:
         raise ValueError(f"task {task.name!r} has no action that is a change of a command: nothing can be disturbed")
-    joints = [name for name, unit in changes.items() if unit == "rad"]
-    names = list(task.actions)
-    return np.array([names.index(name) for name in joints or list(changes)[:2]])
+    joints = [index for index in changes if task.action_units[index] == "rad"]
+    return np.array(joints or changes[:2])
 
 
 def height_column(task: Task) -> int | None:
@@ -166,7 +165,7 @@ def height_column(task: Task) -> int | None:
         >>> [height_column(get_task(name)) for name in ("avoiding", "aligning", "stacking")]
         [None, 2, None]
     """
-    lengths = [index for index, unit in enumerate(task.actions.values()) if unit == "m"]
+    lengths = [index for index, unit in enumerate(task.action_units) if unit == "m"]
     return lengths[2] if len(lengths) == 3 and list(disturbed_columns(task)) == lengths[:2] else None
 
 

@@ -94,7 +94,7 @@ def record_random_play(
 def _tool_columns(task: Task) -> slice:
     """Columns of the observation that hold the position which actions change."""
     columns = task.observation[task.position]
-    if task.env is None or task.action_targets or columns.stop - columns.start != task.action_dim:
+    if task.env is None or task.targets or columns.stop - columns.start != task.action_dim:
         raise ValueError(
             f"random play pushes a tool about; task {task.name!r} has no environment in which {task.action_dim} actions"
             " change the position of one"

@@ -30,8 +30,8 @@ from torchrl_koap.data.d3il.conversion import get_converter
 from torchrl_koap.envs.contexts import yaw_quaternions
 from torchrl_koap.envs.experts.disturbances import Disturbances
 from torchrl_koap.envs.registry import mode_index_of
+from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.import_strings import resolve
 
 FAULTS = ("collision", "unfinished", "mode", "close", "slow")
 

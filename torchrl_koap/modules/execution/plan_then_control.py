@@ -54,7 +54,7 @@ class PlanThenControl(RecedingHorizonPolicy):
             Default: all.
         action_rule (callable, optional): ``action_rule(states [B, T, d], actions [B, T, act]) -> actions`` has the last
             word on the actions of a window of observed and planned states; such as the gripper's number, which is read
-            off the planned widths (:func:`~torchrl_koap.tasks.gripper.command_gripper`).
+            off the planned widths (:func:`~torchrl_koap.tasks.action_rules.command_gripper`).
         candidates (int): plans sampled whenever one is due, of which one that goes on with the plan in force is taken
             (:mod:`torchrl_koap.modules.execution.candidates`). Defaults to ``1``.
         choice (str): the rule by which it is taken. Defaults to ``"quarter"``.
