@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_koap.files import sha256_of
-from torchrl_koap.tasks.import_strings import resolve
+from torchrl_koap.lookup import resolve
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet, as torchvision normalises
 NETWORK = "efficientnet_lite0"
