@@ -17,13 +17,13 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
+from torchrl_koap.vision.pooling import POOLINGS, Projection
 
 from torchrl_koap.data.lerobot.images import ImageEpisode, read_image_episodes
 from torchrl_koap.envs.scooping.recording import play_episodes
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS, IMAGE_SIZE
 from torchrl_koap.vision.backbones import load_backbone
 from torchrl_koap.vision.encoder import BATCH
-from torchrl_koap.vision.pooling import POOLINGS, Projection
 
 TABLE = Path(__file__).parent / "results" / "scooping_probe.csv"
 HELD_OUT = 0.25  # share of the demonstrations that the map is judged on

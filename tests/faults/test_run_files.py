@@ -155,7 +155,6 @@ ENTRIES = {
     "controller.decoder": ("null",),
     "controller.preset": (),
     "controller.state": (),
-    "controller.released": ("null",),
     "candidates": ("null",),
     "data": (),
     "versions": (),

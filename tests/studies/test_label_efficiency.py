@@ -147,14 +147,6 @@ def test_other_settings_are_named(options, message, curve, demonstrations, capsy
     assert (marks(curve), (curve / "curve.json").read_bytes()) == before
 
 
-def test_a_folder_that_is_older_than_an_option_is_continued(curve, demonstrations):
-    kept = json.loads((curve / "curve.json").read_text())
-    for name in ("released_settings", "epochs"):
-        kept.pop(name)
-    (curve / "curve.json").write_text(json.dumps(kept))
-    assert run(curve, demonstrations)["done"] == 2
-
-
 def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, capsys):
     (tmp_path / "thesis.tex").write_text("precious")
     assert "is not empty and no folder of `koap curve`" in fails(capsys, *command_of(tmp_path, demonstrations))
@@ -181,7 +173,6 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, caps
         ({"episodes": 0}, "episodes must be >= 1, got 0"),
         ({"steps": 0}, "steps must be >= 1, got 0"),
         ({"workers": 0}, "workers must be >= 1, got 0"),
-        ({"epochs": 3}, "epochs are counted with --released-settings only"),
         ({"launcher": "lokal"}, "unknown launcher 'lokal'; did you mean 'local'?"),
         ({"address": "10.0.0.1:1"}, "launcher 'local' works on this machine alone"),
         ({"dataset": "scripted", "demonstrations": 40, "fractions": "0.01"}, "selects none of the 40 trajectories"),

@@ -105,7 +105,6 @@ def test_quick_is_small_but_what_is_asked_for_stays(asked, tmp_path):
         ({"steps": 700}, [700, 700]),
         ({"steps": 700, "policy_steps": 900}, [900, 900]),
         ({"quick": True}, [2000, 2000]),
-        ({"released_settings": True}, [None, None]),
     ],
     ids=str,
 )

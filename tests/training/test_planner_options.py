@@ -62,7 +62,7 @@ def test_a_task_brings_its_own_view_unless_another_is_named():
     resolved, planner = planner_of("sorting")  # names its denoiser
     assert resolved.options.observed_frames == planner.history == 1
     assert planner_of("sorting", observed_frames=2)[1].history == planner_of("avoiding")[1].history == 2
-    for asked in ({"method": "dp"}, {"released_settings": True}, {"task": "stacking"}):
+    for asked in ({"method": "dp"}, {"task": "stacking"}):
         assert resolve(TrainConfig(out=Path("run"), **({"task": "sorting"} | asked))).options.observed_frames is None
 
 
@@ -112,4 +112,4 @@ def test_a_task_brings_its_own_planner_unless_one_is_named():
     )
     assert options(task="stacking", denoiser_width=64).denoiser_width == 64
     assert options(task="sorting", batch_size=16).batch_size == 16
-    assert options(task="avoiding").denoiser == options(task="aligning", released_settings=True).denoiser == "unet"
+    assert options(task="avoiding").denoiser == "unet"

@@ -27,9 +27,6 @@ class TestTheTasksMethod:
         assert ("tracking" in resolved.controller) == (method == "koap_mpc")
         assert resolve(TrainConfig(out=Path("run"), task=task, method="linear")).options.method == "linear"
 
-    def test_settings_of_the_first_public_code_are_its_own_method(self):
-        assert resolve(TrainConfig(out=Path("run"), task="stacking", released_settings=True)).method.name == "koap"
-
 
 class TestTheTasksPreset:
     def preset(self, **options):
@@ -38,7 +35,6 @@ class TestTheTasksPreset:
     def test_is_that_of_its_own_method_unless_another_is_asked_for(self):
         assert self.preset(task="po_sorting") == "semi_supervised"
         assert self.preset(task="po_sorting", preset="default") == "default"
-        assert self.preset(task="po_sorting", released_settings=True) == "released"
         assert self.preset(task="sorting") == "default"
 
     @pytest.mark.parametrize(

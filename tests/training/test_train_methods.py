@@ -66,7 +66,6 @@ def weights(folder: Path) -> bytes:
 
 
 CASES = [(method, unit, {}) for method in METHODS for unit in ("trajectory", "window")]
-CASES += [(method, "window", {"released_settings": True, "epochs": 1}) for method in ("koap", "pretrain", "dd")]
 
 
 @pytest.mark.parametrize(("method", "unit", "options"), CASES)

@@ -30,9 +30,7 @@ class TrainConfig:
             `koap eval` to judge its plans by (default: 0.1 for a task without an environment, else none).
         method: "koap", "koap_mpc" (plans followed by prediction), "linear" (ridge on raw frames), "dd" (supervised
             inverse dynamics), "dp" (Diffusion Policy), or another name in torchrl_koap.training.methods.METHODS, those
-            that plugins register included (default: that of the task; "koap" with --released-settings).
-        released_settings: the unequal network, learning rate and updates that the first public code has for the method.
-        epochs: with released settings, epochs instead of the first code's.
+            that plugins register included (default: that of the task).
         preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the
             task's for its own method, else the method's).
         koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
@@ -112,8 +110,6 @@ class TrainConfig:
     validation_fraction: float | None = None
     seed: int = 0
     method: str | None = None
-    released_settings: bool = False
-    epochs: int | None = None
     preset: str | None = None
     koopman_coeff: float | None = None
     action_coeff: float | None = None

@@ -38,7 +38,6 @@ PLANNER = {
 CONTROLLER = {
     "method": str,
     "decoder": str | None,
-    "released": bool | None,
     "preset": str,
     "state": str,
     "revised": bool,

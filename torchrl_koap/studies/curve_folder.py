@@ -23,8 +23,6 @@ FIXED = (
     "episodes",
     "steps",
     "controller_steps",
-    "released_settings",
-    "epochs",
     "planner_from",
     "planner_observations",
     "data_share",

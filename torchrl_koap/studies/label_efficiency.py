@@ -32,7 +32,6 @@ from torchrl_koap.studies.report import write_curve_report
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.methods import get_method
-from torchrl_koap.training.released_settings import get_released
 from torchrl_koap.training.resolved import resolve
 from torchrl_koap.training.run import check_networks
 
@@ -58,8 +57,6 @@ class CurveConfig(CellOptions):
         episodes: rollouts per cell; all cells with the same seed meet the same contexts and noise.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: updates of every controller.
-        released_settings: the unequal settings of the first public code instead of equal ones (koap, pretrain, dd, dp).
-        epochs: with released settings, epochs instead of the first code's.
         workers: cells at a time (default: one per core; a cluster given by its address decides for itself).
         launcher: "local" or "ray".
         address: of a Ray cluster (default: one on this machine).
@@ -90,8 +87,6 @@ class CurveConfig(CellOptions):
     episodes: int = 60
     steps: int | None = None
     controller_steps: int = 1000
-    released_settings: bool = False
-    epochs: int | None = None
     workers: int | None = None
     launcher: str = "local"
     address: str | None = None
@@ -167,12 +162,10 @@ def check_curve(config: CurveConfig) -> tuple[CurveConfig, Task, list[Cell], Run
     cells = _cells(options)
     task = find_task_of(options.dataset, options.task)
     options = replace(options, task=task.name)
-    for name in ("seeds", "demonstrations", "episodes", "steps", "controller_steps", "epochs", "workers"):
+    for name in ("seeds", "demonstrations", "episodes", "steps", "controller_steps", "workers"):
         value = getattr(options, name)
         if value is not None and value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")
-    if options.epochs is not None and not options.released_settings:
-        raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
     methods = list(dict.fromkeys(cell.method for cell in cells))
     check_cell_options(options, [get_method(name) for name in methods])
     check_launcher(options.launcher, address=options.address)
@@ -191,7 +184,6 @@ def _check_method(name: str, options: CurveConfig, task: Task) -> None:
         "task": task.name,
         "method": name,
         "steps": options.steps,
-        "released_settings": options.released_settings,
         "planner_from": options.planner_from if method.has_planner else None,
     }
     resolved = resolve(TrainConfig(**settings | training_options(options, name)), task)
@@ -206,7 +198,7 @@ def _cells(options: CurveConfig) -> list[Cell]:
     """All cells in the order asked for; repeated names count once."""
     methods = _split("methods", options.methods, str)
     for name in methods:
-        get_released(name) if options.released_settings else get_method(name)
+        get_method(name)
     fractions = _split("fractions", options.fractions, float)
     observations = _split("observations", options.observations, float)
     for name, values in {"fractions": fractions, "observations": observations}.items():
@@ -252,11 +244,7 @@ def _work(root: RunDirectory, options: CurveConfig, cells: Sequence[Cell], datas
         "controller_steps": options.controller_steps,
         "plugins": options.plugins,
     }
-    cell_settings = common | {
-        "label_unit": options.units,
-        "released_settings": options.released_settings,
-        "epochs": options.epochs,
-    }
+    cell_settings = common | {"label_unit": options.units}
     todo = [cell for cell in cells if not table.is_done(cell)]
     todo.sort(key=lambda cell: cell.planner is not None)  # those without a planner need not wait for one
     jobs, names, planners = [], {}, {}

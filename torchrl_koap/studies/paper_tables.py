@@ -128,8 +128,6 @@ class BenchConfig(CellOptions):
         episodes: rollouts per cell.
         steps: updates of planner and dp (default: that of the task, for dp at most 8,000).
         controller_steps: updates of every controller.
-        released_settings: the unequal settings of the first public code.
-        epochs: with released settings, epochs instead of the first code's.
         workers: cells at a time (default: one per core).
         launcher: "local" or "ray".
         address: of a Ray cluster.
@@ -159,8 +157,6 @@ class BenchConfig(CellOptions):
     episodes: int | None = None
     steps: int | None = None
     controller_steps: int | None = None
-    released_settings: bool = False
-    epochs: int | None = None
     workers: int | None = None
     launcher: str = "local"
     address: str | None = None
@@ -241,7 +237,7 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
     values: dict[str, Any] = standard | quick
     values |= {name: getattr(config, name) for name in values if getattr(config, name) is not None}
     own = {name: getattr(config, name) for name in OPTION_NAMES}
-    if config.denoiser is None and not config.released_settings:
+    if config.denoiser is None:
         wide = SMALL_PLANNER if config.quick else WIDE_PLANNER
         own |= {name: value for name, value in wide.items() if own[name] is None}
     common = [name for name in preset.methods.split(",") if name in METHODS]
@@ -256,7 +252,7 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
             if not config.all_levels_alike:
                 once = _shares(task, [level for level in levels if level in preset.first_seed_only])
         planner = planners.get(task.name)
-        if not config.released_settings and config.policy_steps is None:
+        if config.policy_steps is None:
             own["policy_steps"] = values["steps"] or min(POLICY_STEPS, task.defaults.planner_steps)
         share = paper_share(task.name) if config.data_share == "paper" else None
         usual = [] if config.table is None else [task.defaults.method]  # what `koap train` takes
@@ -274,8 +270,6 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
                 observations=preset.observations,
                 planner_observations=preset.planner_observations,
                 planner_from=None if planner is None else Path(planner),
-                released_settings=config.released_settings,
-                epochs=config.epochs,
                 workers=config.workers,
                 launcher=config.launcher,
                 address=config.address,
@@ -290,7 +284,7 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
 def _shared_planners(config: BenchConfig, tasks: Sequence[Task]) -> dict[str, str]:
     """Runs whose planners are shared, by task: those asked for; for a quick comparison also those of the repository."""
     named = _by_task("planners", config.planners, tasks)
-    made = [*PLANNER, "steps", "released_settings"]  # whoever says how planners are made wants them made
+    made = [*PLANNER, "steps"]  # whoever says how planners are made wants them made
     if not config.quick or config.planner_seeds != 1 or any(getattr(config, name) for name in made):
         return named
     found = [task.name for task in tasks if task.name in pretrained_folders()]

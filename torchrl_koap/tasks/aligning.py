@@ -133,7 +133,6 @@ register_task(
             planner_steps=8000,
             planner=WIDE_MLP,
             view={"observed_frames": 1},
-            released_epochs=200,
             execution={"command_lead": COMMAND_LEAD},
         ),
     )

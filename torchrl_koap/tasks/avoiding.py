@@ -100,8 +100,6 @@ register_task(
         ),
         label_levels=(0.02, 0.05, 0.1, 0.25, 0.5),
         in_paper=True,
-        defaults=Defaults(
-            demonstrations=96, planner_steps=5000, channels=(32, 64), relative=False, released_epochs=500
-        ),
+        defaults=Defaults(demonstrations=96, planner_steps=5000, channels=(32, 64), relative=False),
     )
 )

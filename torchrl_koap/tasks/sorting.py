@@ -154,7 +154,6 @@ def _sorting(num_boxes: int) -> Task:
             planner_steps=24000,
             planner=WIDE_MLP,
             view={"observed_frames": 1},
-            released_epochs=400,
             execution={"command_lead": COMMAND_LEAD},
         ),
     )
@@ -176,7 +175,6 @@ register_task(
             planner_steps=24000,
             planner=WIDE_MLP,
             view={"observed_frames": 1},
-            released_epochs=200,
             execution={"command_lead": COMMAND_LEAD, "action_gain": ACTION_GAIN},
         ),
     )

@@ -109,9 +109,7 @@ _STACKING = register_task(
             " never moved and for those dropped on the way.",
             camera="front",
         ),
-        defaults=Defaults(
-            method="koap_mpc", demonstrations=1000, planner_steps=18000, planner=WIDE_MLP, released_epochs=400
-        ),
+        defaults=Defaults(method="koap_mpc", demonstrations=1000, planner_steps=18000, planner=WIDE_MLP),
     )
 )
 _STACKING_1 = register_task(

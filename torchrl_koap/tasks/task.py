@@ -84,7 +84,6 @@ class Defaults:
             no denoiser is asked for: ``denoiser``, its sizes, ``batch_size``, ``planner_learning_rate``.
         recovery_response (str): how that augmentation leads back, ``"first_order"`` or ``"second_order"``.
         view (dict): options of `koap train` for what the planner sees: ``observed_frames``, ``neighbor_recovery``, ...
-        released_epochs (int): epochs of a controller in KOAP's first public code.
         execution (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig` for how plans are followed.
 
     Examples:
@@ -104,7 +103,6 @@ class Defaults:
     recovery_response: str = "first_order"
     planner: Mapping[str, Any] = field(default_factory=dict)
     view: Mapping[str, Any] = field(default_factory=dict)
-    released_epochs: int = 400
     execution: Mapping[str, Any] = field(default_factory=dict)
 
 

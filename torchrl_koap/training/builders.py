@@ -13,7 +13,6 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import Normalizer
 from torchrl_koap.training.method import Method, normalizers_of
 from torchrl_koap.training.methods import get_method
-from torchrl_koap.training.released_settings import get_released
 
 # what every preset was designed with: how states and actions are normalised
 NORMALIZATION = {
@@ -70,7 +69,5 @@ def method_named(options: Mapping[str, Any]) -> Method:
     Raises:
         ValueError: if there is none.
     """
-    if options.get("released"):
-        return get_released(options["method"]).method
     method = get_method(options["method"], options.get("decoder"))
     return get_method(method.earlier) if method.earlier and not options.get("revised") else method

@@ -10,10 +10,9 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
 from torch import nn
 
-from torchrl_koap.data import WindowTable, cut_windows, extrapolate_ends, make_window_buffer
+from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.compact_lifting import UNFOLD_UPDATES
@@ -23,7 +22,6 @@ from torchrl_koap.runs.progress import count_up_to, progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import save_tensors, save_weights
 from torchrl_koap.tasks import HORIZON, WINDOW
-from torchrl_koap.training import released_settings
 from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
 from torchrl_koap.training.loop import moving_average, train_phase
@@ -99,30 +97,10 @@ class _Training:
 
     def __init__(self, run: RunDirectory | None, resolved: ResolvedConfig, logger: Any):
         self.run, self.options, self.logger, self.task = run, resolved.options, logger, resolved.task
-        self.released = resolved.released
-        self.epochs = resolved.task.defaults.released_epochs
         self.controller_budget = min(self.options.controller_steps, self.options.steps)
         self.updates = 0
 
-    def batch_size(self, own: int) -> int:
-        """Windows per update."""
-        return own if self.released is None else released_settings.BATCH_SIZE
-
-    def budget(self, phase: Phase, own: int, table: WindowTable, epochs: int | None = None) -> int:
-        """Updates of a phase: its share of what every method has, or the epochs of the first public code."""
-        if self.released is None:
-            return max(round(own * phase.share), 1)
-        epochs = self.options.epochs or epochs or self.epochs
-        return self.released.updates(phase, table, epochs)
-
     def __call__(self, name: str, loss: nn.Module, sample: Callable, *, num_steps: int, **settings) -> dict[str, float]:
-        if self.released is not None:
-            settings |= {
-                "learning_rate": self.released.learning_rate,
-                "weight_decay": released_settings.WEIGHT_DECAY,
-                "warmup": released_settings.WARMUP,
-                "decay": False,
-            }
         self.updates += num_steps
         with progress_bar(num_steps, name, smoothing=0.05, mininterval=0.5) as bar:
             return train_phase(
@@ -157,12 +135,11 @@ def _train_network(
     if budget and method.phases and getattr(controller, "unfolds", False):
         with progress_bar(2 * min(budget, UNFOLD_UPDATES), "unfolding", smoothing=0.05, mininterval=0.5) as bar:
             controller.unfold(windows["state"], min(budget, UNFOLD_UPDATES), count_up_to(bar))
-    table = WindowTable.build(data, window, pad_before=history)
     for phase in method.phases if budget else ():
         buffer = make_window_buffer(
             data,
             window,
-            train_one.batch_size(options.controller_batch_size),
+            options.controller_batch_size,
             select=_KEYS,
             pad_before=history,
             labelled_share=LABELLED_SHARES[phase.windows],
@@ -171,7 +148,7 @@ def _train_network(
             phase.name,
             phase.loss(controller, **_coefficients(options, phase)),
             buffer.sample,
-            num_steps=train_one.budget(phase, budget, table),
+            num_steps=max(round(budget * phase.share), 1),
             learning_rate=options.controller_learning_rate,
             weight_decay=1e-3,
         )
@@ -211,17 +188,15 @@ def _train_policy(
     buffer = make_window_buffer(
         data,
         WINDOW,
-        train_one.batch_size(options.batch_size),
+        options.batch_size,
         select=_KEYS,
         pad_before=1,
         pad_after=HORIZON - 1,
         labelled_share=LABELLED_SHARES[phase.windows],
     )
     loss = phase.loss(policy)
-    # what the planner's windows undergo, but for the settings of the first public code, which has none of it
-    augment = augmentation(options, task, actions=True) if resolved.released is None else TensorDictSequential()
-    table = WindowTable.build(data, WINDOW, pad_before=1, pad_after=HORIZON - 1)
-    num_steps = train_one.budget(phase, options.steps, table, released_settings.POLICY_EPOCHS)
+    augment = augmentation(options, task, actions=True)  # what the planner's windows undergo
+    num_steps = max(round(options.steps * phase.share), 1)
     values = train_one(
         phase.name,
         loss,

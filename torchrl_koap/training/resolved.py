@@ -22,7 +22,6 @@ from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.posture import posture_columns
-from torchrl_koap.training.released_settings import POLICY, Released, get_released
 from torchrl_koap.training.response import tracked_columns
 from torchrl_koap.training.validation import default_fraction
 
@@ -39,7 +38,6 @@ class ResolvedConfig:
         task (Task): the task.
         method (Method): the method, with the decoder asked for.
         teacher (Method, optional): the method that labels the rest of the data for it.
-        released (Released, optional): the settings of the first public code, if they were asked for.
         budget (LabelBudget): which labels may be seen.
         planner (dict): what :func:`~torchrl_koap.training.diffusion_builders.build_planner` takes.
         controller (dict): what :func:`~torchrl_koap.training.builders.build_controller` takes.
@@ -56,7 +54,6 @@ class ResolvedConfig:
     task: Task
     method: Method
     teacher: Method | None
-    released: Released | None
     budget: LabelBudget
     planner: dict[str, Any]
     controller: dict[str, Any]
@@ -103,9 +100,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     """
     task = find_task_of(config.dataset, config.task) if task is None else task
     options = replace(_with_task_defaults(config, task), task=task.name)
-    released = _released(options)
-    method = _method(options) if released is None else released.method
-    if method.has_planner and options.planner_from is None and released is None:
+    method = _method(options)
+    if method.has_planner and options.planner_from is None:
         view = {name: value for name, value in task.defaults.view.items() if getattr(options, name) is None}
         options = replace(options, **view)
     _check(options, method)
@@ -121,13 +117,10 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:
         planner = _planner_entry(options, task)
-    if released is not None and not method.has_planner:
-        planner |= POLICY
-    preset = "released" if options.released_settings else options.preset or _own_preset(method, task)
+    preset = options.preset or _own_preset(method, task)
     controller: dict[str, Any] = {
         "method": options.method,
         "decoder": options.decoder,
-        "released": options.released_settings,
         "preset": preset,
         "state": options.controller_state if method.has_planner else "all",
     }
@@ -146,7 +139,6 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         task=task,
         method=method,
         teacher=get_method(method.teacher) if method.teacher else None,
-        released=released,
         budget=_budget(options),
         planner=planner,
         controller=controller,
@@ -168,13 +160,12 @@ _UNET = {"denoiser": "unet", "batch_size": 128, "planner_learning_rate": 3e-3}
 
 
 def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
-    # a network that is asked for by name, or that of the first public code, comes with its own sizes
-    own = task.defaults.planner if options.denoiser is None and not options.released_settings else {}
+    own = task.defaults.planner if options.denoiser is None else {}  # a network asked for comes with its own sizes
     defaults: dict[str, Any] = (
         _UNET
         | dict(own)
         | {
-            "method": "koap" if options.released_settings else task.defaults.method,
+            "method": task.defaults.method,
             "steps": task.defaults.planner_steps,
             "recovery_sigma": task.defaults.recovery_sigma,
             "recovery_response": task.defaults.recovery_response,
@@ -183,22 +174,10 @@ def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
             "relative": task.defaults.relative,
             "channels": task.defaults.channels,
             "validation_fraction": default_fraction(task),
-            "forecast": True if task.env is None and not options.released_settings else None,
+            "forecast": True if task.env is None else None,
         }
     )
     return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
-
-
-def _released(options: TrainConfig) -> Released | None:
-    if not options.released_settings:
-        if options.epochs is not None:
-            raise ValueError("epochs are counted with --released-settings only; otherwise there are --controller-steps")
-        return None
-    if options.decoder is not None or options.preset is not None:
-        raise ValueError("released settings come with their own decoder and preset: no --decoder, no --preset")
-    if options.epochs is not None and options.epochs < 1:
-        raise ValueError(f"epochs must be >= 1, got {options.epochs}")
-    return get_released(options.method)
 
 
 def _method(options: TrainConfig) -> Method:
