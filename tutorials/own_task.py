@@ -34,11 +34,12 @@ from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.reports.scenes import draw_scene
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.tasks import Action, Body, Defaults, Modes, Scene, Shape, StartRegions
+from torchrl_koap.tasks import Action, Body, Defaults, Modes, Scene, Shape
 
 GOAL, GOAL_RADIUS = (0.5, 0.4), 0.05  # m
 POST = (0.5, 0.2)
 PUCK_RADIUS, ROBOT_RADIUS = 0.03, 0.01
+START = ((0.4, 0.6), (0.05, 0.1))  # of the puck: x range, y range (m)
 HERE = "own_task"  # import strings name modules; this file stands for one
 sys.modules[HERE] = sys.modules[__name__]
 
@@ -65,8 +66,6 @@ task = register_task(
         relative_positions=(("robot_xy", "puck_xy"),),
         goal=f"{HERE}:goal_reached",
         modes=Modes((("side", ("left", "right")),), index=f"{HERE}:mode_index", entropy="all"),
-        bodies=(Body("puck", "puck_xy", color="blue", half=(PUCK_RADIUS, PUCK_RADIUS)),),
-        start_regions=StartRegions((((0.4, 0.6), (0.05, 0.1)),)),
         env=f"{HERE}:PushEnv",
         expert=f"{HERE}:PushExpert",
         scene=Scene(
@@ -74,6 +73,7 @@ task = register_task(
                 Shape("circle", GOAL, (GOAL_RADIUS, GOAL_RADIUS), "zone", label="goal"),
                 Shape("circle", POST, (0.01, 0.01), "obstacle"),
             ),
+            bodies=(Body("puck", "puck_xy", starts=(START,), color="blue", half=(PUCK_RADIUS, PUCK_RADIUS)),),
             x=(0.25, 0.75),
             y=(-0.05, 0.5),
         ),

@@ -21,6 +21,7 @@ from pages import (
     write_page,
 )
 
+from torchrl_koap.envs.gym import IDS
 from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.registry import TASKS
@@ -68,11 +69,11 @@ def write_task(task: Task) -> None:
     facts = [
         ("control rate", f"{task.control_hz:.4g} Hz"),
         ("an episode is cut after", f"{task.max_steps} control steps ({task.max_steps / task.control_hz:.1f} s)"),
-        ("ends by a collision", "yes" if task.collides else "no"),
+        ("ends by a collision", "yes" if task.env and resolve(task.env, "env").COLLIDES else "no"),
         ("noise on the measured tool", f"{1e3 * task.noise:g} mm" if task.noise else "none"),
         ("plans are", "displacements" if task.defaults.relative else "positions"),
         ("demonstrations, planner updates", f"{task.defaults.demonstrations}, {task.defaults.planner_steps:,}"),
-        ("Gymnasium id", f"``{task.gym_id}``" if task.gym_id else "none"),
+        ("Gymnasium id", next((f"``torchrl_koap/{name}``" for name, own in IDS.items() if own == task.name), "none")),
         ("environment", f":class:`~{task.env.replace(':', '.')}`" if task.env else "none"),
         ("scripted expert", f":class:`~{task.expert.replace(':', '.')}`" if task.expert else "none"),
         ("demonstrations are those of", f":doc:`{task.source}`" if task.source != task.name else "this task"),
@@ -131,7 +132,6 @@ def action_rows(task: Task) -> list[tuple[str, ...]]:
 def action_limits(task: Task) -> tuple[list[float] | None, list[float] | None]:
     """Bounds of the environment's actions, as its specification says."""
     from torchrl_koap.envs.registry import make_env
-    from torchrl_koap.lookup import resolve
 
     known = inspect.signature(resolve(task.env, "env").__init__).parameters
     blind = {"embed": False} if "embed" in known else {}  # what is commanded is known without a camera
@@ -158,14 +158,15 @@ def mode_blocks(task: Task) -> list[str]:
 
 def body_blocks(task: Task) -> list[str]:
     """What a context places, and where."""
-    if not task.bodies or task.start_regions is None:
+    scene = task.scene
+    if not scene.varies:
         return []
-    regions, (low, high) = task.start_regions, task.start_regions.yaw
+    low, high = scene.start_yaw
     rows = []
     for index, body in enumerate(task.bodies):
-        for (x0, x1), (y0, y1) in regions.of(index):
+        for (x0, x1), (y0, y1) in scene.starts_of(index):
             rows.append((body.label, f"{x0:g} to {x1:g}", f"{y0:g} to {y1:g}", f"{low:g} to {high:g}"))
-    dealt = "The regions are dealt out to the bodies at random." if regions.dealt else ""
+    dealt = "The regions are dealt out to the bodies at random." if scene.shared_starts else ""
     return [
         heading("Where the bodies start", 1),
         table(("body", "x (m)", "y (m)", "yaw (deg)"), rows),
@@ -227,8 +228,8 @@ def draw(task: Task) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(4.6, 4), layout="constrained")
     axes = draw_scene(figure.add_subplot(), task.name)
-    for index, body in enumerate(task.bodies if task.start_regions else ()):
-        for (x0, x1), (y0, y1) in task.start_regions.of(index):
+    for index, body in enumerate(task.bodies):
+        for (x0, x1), (y0, y1) in task.scene.starts_of(index):
             color = color_of(body.color)
             axes.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, linestyle=":", edgecolor=color))
             x, y = (x0 + x1) / 2, (y0 + y1) / 2

@@ -74,7 +74,7 @@ def test_the_table_holds_60_contexts_inside_the_ranges(task):
     table = evaluation_contexts(task)
     assert table.shape == (60, len(get_task(task).objects), 3)
     np.testing.assert_array_equal(check_contexts(get_task(task), table), table)
-    assert np.abs(table[..., 2]).max() <= math.radians(TASKS[task].start_regions.yaw[1])
+    assert np.abs(table[..., 2]).max() <= math.radians(TASKS[task].scene.start_yaw[1])
     assert len(np.unique(table.reshape(60, -1), axis=0)) == 60
     np.testing.assert_array_equal(evaluation_contexts(task, 3), table[:3])
     table[:] = 0  # what is handed out is a copy

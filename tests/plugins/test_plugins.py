@@ -20,6 +20,7 @@ from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.envs import make_env, mode_index_of
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts, evaluation_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations, record_episodes, write_raw_episodes
+from torchrl_koap.envs.gym import register
 from torchrl_koap.evaluation.diagnosis import contexts_of
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.keys import validate
@@ -114,6 +115,7 @@ def test_it_is_drawn():
 
 
 def test_gymnasium_knows_it():
+    register("puck/Puck-v0", "puck")
     env = gymnasium.make("puck/Puck-v0", disable_env_checker=True)
     observation, info = env.reset(seed=0)
     assert observation.shape == (4,) and info["mode_index"] == -1 and info["context"].shape == (1, 3)

@@ -86,7 +86,7 @@ def test_no_state_shows_the_command(name):
 @pytest.mark.parametrize("name", TASKS)
 def test_facts_fit_each_other(name):
     task = get_task(name)
-    assert set(task.plotted.values()) <= set(task.observation)
+    assert {body.position for body in task.bodies} <= set(task.observation)
     command = set() if task.command is None else {task.command}
     assert {*task.state, *task.hidden, *command, task.position} <= set(task.observation)
     assert all(0 <= column < task.state_dim for column in (*task.moved_columns(or_robot=True), *task.robot))

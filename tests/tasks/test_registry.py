@@ -93,18 +93,6 @@ def test_a_task_may_be_registered_again_but_no_other_of_its_name(tasks):
         register_task(TOY)
 
 
-def test_observers_see_every_task(tasks):
-    seen = []
-    registry_module.observe_tasks(seen.append)
-    try:
-        assert [task.name for task in seen] == list(TASKS)
-        added = register_task(Task(**TOY))
-        register_task(added)
-        assert seen[-1] is added and seen.count(added) == 1
-    finally:
-        registry_module._observers.remove(seen.append)
-
-
 class Point:
     name, value = "mine", "my_package.my_task"
 

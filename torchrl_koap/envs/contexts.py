@@ -16,17 +16,18 @@ from pathlib import Path
 import numpy as np
 
 from torchrl_koap.data.d3il.unpickling import load_pickle
-from torchrl_koap.tasks import StartRegions, Task, get_task
+from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks.scene import Scene
 
 TABLE = Path(__file__).with_name("evaluation_contexts.json")
 NUM_EVALUATION_CONTEXTS = 60
 _SLACK = 1e-6  # D3IL keeps contexts in float32
 
 
-def _starts(task: Task) -> StartRegions:
-    if task.start_regions is None or not task.bodies:
+def _scene(task: Task) -> Scene:
+    if not task.scene.varies:
         raise ValueError(f"task {task.name!r} has no contexts: every episode starts the same")
-    return task.start_regions
+    return task.scene
 
 
 def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | int | None = None) -> np.ndarray:
@@ -49,20 +50,20 @@ def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | i
         (5, 4, 3)
     """
     task = get_task(task) if isinstance(task, str) else task
-    starts = _starts(task)
+    scene = _scene(task)
     if num < 1:
         raise ValueError(f"the number of contexts must be at least 1, got {num}")
     drawing = np.random.default_rng(generator)
     contexts = np.empty((num, len(task.objects), 3))
     for context in contexts:
-        regions = starts.regions
-        if starts.dealt:
-            regions = tuple(regions[index] for index in drawing.permutation(len(regions)))
-        elif starts.whose is not None:
-            own = [starts.of(body) for body in range(len(context))]
-            regions = tuple(each[drawing.integers(len(each))] for each in own)
+        if scene.shared_starts:
+            order = drawing.permutation(len(scene.shared_starts))
+            regions = [scene.shared_starts[index] for index in order]
+        else:  # a body with a single region draws nothing here
+            own = [body.starts for body in scene.bodies]
+            regions = [each[drawing.integers(len(each)) if len(each) > 1 else 0] for each in own]
         for row, (x, y) in zip(context, regions, strict=False):
-            row[:] = drawing.uniform(*x), drawing.uniform(*y), math.radians(drawing.uniform(*starts.yaw))
+            row[:] = drawing.uniform(*x), drawing.uniform(*y), math.radians(drawing.uniform(*scene.start_yaw))
     return contexts
 
 
@@ -93,7 +94,7 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
         (60, 2, 3)
     """
     task = get_task(task) if isinstance(task, str) else task
-    _starts(task)
+    _scene(task)
     rows = _table()["contexts"].get(task.source)
     if rows is None:  # not D3IL's: the same ones every time
         seed = [*task.source.encode()]
@@ -117,7 +118,7 @@ def check_contexts(task: Task, contexts) -> np.ndarray:
         ValueError: if the task has none, the shape is not ``[C, objects, 3]``, or an object lies where the task never
             puts it.
     """
-    starts, contexts = _starts(task), np.asarray(contexts, dtype=np.float64)
+    scene, contexts = _scene(task), np.asarray(contexts, dtype=np.float64)
     if contexts.ndim != 3 or contexts.shape[1:] != (len(task.objects), 3) or not len(contexts):
         raise ValueError(
             f"contexts of task {task.name!r} must be [C, {len(task.objects)}, 3] (x, y in m, yaw in rad for"
@@ -126,7 +127,7 @@ def check_contexts(task: Task, contexts) -> np.ndarray:
     if not np.isfinite(contexts).all():
         raise ValueError(f"contexts must be finite; row {int(np.argwhere(~np.isfinite(contexts))[0][0])} is not")
     for index, name in enumerate(task.objects):
-        regions = starts.of(index)
+        regions = scene.starts_of(index)
         low, high = (np.array([[bound[side] for bound in region] for region in regions]) for side in (0, 1))
         xy = contexts[:, None, index, :2]
         inside = ((xy >= low - _SLACK) & (xy <= high + _SLACK)).all(-1).any(-1)
@@ -153,7 +154,7 @@ def load_contexts(file: str | Path, task: Task | str) -> np.ndarray:
         ValueError: if the file does not hold contexts of this task.
     """
     task = get_task(task) if isinstance(task, str) else task
-    _starts(task)
+    _scene(task)
     contexts = load_pickle(Path(file))
     if not isinstance(contexts, (list, tuple)) or not contexts:
         raise ValueError(f"{file}: wanted a list of contexts, got {type(contexts).__name__}")

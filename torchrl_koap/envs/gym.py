@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The tasks as single Gymnasium environments, registered under ``Task.gym_id``."""
+"""The tasks as single Gymnasium environments."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from tensordict import TensorDict
 from torchrl_koap import keys
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.registry import make_env, mode_index_of
-from torchrl_koap.tasks import Task, get_task
-from torchrl_koap.tasks.registry import observe_tasks
+from torchrl_koap.tasks import get_task
+
+IDS = {"Avoiding-v0": "avoiding", "Aligning-v0": "aligning", "Stacking-v0": "stacking"}
+IDS |= {"Sorting4-v0": "sorting", "Sorting2-v0": "sorting_2", "Sorting6-v0": "sorting_6"}
 
 
 class ManipulationGymEnv(gymnasium.Env):
@@ -124,7 +126,7 @@ class ManipulationGymEnv(gymnasium.Env):
             keys.MODE: data[keys.MODE][0].numpy(),
             "mode_index": self._mode_index(data[keys.MODE]).item(),
         }
-        if self.task.collides:
+        if keys.COLLISION in data.keys():
             info[keys.COLLISION] = data[keys.COLLISION].item()
         if self.task.objects:
             info[keys.CONTEXT] = self._context.copy()
@@ -149,15 +151,14 @@ class AvoidingGymEnv(ManipulationGymEnv):
         super().__init__("avoiding", render_mode, **options)
 
 
-def register() -> None:
-    """Registers every task with a ``gym_id`` with Gymnasium, later ones too; importing ``torchrl_koap.envs`` calls it.
+def register(env_id: str, task: str) -> None:
+    """Registers a task with Gymnasium, unless the id is taken; importing ``torchrl_koap.envs`` does so for D3IL's.
 
-    ``gymnasium.make("torchrl_koap.envs:torchrl_koap/Avoiding-v0")`` imports it first.
+    Args:
+        env_id (str): name with Gymnasium, such as ``"torchrl_koap/Avoiding-v0"``; the prefix
+            ``"torchrl_koap.envs:"`` has this package imported first.
+        task (str): name of the task.
     """
-    observe_tasks(_register)
-
-
-def _register(task: Task) -> None:
-    if task.gym_id and task.gym_id not in gymnasium.registry:
+    if env_id not in gymnasium.registry:
         entry_point = f"{ManipulationGymEnv.__module__}:{ManipulationGymEnv.__name__}"
-        gymnasium.register(task.gym_id, entry_point=entry_point, kwargs={"task": task.name})
+        gymnasium.register(env_id, entry_point=entry_point, kwargs={"task": task})

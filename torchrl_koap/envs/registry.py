@@ -9,7 +9,7 @@ What an environment has to offer, D3IL's (:class:`~torchrl_koap.envs.Manipulatio
                      (rad). Without it the environment draws them. One call resets all environments
     set_seed         of the contexts that it draws
     observation      [n, obs]; success [n, 1] bool, latched until the reset; mode [n, ...], what Task.modes.index reads
-    collision        [n, 1] bool, where Task.collides
+    collision        [n, 1] bool, where an episode can end by one
     context          [n, bodies, 3], where the task has bodies
     reward, done, terminated, truncated
 

@@ -111,7 +111,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         position=task.observation[task.position],
         mode_index=place.mode_index,
         interval=execution["replan_interval"],
-        objects=[task.observation[part] for part in task.plotted.values()] if config.env is None else (),
+        objects=[task.observation[body.position] for body in task.bodies] if config.env is None else (),
         plans_position=task.plans_position,
     )
     if place.contexts is not None:  # in full precision: a film of the same episode starts from it

@@ -4,7 +4,7 @@
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.columns import Columns
 from torchrl_koap.tasks.registry import TASKS, adopt_task, get_task, register_task, task_of
-from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.scene import Body, Scene, Shape
 from torchrl_koap.tasks.task import CONTROL_HZ, HISTORY, HORIZON, REPLAN_INTERVAL, WINDOW, Defaults, Modes, Task
 
 from torchrl_koap.tasks import avoiding, aligning, sorting, stacking, scooping  # isort: skip  # in the order of TASKS
@@ -23,7 +23,6 @@ __all__ = [
     "Modes",
     "Scene",
     "Shape",
-    "StartRegions",
     "Task",
     "adopt_task",
     "aligning",

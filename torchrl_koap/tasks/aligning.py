@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
-from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.scene import Body, Scene, Shape
 from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
 
 DISTANCE_TOLERANCE = 0.018  # m, between the centres, height included
@@ -98,25 +98,33 @@ register_task(
             entropy="contexts",
         ),
         score="torchrl_koap.tasks.aligning:score",
-        bodies=(
-            Body("box", "box_position", "box_quaternion", "tray", "#9a5b13", (BASE_HALF, BASE_HALF), front=True),
-            Body(
-                "target",
-                "target_position",
-                "target_quaternion",
-                color="#0a7f7f",
-                half=(BASE_HALF, BASE_HALF),
-                front=True,
-                still=True,
-            ),
-        ),
-        start_regions=StartRegions(REGIONS),
         env="torchrl_koap.envs.aligning:AligningEnv",
         expert="torchrl_koap.envs.experts.aligning:AligningExpert",
-        gym_id="torchrl_koap/Aligning-v0",
         converter="torchrl_koap.data.d3il.conversion:ALIGNING",
         scene=Scene(
             shapes=tuple(_frame(region) for region in REGIONS),
+            bodies=(
+                Body(
+                    "box",
+                    "box_position",
+                    "box_quaternion",
+                    (REGIONS[0],),
+                    "tray",
+                    "#9a5b13",
+                    (BASE_HALF, BASE_HALF),
+                    front=True,
+                ),
+                Body(
+                    "target",
+                    "target_position",
+                    "target_quaternion",
+                    (REGIONS[1],),
+                    color="#0a7f7f",
+                    half=(BASE_HALF, BASE_HALF),
+                    front=True,
+                    still=True,
+                ),
+            ),
             x=(0.21, 0.79),
             y=(-0.39, 0.47),
             caption=" The second panel shows the tray: where it starts (an outline with a thick far side; of many only"
@@ -126,7 +134,6 @@ register_task(
             camera="cage",
         ),
         label_levels=(0.02, 0.05, 0.1, 0.25, 0.5),
-        in_paper=True,
         defaults=Defaults(
             demonstrations=1000,
             disturbance=0.5,

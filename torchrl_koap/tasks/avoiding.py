@@ -74,7 +74,6 @@ register_task(
         actions={"x": Action("m", column=0), "y": Action("m", column=1)},
         max_steps=250,
         robot=(0, 1),
-        collides=True,
         goal="torchrl_koap.tasks.avoiding:goal_reached",
         modes=Modes(
             (
@@ -87,7 +86,6 @@ register_task(
         score="torchrl_koap.tasks.avoiding:score",
         env="torchrl_koap.envs.avoiding:AvoidingEnv",
         expert="torchrl_koap.envs.experts.avoiding:AvoidingExpert",
-        gym_id="torchrl_koap/Avoiding-v0",
         converter="torchrl_koap.data.d3il.conversion:AVOIDING",
         scene=Scene(
             shapes=(*_cylinders(), Shape("line", (0.5, FINISH_Y), (0.5, 0.0), "finish", label="finish")),
@@ -99,7 +97,6 @@ register_task(
             camera="front",
         ),
         label_levels=(0.02, 0.05, 0.1, 0.25, 0.5),
-        in_paper=True,
         defaults=Defaults(demonstrations=96, planner_steps=5000, channels=(32, 64), relative=False),
     )
 )

@@ -70,7 +70,7 @@ def _part_faults(task: Task) -> list[str]:
         "command": () if task.command is None else (task.command,),
         "state": task.state,
         "hidden": task.hidden,
-        "bodies": [part for body in task.bodies for part in (body.position, body.yaw) if part],
+        "scene.bodies": [part for body in task.bodies for part in (body.position, body.yaw) if part],
     }
     parts = task.observation_parts
     faults = [
@@ -113,10 +113,11 @@ def _column_faults(task: Task) -> list[str]:
 def _body_faults(task: Task) -> list[str]:
     named = [name for group in task.interchangeable for name in group]
     faults = [f"interchangeable: no body {name!r}" for name in named if name not in task.objects]
-    starts = task.start_regions
-    if starts is not None and len(starts.regions) < len(task.bodies):
-        faults.append(f"start_regions: {len(starts.regions)} regions for {len(task.bodies)} bodies")
-    elif starts is not None:
-        without = [body.name for index, body in enumerate(task.bodies) if not starts.of(index)]
-        faults += [f"start_regions: no region is for the body {name!r}" for name in without]
+    shared, without = len(task.scene.shared_starts), [body.name for body in task.bodies if not body.starts]
+    if shared and len(without) < len(task.bodies):
+        faults.append("scene: bodies have starts of their own or share them, not both")
+    elif shared and shared < len(task.bodies):
+        faults.append(f"scene.shared_starts: {shared} regions for {len(task.bodies)} bodies")
+    elif not shared and 0 < len(without) < len(task.bodies):
+        faults += [f"scene: no region is for the body {name!r}" for name in without]
     return faults

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -12,7 +12,6 @@ from torchrl_koap.tasks.task import Task
 
 GROUP = "torchrl_koap.tasks"
 TASKS: dict[str, Task] = {}
-_observers: list[Callable[[Task], None]] = []
 _loaded = False
 _adopted: set[str] = set()  # names of tasks that came with data
 
@@ -48,8 +47,6 @@ def register_task(task: Task) -> Task:
         raise ValueError(f"another task named {task.name!r} is registered already; choose another name")
     if known is None:
         TASKS[task.name] = task
-        for observer in _observers:
-            observer(task)
     return TASKS[task.name]
 
 
@@ -194,14 +191,3 @@ def load_entry_points() -> None:
             raise RuntimeError(f"entry point {point.name!r} = {point.value!r} of {GROUP!r} failed: {error}") from error
         if isinstance(found, Task):
             register_task(found)
-
-
-def observe_tasks(observer: Callable[[Task], None]) -> None:
-    """Calls a function for every task, those registered later included.
-
-    Args:
-        observer (callable): called with a task.
-    """
-    _observers.append(observer)
-    for task in list(TASKS.values()):
-        observer(task)

@@ -48,13 +48,14 @@ class Shape:
 
 @dataclass(frozen=True)
 class Body:
-    """A body that a context places: where it may start, what tells its pose, and how it looks from above.
+    """A body that a context places: what tells its pose, where it may start, and how it looks from above.
 
     Args:
         name (str): its name in contexts and messages.
         position (str): part of the observation that begins with its x, y (m).
         yaw (str): part of the observation that tells its yaw: a quaternion (w, x, y, z) or ``tan(yaw)``; empty where
             nothing does, its yaw is then 0.
+        starts (tuple): regions, x range and y range (m) each, in any of which it may start.
         label (str): its name in legends; bodies of the same label share an entry.
         color (str): ``"red"``, ``"green"``, ``"blue"``, ``"grey"`` or ``"#rrggbb"``.
         half (tuple of float): half its width and half its depth (m).
@@ -70,6 +71,7 @@ class Body:
     name: str
     position: str
     yaw: str = ""
+    starts: tuple[Region, ...] = ()
     label: str = ""
     color: str = "grey"
     half: tuple[float, float] = (0.03, 0.03)
@@ -82,62 +84,40 @@ class Body:
 
 @dataclass(frozen=True)
 class Scene:
-    """What stands still in a task, and the part of the plane that pictures show.
+    """What stands in a task and where the rest of it starts, and the part of the plane that pictures show.
 
     Args:
-        shapes (tuple of Shape): in the order in which they are drawn.
+        shapes (tuple of Shape): what stands still, in the order in which it is drawn.
+        bodies (tuple of Body): what starts elsewhere in every episode.
+        shared_starts (tuple): regions that are dealt out to the bodies at random, each to one at most, instead of
+            ``Body.starts``; there may be more of them than bodies.
+        start_yaw (tuple of float): least and greatest yaw of a body (deg).
         x (tuple of float): least and greatest x of a picture (m); None shows what is drawn.
         y (tuple of float): likewise for y.
         caption (str): what the report adds to the picture of the rollouts.
         camera (str, optional): camera of the simulator that shows the task best; None where there is none to film with.
 
     Examples:
-        >>> from torchrl_koap.tasks.scene import Scene
-        >>> Scene(x=(0.0, 1.0), y=(0.0, 1.0)).shapes
-        ()
+        >>> from torchrl_koap.tasks import Body, Scene
+        >>> left, right = ((0.2, 0.3), (0.0, 0.1)), ((0.6, 0.7), (0.0, 0.1))
+        >>> Scene(bodies=(Body("mug", "mug_xy", starts=(left, right)),)).starts_of(0) == (left, right)
+        True
     """
 
     shapes: tuple[Shape, ...] = ()
+    bodies: tuple[Body, ...] = ()
+    shared_starts: tuple[Region, ...] = ()
+    start_yaw: tuple[float, float] = (-90.0, 90.0)
     x: tuple[float, float] | None = None
     y: tuple[float, float] | None = None
     caption: str = ""
     camera: str | None = None
 
+    @property
+    def varies(self) -> bool:
+        """Whether bodies start elsewhere in every episode, so that there are contexts."""
+        return any(self.starts_of(index) for index in range(len(self.bodies)))
 
-@dataclass(frozen=True)
-class StartRegions:
-    """Where the bodies of a context may start.
-
-    Args:
-        regions (tuple): x range and y range (m) of every body, in their order.
-        dealt (bool): the regions are dealt out to the bodies at random, each to one at most; there may be more of them.
-        yaw (tuple of float): least and greatest yaw (deg).
-        whose (tuple of int, optional): number of the body that each region is for, where a body has several of them, in
-            any of which it may start. Default: one each, or dealt.
-
-    Raises:
-        ValueError: if ``whose`` names another number of regions, or they are dealt besides.
-
-    Examples:
-        >>> from torchrl_koap.tasks.scene import StartRegions
-        >>> left, right, ahead = (((x, x + 0.1), (0.0, 0.1)) for x in (0.2, 0.6, 0.4))
-        >>> starts = StartRegions((left, right, ahead), whose=(0, 0, 1))
-        >>> starts.of(0) == (left, right), starts.of(1) == (ahead,)
-        (True, True)
-    """
-
-    regions: tuple[Region, ...]
-    dealt: bool = False
-    yaw: tuple[float, float] = (-90.0, 90.0)
-    whose: tuple[int, ...] | None = None
-
-    def __post_init__(self):
-        if self.whose is not None and (self.dealt or len(self.whose) != len(self.regions)):
-            fault = "dealt out too" if self.dealt else f"{len(self.regions)}, not {len(self.whose)}"
-            raise ValueError(f"whose says which body each region is for, but the regions are {fault}")
-
-    def of(self, index: int) -> tuple[Region, ...]:
+    def starts_of(self, index: int) -> tuple[Region, ...]:
         """Regions in one of which body ``index`` starts."""
-        if self.whose is not None:
-            return tuple(region for region, body in zip(self.regions, self.whose, strict=True) if body == index)
-        return self.regions if self.dealt else self.regions[index : index + 1]
+        return self.shared_starts or self.bodies[index].starts

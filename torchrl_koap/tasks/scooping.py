@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
-from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.scene import Body, Scene, Shape
 from torchrl_koap.tasks.task import Defaults, Task
 
 if TYPE_CHECKING:
@@ -85,12 +85,13 @@ _SCOOPING = register_task(
         max_steps=120,
         control_hz=FRAME_HZ,
         score="torchrl_koap.tasks.scooping:scores",
-        bodies=(Body("spoon", "spoon", color="grey", half=(0.02, 0.02)),),
-        start_regions=StartRegions(_START_REGIONS, dealt=True, yaw=(-180.0, 180.0)),
         env="torchrl_koap.envs.scooping:ScoopingEnv",
         expert="torchrl_koap.envs.scooping.expert:ScoopingExpert",
         scene=Scene(
             shapes=(Shape("circle", BOWL, (RIM_RADIUS, RIM_RADIUS), "zone", label="bowl"),),
+            bodies=(Body("spoon", "spoon", color="grey", half=(0.02, 0.02)),),
+            shared_starts=_START_REGIONS,
+            start_yaw=(-180.0, 180.0),
             x=(0.25, 0.7),
             y=(-0.3, 0.3),
             caption=" The spoon's path; the circle is the rim of the bowl.",
@@ -119,11 +120,18 @@ register_task(
         observation_parts={**_SCOOPING.observation_parts, "bowl": ("bowl_x", "bowl_y")},
         observation_units=_SCOOPING.observation_units + ("m",) * 2,
         hidden=("spoon", "bowl"),
-        bodies=(*_SCOOPING.bodies, Body("bowl", "bowl", half=(BOWL_RADIUS, BOWL_RADIUS), still=True)),
-        start_regions=StartRegions((*_START_REGIONS, _BOWL_REGION), yaw=(-180.0, 180.0), whose=(0, 0, 0, 1)),
         env_options={"task": "scooping_moving_bowl"},
         # the nearest other picture may show the bowl elsewhere: no gain (docs/results/scooping.md)
         defaults=replace(_SCOOPING.defaults, view={}),
-        scene=replace(_SCOOPING.scene, shapes=(), caption=" The spoon's path, and where the bowl stands."),
+        scene=replace(
+            _SCOOPING.scene,
+            shapes=(),
+            bodies=(
+                replace(_SCOOPING.bodies[0], starts=_START_REGIONS),
+                Body("bowl", "bowl", starts=(_BOWL_REGION,), half=(BOWL_RADIUS, BOWL_RADIUS), still=True),
+            ),
+            shared_starts=(),
+            caption=" The spoon's path, and where the bowl stands.",
+        ),
     )
 )

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
-from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.scene import Body, Scene, Shape
 from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
 
 # of PO-Sorting, where time is short: noise makes decoded actions too small, and plans are followed from behind; chosen
@@ -135,20 +135,25 @@ def _sorting(num_boxes: int) -> Task:
             entropy="solved_contexts",
         ),
         score="torchrl_koap.tasks.sorting:score",
-        bodies=tuple(
-            Body(box, f"{box}_xy", f"{box}_tan_yaw", f"{colour} boxes", colour, (BOX_HALF, BOX_HALF))
-            for box in boxes
-            for colour in (box.partition("_")[0],)
-        ),
-        start_regions=StartRegions(REGIONS, dealt=True),
         env="torchrl_koap.envs.sorting:SortingEnv",
         env_options={"num_boxes": num_boxes},
         expert="torchrl_koap.envs.experts.sorting:SortingExpert",
-        expert_options={"num_boxes": num_boxes},
-        gym_id=f"torchrl_koap/Sorting{num_boxes}-v0",
         converter=f"torchrl_koap.data.d3il.conversion:SORTING_{num_boxes}",
-        scene=Scene(shapes=(platform, *_walls()), x=(0.17, 0.83), y=(-0.43, 0.45), caption=_CAPTION, camera="cage"),
-        in_paper=num_boxes == 4,
+        scene=Scene(
+            shapes=(platform, *_walls()),
+            bodies=tuple(
+                Body(
+                    box, f"{box}_xy", f"{box}_tan_yaw", label=f"{colour} boxes", color=colour, half=(BOX_HALF, BOX_HALF)
+                )
+                for box in boxes
+                for colour in (box.partition("_")[0],)
+            ),
+            shared_starts=REGIONS,
+            x=(0.17, 0.83),
+            y=(-0.43, 0.45),
+            caption=_CAPTION,
+            camera="cage",
+        ),
         defaults=Defaults(
             demonstrations=1000,
             planner_steps=24000,
@@ -168,7 +173,6 @@ register_task(
         hidden=tuple(f"{box}_tan_yaw" for box in _BY_BOXES[4].objects),
         noise=PO_NOISE,
         data="sorting",
-        gym_id="",
         defaults=Defaults(
             preset="semi_supervised",  # positions are noisy
             demonstrations=1000,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
-from torchrl_koap.tasks.scene import Body, Scene, Shape, StartRegions
+from torchrl_koap.tasks.scene import Body, Scene, Shape
 from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
 
 TARGET = (0.5, 0.2)  # centre of the target zone (m)
@@ -21,6 +21,8 @@ HEIGHT_GAP = 0.03  # m; boxes lie on top of each other if all their heights diff
 # name, half sizes (m)
 BOXES = (("red", (0.03, 0.03, 0.03)), ("green", (0.03, 0.03, 0.03)), ("blue", (0.03, 0.05, 0.03)))
 NAMES = tuple(name for name, _ in BOXES)
+# where each box starts: x range, y range (m)
+_STARTS = (((0.35, 0.45), (-0.25, -0.15)), ((0.35, 0.45), (-0.1, 0.0)), ((0.55, 0.6), (-0.2, 0.0)))
 _JOINTS = {f"joint {joint}": Action("rad") for joint in range(1, 8)}
 
 
@@ -85,21 +87,18 @@ _STACKING = register_task(
             entropy="solved_contexts",
         ),
         score="torchrl_koap.evaluation.scores:stacking_scores",
-        bodies=tuple(
-            Body(name, f"{name}_position", f"{name}_tan_yaw", f"{name} box", name, half[:2]) for name, half in BOXES
-        ),
-        start_regions=StartRegions(
-            (((0.35, 0.45), (-0.25, -0.15)), ((0.35, 0.45), (-0.1, 0.0)), ((0.55, 0.6), (-0.2, 0.0)))
-        ),
         env="torchrl_koap.envs.stacking:StackingEnv",
         env_options={"num_boxes": 3},
         expert="torchrl_koap.envs.experts.stacking:StackingExpert",
-        gym_id="torchrl_koap/Stacking-v0",
         converter="torchrl_koap.data.d3il.conversion:STACKING",
         scene=Scene(
             shapes=(
                 Shape("circle", TARGET, (ZONE_RADIUS, ZONE_RADIUS), "zone", label="zone"),
                 Shape("rectangle", TARGET, (TARGET_HALF, TARGET_HALF), "target"),
+            ),
+            bodies=tuple(
+                Body(name, f"{name}_position", f"{name}_tan_yaw", (start,), f"{name} box", name, half[:2])
+                for (name, half), start in zip(BOXES, _STARTS, strict=True)
             ),
             x=(0.28, 0.68),
             y=(-0.3, 0.32),
@@ -122,7 +121,6 @@ _STACKING_1 = register_task(
         score="torchrl_koap.evaluation.scores:first_box_scores",
         env_options={"num_boxes": 1},
         data="stacking",
-        gym_id="",
     )
 )
 # as the paper has it: joints are commanded but not seen, and the gripper's number is decoded like any other action
@@ -137,6 +135,5 @@ register_task(
         tool_kinematics=None,
         actions=_JOINTS | {"gripper": Action("m", "absolute")},
         defaults=replace(_STACKING.defaults, method="koap_posture"),  # what the commands move is not seen
-        in_paper=True,
     )
 )

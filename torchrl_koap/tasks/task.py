@@ -22,7 +22,7 @@ from torchrl_koap.tasks.action_rules import Action, ActionRule
 from torchrl_koap.tasks.checks import check_task
 from torchrl_koap.tasks.columns import Columns
 from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
-from torchrl_koap.tasks.scene import Body, Scene, StartRegions
+from torchrl_koap.tasks.scene import Body, Scene
 
 CONTROL_HZ = 1 / 0.035
 # what wins on the tasks with objects: capacity and many samples (docs/results/planners.md)
@@ -65,6 +65,25 @@ class Modes:
     def number(self) -> int:
         """Number of modes; 1 where nothing is to choose."""
         return math.prod(len(names) for _, names in self.choices)
+
+    def name_of(self, index: int) -> str:
+        """Names a mode by its choices, the slowest first; ``"no mode"`` where the number is none of them.
+
+        Args:
+            index (int): number of the mode.
+
+        Examples:
+            >>> from torchrl_koap.tasks import get_task
+            >>> get_task("avoiding").modes.name_of(23), get_task("sorting").modes.name_of(1)
+            ('right, right, gap 4', 'red, blue, red, blue')
+        """
+        if not 0 <= index < self.number:
+            return "no mode"
+        words = []
+        for _, names in reversed(self.choices):
+            index, digit = divmod(index, len(names))
+            words.append(names[digit])
+        return ", ".join(reversed(words))
 
 
 @dataclass(frozen=True)
@@ -131,22 +150,16 @@ class Task(Columns):
         modes (Modes): the ways in which the task can be done.
         score (str, optional): import string of a function of the result of
             :func:`~torchrl_koap.evaluation.scores.score`, the episodes and their contexts that returns further figures.
-        bodies (tuple of Body): what a context places: bodies that start elsewhere in every episode.
-        start_regions (StartRegions, optional): where they start.
-        collides (bool): an episode can end by a collision.
         noise (float): standard deviation of the noise on the measured end effector (m), in rollouts and on the
             demonstrations as they are loaded.
         env (str, optional): import string of the environment (:mod:`torchrl_koap.envs.registry` says what it has to
             offer). None: a robot with data and no simulator.
         env_options (dict): its further keyword arguments.
         expert (str, optional): import string of the scripted expert (:mod:`torchrl_koap.envs.experts.recording`).
-        expert_options (dict): its further keyword arguments.
-        gym_id (str): name with Gymnasium, such as ``"torchrl_koap/Avoiding-v0"``; empty: none.
         data (str): name of the task whose demonstrations are used, if another one.
         converter (str, optional): import string of the :class:`~torchrl_koap.data.Converter` of D3IL's raw pickles.
-        scene (Scene): how it looks from above.
+        scene (Scene): the bodies that a context places, where they start, and how all looks from above.
         label_levels (tuple of float): shares of labelled windows of the label levels 1, 2, ...
-        in_paper (bool): the paper compares its methods on it.
         defaults (Defaults): settings that are the task's own.
 
     Raises:
@@ -176,20 +189,14 @@ class Task(Columns):
     goal: str | None = None
     modes: Modes = Modes()
     score: str | None = None
-    bodies: tuple[Body, ...] = ()
-    start_regions: StartRegions | None = None
-    collides: bool = False
     noise: float = 0.0
     env: str | None = None
     env_options: Mapping[str, Any] = field(default_factory=dict)
     expert: str | None = None
-    expert_options: Mapping[str, Any] = field(default_factory=dict)
-    gym_id: str = ""
     data: str = ""
     converter: str | None = None
     scene: Scene = Scene()
     label_levels: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.25)
-    in_paper: bool = False
     defaults: Defaults = Defaults()
 
     def __post_init__(self):
@@ -267,14 +274,14 @@ class Task(Columns):
         return self.modes.number
 
     @property
+    def bodies(self) -> tuple[Body, ...]:
+        """What a context places."""
+        return self.scene.bodies
+
+    @property
     def objects(self) -> tuple[str, ...]:
         """Names of the bodies that a context places."""
         return tuple(body.name for body in self.bodies)
-
-    @property
-    def plotted(self) -> dict[str, str]:
-        """Body to the part of the observation with its ``x, y``."""
-        return {body.name: body.position for body in self.bodies}
 
     @property
     def source(self) -> str:

@@ -113,7 +113,7 @@ def rmse_mm(predicted: Tensor, true: Tensor) -> float:
 
 def _plotted(task: Task, observation: Tensor) -> dict[str, Tensor]:
     """Positions of the tool ``[N, 2]`` and, where there are any, of the objects ``[N, objects, 2]`` for pictures."""
-    starts = [task.observation[part].start for part in (task.position, *task.plotted.values())]
+    starts = [task.observation[part].start for part in (task.position, *(body.position for body in task.bodies))]
     tool, *objects = (observation[:, start : start + 2] for start in starts)
     return {"position": tool.contiguous()} | ({"objects": torch.stack(objects, 1)} if objects else {})
 

@@ -23,7 +23,7 @@ def play(modes, contexts, seeds, num_boxes=4, steps=500):
     """Actions [T, n, 2], success [n], mode number [n] and control steps [n]; a finished episode stands still."""
     count = len(modes)
     env = SortingEnv(count, max_steps=steps, num_boxes=num_boxes, contexts=contexts, dtype=torch.float64)
-    expert = SortingExpert(modes, contexts, seeds, num_boxes=num_boxes)
+    expert = SortingExpert(modes, contexts, seeds)
     out, actions, lengths = env.reset(), [], np.zeros(count, dtype=int)
     running = np.ones(count, dtype=bool)
     while running.any():
@@ -81,16 +81,16 @@ def steady(expert, seen, steps=12):
 
 def test_it_pushes_a_box_that_lies_in_front_of_the_rod():
     contexts = np.zeros((1, 2, 3))
-    expert = SortingExpert([0], contexts, [(0,)], num_boxes=2)
+    expert = SortingExpert([0], contexts, [(0,)])
     action = steady(expert, observation((0.4, 0.04), [(0.4, 0.08), (0.62, 0.0)]))
     assert action[1] > 0.006 and abs(action[0]) < 0.003
-    beside = SortingExpert([0], contexts, [(0,)], num_boxes=2)
+    beside = SortingExpert([0], contexts, [(0,)])
     action = steady(beside, observation((0.4, 0.15), [(0.4, 0.08), (0.62, 0.0)]))
     assert np.abs(action[0]) > 0.003  # in front of the box: goes round it
 
 
 def test_it_goes_round_a_box_of_the_other_colour():
-    expert = SortingExpert([0], np.zeros((1, 2, 3)), [(0,)], num_boxes=2)
+    expert = SortingExpert([0], np.zeros((1, 2, 3)), [(0,)])
     rod, path = np.array([0.45, -0.25]), []
     for _ in range(60):
         seen = observation(rod, [(0.42, 0.08), (0.43, -0.1)])
@@ -105,7 +105,7 @@ def test_it_goes_round_a_box_of_the_other_colour():
 
 def test_it_rests_after_the_last_box_and_after_a_lost_one():
     for places in ([(0.4, 0.3), (0.6, 0.3)], [(0.15, 0.0), (0.6, 0.0)]):
-        expert = SortingExpert([0], np.zeros((1, 2, 3)), [(0,)], num_boxes=2)
+        expert = SortingExpert([0], np.zeros((1, 2, 3)), [(0,)])
         assert not expert.finished.any()
         action = steady(expert, observation((0.5, 0.1), places), 10)
         assert expert.finished.all() and np.abs(action).max() < 1e-4

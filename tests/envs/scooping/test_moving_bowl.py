@@ -17,7 +17,6 @@ from torchrl_koap.envs.scooping.expert import ScoopingExpert, start_joints
 from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.scene import StartRegions
 from torchrl_koap.tasks.scooping import BOWL, BOWL_REACH, RIM_RADIUS, START_HALF, STARTS, start_of
 from torchrl_koap.vision import projection_of
 
@@ -59,14 +58,18 @@ def test_a_context_has_the_spoon_at_one_of_its_starts_and_the_bowl_anywhere_in_i
         check_contexts(TASK, contexts[:1, ::-1])
 
 
-def test_regions_say_whose_they_are_once_and_everybody_has_one():
-    regions = TASK.start_regions.regions
-    with pytest.raises(ValueError, match="the regions are 4, not 3"):
-        StartRegions(regions, whose=(0, 0, 1))
-    with pytest.raises(ValueError, match="the regions are dealt out too"):
-        StartRegions(regions, whose=(0, 0, 0, 1), dealt=True)
+def test_bodies_have_starts_of_their_own_or_share_them():
+    spoon, bowl = TASK.bodies
+
+    def changed(**change):
+        return replace(TASK, scene=replace(TASK.scene, **change))
+
+    with pytest.raises(ValueError, match="bodies have starts of their own or share them, not both"):
+        changed(shared_starts=spoon.starts)
     with pytest.raises(ValueError, match="no region is for the body 'bowl'"):
-        replace(TASK, start_regions=StartRegions(regions, whose=(0, 0, 0, 0)))
+        changed(bodies=(spoon, replace(bowl, starts=())))
+    with pytest.raises(ValueError, match="shared_starts: 1 regions for 2 bodies"):
+        changed(bodies=(replace(spoon, starts=()), replace(bowl, starts=())), shared_starts=bowl.starts)
 
 
 def test_the_bowl_and_its_pieces_stand_where_the_context_says():

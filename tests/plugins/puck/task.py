@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from torchrl_koap import Task, register_task
-from torchrl_koap.tasks import Action, Body, Defaults, Modes, Scene, Shape, StartRegions
+from torchrl_koap.tasks import Action, Body, Defaults, Modes, Scene, Shape
 
 GOAL, GOAL_RADIUS = (0.5, 0.4), 0.05  # m
 POST, GATE_Y = (0.5, 0.2), 0.2  # where the side is decided (m)
 PUCK_RADIUS, ROBOT_RADIUS = 0.03, 0.01  # m
+START = ((0.4, 0.6), (0.05, 0.1))  # of the puck: x range, y range (m)
 
 
 def goal_reached(task, state):
@@ -40,16 +41,14 @@ TASK = register_task(
         goal="puck.task:goal_reached",
         modes=Modes((("side", ("left", "right")),), index="puck.task:mode_index", entropy="solved_contexts"),
         score="puck.task:score",
-        bodies=(Body("puck", "puck_xy", color="blue", half=(PUCK_RADIUS, PUCK_RADIUS)),),
-        start_regions=StartRegions((((0.4, 0.6), (0.05, 0.1)),)),
         env="puck.env:PuckEnv",
         expert="puck.expert:PuckExpert",
-        gym_id="puck/Puck-v0",
         scene=Scene(
             shapes=(
                 Shape("circle", GOAL, (GOAL_RADIUS, GOAL_RADIUS), "zone", label="goal"),
                 Shape("circle", POST, (0.01, 0.01), "obstacle"),
             ),
+            bodies=(Body("puck", "puck_xy", starts=(START,), color="blue", half=(PUCK_RADIUS, PUCK_RADIUS)),),
             x=(0.2, 0.8),
             y=(-0.05, 0.55),
             caption=" The puck passes the post on one side.",

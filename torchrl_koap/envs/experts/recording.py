@@ -4,7 +4,7 @@
 What an expert (``Task.expert``) has to offer::
 
     __init__          (modes=, contexts=, seeds=) a mode, a context [bodies, 3] and a seed per episode, contexts=None in
-                      a task without bodies; Task.expert_options are further arguments
+                      a task without bodies
     act(observation)  float64 [n, obs] to the next actions [n, act], once per control step
     finished          bool [n]: which episodes are over for the expert
     rules             RecordingRules, optional
@@ -130,7 +130,7 @@ def play(
     count, make = env.batch_size[0], expert_of(task)
     rules = rules or getattr(make, "rules", RecordingRules())
     placed = None if contexts is None else contexts[rows]
-    expert = make(modes=modes, contexts=placed, seeds=seeds, **task.expert_options)
+    expert = make(modes=modes, contexts=placed, seeds=seeds)
     recorder = _RawRecorder(task) if task.converter is not None and hasattr(env, "raw_log") else _PlainRecorder()
     active = np.zeros(count, dtype=bool)
     active[rows] = True

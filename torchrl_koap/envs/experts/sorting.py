@@ -43,12 +43,9 @@ class SortingExpert:
     Args:
         modes (sequence of int): the order of colours each episode shall take, numbers as
             :func:`~torchrl_koap.envs.sorting.mode_index` gives them.
-        contexts (array): contexts of the episodes [n, num_boxes, 3]; only their number is looked at, the player sees
+        contexts (array): contexts of the episodes [n, num_boxes, 3]; only their numbers are looked at, the player sees
             the boxes themselves.
         seeds (sequence): for each episode a tuple of integers, as for ``numpy.random.default_rng``.
-
-    Keyword Args:
-        num_boxes (int): 2, 4 or 6.
 
     Raises:
         ValueError: if a mode does not exist or the numbers of modes, contexts and seeds differ.
@@ -61,7 +58,7 @@ class SortingExpert:
         >>> from torchrl_koap.envs.experts.sorting import SortingExpert
         >>> contexts = evaluation_contexts("sorting_2", 2)
         >>> env = SortingEnv(2, num_boxes=2, contexts=contexts, dtype=torch.float64)
-        >>> expert = SortingExpert([0, 1], contexts, [(1, 0), (1, 1)], num_boxes=2)
+        >>> expert = SortingExpert([0, 1], contexts, [(1, 0), (1, 1)])
         >>> def policy(td):
         ...     return td.set("action", torch.from_numpy(expert.act(td["observation"].numpy())))
         >>> last = env.rollout(300, policy, break_when_any_done=False, break_when_all_done=True)["next"][:, -1]
@@ -77,11 +74,12 @@ class SortingExpert:
     _pause: np.ndarray
     _tempo: np.ndarray
 
-    def __init__(self, modes: Sequence[int], contexts, seeds: Sequence, *, num_boxes: int = 4):
+    def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
         modes, seeds, contexts = list(modes), list(seeds), np.asarray(contexts)
+        num_boxes = contexts.shape[1] if contexts.ndim == 3 else 0
         if not modes or len(modes) != len(seeds) or contexts.shape != (len(modes), num_boxes, 3):
             raise ValueError(
-                f"as many modes, contexts [{num_boxes}, 3] and seeds are needed, at least one, got {len(modes)} modes,"
+                f"as many modes, contexts [num_boxes, 3] and seeds are needed, at least one, got {len(modes)} modes,"
                 f" contexts of shape {list(contexts.shape)}, {len(seeds)} seeds"
             )
         self._colours = box_colours(num_boxes)
