@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import csv
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import numpy as np
 import torch
 
 from torchrl_koap import Agent, EvalConfig, TrainConfig, evaluate, load_policy, train
-from torchrl_koap.data import controller_view, make_demonstrations, save_demonstrations, select_state
+from torchrl_koap.data import controller_view, make_demonstrations, save_ted, select_state
 from torchrl_koap.evaluation import load_run
 from torchrl_koap.modules import LinearInverseDynamics
 from torchrl_koap.training.action_errors import first_actions
@@ -94,8 +95,7 @@ def _few(actions: list[np.ndarray]) -> list[np.ndarray | None]:
 def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, Any]:
     """Records, trains, judges and drives once."""
     states, actions = record(seed)
-    data = save_demonstrations(
-        folder / "arm",
+    data, task = make_demonstrations(
         states,
         _few(actions),
         control_hz=30,
@@ -104,9 +104,11 @@ def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, A
         action_units="rad",
         robot=NAMES[:JOINTS],
     )
+    if not options.forecast:
+        task = replace(task, defaults=replace(task.defaults, view={"forecast": False}))
+    save_ted(data, folder / "arm" / "ted", task=task)
     run = folder / "run"
-    forecast = None if options.forecast else False
-    summary = train(TrainConfig(dataset=str(data), out=run, steps=options.steps, seed=seed, forecast=forecast))
+    summary = train(TrainConfig(dataset=str(folder / "arm"), out=run, steps=options.steps, seed=seed))
     result = evaluate(run, EvalConfig(threads=1))
     error, ridge = action_errors(run, states, actions)
     away = drive(run, seed)

@@ -17,7 +17,7 @@ from planner_speed import median_seconds
 from resumable_table import open_table
 from tensordict import TensorDict
 
-from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner
+from torchrl_koap.modules import MLPDenoiser, StatePlanner
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.device import has_bfloat16_units
 
@@ -30,7 +30,7 @@ def update_of(width: int, depth: int, batch: int, dtype: torch.dtype | None):
     """One training step: loss, gradients, AdamW (fused)."""
     torch.manual_seed(0)
     denoiser = MLPDenoiser(STATE_DIM, HISTORY * STATE_DIM, horizon=HORIZON, width=width, depth=depth)
-    planner = StatePlanner(denoiser, NoiseSchedule(prediction="sample"), state_dim=STATE_DIM, horizon=HORIZON)
+    planner = StatePlanner(denoiser, state_dim=STATE_DIM, horizon=HORIZON)
     windows = TensorDict({"state": torch.randn(batch, HISTORY + HORIZON, STATE_DIM).cumsum(1)}, [batch])
     planner.fit_normalizers(windows["state"])
     planner.training_dtype = dtype

@@ -8,25 +8,13 @@ import torch
 from loss_test_base import LossTestBase
 from torchrl.objectives import SoftUpdate
 
-KINDS = [
-    (s, p)
-    for s in ("squared_cosine", "flow")
-    for p in ("epsilon", "sample", "velocity")
-    if (s, p) != ("flow", "epsilon")
-]
+PREDICTIONS = ("epsilon", "sample")
 
 
-def noised_and_target(network, schedule, prediction, clean, noise, time):
-    """Noised sequences and what the denoiser should answer, by the formulas of the two kinds of path."""
-    if schedule == "flow":
-        noise_level = (time / 50)[:, None, None]
-        signal, velocity = 1 - noise_level, noise - clean
-    else:
-        signal = network.schedule.signal.to(clean.dtype)[time.long()][:, None, None]
-        noise_level = (1 - signal**2).sqrt()
-        velocity = signal * noise - noise_level * clean
-    target = {"epsilon": noise, "sample": clean, "velocity": velocity}[prediction]
-    return signal * clean + noise_level * noise, target
+def noised_and_target(network, prediction, clean, noise, time):
+    """Noised sequences and what the denoiser should answer, by the formula of the schedule."""
+    signal = network.schedule.signal.to(clean.dtype)[time.long()][:, None, None]
+    return signal * clean + (1 - signal**2).sqrt() * noise, {"epsilon": noise, "sample": clean}[prediction]
 
 
 class DenoisingLossTestBase(LossTestBase):
@@ -66,7 +54,7 @@ class DenoisingLossTestBase(LossTestBase):
             torch.testing.assert_close(target[name], value)
             assert not target[name].requires_grad
         network = self.network(loss)
-        history, noise = torch.randn(3, network.history, network.state_dim), torch.randn(3, *network.sample_shape)
+        history, noise = torch.randn(3, network.history, network.state_dim), torch.randn(3, *network.noise_shape)
         trained = network.sample(history, noise)
         with getattr(loss, f"target_{self.name}_params").to_module(network):
             averaged = network.sample(history, noise)

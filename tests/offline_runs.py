@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from torchrl_koap.data import save_demonstrations
+from torchrl_koap.data import make_demonstrations, save_ted
 from torchrl_koap.training import TrainConfig, train
 
 TINY = {"steps": 20, "controller_steps": 20, "batch_size": 8, "controller_batch_size": 16, "channels": (8, 16)}
@@ -32,12 +33,17 @@ def record(count: int = 10, steps: int = 40, joints: int = 7, *, seed: int = 0):
 
 
 def save_arm(
-    folder: Path, *, count: int = 10, labelled: int = 3, joints: int = 7, units: str | list[str] = "rad"
+    folder: Path,
+    *,
+    count: int = 10,
+    labelled: int = 3,
+    joints: int = 7,
+    units: str | list[str] = "rad",
+    forecast: bool = True,
 ) -> Path:
     """A data set of which the first trajectories have labels."""
     states, actions = record(count, joints=joints)
-    return save_demonstrations(
-        folder,
+    data, task = make_demonstrations(
         states,
         [action if number < labelled else None for number, action in enumerate(actions)],
         name="arm",
@@ -48,6 +54,8 @@ def save_arm(
         action_units=units,
         robot=list(range(joints)),
     )
+    task = replace(task, defaults=replace(task.defaults, view={"forecast": forecast}))
+    return save_ted(data, folder / "ted", task=task).parent
 
 
 def train_arm(out: Path, dataset: Path, **options) -> Path:

@@ -34,8 +34,6 @@ EVALUATION = {
     "control_ms": 0.5,
     "control_hz": 400.0,
     "execution": "feedback",
-    "solver": "flow_euler",
-    "solver_steps": 8,
     "episode": [{"seed": 100 + e, "outcome": "success", "mode": e, "steps": 20} for e in range(4)],
 }
 

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import KoopmanOperator, make_koopman_inverse_dynamics
-from torchrl_koap.modules.diffusion.denoisers import check_activation
-from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
+from torchrl_koap.modules.diffusion.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.tasks import get_task
 
@@ -46,10 +46,8 @@ def test_without_a_near_name_all_are_listed(name):
         (lambda name: KoopmanOperator(4, init=name), "unknown operator init"),
         (lambda name: make_koopman_inverse_dynamics(2, 2, preset=name), "unknown preset"),
         (lambda name: make_koopman_inverse_dynamics(2, 2, network=name), "unknown network"),
-        (lambda name: NoiseSchedule(name), "unknown schedule"),
         (lambda name: NoiseSchedule(prediction=name), "unknown prediction"),
-        (lambda name: NoiseSchedule().check_solver(name), "unknown solver"),
-        (lambda name: check_activation(name), "unknown activation"),
+        (lambda name: NoiseSchedule().solve(None, torch.zeros(1, 1, 1), 1, name), "unknown solver"),
         (lambda name: Normalizer.fit(None, mode=name), "unknown normalisation"),
     ],
 )

@@ -11,14 +11,14 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_koap.envs.avoiding import OBSTACLES
-from torchrl_koap.modules import NoiseSchedule, StatePlanner
+from torchrl_koap.modules import StatePlanner
 
 
 class CountingPlanner(nn.Module):
     """Planned frame ``i`` of a plan made at state ``x`` is ``(x + 1000 (i + 1), x)``."""
 
-    history, horizon, num_steps, solver, state_dim = 2, 6, 1, "ddim", 2
-    sample_shape = noise_shape = (6, 2)
+    history, horizon, state_dim = 2, 6, 2
+    noise_shape = (6, 2)
     noise_key = "noise"
 
     def __init__(self):
@@ -111,15 +111,12 @@ class Wandering(nn.Module):
             push = 0.008 * torch.exp(-((gap[..., 0] / 0.05) ** 2)) * torch.sign(gap[..., 0])
             sideways = sideways + push * ((gap[..., 1] > -0.13) & (gap[..., 1] < 0.02))
         speed = torch.stack([sideways, torch.full_like(sideways, 0.009)], -1)
-        # the schedule reads the output as the derivative of a straight path: noise minus plan
-        return x - (now[..., None, :] + ahead[:, None] * speed[..., None, :])
+        return now[..., None, :] + ahead[:, None] * speed[..., None, :]
 
 
 def wandering_planner():
     """Plans that lead into different gaps, or into cylinders, depending on the noise alone."""
-    return StatePlanner(
-        Wandering(), NoiseSchedule("flow"), state_dim=2, horizon=14, relative=False, solver="euler", num_steps=1
-    )
+    return StatePlanner(Wandering(), state_dim=2, horizon=14, relative=False, num_steps=1)
 
 
 class PlannedStep(TensorDictModuleBase):

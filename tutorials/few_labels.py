@@ -34,7 +34,7 @@ from torchrl_koap.envs import AvoidingEnv, mode_index_of
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.evaluation.rollouts import make_policy, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
-from torchrl_koap.modules import NoiseSchedule, Normalizer, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+from torchrl_koap.modules import Normalizer, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.reports.rollout_plots import plot_rollouts
 from torchrl_koap.tasks import get_task
@@ -80,9 +80,7 @@ print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
 # ---------------------
 # It never sees an action. Recovery augmentation shows it states beside the demonstrations together with the way back.
 
-planner = StatePlanner(
-    TemporalUnet(2, 4), NoiseSchedule("squared_cosine", "sample"), state_dim=2, relative=False, clip=1.2, num_steps=5
-)
+planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, relative=False, clip=1.2, num_steps=5)
 extended = extrapolate_ends(data, 13)
 planner.fit_normalizers(cut_windows(extended, 16, select=["state"], pad_before=1)["state"])
 planner_loss = PlannerLoss(planner)

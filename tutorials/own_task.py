@@ -83,7 +83,6 @@ task = register_task(
             planner={
                 "denoiser": "mlp",
                 "denoiser_width": 256,
-                "denoiser_depth": 3,
                 "batch_size": 256,
                 "planner_learning_rate": 1e-3,
             },

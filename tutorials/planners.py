@@ -70,8 +70,9 @@ for solver in ("ddim", "dpm++2m"):
 seeds = list(range(24))
 
 
-def closed_loop(**options):
-    policy = load_policy(run, EvalConfig(**options))
+def closed_loop(steps, candidates=1):
+    policy = load_policy(run, EvalConfig(candidates=candidates))
+    policy.planner.num_steps = steps
     episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
     return score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index_of(task)), episodes
 
@@ -79,13 +80,12 @@ def closed_loop(**options):
 print("\nclosed loop, 24 rollouts each")
 results = {}
 for name, options in {
-    "1 step": {"solver_steps": 1},
-    "2 steps": {"solver_steps": 2},
-    "10 steps": {"solver_steps": 10},
-    "10 steps, 8 candidates": {"solver_steps": 10, "candidates": 8},
-    "10 steps, nearest of 8": {"solver_steps": 10, "candidates": 8, "choice": "nearest"},
+    "1 step": (1,),
+    "2 steps": (2,),
+    "10 steps": (10,),
+    "10 steps, 8 candidates": (10, 8),
 }.items():
-    results[name], episodes = closed_loop(**options)
+    results[name], episodes = closed_loop(*options)
     result = results[name]
     print(
         f"{name:24} success {100 * result['success_rate']:5.1f} %"

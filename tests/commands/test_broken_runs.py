@@ -80,9 +80,6 @@ def test_a_run_that_cannot_be_evaluated_is_named(kind, copied_run, capsys):
     ("options", "message"),
     [
         (("--execution", "openloop"), "unknown execution 'openloop'; did you mean 'open_loop'?"),
-        (("--solver", "dmp"), "unknown solver 'dmp'"),
-        (("--solver", "heun"), "solver 'heun' walks a flow path"),
-        (("--solver-steps", "51"), "num_steps must lie in 1..50"),
         (("--replan-interval", "15"), "replan_interval must be in 1..14"),
         (("--episodes", "0"), "episodes must be >= 1, got 0"),
         (("--batch-size", "0"), "batch_size must be >= 1, got 0"),

@@ -47,7 +47,6 @@ def test_an_evaluation_does_not_depend_on_the_batch_size(copied_run, no_report):
     ("options", "wanted"),
     [
         (("--execution", "open_loop"), {"execution": "open_loop"}),
-        (("--solver", "ddpm", "--solver-steps", "4"), {"solver": "ddpm", "solver_steps": 4}),
         (("--replan-interval", "2"), {"replan_interval": 2}),
     ],
 )

@@ -147,7 +147,7 @@ def test_a_missing_data_set_is_named(run, tmp_path, capsys):
 
 
 def test_export_and_latency(run, tmp_path, capsys):
-    assert koap("export", run, "--out", tmp_path / "exported", "--solver-steps", 2) == 0
+    assert koap("export", run, "--out", tmp_path / "exported") == 0
     assert {file.name for file in (tmp_path / "exported").iterdir()} == {
         "policy.pt2",
         "controller.pt2",

@@ -8,12 +8,9 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import GripperRecovery
-from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.action_rules import PLANNED_OPEN_ABOVE, gripper_command
-from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.planner import augmentation
-from torchrl_koap.training.resume import started_with
 
 OPEN, HELD = 0.08, 0.0617
 
@@ -62,41 +59,20 @@ def test_no_other_column_is_touched_and_the_share_is_kept():
     assert begin.min() < 0.002 and begin.max() > 0.048
 
 
-@pytest.mark.parametrize(("task", "share"), [("stacking", 0.1), ("stacking_1", 0.1), ("sorting", None)])
-def test_tasks_with_a_gripper_have_it_by_default(task, share):
-    options = resolve(TrainConfig(out="run", task=task)).options
-    steps = augmentation(options, get_task(task)).module
-    assert options.gripper_recovery == share
-    assert [step.share for step in steps if isinstance(step, GripperRecovery)] == ([share] if share else [])
-    off = resolve(TrainConfig(out="run", task=task, gripper_recovery=0.0)).options
-    assert not any(isinstance(step, GripperRecovery) for step in augmentation(off, get_task(task)).module)
+@pytest.mark.parametrize(("task", "shares"), [("stacking", [0.1]), ("stacking_1", [0.1]), ("sorting", [])])
+def test_tasks_with_a_gripper_have_it_for_their_planner(task, shares):
+    def found(**options):
+        return [step.share for step in augmentation(get_task(task), **options).module if type(step) is GripperRecovery]
 
-
-def test_a_policy_without_plans_has_none():
-    assert resolve(TrainConfig(out="run", task="stacking", method="dp")).options.gripper_recovery is None
-    with pytest.raises(ValueError, match="gripper_recovery is the planner's, which method 'dp' does not have"):
-        resolve(TrainConfig(out="run", task="stacking", method="dp", gripper_recovery=0.1))
-
-
-def test_a_run_of_before_goes_on_without(tmp_path):
-    config = TrainConfig(out=tmp_path, task="stacking", resume=True)
-    (tmp_path / "config.json").write_text('{"task": "stacking", "seed": 3}')
-    options = resolve(started_with(RunDirectory(tmp_path), config)).options
-    assert (options.seed, options.gripper_recovery) == (3, 0.0)
-    (tmp_path / "config.json").write_text('{"task": "stacking", "gripper_recovery": 0.3}')
-    assert resolve(started_with(RunDirectory(tmp_path), config)).options.gripper_recovery == 0.3
+    assert found() == shares and found(actions=True) == []
 
 
 @pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
 def test_shares_out_of_range_are_refused(value):
-    with pytest.raises(ValueError, match="gripper_recovery must be a share"):
-        resolve(TrainConfig(out="run", task="stacking", gripper_recovery=value))
     with pytest.raises(ValueError, match="share and decay must be in"):
         GripperRecovery(0, share=value)
 
 
-def test_a_task_without_a_gripper_and_hands_as_wide_as_open_ones_are_refused():
-    with pytest.raises(ValueError, match="gripper_recovery was given, but task 'avoiding' has no gripper"):
-        resolve(TrainConfig(out="run", task="avoiding", gripper_recovery=0.2))
+def test_hands_as_wide_as_open_ones_are_refused():
     with pytest.raises(ValueError, match="empty must be above 0 and below open_above"):
         GripperRecovery(0, empty=0.08)

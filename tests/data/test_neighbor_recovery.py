@@ -6,11 +6,9 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import NeighborRecovery
-from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.planner import augmentation
-from torchrl_koap.training.resume import started_with
 
 
 def moved(windows, share, **options):
@@ -60,37 +58,15 @@ def test_numbers_out_of_range_are_refused(share, decay):
         NeighborRecovery(share, decay=decay)
 
 
-def test_it_is_an_option_of_the_planner():
-    on = resolve(TrainConfig(out="run", task="avoiding", neighbor_recovery=0.5)).options
-    (step,) = [step for step in augmentation(on, get_task("avoiding")).module if isinstance(step, NeighborRecovery)]
-    assert step.share == 0.5
-    with pytest.raises(ValueError, match="neighbor_recovery is the planner's, which method 'dp' does not have"):
-        resolve(TrainConfig(out="run", task="avoiding", method="dp", neighbor_recovery=0.5))
+@pytest.mark.parametrize(("task", "shares"), [("scooping", [2.0]), ("scooping_moving_bowl", []), ("avoiding", [])])
+def test_scooping_has_it_for_its_planner(task, shares):
+    def found(**options):
+        return [step.share for step in augmentation(get_task(task), **options).module if type(step) is NeighborRecovery]
 
-
-@pytest.mark.parametrize(("task", "share"), [("scooping", 2.0), ("scooping_moving_bowl", None), ("avoiding", None)])
-def test_scooping_has_it_by_default(task, share):
-    options = resolve(TrainConfig(out="run", task=task)).options
-    steps = augmentation(options, get_task(task)).module
-    assert options.neighbor_recovery == share
-    assert [step.share for step in steps if isinstance(step, NeighborRecovery)] == ([share] if share else [])
-    assert resolve(TrainConfig(out="run", task=task, method="dp")).options.neighbor_recovery is None
-
-
-def test_a_run_of_before_goes_on_without(tmp_path):
-    (tmp_path / "config.json").write_text('{"task": "scooping", "seed": 3}')
-    config = TrainConfig(out=tmp_path, task="scooping", resume=True)
-    assert resolve(started_with(RunDirectory(tmp_path), config)).options.neighbor_recovery == 0.0
-
-
-@pytest.mark.parametrize("share", [-0.1, float("nan"), float("inf")])
-def test_options_out_of_range_are_refused(share):
-    with pytest.raises(ValueError, match="neighbor_recovery must be a share of at least 0"):
-        resolve(TrainConfig(out="run", task="avoiding", neighbor_recovery=share))
+    assert found() == shares and found(actions=True) == []
 
 
 def test_a_batch_without_neighbours_is_refused_before_any_work():
-    with pytest.raises(ValueError, match="batch_size: neighbor_recovery 2 looks for neighbours in a batch of two"):
+    with pytest.raises(ValueError, match="batch_size: the neighbor_recovery of task 'scooping' looks for neighbours"):
         resolve(TrainConfig(out="run", task="scooping", batch_size=1))
-    options = resolve(TrainConfig(out="run", task="scooping", batch_size=1, neighbor_recovery=0.0)).options
-    assert options.batch_size == 1
+    assert resolve(TrainConfig(out="run", task="scooping", method="dp", batch_size=1)).options.batch_size == 1

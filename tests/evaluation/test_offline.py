@@ -28,8 +28,9 @@ def arm(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def run(arm, tmp_path_factory):
-    return train_arm(tmp_path_factory.mktemp("runs") / "run", arm, forecast=False)
+def run(tmp_path_factory):
+    arm = save_arm(tmp_path_factory.mktemp("data") / "arm", forecast=False)
+    return train_arm(tmp_path_factory.mktemp("runs") / "run", arm)
 
 
 def test_a_run_of_seven_joints(run):

@@ -50,11 +50,9 @@ RIGHT = {
     "eval": ("--seed 0",),
     "inspect": ("--seed 0",),
     "suggest": ("--seed 0",),
-    "curve": ("--condition-octaves 0",),
-    "bench": ("--condition-octaves 0",),
     "train": (
-        *("--seed 0", "--controller-steps 0", "--condition-octaves 0", "--episodes -1", "--episodes 0"),
-        *("--denoiser-width", "--denoiser-depth"),
+        *("--seed 0", "--controller-steps 0", "--episodes -1", "--episodes 0"),
+        "--denoiser-width",
     ),
 }
 EMPTY = ("--action-units", "--state-units")  # of a number without a unit
@@ -63,9 +61,7 @@ SAYS = {
     "--label-count": "labelled|label-count",
     "--label-unit": "unit",
     "--controller-steps": "steps",
-    "--solver-steps": "solver-steps|num_steps",
     "--controller-state": "part of the state|controller-state",
-    "--recovery-response": "recovery response|recovery-response",
     "--action-kind": "kind of action|action-kind",
     "--to": "unknown format|--to",
     "--tasks": "task",

@@ -142,15 +142,9 @@ ENTRIES = {
     "controller": (),
     "planner.denoiser": (),
     "planner.channels": (),
-    "planner.schedule": (),
-    "planner.prediction": (),
     "planner.history": (),
     "planner.horizon": (),
     "planner.relative": ("true",),
-    "planner.relations": ("true",),
-    "planner.solver": (),
-    "planner.solver_steps": (),
-    "planner.clip": (),
     "controller.method": (),
     "controller.decoder": ("null",),
     "controller.preset": (),
@@ -170,7 +164,6 @@ def entries() -> Iterator[Fault]:
                 ("label_fraction", "null"),
                 ("candidates", "null"),
                 ("controller.decoder", "null"),
-                ("planner.relations", "true"),
                 ("label_count", "null"),
             ):
                 continue
@@ -179,8 +172,8 @@ def entries() -> Iterator[Fault]:
         yield Fault(f"config.json plugins is {kind}", EVAL, "config.json", entry("plugins", TYPES[kind]))
     yield Fault("config.json relative was flipped", EVAL, "config.json changed", flip_relative)
     yield Fault("config.json relative was flipped", READERS["doctor"], "config.json changed", flip_relative)
-    yield Fault("config.json NaN", EVAL, "config.json", entry("planner.clip", float("nan")))
-    yield Fault("config.json infinite", EVAL, "config.json", entry("planner.clip", float("inf")))
+    yield Fault("config.json NaN", EVAL, "config.json", entry("planner_learning_rate", float("nan")))
+    yield Fault("config.json infinite", EVAL, "config.json", entry("planner_learning_rate", float("inf")))
     yield Fault("config.json beyond 64 bits", EVAL, "config.json", entry("planner.history", 10**40))
     yield Fault("config.json names a module", EVAL, "no_such_module", entry("plugins", ["no_such_module"]))
 

@@ -14,7 +14,6 @@ from torchrl_koap.modules import (
     DiffusionPolicy,
     LinearInverseDynamics,
     MLPDenoiser,
-    NoiseSchedule,
     NonlinearInverseDynamics,
     Normalizer,
     QuantizedInverseDynamics,
@@ -22,15 +21,13 @@ from torchrl_koap.modules import (
     StatePlanner,
     SupervisedInverseDynamics,
     TemporalUnet,
-    TransformerDenoiser,
     VariationalInverseDynamics,
     make_koopman_inverse_dynamics,
 )
 
 PLANNERS = {
     "unet": lambda: StatePlanner(TemporalUnet(2, 4, channels=(8,)), state_dim=2),
-    "mlp": lambda: StatePlanner(MLPDenoiser(2, 4, horizon=14), NoiseSchedule("flow"), state_dim=2),
-    "transformer": lambda: StatePlanner(TransformerDenoiser(2, 4), state_dim=2),
+    "mlp": lambda: StatePlanner(MLPDenoiser(2, 4, horizon=14), state_dim=2),
     "policy": lambda: DiffusionPolicy(TemporalUnet(2, 4, channels=(8,)), state_dim=2, action_dim=2),
     "linear": lambda: LinearInverseDynamics(2, 2),
 }

@@ -1,25 +1,25 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The planner's loss: closed forms, masks, keys, reductions, the averaged copy of the weights, compilation."""
+"""The planner's loss: closed forms, keys, reductions, the averaged copy of the weights, compilation."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from denoising_test_base import KINDS, DenoisingLossTestBase, noised_and_target
+from denoising_test_base import PREDICTIONS, DenoisingLossTestBase, noised_and_target
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
 from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser
+from torchrl_koap.modules.diffusion.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.planner import StatePlanner
-from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.unet import TemporalUnet
 from torchrl_koap.objectives import PlannerLoss
 
 
-def make_loss(schedule="squared_cosine", prediction=None, dtype=torch.float32, seed=0, **options):
+def make_loss(prediction="epsilon", dtype=torch.float32, seed=0, **options):
     torch.manual_seed(seed)
     denoiser = MLPDenoiser(2, 4, horizon=6, width=32, depth=1)
-    planner = StatePlanner(denoiser, NoiseSchedule(schedule, prediction), state_dim=2, horizon=6)
+    planner = StatePlanner(denoiser, NoiseSchedule(prediction), state_dim=2, horizon=6)
     planner.fit_normalizers(windows(64))
     return PlannerLoss(planner.to(dtype), **options)
 
@@ -29,14 +29,13 @@ def windows(*batch, dtype=torch.float32):
     return torch.randn(*batch, 8, 2, generator=generator, dtype=dtype).cumsum(-2)
 
 
-def batch_of(*batch, dtype=torch.float32, **more):
+def batch_of(*batch, dtype=torch.float32):
     generator = torch.Generator().manual_seed(5)
     return TensorDict(
         {
             "state": windows(*batch, dtype=dtype),
             "planner_noise": torch.randn(*batch, 6, 2, generator=generator, dtype=dtype),
             "planner_time": torch.randint(1, 50, batch, generator=generator),
-            **more,
         },
         batch,
     )
@@ -44,14 +43,7 @@ def batch_of(*batch, dtype=torch.float32, **more):
 
 class TestPlannerLoss(DenoisingLossTestBase):
     name = "planner"
-    default_keys = {
-        "state": "state",
-        "history": "history",
-        "plan": "plan",
-        "mask": "mask",
-        "noise": "planner_noise",
-        "time": "planner_time",
-    }
+    default_keys = {"state": "state", "noise": "planner_noise", "time": "planner_time"}
     in_names, out_keys = ("state",), ("loss_planner",)
 
     def make_loss(self, seed=0, **options):
@@ -61,23 +53,10 @@ class TestPlannerLoss(DenoisingLossTestBase):
         return batch_of(*batch)
 
 
-class TestPlannerLossOfHistoryAndPlan(TestPlannerLoss):
-    in_names = ("history", "plan")
-    test_compiled_equals_eager = None  # compiled above, with windows
-
-    def make_loss(self, seed=0, **options):
-        return make_loss(seed=seed, window=False, **options)
-
-    def make_batch(self, *batch):
-        data = batch_of(*batch)
-        state = data.pop("state")
-        return data.set("history", state[..., :2, :]).set("plan", state[..., 2:, :])
-
-
-@pytest.mark.parametrize(("schedule", "prediction"), KINDS)
+@pytest.mark.parametrize("prediction", PREDICTIONS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_value_in_closed_form(schedule, prediction, dtype):
-    loss = make_loss(schedule, prediction, dtype, reduction="none")
+def test_value_in_closed_form(prediction, dtype):
+    loss = make_loss(prediction, dtype, reduction="none")
     data = batch_of(5, dtype=dtype)
     value = loss(data)["loss_planner"]
 
@@ -87,14 +66,14 @@ def test_value_in_closed_form(schedule, prediction, dtype):
     clean = ((clean.flatten(1) - planner.plan_normalizer.offset) / planner.plan_normalizer.scale).reshape(5, 6, 2)
     condition = torch.cat([state[:, 0] - state[:, 1], state[:, 1]], -1)
     condition = (condition - planner.condition_normalizer.offset) / planner.condition_normalizer.scale
-    noisy, target = noised_and_target(planner, schedule, prediction, clean, noise, time)
+    noisy, target = noised_and_target(planner, prediction, clean, noise, time)
     with loss.planner_params.to_module(planner):
         output = planner.denoiser(noisy, time, condition)
     torch.testing.assert_close(value, (output - target) ** 2, atol=1e-4, rtol=1e-4)
     assert value.dtype == dtype
 
 
-def test_reductions_batches_and_both_ways_of_reading_agree():
+def test_reductions_and_batches_agree():
     data = batch_of(3, 4)
     elements = make_loss(reduction="none")(data)["loss_planner"]
     assert elements.shape == (3, 4, 6, 2)
@@ -102,34 +81,11 @@ def test_reductions_batches_and_both_ways_of_reading_agree():
     torch.testing.assert_close(make_loss(reduction="sum")(data)["loss_planner"], elements.sum())
     flat = make_loss(reduction="none")(data.reshape(-1))["loss_planner"]
     torch.testing.assert_close(elements.flatten(0, 1), flat)
-    cut = data.exclude("state").set("history", data["state"][..., :2, :]).set("plan", data["state"][..., 2:, :])
-    torch.testing.assert_close(make_loss(window=False)(cut)["loss_planner"], elements.mean())
 
 
-@pytest.mark.parametrize("shape", [(8,), (6,), (8, 1)])
-def test_masked_steps_count_nothing_and_may_hold_nan(shape):
-    data = batch_of(5)
-    length = shape[0]
-    mask = torch.ones(5, *shape, dtype=torch.bool)
-    mask[:3, length - 2 :] = False
-    data["mask"] = mask
-    reference = make_loss(reduction="none")
-    elements = reference(data)["loss_planner"]
-    assert (elements[:3, -2:] == 0).all() and (elements[3:] > 0).all() and (elements[:, :-2] > 0).all()
-    poisoned = data.clone()
-    poisoned["state"][:3, -2:] = float("nan")
-    loss = make_loss()
-    value = loss(poisoned)["loss_planner"]
-    torch.testing.assert_close(value, elements.sum() / (5 * 12 - 3 * 4))
-    value.backward()
-    assert all(parameter.grad.isfinite().all() for parameter in loss.parameters() if parameter.requires_grad)
-    data["mask"] = torch.zeros_like(mask)
-    assert make_loss()(data)["loss_planner"] == 0
-
-
-@pytest.mark.parametrize(("schedule", "prediction"), KINDS)
-def test_loss_decreases_on_a_fixed_batch(schedule, prediction):
-    loss, data = make_loss(schedule, prediction), batch_of(32)
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+def test_loss_decreases_on_a_fixed_batch(prediction):
+    loss, data = make_loss(prediction), batch_of(32)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
     values = []
     for _ in range(60):
@@ -145,7 +101,6 @@ def test_training_recovers_the_mean_and_spread_of_the_data():
     torch.manual_seed(0)
     planner = StatePlanner(
         MLPDenoiser(1, 1, horizon=2, width=32, depth=1),
-        NoiseSchedule("squared_cosine", "sample"),
         state_dim=1,
         history=1,
         horizon=2,
@@ -172,9 +127,8 @@ def test_training_recovers_the_mean_and_spread_of_the_data():
 def test_set_keys_reaches_everything():
     loss = make_loss()
     expected = loss(batch_of(4))["loss_planner"]
-    loss.set_keys(state=("window", "x"), noise="e", time="t", history="past", plan="future")
+    loss.set_keys(state=("window", "x"), noise="e", time="t")
     assert loss.in_keys == [("window", "x")]
-    assert loss.planner.in_keys == ["past"] and loss.planner.out_keys == ["future"]
     data = batch_of(4)
     renamed = TensorDict({"window": {"x": data["state"]}, "e": data["planner_noise"], "t": data["planner_time"]}, [4])
     before = renamed.clone()
@@ -184,19 +138,12 @@ def test_set_keys_reaches_everything():
         loss.set_keys(future="x")
 
 
-def test_keys_of_the_planner_are_taken_over_and_dispatch_works():
-    planner = StatePlanner(
-        MLPDenoiser(2, 4, horizon=6, width=8, depth=1), state_dim=2, horizon=6, in_keys=["past"], out_keys=["future"]
-    )
-    loss = PlannerLoss(planner, window=False)
-    assert loss.in_keys == ["past", "future"] and loss.out_keys == ["loss_planner"]
-    state = windows(4)
+def test_dispatch_by_name():
+    loss = make_loss()
     torch.manual_seed(1)
-    by_name = loss(past=state[:, :2], future=state[:, 2:])
+    by_name = loss(state=windows(4))
     torch.manual_seed(1)
-    torch.testing.assert_close(
-        by_name, loss(TensorDict({"past": state[:, :2], "future": state[:, 2:]}, [4]))["loss_planner"]
-    )
+    torch.testing.assert_close(by_name, loss(TensorDict({"state": windows(4)}, [4]))["loss_planner"])
 
 
 def test_reset_and_state_dict():
@@ -214,8 +161,6 @@ def test_bad_input_is_explained():
         loss(TensorDict({"states": windows(4)}, [4]))
     with pytest.raises(ValueError, match=r"windows must be \[\*B, 8, 2\]"):
         loss(TensorDict({"state": windows(4)[:, 1:]}, [4]))
-    with pytest.raises(ValueError, match=r"'mask' must be \[\*B, 6\] \(horizon\) or \[\*B, 8\]"):
-        loss(batch_of(4, mask=torch.ones(4, 5, dtype=torch.bool)))
 
 
 @pytest.mark.parametrize("network", ["mlp", "unet"])
@@ -232,20 +177,6 @@ def test_forward_and_plan_compile_without_a_graph_break(network):
     history, noise = windows(4)[:, :2], torch.randn(4, 6, 2)
     with torch.no_grad():
         torch.testing.assert_close(plan(history, noise), loss.planner.plan(history, noise))
-
-
-def test_first_steps_weigh_more_and_the_mean_weight_stays():
-    torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8,)), state_dim=2)
-    windows = TensorDict({"state": torch.randn(6, 16, 2)}, [6])
-    windows["planner_noise"], windows["planner_time"] = torch.randn(6, 14, 2), torch.full((6,), 20.0)
-    plain = PlannerLoss(planner, reduction="none")(windows)["loss_planner"]
-    weighted = PlannerLoss(planner, reduction="none", first_steps_weight=10.0)(windows)["loss_planner"]
-    weights = (weighted / plain).detach().mean((0, 2))
-    assert weights[0] / weights[-1] == pytest.approx(10, rel=1e-4) and weights.mean() == pytest.approx(1, rel=1e-4)
-    assert (weights.diff() < 0).all()
-    with pytest.raises(ValueError, match="first_steps_weight must be > 0, got 0"):
-        PlannerLoss(planner, first_steps_weight=0)
 
 
 def test_half_precision_products_leave_weights_and_gradients_in_float32():

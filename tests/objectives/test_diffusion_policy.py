@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from denoising_test_base import KINDS, DenoisingLossTestBase, noised_and_target
+from denoising_test_base import PREDICTIONS, DenoisingLossTestBase, noised_and_target
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
@@ -16,11 +16,11 @@ from torchrl_koap.objectives import DiffusionPolicyLoss
 HORIZON, ACT = 6, 3
 
 
-def make_policy(schedule="squared_cosine", prediction=None, history=2, **options):
+def make_policy(prediction="epsilon", history=2, **options):
     denoiser = MLPDenoiser(ACT, 2 * history, horizon=HORIZON, width=32, depth=1)
     policy = DiffusionPolicy(
         denoiser,
-        NoiseSchedule(schedule, prediction),
+        NoiseSchedule(prediction),
         state_dim=2,
         action_dim=ACT,
         history=history,
@@ -32,9 +32,9 @@ def make_policy(schedule="squared_cosine", prediction=None, history=2, **options
     return policy
 
 
-def make_loss(schedule="squared_cosine", prediction=None, seed=0, policy_options=None, **options):
+def make_loss(prediction="epsilon", seed=0, policy_options=None, **options):
     torch.manual_seed(seed)
-    return DiffusionPolicyLoss(make_policy(schedule, prediction, **(policy_options or {})), **options)
+    return DiffusionPolicyLoss(make_policy(prediction, **(policy_options or {})), **options)
 
 
 def batch_of(*batch, history=2):
@@ -76,11 +76,11 @@ class TestDiffusionPolicyLoss(DenoisingLossTestBase):
         return int(batch["has_action"][..., 1:-1, :].sum()) * ACT
 
 
-@pytest.mark.parametrize(("schedule", "prediction"), KINDS)
+@pytest.mark.parametrize("prediction", PREDICTIONS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("history", [1, 3])
-def test_value_in_closed_form(schedule, prediction, dtype, history):
-    loss = make_loss(schedule, prediction, policy_options={"history": history}, reduction="none").to(dtype)
+def test_value_in_closed_form(prediction, dtype, history):
+    loss = make_loss(prediction, policy_options={"history": history}, reduction="none").to(dtype)
     data = batch_of(5, history=history).apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
     value = loss(data)["loss_policy"]
 
@@ -91,7 +91,7 @@ def test_value_in_closed_form(schedule, prediction, dtype, history):
     clean = clean.nan_to_num(0.0)
     condition = data["state"][:, :history].flatten(1)
     condition = (condition - policy.condition_normalizer.offset) / policy.condition_normalizer.scale
-    noisy, target = noised_and_target(policy, schedule, prediction, clean, noise, time)
+    noisy, target = noised_and_target(policy, prediction, clean, noise, time)
     with loss.policy_params.to_module(policy):
         output = policy.denoiser(noisy, time, condition)
     torch.testing.assert_close(value, torch.where(counts, (output - target) ** 2, 0.0), atol=1e-4, rtol=1e-4)
@@ -169,7 +169,6 @@ def test_training_recovers_a_linear_law_from_few_labels():
     data, _ = LabelBudget(10, seed=1).apply(select_state(data, (0, 1)))
     policy = DiffusionPolicy(
         MLPDenoiser(2, 4, horizon=4, width=64, depth=1, frequencies=0),
-        NoiseSchedule("flow"),
         state_dim=2,
         action_dim=2,
         horizon=4,

@@ -76,7 +76,7 @@ def test_order_headline_labels_pictures_commands(run):
     places = [text.index(word) for word in ("Result", "Labels", "Executed rollouts", "All numbers", "Do it again")]
     assert places == sorted(places)
     assert "koap train --out 'a folder'" in text
-    solver = "--episodes 4 --seed 100 --execution feedback --solver flow_euler --solver-steps 8"
+    solver = "--episodes 4 --seed 100 --execution feedback"
     assert f"koap eval {run} {solver}" in text
 
 

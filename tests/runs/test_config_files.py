@@ -22,7 +22,7 @@ from torchrl_koap.runs.config_files import CONTROLLER, PLANNER, check_config, ch
     [
         {},
         {"label_episodes": (1, 4), "channels": (8, 16), "plugins": ("math",)},
-        {"denoiser": "mlp", "denoiser_width": 64, "denoiser_depth": 2, "condition_octaves": 3, "dropout": 0.1},
+        {"denoiser": "mlp", "denoiser_width": 64},
         {"method": "dp", "label_count": 3},
     ],
 )
@@ -45,7 +45,7 @@ def test_every_field_is_checked():
         ({"seed": True}, "entry 'seed' must be int, got True"),
         ({"seed": 10**30}, "entry 'seed' must be int"),
         ({"planner": {"channels": [8, "a"]}}, r"entry 'planner.channels' must be a list of int, got \[8, 'a'\]"),
-        ({"planner": {"clip": "x" * 99}}, "entry 'planner.clip' must be a number, got 'x+..."),
+        ({"planner_learning_rate": "x" * 99}, "entry 'planner_learning_rate' must be a number or null, got 'x+..."),
         ({"controller": {"decoder": 3}}, "entry 'controller.decoder' must be text or null, got 3"),
         ({"out": 3}, "entry 'out' must be a path, got 3"),
     ],

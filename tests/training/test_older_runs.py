@@ -8,14 +8,10 @@ import json
 import shutil
 
 import pytest
-import torch
-from offline_runs import save_arm, train_arm
 from tiny_runs import koap
 
 from torchrl_koap.evaluation import load_run
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.training import TrainConfig, train
 
 # every run had these columns, whatever was logged
 COLUMNS = (
@@ -58,18 +54,3 @@ def test_it_goes_on_and_ends_with_the_same_weights(older_run, trained_run):
     rows = RunDirectory(older_run).read_metrics()
     assert tuple(rows[0]) == COLUMNS and [row["phase"] for row in rows] == ["planner", "controller"]
     assert json.loads((older_run / "config.json").read_text())["plugins"] == []
-
-
-def test_a_run_of_recorded_data_goes_on_without_a_forecast(tmp_path):
-    """There was none to choose when it was begun."""
-    arm = save_arm(tmp_path / "arm", joints=2)
-    run = train_arm(tmp_path / "run", arm, method="linear", forecast=False)
-    config = json.loads((run / "config.json").read_text())
-    del config["forecast"]
-    (run / "config.json").write_text(json.dumps(config))
-    weights = load_tensors(run / "controller.safetensors")[0]
-    (run / "controller.safetensors").unlink()
-    train(TrainConfig(out=run, resume=True))
-    again = load_tensors(run / "controller.safetensors")[0]
-    assert again.keys() == weights.keys() and all(torch.equal(again[name], weights[name]) for name in weights)
-    assert load_run(run).planner.forecast is None

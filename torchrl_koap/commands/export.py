@@ -10,7 +10,7 @@ from typing import Any
 import tyro
 
 from torchrl_koap.commands.command import Command
-from torchrl_koap.evaluation import EvalConfig, load_policy, load_run
+from torchrl_koap.evaluation import load_policy, load_run
 from torchrl_koap.evaluation.latency import time_calls
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PlanThenControl
@@ -28,7 +28,6 @@ class Export(Command):
         run: run directory of `koap train`, or pretrained:NAME.
         out: folder to write (default: RUN/exported).
         format: "torch" (torch.export), "onnx" (ONNX Runtime) or "aoti" (AOTInductor, needs a C++ compiler).
-        solver_steps: solver steps that are unrolled (default: the run's).
         threads: torch threads.
         latency: time the exported parts against eager ones.
     """
@@ -36,7 +35,6 @@ class Export(Command):
     run: tyro.conf.Positional[str]
     out: Path | None = None
     format: str = "torch"
-    solver_steps: int | None = None
     threads: int = 1
     latency: bool = True
 
@@ -45,7 +43,7 @@ class Export(Command):
         suffix = lookup(SUFFIXES, self.format, "export format")
         set_up_torch(self.threads, "cpu")
         trained = load_run(self.run)
-        policy = load_policy(trained, EvalConfig(solver_steps=self.solver_steps))
+        policy = load_policy(trained)
         out = writable_folder(self.run) / "exported" if self.out is None else self.out
         out.mkdir(parents=True, exist_ok=True)
         parts = [part for part in PARTS if part != "controller" or isinstance(policy, PlanThenControl)]

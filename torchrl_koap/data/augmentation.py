@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -13,37 +12,20 @@ from torch import Tensor
 
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.keys import ACTION, EPISODE, STATE
-from torchrl_koap.lookup import lookup
 
 _DIFFERENCE = 1e-3  # rad, of the numerical Jacobian
 _DAMPING = 1e-4  # m2 / rad2, added to the squared reach of the joints: bounds them where the arm is stretched out
-
-
-def _first_order(steps: Tensor, decay: float) -> Tensor:
-    return decay**steps
-
-
-def _second_order(steps: Tensor, decay: float) -> Tensor:
-    return (1 - steps * math.log(decay)) * decay**steps if decay else 0**steps
-
-
-RESPONSES = {"first_order": _first_order, "second_order": _second_order}
 
 
 class RecoveryAugmentation(TensorDictModuleBase):
     r"""Recovery augmentation: moves the observed frames of a window aside and lets the future come back.
 
     .. math::
-        x'_{t-j} = x_{t-j} + \delta, \qquad x'_{t+i} = x_{t+i} + \rho_i \delta, \qquad
+        x'_{t-j} = x_{t-j} + \delta, \qquad x'_{t+i} = x_{t+i} + \rho^i \delta, \qquad
         \delta = 2 \sigma\, r\, n, \; r \sim U(0, 1), \; n \sim N(0, I)
 
     A planner trained on demonstrations alone has never seen a state beside them; executed in closed loop it drifts
     there. The augmentation shows it such states together with the way back.
-
-    With the response ``"first_order"`` the share that remains is :math:`\rho_i = \rho^i`: the way back begins at once
-    and at its full speed. A robot that follows its commands some steps late cannot move like that, and an inverse
-    dynamics that looks those steps ahead sees only the end of the way; for it there is ``"second_order"``, the
-    critically damped :math:`\rho_i = (1 - i \ln \rho)\, \rho^i`, which sets out from rest.
 
     An arm with more joints than its tool needs is moved aside at the tool: the tool is displaced, and the joints follow
     by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`. Joints shifted one by one would mostly
@@ -55,14 +37,13 @@ class RecoveryAugmentation(TensorDictModuleBase):
     Keyword Args:
         history (int): observed frames of the window. Defaults to ``2``.
         decay (float): ``rho``, how slowly it comes back. Defaults to ``0.7``.
-        response (str): ``"first_order"`` or ``"second_order"``. Defaults to ``"first_order"``.
         columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
         tool (sequence of int, optional): state columns of the tool's position; the shift is drawn there, and the
             arm's joints, which are then ``columns``, follow.
         kinematics (callable, optional): the function from joints ``[*B, J]`` to the position of the tool ``[*B, 3]``,
             needed with ``tool``, such as :func:`~torchrl_koap.tasks.panda_kinematics.tool_position`.
         moved_by (sequence of int, optional): for every action column the state column that it moves: actions are given
-            the way back too, ``a'_{t+i} = a_{t+i} + (rho_{i+1} - rho_i) delta``. Default: no action is touched.
+            the way back too, ``a'_{t+i} = a_{t+i} + (rho^{i+1} - rho^i) delta``. Default: no action is touched.
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
         action_key (NestedKey): actions ``[*B, T, act]``, replaced with ``moved_by``; NaN stays. Defaults to
             ``"action"``.
@@ -85,7 +66,6 @@ class RecoveryAugmentation(TensorDictModuleBase):
         *,
         history: int = 2,
         decay: float = 0.7,
-        response: str = "first_order",
         columns: Sequence[int] | None = None,
         tool: Sequence[int] | None = None,
         kinematics: Callable[[Tensor], Tensor] | None = None,
@@ -101,7 +81,6 @@ class RecoveryAugmentation(TensorDictModuleBase):
         self.in_keys = self.out_keys = [key] if moved_by is None else [key, action_key]
         self.moved_by = None if moved_by is None else list(moved_by)
         self.sigma, self.history, self.decay = sigma, history, decay
-        self.response = lookup(RESPONSES, response, "recovery response")
         self.columns = None if columns is None else list(columns)
         self.tool = None if tool is None else list(tool)
         self.kinematics = kinematics
@@ -117,10 +96,10 @@ class RecoveryAugmentation(TensorDictModuleBase):
             keep[..., self.columns] = 1
             shift = shift * keep
         frames = torch.arange(state.shape[-2], device=state.device) - (self.history - 1)
-        remaining = self.response(frames.clamp_min(0).to(state.dtype), self.decay)
+        remaining = self.decay ** frames.clamp_min(0).to(state.dtype)
         shifted = state + shift * remaining[:, None]
         if self.moved_by is not None:
-            following = self.response((frames + 1).clamp_min(0).to(state.dtype), self.decay)
+            following = self.decay ** (frames + 1).clamp_min(0).to(state.dtype)
             back = shift[..., self.moved_by] * (following - remaining)[:, None]
             tensordict.set(self.in_keys[1], tensordict.get(self.in_keys[1]) + back)
         if self.tool is not None and self.sigma:
@@ -152,9 +131,9 @@ class RandomPlanarTransform(TensorDictModuleBase):
         directions (sequence): state columns ``(cos, sin)`` of every yaw.
 
     Keyword Args:
-        shift (float): standard deviation of the displacement (m).
+        shift (float): standard deviation of the displacement (m). Defaults to ``0.05``.
         turn (float): standard deviation of the angle (rad); the scene turns about the first point of the last frame
-            observed.
+            observed. Defaults to ``0.3``.
         history (int): observed frames of the window. Defaults to ``2``.
         turned_actions (sequence of int, optional): action columns ``(x, y)`` of a displacement, turned with the scene.
         key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
@@ -180,8 +159,8 @@ class RandomPlanarTransform(TensorDictModuleBase):
         points: Sequence[tuple[int, int]],
         directions: Sequence[tuple[int, int]],
         *,
-        shift: float,
-        turn: float,
+        shift: float = 0.05,
+        turn: float = 0.3,
         history: int = 2,
         turned_actions: Sequence[int] | None = None,
         key: NestedKey = STATE,

@@ -26,8 +26,6 @@ class EvalConfig:
             what fails then is not a question of labels.
         execution: "feedback" (decode at every step) or "open_loop" (decode once per plan) (default: feedback, or the
             task's).
-        solver: another solver than in training: ddpm, ddim, dpm++2m, euler, heun.
-        solver_steps: another number of solver steps.
         replan_interval: control steps per plan (default: 4, or the task's).
         blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are
             (default: 0.8, or the task's).
@@ -37,7 +35,6 @@ class EvalConfig:
             planned (default: the task's, else 1).
         candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
             the one in force (default: as the run says, else 1).
-        choice: rule of that choice: "quarter", "typical" or "nearest".
         out: folder to evaluate in instead of the run's own; what the run is made of is copied there.
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
@@ -61,14 +58,11 @@ class EvalConfig:
     seed: int = 100
     controller: str = "learned"
     execution: str | None = None
-    solver: str | None = None
-    solver_steps: int | None = None
     replan_interval: int | None = None
     blend_decay: float | None = None
     command_lead: float | None = None
     action_gain: float | None = None
     candidates: int | None = None
-    choice: str = "quarter"
     out: Path | None = None
     batch_size: int | None = None
     contexts_file: Path | None = None

@@ -30,7 +30,7 @@ from torchrl_koap.training.provenance import versions
 
 FORMAT, VERSION = "torchrl_koap policy", 1
 BLEND_DECAY = 0.8
-_OPTIONS = ("execution", "replan_interval", "blend_decay", "candidates", "choice", "command_lead", "action_gain")
+_OPTIONS = ("execution", "replan_interval", "blend_decay", "candidates", "command_lead", "action_gain")
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,6 @@ def assemble_policy(
     replan_interval: int = REPLAN_INTERVAL,
     blend_decay: float = BLEND_DECAY,
     candidates: int = 1,
-    choice: str = "quarter",
     command_lead: float = 0.0,
     action_gain: float = 1.0,
 ) -> RecedingHorizonPolicy:
@@ -107,7 +106,6 @@ def assemble_policy(
         replan_interval (int): control steps per plan.
         blend_decay (float): share of the distance between state and plan that is left after each step.
         candidates (int): plans, or action chunks, sampled whenever one is due.
-        choice (str): the rule by which one of them is taken.
         command_lead (float): farthest that the command may be ahead of the robot
             (:class:`~torchrl_koap.modules.CommandLeash`); 0: any distance.
         action_gain (float): what actions that are changes of a command are multiplied by.
@@ -125,7 +123,6 @@ def assemble_policy(
             history=controller.history,
             replan_interval=replan_interval,
             candidates=candidates,
-            choice=choice,
         )
     else:
         policy = make_policy(
@@ -138,7 +135,6 @@ def assemble_policy(
             controller_columns=description.columns,
             action_rule=task.action_rule,
             candidates=candidates,
-            choice=choice,
         )
     policy.description = description
     policy.leash, policy.action_gain = make_leash(task, command_lead), make_gain(task, action_gain)
@@ -236,13 +232,12 @@ def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
         "version": VERSION,
         "task": made.task.name,
         "task_definition": None if made.task.import_strings() else made.task.to_json(),
-        "planner": made.planner | {"solver": policy.planner.solver, "solver_steps": policy.planner.num_steps},
+        "planner": made.planner,
         "controller": made.controller,
         "columns": list(made.columns),
         "plugins": list(made.plugins),
         "replan_interval": policy.replan_interval,
         "candidates": policy.candidates,
-        "choice": policy.choice,
         "versions": versions(),
     }
     if policy.leash is not None:

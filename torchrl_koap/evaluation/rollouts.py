@@ -44,7 +44,6 @@ def make_policy(
     controller_columns: Sequence[int] | None = None,
     action_rule: Callable[[Tensor, Tensor], Tensor] | None = None,
     candidates: int = 1,
-    choice: str = "quarter",
     leash: CommandLeash | None = None,
     action_gain: Tensor | None = None,
 ) -> PlanThenControl:
@@ -67,7 +66,6 @@ def make_policy(
         controller_columns (sequence of int, optional): columns of the state that the controller reads.
         action_rule (callable, optional): has the last word on actions, such as ``task.action_rule``.
         candidates (int): plans sampled whenever one is due.
-        choice (str): the rule by which one of them is taken.
         leash (CommandLeash, optional): how far the command may be ahead of the robot (:func:`make_leash`).
         action_gain (Tensor, optional): what every entry of an action is multiplied by ``[act]`` (:func:`make_gain`).
     """
@@ -89,7 +87,6 @@ def make_policy(
         controller_columns=controller_columns,
         action_rule=action_rule,
         candidates=candidates,
-        choice=choice,
     )
     policy.leash, policy.action_gain = leash, action_gain
     return policy

@@ -68,7 +68,6 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if config.dataset is not None:
         raise ValueError(f"dataset is for judging without an environment; task {task.name!r} is rolled out in one")
     policy, execution = load_policy(trained, config), execution_of(trained, config)
-    sampler = trained.controller if trained.planner is None else trained.planner
     seeds = list(range(config.seed, config.seed + config.episodes))
     place = place_of(task, config)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
@@ -99,8 +98,6 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         "controller": config.controller,
         **execution,
         "execution": "chunks" if trained.planner is None else execution["execution"],
-        "solver": sampler.solver,
-        "solver_steps": sampler.num_steps,
         "candidates": policy.candidates,
         "episode": rows,
     }
@@ -133,8 +130,7 @@ def _judge_offline(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:
     choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
     policy = load_policy(trained, config)
     result = evaluate_offline(trained, dataset=config.dataset, samples=config.samples, seed=config.seed)
-    sampler = trained.controller if trained.planner is None else trained.planner
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
-    result |= {"solver": sampler.solver, "solver_steps": sampler.num_steps, "seed": config.seed}
+    result["seed"] = config.seed
     trained.directory.write_json("eval.json", result)
     return result

@@ -128,14 +128,14 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     Args:
         run (str, Path or TrainedRun): a run directory, ``"pretrained:NAME"``, what :func:`load_run` made of one, or a
             file.
-        config (EvalConfig, optional): execution, solver, interval between plans, device and plugins; the rest is not
+        config (EvalConfig, optional): execution, interval between plans, device and plugins; the rest is not
             used. What is not asked for is as ``koap eval`` has it, for a file as it was saved.
 
     Returns:
         RecedingHorizonPolicy: in evaluation mode, on the device asked for.
 
     Raises:
-        ValueError: for an unknown execution or solver, or an interval out of range.
+        ValueError: for an unknown execution, or an interval out of range.
         RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`; a :class:`CheckpointError` names the file.
 
     Examples:
@@ -148,7 +148,7 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
     """
     given, config = config, EvalConfig() if config is None else config
     check_ways(config)
-    names = ("execution", "replan_interval", "blend_decay", "choice", "candidates", "command_lead", "action_gain")
+    names = ("execution", "replan_interval", "blend_decay", "candidates", "command_lead", "action_gain")
     options = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
     if config.controller == "oracle":
         trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
@@ -176,10 +176,6 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
         policy = assemble_policy(
             trained.planner, trained.controller, description, **kept | options | execution_of(trained, config)
         )
-    if config.solver is not None:
-        policy.planner.solver = config.solver
-    if config.solver_steps is not None:
-        policy.planner.num_steps = config.solver_steps
     return policy.to(config.device)
 
 

@@ -9,10 +9,10 @@ from torchrl_koap.modules.baselines.quantized import QuantizedInverseDynamics
 from torchrl_koap.modules.baselines.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
 from torchrl_koap.modules.baselines.window_variational import WindowVariationalInverseDynamics
-from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser, TransformerDenoiser
+from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser
+from torchrl_koap.modules.diffusion.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.diffusion.policy import DiffusionPolicy
-from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
 from torchrl_koap.modules.diffusion.unet import TemporalUnet
 from torchrl_koap.modules.execution.action_chunks import ChunkedPolicy
 from torchrl_koap.modules.execution.agent import Agent
@@ -85,7 +85,6 @@ __all__ = [
     "StatePlanner",
     "SupervisedInverseDynamics",
     "TemporalUnet",
-    "TransformerDenoiser",
     "VariationalInverseDynamics",
     "WindowVariationalInverseDynamics",
     "blend_plan",

@@ -58,7 +58,6 @@ class DenoisingLoss(LossModule):
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         self.reduction = reduction
-        self.step_weights: Tensor | None = None  # [H, 1], of mean 1
         self.convert_to_functional(network, self.name, create_target_params=create_target_params)
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -110,8 +109,6 @@ class DenoisingLoss(LossModule):
                 sample = self.encode(history, sequence, counts)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
             error = network.denoising_error(condition, sample, noise, time)  # [*B, H, width]
-            if self.step_weights is not None:
-                error = error * self.step_weights.to(error)
 
         result = TensorDict({f"loss_{self.name}": self._reduce(error, counts)}, batch_size=[])
         self._clear_weakrefs(tensordict, result, f"{self.name}_params", f"target_{self.name}_params")

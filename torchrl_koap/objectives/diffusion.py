@@ -25,16 +25,12 @@ class PlannerLoss(DenoisingLoss):
 
         L = mean | denoiser(signal(t) x_0 + noise(t) eps, t, condition) - target |^2
 
-    where the schedule's prediction type says whether the target is the noise, the clean plan or the velocity.
+    where the schedule's prediction type says whether the target is the clean plan or the noise.
 
     Args:
         planner (StatePlanner): planner to train, its normalisers already fitted.
 
     Keyword Args:
-        window (bool): read whole windows ``[*B, history + horizon, d]`` from the entry ``state`` and cut them (True),
-            or read the entries ``history`` and ``plan`` (False). Defaults to True.
-        first_steps_weight (float): weight of the first planned step against that of the last; it falls geometrically
-            in between, and the mean weight is 1. Defaults to 1.
         create_target_params (bool): keep an averaged copy of the weights in ``target_planner_params``, to be moved by
             :class:`torchrl.objectives.SoftUpdate` and used for planning. Defaults to True.
         reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, d]``. Defaults to ``"mean"``.
@@ -60,22 +56,15 @@ class PlannerLoss(DenoisingLoss):
 
     @dataclass
     class _AcceptedKeys:
-        """Entries of the input; the last three are read if they are there.
+        """Entries of the input; the last two are read if they are there.
 
         Attributes:
             state (NestedKey): windows ``[*B, history + horizon, d]``. Defaults to ``"state"``.
-            history (NestedKey): observed frames ``[*B, history, d]``. Defaults to the planner's in-key.
-            plan (NestedKey): recorded future ``[*B, horizon, d]``. Defaults to the planner's out-key.
-            mask (NestedKey): bool, False where a step is padding: ``[*B, horizon]`` or ``[*B, history + horizon]``,
-                with or without a trailing 1. Defaults to ``"mask"``.
             noise (NestedKey): noise ``[*B, horizon, d]`` instead of random. Defaults to ``"planner_noise"``.
             time (NestedKey): time ``[*B]`` in training steps instead of random. Defaults to ``"planner_time"``.
         """
 
         state: NestedKey = keys.STATE
-        history: NestedKey = keys.HISTORY
-        plan: NestedKey = keys.PLAN
-        mask: NestedKey = "mask"
         noise: NestedKey = "planner_noise"
         time: NestedKey = "planner_time"
 
@@ -88,65 +77,29 @@ class PlannerLoss(DenoisingLoss):
     planner_params: TensorDictParams
     target_planner_params: TensorDictParams
 
-    def __init__(self, planner: StatePlanner, *, window: bool = True, first_steps_weight: float = 1.0, **options: Any):
+    def __init__(self, planner: StatePlanner, **options: Any):
         super().__init__(planner, **options)
-        if first_steps_weight <= 0:
-            raise ValueError(f"first_steps_weight must be > 0, got {first_steps_weight}")
-        self.window = window
-        if first_steps_weight != 1:
-            share = torch.linspace(1, 0, len(planner.steps))[:, None]
-            weights = first_steps_weight**share  # [H, 1]
-            self.step_weights = weights / weights.mean()
-        super().set_keys(history=planner.in_keys[0], plan=planner.out_keys[0])
-
-    def set_keys(self, **kwargs) -> None:
-        """Renames entries; ``history`` and ``plan`` are renamed in the planner too."""
-        super().set_keys(**kwargs)
-        self.planner.set_keys(history=kwargs.get("history"), plan=kwargs.get("plan"))
 
     def _entries(self) -> list[NestedKey]:
-        names = self.tensor_keys
-        return [names.state] if self.window else [names.history, names.plan]
+        return [self.tensor_keys.state]
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Histories, recorded futures and the mask of the planned steps (:meth:`DenoisingLoss.read`)."""
-        names = self.tensor_keys
-        if self.window:
-            history, plan = self.planner.split_window(read_entry(tensordict, names.state))
-        else:
-            history, plan = read_entry(tensordict, names.history), read_entry(tensordict, names.plan)
-        return history, plan, self._mask(tensordict, plan)
+        """Histories and recorded futures, of which all steps count (:meth:`DenoisingLoss.read`)."""
+        history, plan = self.planner.split_window(read_entry(tensordict, self.tensor_keys.state))
+        return history, plan, None
 
     def encode(self, history: Tensor, sequence: Tensor, counts: Tensor | None) -> Tensor:
-        """The normalised plans; steps that do not count stay where the robot is.
+        """The normalised plans.
 
         Args:
             history (Tensor): raw histories ``[*B, h, d]``.
             sequence (Tensor): raw plans ``[*B, H, d]``.
-            counts (Tensor, optional): steps that count, bool ``[*B, H, 1]``; None: all.
+            counts (Tensor, optional): None: all steps count.
 
         Returns:
             Tensor: ``[*B, H, d]``.
         """
-        if counts is not None:  # before the network: padding may hold anything, and 0 * nan is nan
-            sequence = torch.where(counts, sequence, history[..., -1:, :])
         return self.planner.encode_plan(history, sequence)
-
-    def _mask(self, tensordict: TensorDictBase, plan: Tensor) -> Tensor | None:
-        mask = tensordict.get(self.tensor_keys.mask, None)
-        if mask is None:
-            return None
-        if len(self.planner.steps) != self.planner.horizon:
-            raise ValueError(f"{self.tensor_keys.mask!r} was given, but the planner models some steps of plans alone")
-        if mask.ndim == plan.ndim and mask.shape[-1] == 1:
-            mask = mask.squeeze(-1)
-        horizon, length = self.planner.horizon, self.planner.history + self.planner.horizon
-        if mask.ndim != plan.ndim - 1 or mask.shape[-1] not in (horizon, length):
-            raise ValueError(
-                f"{self.tensor_keys.mask!r} must be [*B, {horizon}] (horizon) or [*B, {length}] (history + horizon),"
-                f" got {list(mask.shape)}"
-            )
-        return mask[..., -horizon:].bool().unsqueeze(-1)
 
 
 class DiffusionPolicyLoss(DenoisingLoss):
@@ -157,7 +110,7 @@ class DiffusionPolicyLoss(DenoisingLoss):
 
         L = mean over labelled steps | denoiser(signal(t) a + noise(t) eps, t, condition) - target |^2
 
-    where the schedule's prediction type says whether the target is the noise, the clean actions or the velocity.
+    where the schedule's prediction type says whether the target is the clean actions or the noise.
 
     A step counts if it has a label and neither its frame nor the next one is padded. The denoiser sees steps that do
     not count as the middle of the range of actions, noise added; what was stored there (NaN) reaches neither value

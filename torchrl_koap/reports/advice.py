@@ -115,8 +115,7 @@ def planner_imagines_failure(numbers: Numbers) -> Advice | None:
         return None
     return Advice(
         f"plans that come true reach the goal in {_percent(imagined)} only: the planner is what fails, not the labels",
-        "more updates (--steps), more demonstrations, or a wide MLP (--denoiser mlp --denoiser-width 512); more labels"
-        " will not help",
+        "more updates (--steps), more demonstrations, or a wide MLP (--denoiser mlp); more labels will not help",
     )
 
 
@@ -134,7 +133,7 @@ def plans_are_not_followed(numbers: Numbers) -> Advice | None:
         )
     return Advice(
         f"{seen}; recorded futures are followed well: executed states leave what the planner was trained on",
-        "train the planner with larger disturbances (--recovery-sigma, twice the present one)",
+        "train the planner with larger disturbances (recovery_sigma of the task, twice the present one)",
     )
 
 
@@ -203,7 +202,7 @@ def worse_than_standing_still(numbers: Numbers) -> Advice | None:
     if plan is not None and plan >= 1:
         return Advice(
             f"plans lie {plan:.2f} times as far from the recordings as standing still would",
-            "more updates (--steps), or displacements instead of positions (--relative)",
+            "more updates (--steps), or displacements instead of positions (relative of the task)",
         )
     if action is not None and action >= 1:
         return Advice(
@@ -221,7 +220,7 @@ def too_slow(numbers: Numbers) -> Advice | None:
         return None
     return Advice(
         f"a plan takes {plan:.0f} ms, a control step {1000 / control:.0f} ms",
-        "plan in a thread (AsynchronousAgent), or with fewer solver steps",
+        "plan in a thread (AsynchronousAgent), or less often (--replan-interval)",
         "koap latency {run}",
     )
 

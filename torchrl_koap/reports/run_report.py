@@ -301,11 +301,11 @@ def _command(command: Any) -> str:
 def _eval_command(run_dir: Path, evaluation: Mapping[str, Any]) -> str:
     words = ["koap", "eval", str(run_dir)]
     if evaluation.get("kind") == "offline":
-        evaluation = {name: evaluation.get(name) for name in ("seed", "solver", "solver_steps")}
+        evaluation = {name: evaluation.get(name) for name in ("seed",)}
     episode = evaluation.get("episode")
     first = episode[0] if isinstance(episode, list) and episode and isinstance(episode[0], Mapping) else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
-    options |= {key: evaluation.get(key) for key in ("execution", "solver", "solver_steps", "env", "success_key")}
+    options |= {key: evaluation.get(key) for key in ("execution", "env", "success_key")}
     options["controller"] = "oracle" if evaluation.get("controller") == "oracle" else None
     for key, value in options.items():
         if value is not None:

@@ -38,47 +38,18 @@ class TrainConfig:
         decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
         steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
         controller_steps: controller updates.
-        batch_size: windows per planner update (default: 128, or the task's).
+        batch_size: windows per planner update (default: the denoiser's, 128 for "unet" and 512 for "mlp").
         controller_batch_size: windows per controller update.
-        planner_learning_rate: peak learning rate of the planner (default: 3e-3, or the task's).
+        planner_learning_rate: peak learning rate of the planner (default: the denoiser's, 3e-3 and 1e-3).
         controller_learning_rate: peak learning rate of the controller.
-        denoiser: "unet", "mlp", "film" (an mlp that the condition also scales and shifts), "transformer" or "released"
-            (11.9 M parameters).
-        denoiser_width: hidden width of "mlp" and "transformer" (default: 256 and 64).
-        denoiser_depth: their number of residual layers (default: 3).
-        condition_octaves: octaves of the Fourier features of what was observed (default: 4).
-        dropout: share of the hidden units of "mlp" dropped in training (default: 0).
-        planner_weight_decay: decoupled weight decay of the planner (default: 1e-4).
-        first_steps_weight: weight of the first planned step in the planner's loss against the last one's (default: 1).
+        denoiser: "unet" or "mlp" (default: the task's, else "unet").
+        denoiser_width: hidden width of "mlp" (default: 512).
         precision: "float32", "bfloat16" for the matrix products of the planner's training, several times quicker where
             the processor has units for them and many times slower where not, or "auto", which looks (default: float32).
         candidates: plans sampled whenever one is due at evaluation, unless told otherwise there (default: 1).
         channels: widths of the U-Net's levels (default: the task's).
-        schedule: "squared_cosine", "linear" or "flow".
-        prediction: "sample", "epsilon" or "velocity".
-        relative: plan displacements from the current state instead of states (default: the task's).
-        forecast: plan deviations from a linear forecast, which carries over to goals not demonstrated (default: for a
-            task without an environment).
-        frame: object from which the planner sees everything, such as "target": tasks whose place on the table does not
-            matter; "world" for none (default: the task's).
-        plan_steps: frames of the plan that are modelled, counted from 1, such as 1 2 3 4 6 8 11 14; those in between
-            lie on straight lines, and the last one is the horizon (default: all of 14).
         observed_frames: frames that the planner sees, 1 or 2 (default: the task's).
-        relations: tell the planner where the tool is as seen from the objects (tasks with objects).
         controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
-        recovery_sigma: typical shift of the recovery augmentation in m or rad (default: the task's); 0 turns it off.
-        recovery_response: how the augmentation leads back, "first_order" at once or "second_order" from rest, which
-            robots that follow their commands late can do (default: the task's).
-        gripper_recovery: share of the windows with open fingers that are shown with fingers closed on nothing, which
-            open again; for tasks with a gripper (default: 0.1); 0 turns it off.
-        neighbor_recovery: farthest share of the way to the nearest other window of a batch that windows are moved, and
-            come back, for states without a column that is a position, such as embeddings (default: the task's, else
-            none); 0 turns it off.
-        scene_shift: typical displacement (m) of whole scenes, for tasks whose place on the table does not matter.
-        scene_turn: typical angle (rad) by which such scenes are turned.
-        exchange: exchange objects that are alike.
-        solver: solver used at evaluation unless told otherwise.
-        solver_steps: its number of steps.
         planner_from: run directory whose planner is taken over instead of training one, or pretrained:NAME.
         episodes: number of scripted demonstrations (default: that of the task).
         threads: torch threads.
@@ -122,32 +93,11 @@ class TrainConfig:
     controller_learning_rate: float = 1e-3
     denoiser: str | None = None
     denoiser_width: int | None = None
-    denoiser_depth: int | None = None
-    condition_octaves: int | None = None
-    dropout: float | None = None
-    planner_weight_decay: float | None = None
-    first_steps_weight: float | None = None
     precision: str | None = None
     candidates: int | None = None
     channels: tuple[int, ...] | None = None
-    schedule: str = "squared_cosine"
-    prediction: str = "sample"
-    relative: bool | None = None
-    forecast: bool | None = None
-    frame: str | None = None
-    plan_steps: tuple[int, ...] | None = None
     observed_frames: int | None = None
-    relations: bool = True
     controller_state: str = "robot"
-    recovery_sigma: float | None = None
-    recovery_response: str | None = None
-    gripper_recovery: float | None = None
-    neighbor_recovery: float | None = None
-    scene_shift: float = 0.05
-    scene_turn: float = 0.3
-    exchange: bool = True
-    solver: str = "dpm++2m"
-    solver_steps: int = 10
     planner_from: Path | None = None
     episodes: int | None = None
     threads: int = 1

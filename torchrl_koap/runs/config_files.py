@@ -18,22 +18,11 @@ from torchrl_koap.runs.run_directory import RunDirectoryError
 PLANNER = {
     "denoiser": str,
     "channels": tuple[int, ...],
-    "schedule": str,
-    "prediction": str,
     "history": int,
     "horizon": int,
     "relative": bool,
-    "relations": bool,
-    "solver": str,
-    "solver_steps": int,
-    "clip": float,
     "width": int,
-    "depth": int,
-    "frequencies": int,
-    "dropout": float,
     "forecast": bool,
-    "frame": dict,
-    "plan_steps": tuple[int, ...],
 }
 CONTROLLER = {
     "method": str,

@@ -20,8 +20,6 @@ PUBLISHED = {"koap_paper": {"controller_state": "all", "execution": "open_loop",
 PLANNER = (
     "denoiser",
     "denoiser_width",
-    "denoiser_depth",
-    "condition_octaves",
     "precision",
     "batch_size",
     "planner_learning_rate",
@@ -46,8 +44,6 @@ class CellOptions:
         action_coeff: weight of the action term in the loss of KOAP's jointly trained methods (default: 1).
         denoiser: network of planner and dp, a name as of `koap train` (default: unet; `koap bench`: the wide mlp).
         denoiser_width: its hidden width.
-        denoiser_depth: its number of residual layers.
-        condition_octaves: octaves of the Fourier features of what was observed.
         precision: of the matrix products of its training, a name as of `koap train` (default: float32; `koap bench`:
             auto).
         batch_size: windows per update of planner and dp (default: 128).
@@ -70,8 +66,6 @@ class CellOptions:
     action_coeff: float | None = None
     denoiser: str | None = None
     denoiser_width: int | None = None
-    denoiser_depth: int | None = None
-    condition_octaves: int | None = None
     precision: str | None = None
     batch_size: int | None = None
     planner_learning_rate: float | None = None

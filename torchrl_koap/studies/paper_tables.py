@@ -26,14 +26,12 @@ PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobse
 WIDE_PLANNER = {
     "denoiser": "mlp",
     "denoiser_width": 512,
-    "denoiser_depth": 4,
-    "condition_octaves": 1,
     "precision": "auto",
     "batch_size": 256,
     "planner_learning_rate": 1e-3,
 }
 POLICY_STEPS = 8000  # at most: dp trains a network in every cell, planners are shared
-SMALL_PLANNER = WIDE_PLANNER | {"denoiser_width": 256, "denoiser_depth": 3, "batch_size": 128}
+SMALL_PLANNER = WIDE_PLANNER | {"denoiser_width": 256, "batch_size": 128}
 # what --quick asks for where nothing else is: a table that can be read, not one to be cited
 QUICK = {"demonstrations": 48, "seeds": 1, "episodes": 10, "steps": 2000, "controller_steps": 200}
 QUICK_LEVEL = 1

@@ -26,14 +26,7 @@ from torchrl_koap.tasks.scene import Body, Scene
 
 CONTROL_HZ = 1 / 0.035
 # what wins on the tasks with objects: capacity and many samples (docs/results/planners.md)
-WIDE_MLP = {
-    "denoiser": "mlp",
-    "denoiser_width": 512,
-    "denoiser_depth": 4,
-    "condition_octaves": 1,
-    "batch_size": 512,
-    "planner_learning_rate": 1e-3,
-}
+WIDE_MLP = {"denoiser": "mlp"}
 # planner and controller see the same window in every task: 2 observed frames, 14 planned ones; 4 actions of each plan
 # are executed
 HISTORY, HORIZON, REPLAN_INTERVAL = 2, 14, 4
@@ -101,8 +94,9 @@ class Defaults:
         recovery_sigma (float): typical shift of the recovery augmentation, in the units of the robot's columns.
         planner (dict): options of `koap train` for the planner's network and its training that are used together where
             no denoiser is asked for: ``denoiser``, its sizes, ``batch_size``, ``planner_learning_rate``.
-        recovery_response (str): how that augmentation leads back, ``"first_order"`` or ``"second_order"``.
-        view (dict): options of `koap train` for what the planner sees: ``observed_frames``, ``neighbor_recovery``, ...
+        view (dict): what the planner sees: ``observed_frames`` (1 or 2, the default), ``neighbor_recovery`` (farthest
+            share of the way to the nearest other window that windows are moved, for states without a column that is a
+            position) and ``forecast`` (default: in tasks without an environment).
         execution (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig` for how plans are followed.
 
     Examples:
@@ -119,7 +113,6 @@ class Defaults:
     channels: tuple[int, ...] = (64, 128)
     relative: bool = True
     recovery_sigma: float = 0.004
-    recovery_response: str = "first_order"
     planner: Mapping[str, Any] = field(default_factory=dict)
     view: Mapping[str, Any] = field(default_factory=dict)
     execution: Mapping[str, Any] = field(default_factory=dict)

@@ -26,7 +26,7 @@ from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.method import COEFFICIENTS, LABELLED_SHARES, Method, Phase
-from torchrl_koap.training.planner import augmentation, planner_weight_decay
+from torchrl_koap.training.planner import WEIGHT_DECAY, augmentation
 from torchrl_koap.training.posture import POSTURE_SHARE, UPDATES, fit_posture
 from torchrl_koap.training.resolved import ResolvedConfig
 from torchrl_koap.training.response import fit_response
@@ -195,7 +195,7 @@ def _train_policy(
         labelled_share=LABELLED_SHARES[phase.windows],
     )
     loss = phase.loss(policy)
-    augment = augmentation(options, task, actions=True)  # what the planner's windows undergo
+    augment = augmentation(task, actions=True)
     num_steps = max(round(options.steps * phase.share), 1)
     values = train_one(
         phase.name,
@@ -203,7 +203,7 @@ def _train_policy(
         lambda: augment(buffer.sample()),
         num_steps=num_steps,
         learning_rate=options.planner_learning_rate,
-        weight_decay=planner_weight_decay(options),
+        weight_decay=WEIGHT_DECAY,
         target_update=moving_average(loss, num_steps),
     )
     loss.target_policy_params.to_module(policy)

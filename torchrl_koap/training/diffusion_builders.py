@@ -4,58 +4,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 from torch import nn
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import (
-    DiffusionPolicy,
-    MLPDenoiser,
-    NoiseSchedule,
-    StatePlanner,
-    TemporalUnet,
-    TransformerDenoiser,
-)
-from torchrl_koap.modules.diffusion.planar_frame import PlanarFrame
+from torchrl_koap.modules import DiffusionPolicy, MLPDenoiser, StatePlanner, TemporalUnet
 
-
-def _sizes(options: Mapping[str, Any], denoiser: str, *names: str) -> dict[str, Any]:
-    """Those of the denoiser's own sizes that were chosen."""
-    chosen = {name: options[name] for name in ("width", "depth", "frequencies", "dropout") if name in options}
-    unfit = sorted(set(chosen) - set(names))
-    if unfit:
-        has = ", ".join(names) or "none"
-        raise ValueError(f"denoiser {denoiser!r} has no {', '.join(unfit)} to choose, only {has}")
-    return chosen
+CLIP = 1.2  # of normalised sequences, which lie in [-1, 1] in the data
 
 
 def _unet(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    sizes = _sizes(options, "unet", "frequencies")
-    return TemporalUnet(width, condition_dim, channels=tuple(options["channels"]), **sizes)
+    if "width" in options:
+        raise ValueError("denoiser 'unet' has no width to choose, it has channels")
+    return TemporalUnet(width, condition_dim, channels=tuple(options["channels"]))
 
 
-def _mlp(width: int, condition_dim: int, options: Mapping[str, Any], film: bool = False) -> nn.Module:
-    sizes = _sizes(options, "film" if film else "mlp", "width", "depth", "frequencies", "dropout")
-    return MLPDenoiser(width, condition_dim, horizon=options["horizon"], film=film, **sizes)
+def _mlp(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
+    return MLPDenoiser(width, condition_dim, horizon=options["horizon"], width=options["width"])
 
 
-def _transformer(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    return TransformerDenoiser(width, condition_dim, **_sizes(options, "transformer", "width", "depth", "frequencies"))
-
-
-def _released(width: int, condition_dim: int, options: Mapping[str, Any]) -> nn.Module:
-    _sizes(options, "released")
-    return TemporalUnet.released(width, condition_dim)
-
-
-DENOISERS = {
-    "unet": _unet,
-    "mlp": _mlp,
-    "film": partial(_mlp, film=True),
-    "transformer": _transformer,
-    "released": _released,
+DENOISERS = {"unet": _unet, "mlp": _mlp}
+# what a denoiser is trained with where nothing else is asked for, as options of TrainConfig
+SIZES = {
+    "unet": {"batch_size": 128, "planner_learning_rate": 3e-3},
+    "mlp": {"denoiser_width": 512, "batch_size": 512, "planner_learning_rate": 1e-3},
 }
 
 
@@ -63,19 +36,16 @@ def build_planner(options: Mapping[str, Any], state_dim: int, features: nn.Modul
     """A planner without statistics (:meth:`StatePlanner.fit_normalizers`, or weights, bring them).
 
     Args:
-        options (mapping): the ``planner`` entry of ``config.json``: denoiser, channels, schedule, prediction, history,
-            horizon, relative, forecast, solver, solver_steps, clip, frame (columns of a
-            :class:`~torchrl_koap.modules.diffusion.planar_frame.PlanarFrame`) and plan_steps.
+        options (mapping): the ``planner`` entry of ``config.json``: denoiser, channels or width, history, horizon,
+            relative and forecast.
         state_dim (int): number of state columns.
         features (nn.Module, optional): what the condition holds besides the history, see :class:`StatePlanner`.
 
     Raises:
-        ValueError: for an unknown denoiser, schedule, prediction or solver.
+        ValueError: for an unknown denoiser, or a width that it has not.
     """
-    forecast, steps = options.get("forecast", False), options.get("plan_steps")  # runs of before have none
-    parts = _diffusion(options, state_dim, state_dim, features, frames=None if steps is None else len(steps))
-    frame = PlanarFrame(**options["frame"]) if options.get("frame") else None
-    return StatePlanner(forecast=forecast, frame=frame, steps=steps, **parts)
+    parts = _diffusion(options, state_dim, state_dim, features)
+    return StatePlanner(forecast=options.get("forecast", False), **parts)
 
 
 def build_diffusion_policy(
@@ -90,27 +60,21 @@ def build_diffusion_policy(
         features (nn.Module, optional): what the condition holds besides the history.
 
     Raises:
-        ValueError: for an unknown denoiser, schedule, prediction or solver.
+        ValueError: as :func:`build_planner`.
     """
     return DiffusionPolicy(action_dim=action_dim, **_diffusion(options, state_dim, action_dim, features))
 
 
-def _diffusion(
-    options: Mapping[str, Any], state_dim: int, width: int, features: nn.Module | None, frames: int | None = None
-) -> dict[str, Any]:
-    """What planner and diffusion policy take alike, with a denoiser for sequences of that width and so many frames."""
+def _diffusion(options: Mapping[str, Any], state_dim: int, width: int, features: nn.Module | None) -> dict[str, Any]:
+    """What planner and diffusion policy take alike, with a denoiser for sequences of that width."""
     make = lookup(DENOISERS, options["denoiser"], "denoiser")
-    features = features if options.get("relations") else None
     condition_dim = options["history"] * state_dim + (0 if features is None else features.num_features)
     return {
-        "denoiser": make(width, condition_dim, dict(options) | ({} if frames is None else {"horizon": frames})),
-        "schedule": NoiseSchedule(options["schedule"], options["prediction"]),
+        "denoiser": make(width, condition_dim, options),
         "state_dim": state_dim,
         "history": options["history"],
         "horizon": options["horizon"],
         "relative": options["relative"],
         "features": features,
-        "solver": options["solver"],
-        "num_steps": options["solver_steps"],
-        "clip": options["clip"],
+        "clip": CLIP,
     }

@@ -29,24 +29,7 @@ from torchrl_koap.training.planner import learn_states
 from torchrl_koap.training.resolved import ResolvedConfig, resolve
 
 PLANNER_OPTIONS = (
-    *("batch_size", "planner_learning_rate", "denoiser", "channels", "schedule", "prediction", "relative", "forecast"),
-    *(
-        "relations",
-        "recovery_sigma",
-        "recovery_response",
-        "gripper_recovery",
-        "neighbor_recovery",
-        "scene_shift",
-        "scene_turn",
-        "exchange",
-        "solver",
-        "solver_steps",
-        "denoiser_width",
-        "frame",
-        "plan_steps",
-        "observed_frames",
-    ),
-    *("denoiser_depth", "condition_octaves", "dropout", "planner_weight_decay", "first_steps_weight", "precision"),
+    *("batch_size", "planner_learning_rate", "denoiser", "denoiser_width", "channels", "observed_frames", "precision"),
 )
 CONTROLLER_OPTIONS = (
     *("controller_batch_size", "controller_learning_rate", "preset", "decoder", "controller_state"),
@@ -99,7 +82,8 @@ def fit_planner(
         device (str): ``"cpu"`` or ``"cuda"``.
         progress (bool): show a progress bar.
         **options: further options of :class:`~torchrl_koap.training.TrainConfig` that concern the planner:
-            ``batch_size``, ``planner_learning_rate``, ``denoiser``, ``channels``, ``recovery_sigma``, ...
+            ``batch_size``, ``planner_learning_rate``, ``denoiser``, ``denoiser_width``, ``channels``,
+            ``observed_frames``, ``precision``.
 
     Returns:
         StatePlanner: in evaluation mode, with statistics and a :class:`Recipe` as ``recipe``.

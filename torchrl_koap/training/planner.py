@@ -31,6 +31,8 @@ from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.loop import moving_average, phase_finished, train_phase
 from torchrl_koap.training.resolved import ResolvedConfig
 
+WEIGHT_DECAY = 1e-4  # of a planner, or of a policy of its own
+
 
 def train_planner(
     run: RunDirectory, resolved: ResolvedConfig, data: TensorDictBase, logger: Any = None
@@ -88,7 +90,7 @@ def learn_states(
     length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
     extended = extrapolate_ends(data, planner.horizon - 1)
     windows = cut_windows(extended, length, select=["state", "episode"], pad_before=1)
-    augment = augmentation(options, task)
+    augment = augmentation(task)
     states, groups = windows["state"][:, unseen:], windows["episode"][:, -1]
     seen = None if planner.forecast is None else augment(windows.clone())["state"][:, unseen:]
     planner.fit_normalizers(states, seen=seen, groups=groups)
@@ -99,8 +101,7 @@ def learn_states(
         return augment(buffer.sample())[:, unseen:]
 
     planner.training_dtype = training_dtype(options.precision, options.device)
-    weight = 1.0 if options.first_steps_weight is None else options.first_steps_weight
-    loss = PlannerLoss(planner, first_steps_weight=weight)
+    loss = PlannerLoss(planner)
     with progress_bar(options.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
         values = train_phase(
             "planner",
@@ -108,7 +109,7 @@ def learn_states(
             draw,
             num_steps=options.steps,
             learning_rate=options.planner_learning_rate,
-            weight_decay=planner_weight_decay(options),
+            weight_decay=WEIGHT_DECAY,
             target_update=moving_average(loss, options.steps),
             run=run,
             logger=logger,
@@ -120,17 +121,11 @@ def learn_states(
     return values
 
 
-def planner_weight_decay(options: TrainConfig) -> float:
-    """Decoupled weight decay of a planner, or of a policy of its own."""
-    return 1e-4 if options.planner_weight_decay is None else options.planner_weight_decay
-
-
-def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> TensorDictSequential:
+def augmentation(task: Task, *, actions: bool = False) -> TensorDictSequential:
     """What windows undergo before the planner, or a policy of its own, learns from them.
 
     Args:
-        options (TrainConfig): sizes, with the task's defaults filled in.
-        task (Task): whose windows they are.
+        task (Task): the task of the windows.
 
     Keyword Args:
         actions (bool): the windows hold actions, which have to fit the states afterwards. Scenes are then moved, and
@@ -138,22 +133,20 @@ def augmentation(options: TrainConfig, task: Task, *, actions: bool = False) -> 
     """
     moved_by = list(task.moved_columns()) if actions else None
     steps = []
-    if options.exchange and task.interchangeable_columns():
+    if task.interchangeable_columns():
         steps.append(ObjectPermutation(task.interchangeable_columns()))
-    if task.planar_parts and (options.scene_shift or options.scene_turn) and (moved_by or not actions):
+    if task.planar_parts and (moved_by or not actions):
         points, directions = task.planar_columns()
         turned = None if moved_by is None else [moved_by.index(column) for column in points[0]]
-        shift, turn = options.scene_shift, options.scene_turn
-        steps.append(
-            RandomPlanarTransform(points, directions, shift=shift, turn=turn, history=HISTORY, turned_actions=turned)
-        )
+        steps.append(RandomPlanarTransform(points, directions, history=HISTORY, turned_actions=turned))
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
         tool: dict[str, Any] = {"tool": task.tool_columns, "kinematics": task.tool_position}
-        way: dict[str, Any] = {"response": options.recovery_response, "columns": arm, "moved_by": moved_by}
-        steps.append(RecoveryAugmentation(options.recovery_sigma, history=HISTORY, **way, **tool))
-    if task.gripper is not None and options.gripper_recovery and not actions:
-        steps.append(GripperRecovery(task.gripper[1], share=options.gripper_recovery, history=HISTORY))
-    if options.neighbor_recovery and not actions:
-        steps.append(NeighborRecovery(options.neighbor_recovery, history=HISTORY))
+        sigma = task.defaults.recovery_sigma
+        steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, moved_by=moved_by, **tool))
+    if task.gripper is not None and not actions:
+        steps.append(GripperRecovery(task.gripper[1], history=HISTORY))
+    neighbor = task.defaults.view.get("neighbor_recovery")
+    if neighbor and not actions:
+        steps.append(NeighborRecovery(neighbor, history=HISTORY))
     return TensorDictSequential(*steps)

@@ -19,6 +19,7 @@ from torchrl_koap.runs.progress import check_logger
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
 from torchrl_koap.training.datasets import find_task_of
+from torchrl_koap.training.diffusion_builders import SIZES
 from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.posture import posture_columns
@@ -101,22 +102,13 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     task = find_task_of(config.dataset, config.task) if task is None else task
     options = replace(_with_task_defaults(config, task), task=task.name)
     method = _method(options)
-    if method.has_planner and options.planner_from is None:
-        view = {name: value for name, value in task.defaults.view.items() if getattr(options, name) is None}
-        options = replace(options, **view)
-    _check(options, method)
-    if options.gripper_recovery and task.gripper is None:
-        raise ValueError(f"gripper_recovery was given, but task {task.name!r} has no gripper (Task.gripper)")
-    if not method.has_planner:
-        if config.forecast:
-            raise ValueError(f"method {options.method!r} is a policy of its own and has no plans to forecast")
-        if config.gripper_recovery:
-            raise ValueError(f"gripper_recovery is the planner's, which method {options.method!r} does not have")
-        options = replace(options, forecast=None, gripper_recovery=None)
+    if method.has_planner and options.planner_from is None and options.observed_frames is None:
+        options = replace(options, observed_frames=task.defaults.view.get("observed_frames"))
+    _check(options, method, task)
     if options.planner_from is not None:
         planner = RunDirectory(options.planner_from).read_entry("config.json", "planner")
     else:
-        planner = _planner_entry(options, task)
+        planner = _planner_entry(options, task, method)
     preset = options.preset or _own_preset(method, task)
     controller: dict[str, Any] = {
         "method": options.method,
@@ -154,27 +146,19 @@ def _own_preset(method: Method, task: Task) -> str:
     return own or method.presets[0]
 
 
-WORLD = "world"  # no object's frame, where a task has one by default
-GRIPPER_RECOVERY = 0.1  # share of windows
-_UNET = {"denoiser": "unet", "batch_size": 128, "planner_learning_rate": 3e-3}
-
-
 def _with_task_defaults(options: TrainConfig, task: Task) -> TrainConfig:
     own = task.defaults.planner if options.denoiser is None else {}  # a network asked for comes with its own sizes
+    denoiser = options.denoiser or own.get("denoiser", "unet")
     defaults: dict[str, Any] = (
-        _UNET
+        dict(lookup(SIZES, denoiser, "denoiser"))
         | dict(own)
         | {
+            "denoiser": denoiser,
             "method": task.defaults.method,
             "steps": task.defaults.planner_steps,
-            "recovery_sigma": task.defaults.recovery_sigma,
-            "recovery_response": task.defaults.recovery_response,
-            "gripper_recovery": None if task.gripper is None else GRIPPER_RECOVERY,
             "episodes": task.defaults.demonstrations,
-            "relative": task.defaults.relative,
             "channels": task.defaults.channels,
             "validation_fraction": default_fraction(task),
-            "forecast": True if task.env is None else None,
         }
     )
     return replace(options, **{name: value for name, value in defaults.items() if getattr(options, name) is None})
@@ -190,15 +174,10 @@ def _method(options: TrainConfig) -> Method:
     return method
 
 
-_LEAST = (
-    dict.fromkeys(("batch_size", "controller_batch_size", "checkpoint_every", "candidates"), 1)
-    | dict.fromkeys(("denoiser_width", "denoiser_depth"), 1)
-    | dict.fromkeys(("condition_octaves", "dropout", "planner_weight_decay", "first_steps_weight"), 0)
-    | dict.fromkeys(("recovery_sigma", "scene_shift", "scene_turn"), 0)
-)
+_AT_LEAST_ONE = ("batch_size", "controller_batch_size", "checkpoint_every", "candidates", "denoiser_width")
 
 
-def _check(options: TrainConfig, method: Method) -> None:
+def _check(options: TrainConfig, method: Method, task: Task) -> None:
     check_logger(options.logger)
     for name in COEFFICIENTS:
         value = getattr(options, name)
@@ -208,13 +187,10 @@ def _check(options: TrainConfig, method: Method) -> None:
             raise ValueError(f"{name} must be >= 0, got {value}")
     if not method.has_planner and options.planner_from is not None:
         raise ValueError(f"method {options.method!r} is a policy of its own and has no planner to take over")
-    for name in ("frame", "plan_steps", "observed_frames", "neighbor_recovery"):
-        if getattr(options, name) is not None and not method.has_planner:
-            raise ValueError(f"{name} is the planner's, which method {options.method!r} does not have")
+    if options.observed_frames is not None and not method.has_planner:
+        raise ValueError(f"observed_frames is the planner's, which method {options.method!r} does not have")
     if options.observed_frames not in (None, *range(1, HISTORY + 1)):
         raise ValueError(f"observed_frames must be 1 to {HISTORY}, got {options.observed_frames}")
-    if options.plan_steps is not None and (not options.plan_steps or options.plan_steps[-1] < 4):
-        raise ValueError(f"plan_steps must end at 4 or more control steps, got {list(options.plan_steps)}")
     if options.steps < 1 or options.controller_steps < 0:
         raise ValueError(f"steps must be >= 1, got {options.steps} and {options.controller_steps}")
     for name in ("planner_learning_rate", "controller_learning_rate"):
@@ -222,26 +198,20 @@ def _check(options: TrainConfig, method: Method) -> None:
             raise ValueError(f"{name} must be a number above 0, got {getattr(options, name)}")
     if options.label_fraction is not None and not 0 < options.label_fraction <= 1:
         raise ValueError(f"label_fraction: a fraction must be in (0, 1], got {options.label_fraction}")
-    if options.neighbor_recovery is not None and not 0 <= options.neighbor_recovery < math.inf:
-        raise ValueError(f"neighbor_recovery must be a share of at least 0, got {options.neighbor_recovery}")
-    if options.neighbor_recovery and options.batch_size == 1:
+    if method.has_planner and task.defaults.view.get("neighbor_recovery") and options.batch_size == 1:
         raise ValueError(
-            f"batch_size: neighbor_recovery {options.neighbor_recovery:g} looks for neighbours in a batch of two or"
-            " more, got 1; neighbor_recovery 0 goes without"
+            f"batch_size: the neighbor_recovery of task {task.name!r} looks for neighbours in a batch of two or more,"
+            " got 1"
         )
     lookup(PRECISIONS, options.precision or "float32", "precision")
     if options.seed < 0:
         raise ValueError(f"seed must be >= 0, got {options.seed}")
     if not 0 <= (options.validation_fraction or 0) < 1:
         raise ValueError(f"validation_fraction must be in [0, 1), got {options.validation_fraction}")
-    for name, least in _LEAST.items():
+    for name in _AT_LEAST_ONE:
         value = getattr(options, name)
-        if value is not None and value < least:
-            raise ValueError(f"{name} must be >= {least}, got {value}")
-    if options.dropout is not None and options.dropout >= 1:
-        raise ValueError(f"dropout must be in [0, 1), got {options.dropout}")
-    if options.gripper_recovery is not None and not 0 <= options.gripper_recovery <= 1:
-        raise ValueError(f"gripper_recovery must be a share in [0, 1], got {options.gripper_recovery}")
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be >= 1, got {value}")
     if not 0 < options.observation_fraction <= 1:
         raise ValueError(f"observation_fraction: a fraction must be in (0, 1], got {options.observation_fraction}")
 
@@ -257,45 +227,16 @@ def _budget(options: TrainConfig) -> LabelBudget:
     return LabelBudget(amount, unit=unit, seed=options.seed, window=WINDOW, history=HISTORY)
 
 
-def _frame_of(task: Task, name: str) -> dict[str, list]:
-    """Columns of the frame of an object (:class:`~torchrl_koap.modules.diffusion.planar_frame.PlanarFrame`)."""
-    ends = ("_position", "_quaternion")
-    parts = [part.removesuffix(ends[0]) for part in task.planar_parts if part.endswith(ends[0])]
-    bodies = [body for body in parts if body + ends[1] in task.planar_parts]
-    if not bodies:
-        raise ValueError(f"frame was given, but in task {task.name!r} the place on the table matters")
-    lookup((WORLD, *bodies), name, "frame")
-    points, directions = task.planar_columns()
-    place, yaw = (task.state_slices[name + end].start for end in ends)
-    return {
-        "points": [list(pair) for pair in points],
-        "directions": [list(pair) for pair in directions],
-        "origin": [place, place + 1],
-        "heading": [yaw, yaw + 1],
-    }
-
-
-def _planner_entry(options: TrainConfig, task: Task) -> dict[str, Any]:
-    sizes = {
-        "width": options.denoiser_width,
-        "depth": options.denoiser_depth,
-        "frequencies": options.condition_octaves,
-        "dropout": options.dropout,
-        "forecast": options.forecast or None,
-        "frame": None if options.frame in (None, WORLD) else _frame_of(task, options.frame),
-        "plan_steps": None if options.plan_steps is None else list(options.plan_steps),
-    }
-    # what was left out is left out here too, so that a run of before can be resumed
-    return {name: value for name, value in sizes.items() if value is not None} | {
+def _planner_entry(options: TrainConfig, task: Task, method: Method) -> dict[str, Any]:
+    entry = {
         "denoiser": options.denoiser,
         "channels": list(options.channels),
-        "schedule": options.schedule,
-        "prediction": options.prediction,
         "history": options.observed_frames or HISTORY,
-        "horizon": options.plan_steps[-1] if options.plan_steps else HORIZON,
-        "relative": options.relative,
-        "relations": options.relations,
-        "solver": options.solver,
-        "solver_steps": options.solver_steps,
-        "clip": 1.2 if options.prediction == "sample" else 1.0,
+        "horizon": HORIZON,
+        "relative": task.defaults.relative,
     }
+    if options.denoiser_width is not None:
+        entry["width"] = options.denoiser_width
+    if method.has_planner and task.defaults.view.get("forecast", task.env is None):
+        entry["forecast"] = True
+    return entry

@@ -19,9 +19,6 @@ FREE = frozenset(
 )
 _EVERY_TIME = ("resume", "force_data")  # asked for anew or not at all
 
-# of options that there were none of in runs of before
-_OFF_BEFORE = {"forecast": False, "gripper_recovery": 0.0, "neighbor_recovery": 0.0}
-
 
 def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
     """The options of a resumed run: what is not asked for otherwise is as it was.
@@ -36,7 +33,6 @@ def started_with(run: RunDirectory, config: TrainConfig) -> TrainConfig:
     left = [field.name for field in fields(config) if getattr(config, field.name) == field.default]
     left = [name for name in left if name not in _EVERY_TIME]
     kept = {name: earlier[name] for name in left if name in earlier}
-    kept |= {name: off for name, off in _OFF_BEFORE.items() if name in left and name not in earlier}
     kept = {name: tuple(value) if isinstance(value, list) else value for name, value in kept.items()}
     if kept.get("planner_from") is not None:
         kept["planner_from"] = Path(kept["planner_from"])

@@ -6,12 +6,11 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from tensordict.nn.probabilistic import InteractionType, interaction_type
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
-from torchrl_koap.modules.diffusion.solvers import SOLVERS
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules.diffusion.noise_schedule import SOLVERS, NoiseSchedule
 from torchrl_koap.modules.normalizer import Normalizer
 
 
@@ -35,8 +34,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
         horizon (int): number ``H`` of frames of the sequence. Defaults to 14.
         relative (bool): the condition holds the older frames as displacements from the current one.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with ``num_features``.
-        solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
-            flow path.
+        solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
         num_steps (int): solver steps. Defaults to 10.
         clip (float, optional): bound of the normalised sequence at every solver step. Defaults to no bound.
         in_keys (list of NestedKey, optional): the entry of the history, instead of ``in_key``.
@@ -44,13 +42,13 @@ class ConditionedDiffusion(TensorDictModuleBase):
         noise_key (NestedKey, optional): entry of the start noise, read if present. Defaults to ``"noise"``.
 
     Raises:
-        ValueError: for sizes below 1, several in- or out-keys, an unknown or unfit solver.
+        ValueError: for sizes below 1, several in- or out-keys, an unknown solver.
 
     Examples:
         >>> import torch
         >>> from torchrl_koap.modules import StatePlanner, TemporalUnet  # a subclass, of states
         >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, horizon=14)
-        >>> planner.sample_shape, planner.sample(torch.zeros(3, 2, 2)).shape
+        >>> planner.noise_shape, planner.sample(torch.zeros(3, 2, 2)).shape
         ((14, 2), torch.Size([3, 14, 2]))
     """
 
@@ -69,7 +67,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
         history: int = 2,
         horizon: int = 14,
         features: nn.Module | None = None,
-        solver: str | None = None,
+        solver: str = "dpm++2m",
         num_steps: int = 10,
         clip: float | None = None,
         in_keys: list[NestedKey] | None = None,
@@ -95,8 +93,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
             history * state_dim + (0 if features is None else features.num_features)
         )
         self._width = width
-        default = "heun" if self.schedule.path == "flow" else "dpm++2m"
-        self.solver = default if solver is None else solver
+        self.solver = solver
         self.num_steps = num_steps
 
     @property
@@ -106,7 +103,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
 
     @solver.setter
     def solver(self, name: str) -> None:
-        self.schedule.check_solver(name)
+        lookup(SOLVERS, name, "solver")
         self._solver = name
 
     @property
@@ -116,7 +113,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
 
     @num_steps.setter
     def num_steps(self, number: int) -> None:
-        self.schedule.nodes(number)
+        self.schedule.noise_levels(number)
         self._num_steps = number
 
     def _rename(self, history: NestedKey | None, sequence: NestedKey | None) -> None:
@@ -126,15 +123,9 @@ class ConditionedDiffusion(TensorDictModuleBase):
             self.out_keys = [sequence]
 
     @property
-    def sample_shape(self) -> tuple[int, int]:
-        """Shape ``(H, width)`` of one diffused sequence, and so of its start noise."""
+    def noise_shape(self) -> tuple[int, int]:
+        """Shape ``(H, width)`` of the start noise of one sequence, and of the sequence itself."""
         return self.horizon, self._width
-
-    @property
-    def noise_shape(self) -> tuple[int, ...]:
-        """Shape of everything that is drawn for one sequence: its start noise, and a stochastic solver's steps."""
-        draws = (1 + self.num_steps,) if SOLVERS[self.solver].stochastic else ()
-        return (*draws, *self.sample_shape)
 
     def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
         """Cuts windows of states ``[*B, history + horizon, d]`` into history and future."""
@@ -175,7 +166,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
         Returns:
             Tensor: ``[*B, H, width]``.
         """
-        shape = (*history.shape[:-2], *self.sample_shape)
+        shape = (*history.shape[:-2], *self.noise_shape)
         return torch.randn(shape, dtype=history.dtype, device=history.device, generator=generator)
 
     def denoising_error(
@@ -192,7 +183,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
         with torch.no_grad():
             noise = torch.randn_like(sample) if noise is None else noise
             time = self.schedule.sample_time(sample) if time is None else time.to(sample.dtype)
-            noisy, target = self.schedule.add_noise(sample, noise, time), self.schedule.target(sample, noise, time)
+            noisy, target = self.schedule.add_noise(sample, noise, time), self.schedule.target(sample, noise)
         with torch.autocast(sample.device.type, self.training_dtype, enabled=self.training_dtype is not None):
             predicted = self.denoiser(noisy, time, condition)
         return (predicted - target).square()
@@ -214,7 +205,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
 
         Args:
             history (Tensor): raw history.
-            noise (Tensor, optional): as for :meth:`solve`.
+            noise (Tensor, optional): start noise ``[*B, H, width]``. Default: drawn.
             generator (torch.Generator, optional): source of what is drawn.
 
         Raises:
@@ -229,7 +220,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.sample(tensordict.get(self.in_keys[0]), noise))
 
     def _check_sequence(self, sequence: Tensor) -> None:
-        if sequence.shape[-2:] != self.sample_shape:
+        if sequence.shape[-2:] != self.noise_shape:
             raise ValueError(
                 f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self._width}] (horizon, {self.width_name}),"
                 f" got {list(sequence.shape)}"
@@ -246,8 +237,7 @@ class ConditionedDiffusion(TensorDictModuleBase):
 
         Args:
             history (Tensor): raw history.
-            noise (Tensor, optional): start noise ``[*B, H, width]``, or ``[*B, 1 + num_steps, H, width]`` where the
-                rest are the draws of a stochastic solver. Default: drawn.
+            noise (Tensor, optional): start noise ``[*B, H, width]``. Default: drawn.
             generator (torch.Generator, optional): source of what is drawn.
             known (Tensor, optional): normalised first frames ``[*B, k, width]`` that the sequence has to have.
 
@@ -255,35 +245,22 @@ class ConditionedDiffusion(TensorDictModuleBase):
             ValueError: for a history or noise of another shape.
         """
         condition = self.encode_history(history)
-        step_noise = None
         if noise is None:
             noise = self.draw_noise(history, generator)
-        elif noise.ndim == history.ndim + 1:
-            step_noise = noise[..., 1:, :, :].movedim(-3, 0)
-            noise = noise[..., 0, :, :]
-        expected = (*history.shape[:-2], *self.sample_shape)
-        if noise.shape != expected or (step_noise is not None and step_noise.shape[0] < self.num_steps):
+        expected = (*history.shape[:-2], *self.noise_shape)
+        if noise.shape != expected:
             raise ValueError(
-                f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, {self.width_name}]), or hold at least"
-                f" {1 + self.num_steps} (1 + num_steps) of these on axis -3, got start noise {list(noise.shape)}"
-                + ("" if step_noise is None else f" and {step_noise.shape[0]} further draws")
+                f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, {self.width_name}]), got"
+                f" {list(noise.shape)}"
             )
         return self.schedule.solve(
             lambda x, time: self.denoiser(x, time, condition),
             noise,
             self.num_steps,
-            self._solver_now(explicit=step_noise is not None),
+            self.solver,
             clip=self.clip,
-            step_noise=step_noise,
-            generator=generator,
-            known=known,
+            prefix=known,
         )
-
-    def _solver_now(self, explicit: bool) -> str:
-        """A stochastic solver stays if the exploration type asks for samples, or if its draws are given."""
-        if explicit or not SOLVERS[self.solver].stochastic or interaction_type() in (None, InteractionType.RANDOM):
-            return self.solver
-        return "ddim"
 
 
 def identity_normalizer(width: int) -> Normalizer:

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -12,8 +10,7 @@ from torch import Tensor, nn
 from torchrl_koap import keys
 from torchrl_koap.modules.diffusion.base import ConditionedDiffusion, identity_normalizer
 from torchrl_koap.modules.diffusion.forecast import LinearForecast
-from torchrl_koap.modules.diffusion.planar_frame import PlanarFrame
-from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
+from torchrl_koap.modules.diffusion.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.normalizer import Normalizer
 
 
@@ -30,14 +27,6 @@ class StatePlanner(ConditionedDiffusion):
 
     With ``forecast=True`` it is not the plan that is modelled but its deviation from a linear forecast
     (:class:`~torchrl_koap.modules.diffusion.forecast.LinearForecast`), which carries over to goals never seen.
-
-    With a ``frame`` history and plan are modelled as seen from an object
-    (:class:`~torchrl_koap.modules.diffusion.planar_frame.PlanarFrame`); with ``steps`` some frames of the plan are
-    modelled alone, those in between lie on straight lines::
-
-        steps        (1, 2, 4, 8)
-        modelled     x_{t+1}  x_{t+2}           x_{t+4}                             x_{t+8}
-        plan         x_{t+1}  x_{t+2}  x_{t+3}  x_{t+4}  x_{t+5}  x_{t+6}  x_{t+7}  x_{t+8}
 
     Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state
     dict.
@@ -58,32 +47,26 @@ class StatePlanner(ConditionedDiffusion):
         horizon (int): number ``H`` of planned frames. Defaults to 14.
         relative (bool): model displacements from the current state. Defaults to True.
         forecast (bool): model deviations from a linear forecast. Defaults to False.
-        frame (PlanarFrame, optional): what states are seen from. Default: the world.
-        steps (sequence of int, optional): frames of the plan that are modelled, counted from 1, the horizon last; the
-            denoiser is one of as many frames. Default: all.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
             further numbers that the condition holds, such as the relative positions of objects.
-        solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
-            flow path.
+        solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
         num_steps (int): solver steps. Defaults to 10.
         clip (float, optional): bound of the normalised plan at every solver step. Defaults to no bound; ``1.0`` suits
             ``"minmax"`` statistics.
         in_keys (list of NestedKey): the entry of the history ``[*B, h, d]`` in raw units. Defaults to ``["history"]``.
         out_keys (list of NestedKey): the entry of the plan ``[*B, H, d]`` in raw units. Defaults to ``["plan"]``.
-        noise_key (NestedKey, optional): entry read if present: start noise ``[*B, H, d]``, or ``[*B, 1 + num_steps,
-            H, d]`` where the rest are the draws of a stochastic solver. Defaults to ``"noise"``.
+        noise_key (NestedKey, optional): entry of start noise ``[*B, H, d]``, read if present. Defaults to ``"noise"``.
 
     Raises:
-        ValueError: for a history of another length or width, noise of another shape, an unknown or unfit solver, steps
-            that do not rise from 1 or more to the horizon.
+        ValueError: for a history of another length or width, noise of another shape, an unknown solver.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules.diffusion.unet import TemporalUnet
-        >>> from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
+        >>> from torchrl_koap.modules.diffusion.noise_schedule import NoiseSchedule
         >>> from torchrl_koap.modules.diffusion.planner import StatePlanner
-        >>> planner = StatePlanner(TemporalUnet(2, 4), NoiseSchedule("flow"), state_dim=2, num_steps=4)
+        >>> planner = StatePlanner(TemporalUnet(2, 4), NoiseSchedule(), state_dim=2, num_steps=4)
         >>> windows = torch.randn(100, 16, 2).cumsum(1)
         >>> planner.fit_normalizers(windows)
         >>> planner(TensorDict({"history": windows[:5, :2]}, [5]))["plan"].shape
@@ -98,8 +81,6 @@ class StatePlanner(ConditionedDiffusion):
         state_dim: int,
         relative: bool = True,
         forecast: bool = False,
-        frame: PlanarFrame | None = None,
-        steps: Sequence[int] | None = None,
         **options,
     ):
         super().__init__(
@@ -112,25 +93,10 @@ class StatePlanner(ConditionedDiffusion):
             out_key=keys.PLAN,
             **options,
         )
-        self.frame = frame
-        self.steps = tuple(range(1, self.horizon + 1)) if steps is None else tuple(steps)
-        if self.steps[-1:] != (self.horizon,) or any(
-            b <= a for a, b in zip((0, *self.steps), self.steps, strict=False)
-        ):
-            raise ValueError(f"steps must rise from 1 or more to the horizon, {self.horizon}, got {list(self.steps)}")
-        self.plan_normalizer = identity_normalizer(len(self.steps) * state_dim)
+        self.plan_normalizer = identity_normalizer(self.horizon * state_dim)
         self.forecast = None
         if forecast:
-            self.forecast = LinearForecast(len(self.condition_normalizer.scale), len(self.steps) * state_dim)
-
-    @property
-    def sample_shape(self) -> tuple[int, int]:
-        """Shape ``(number of steps, d)`` of one diffused sequence, and so of its start noise."""
-        return len(self.steps), self.state_dim
-
-    def condition(self, history: Tensor) -> Tensor:
-        """The condition ``[*B, h * d + f]`` in raw units, as seen in the frame."""
-        return super().condition(history if self.frame is None else self.frame(history, history[..., -1:, :]))
+            self.forecast = LinearForecast(len(self.condition_normalizer.scale), self.horizon * state_dim)
 
     def set_keys(self, *, history: NestedKey | None = None, plan: NestedKey | None = None) -> None:
         """Renames the entries read and written.
@@ -146,7 +112,6 @@ class StatePlanner(ConditionedDiffusion):
         windows: Tensor,
         *,
         mode: str = "minmax",
-        per_step: bool = True,
         seen: Tensor | None = None,
         groups: Tensor | None = None,
     ) -> None:
@@ -158,18 +123,13 @@ class StatePlanner(ConditionedDiffusion):
         Keyword Args:
             mode (str): ``"minmax"``, ``"standard"`` or ``"identity"`` (see
                 :class:`~torchrl_koap.modules.normalizer.Normalizer`).
-            per_step (bool): own statistics for every planned step instead of shared ones. Defaults to True.
             seen (Tensor, optional): the windows as training augments them, which the forecast is fitted to. Default:
                 as they are.
             groups (Tensor, optional): trajectory of every window ``[*N]``, for the forecast
                 (:meth:`~torchrl_koap.modules.diffusion.forecast.LinearForecast.fit`).
         """
         history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
-        plan = self._modelled(history, plan)
-        if per_step:
-            plan = plan.flatten(-2)
-        else:
-            plan = plan.reshape(-1, self.state_dim).repeat(1, len(self.steps))
+        plan = self._modelled(history, plan).flatten(-2)
         condition = self.condition(history)
         example = self.plan_normalizer.scale
         self.condition_normalizer = Normalizer.fit(condition, mode=mode).to(example)
@@ -181,28 +141,8 @@ class StatePlanner(ConditionedDiffusion):
             self.forecast.fit(self.encode_history(history), self.plan_normalizer(plan.flatten(-2)), groups, mode=mode)
 
     def _modelled(self, history: Tensor, plan: Tensor) -> Tensor:
-        """What is modelled of raw plans ``[*B, H, d]``: the steps, seen in the frame, from the present state."""
-        now = history[..., -1:, :]
-        plan = plan if len(self.steps) == self.horizon else plan[..., [step - 1 for step in self.steps], :]
-        if self.frame is not None:
-            plan, now = self.frame(plan, now), self.frame(now, now)
-        return plan - now if self.relative else plan
-
-    def _whole(self, history: Tensor, modelled: Tensor) -> Tensor:
-        """Inverse of :meth:`_modelled`; frames in between lie on straight lines."""
-        now = history[..., -1:, :]
-        seen = now if self.frame is None else self.frame(now, now)
-        plan = modelled + seen if self.relative else modelled
-        if self.frame is not None:
-            plan = self.frame.inverse(plan, now)
-        if len(self.steps) == self.horizon:
-            return plan
-        knots = torch.tensor((0, *self.steps), device=plan.device)
-        wanted = torch.arange(1, self.horizon + 1, device=plan.device)
-        after = torch.searchsorted(knots, wanted)  # of every frame the first knot that is not before it
-        share = ((wanted - knots[after - 1]) / (knots[after] - knots[after - 1])).to(plan.dtype)[:, None]
-        plan = torch.cat([now, plan], -2)
-        return torch.lerp(plan[..., after - 1, :], plan[..., after, :], share)
+        """What is modelled of raw plans ``[*B, H, d]``."""
+        return plan - history[..., -1:, :] if self.relative else plan
 
     def encode_plan(self, history: Tensor, plan: Tensor) -> Tensor:
         """Raw plans to the normalised sequences that noise is added to.
@@ -212,7 +152,7 @@ class StatePlanner(ConditionedDiffusion):
             plan (Tensor): raw plans ``[*B, H, d]``.
 
         Returns:
-            Tensor: normalised sequences ``[*B, H, d]``, or of as many frames as there are steps.
+            Tensor: normalised sequences ``[*B, H, d]``.
 
         Raises:
             ValueError: for plans of another shape.
@@ -225,7 +165,7 @@ class StatePlanner(ConditionedDiffusion):
         sequence = self.plan_normalizer(self._modelled(history, plan).flatten(-2))
         if self.forecast is not None:
             sequence = self.forecast.take_off(self.encode_history(history), sequence)
-        return sequence.unflatten(-1, self.sample_shape)
+        return sequence.unflatten(-1, self.noise_shape)
 
     def decode_plan(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Inverse of :meth:`encode_plan`.
@@ -240,7 +180,8 @@ class StatePlanner(ConditionedDiffusion):
         sequence = sequence.flatten(-2)
         if self.forecast is not None:
             sequence = self.forecast.add(self.encode_history(history), sequence)
-        return self._whole(history, self.plan_normalizer.inverse(sequence).unflatten(-1, self.sample_shape))
+        plan = self.plan_normalizer.inverse(sequence).unflatten(-1, self.noise_shape)
+        return plan + history[..., -1:, :] if self.relative else plan
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Raw plans of normalised sequences: :meth:`decode_plan`.
@@ -256,7 +197,7 @@ class StatePlanner(ConditionedDiffusion):
 
     def scale_columns(self, plan: Tensor) -> Tensor:
         """Raw plan ``[*B, H, d]`` in units of the columns' spread, the same for all its steps."""
-        return plan / self.plan_normalizer.scale.unflatten(-1, self.sample_shape).mean(0)
+        return plan / self.plan_normalizer.scale.unflatten(-1, self.noise_shape).mean(0)
 
     def plan(
         self,
@@ -290,5 +231,4 @@ class StatePlanner(ConditionedDiffusion):
             )
         rest = known[..., -1:, :].expand(*known.shape[:-2], self.horizon - frames, -1)
         fixed = self.encode_plan(history, torch.cat([known, rest], -2))
-        fixed = fixed[..., : sum(step <= frames for step in self.steps), :]
-        return self.decode_plan(history, self.solve(history, noise, generator, fixed))
+        return self.decode_plan(history, self.solve(history, noise, generator, fixed[..., :frames, :]))

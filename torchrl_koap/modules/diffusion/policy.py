@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from torchrl_koap import keys
 from torchrl_koap.modules.diffusion.base import ConditionedDiffusion, identity_normalizer
-from torchrl_koap.modules.diffusion.schedule import NoiseSchedule
+from torchrl_koap.modules.diffusion.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.normalizer import Normalizer
 
 ACTION_CHUNK = "action_chunk"
@@ -25,8 +25,7 @@ class DiffusionPolicy(ConditionedDiffusion):
         chunk               a_1    a_2    a_3    ...  a_14        a_t moves x_t to x_{t+1}
         entry               0      1      2      ...  13
 
-    KOAP's first public code diffuses ``a_2, a_3, ...`` here and begins to execute them in frame 1, one step too early
-    (and fixes the width of the condition to that of a single task).
+    KOAP's first public code diffuses ``a_2, a_3, ...`` here and begins to execute them in frame 1, one step too early.
 
     The condition is the planner's: states as they are, or with ``relative=True`` older frames as displacements from
     the current one. Sampling starts from random noise, also under ``ExplorationType.DETERMINISTIC``
@@ -44,25 +43,24 @@ class DiffusionPolicy(ConditionedDiffusion):
         relative (bool): the condition holds displacements from the current state. Defaults to False.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
             further numbers that the condition holds.
-        solver (str, optional): a name in ``SOLVERS``. Defaults to ``"dpm++2m"`` on a diffusion and ``"heun"`` on a
-            flow path.
+        solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
         num_steps (int): solver steps. Defaults to 10.
         clip (float, optional): bound of the normalised actions at every solver step. Defaults to no bound; ``1.0``
             suits ``"minmax"`` statistics.
         in_keys (list of NestedKey): the entry of the history ``[*B, h, d]`` in raw units. Defaults to ``["history"]``.
         out_keys (list of NestedKey): the entry of the actions ``[*B, H, act]`` in raw units. Defaults to
             ``["action_chunk"]``.
-        noise_key (NestedKey, optional): entry read if present: start noise ``[*B, H, act]``, or ``[*B, 1 + num_steps,
-            H, act]`` where the rest are the draws of a stochastic solver. Defaults to ``"noise"``.
+        noise_key (NestedKey, optional): entry of start noise ``[*B, H, act]``, read if present. Defaults to
+            ``"noise"``.
 
     Raises:
-        ValueError: for a history of another length or width, noise of another shape, an unknown or unfit solver.
+        ValueError: for a history of another length or width, noise of another shape, an unknown solver.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import DiffusionPolicy, NoiseSchedule, TemporalUnet
-        >>> policy = DiffusionPolicy(TemporalUnet(3, 4), NoiseSchedule("flow"), state_dim=2, action_dim=3, num_steps=4)
+        >>> policy = DiffusionPolicy(TemporalUnet(3, 4), NoiseSchedule(), state_dim=2, action_dim=3, num_steps=4)
         >>> policy.fit_normalizers(torch.randn(100, 16, 2), torch.randn(500, 3))
         >>> policy(TensorDict({"history": torch.randn(5, 2, 2)}, [5]))["action_chunk"].shape
         torch.Size([5, 14, 3])

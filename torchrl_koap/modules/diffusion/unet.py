@@ -9,13 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrl_koap.modules.diffusion.denoisers import (
-    ACTIVATIONS,
-    ConditionEncoder,
-    StepEmbedding,
-    check_activation,
-    check_input,
-)
+from torchrl_koap.modules.diffusion.denoisers import ConditionEncoder, StepEmbedding, check_input
 
 
 class TemporalUnet(nn.Module):
@@ -28,7 +22,7 @@ class TemporalUnet(nn.Module):
 
     Speed on a CPU (one core): ``nn.Conv1d`` reaches 90 % of the matrix-product rate from 64 channels on and beats
     unfolding; group norm costs as much as layer norm, but its gradient ten times that on fewer than 8 steps, hence
-    the padding; Mish costs ten times SiLU, as much as a whole convolution.
+    the padding.
 
     Args:
         state_dim (int): number ``d`` of state columns.
@@ -37,13 +31,9 @@ class TemporalUnet(nn.Module):
         kernel_size (int): odd width of the convolutions in steps. Defaults to 5.
         blocks_per_level (int): residual blocks per level on either side. Defaults to 1.
         embedding_dim (int): width of the step embedding. Defaults to 32.
-        condition_width (int): width of the :class:`ConditionEncoder`; 0 feeds the condition to the FiLM as it is.
-            Defaults to 128.
+        condition_width (int): width of the :class:`ConditionEncoder`. Defaults to 128.
         frequencies (int): octaves of its Fourier features. Defaults to 4.
         groups (int): groups of the group norm; must divide every entry of ``channels``. Defaults to 8.
-        multiple (int): plans are padded to a multiple of this many steps, itself a multiple of ``2^(levels - 1)``.
-            Defaults to 8 or that power of two, whichever is larger.
-        activation (str): a name in ``ACTIVATIONS``. Defaults to ``"silu"``.
 
     Raises:
         ValueError: if a size is not possible; the message names the argument.
@@ -68,11 +58,8 @@ class TemporalUnet(nn.Module):
         condition_width: int = 128,
         frequencies: int = 4,
         groups: int = 8,
-        multiple: int | None = None,
-        activation: str = "silu",
     ):
         super().__init__()
-        check_activation(activation)
         channels = tuple(channels)
         if not channels or any(width < 1 or width % groups for width in channels):
             raise ValueError(f"channels must be multiples of groups ({groups}), got {channels}")
@@ -81,21 +68,14 @@ class TemporalUnet(nn.Module):
         if blocks_per_level < 1:
             raise ValueError(f"blocks_per_level must be at least 1, got {blocks_per_level}")
         self.state_dim, self.condition_dim = state_dim, condition_dim
-        shrinkage = 2 ** (len(channels) - 1)
-        self.multiple = max(8, shrinkage) if multiple is None else multiple
-        if self.multiple < 1 or self.multiple % shrinkage:
-            raise ValueError(f"multiple must be a multiple of {shrinkage} (2^(levels - 1)), got {multiple}")
-        self.step_embedding = StepEmbedding(embedding_dim, activation)
-        self.encoder = (
-            ConditionEncoder(condition_dim, frequencies=frequencies, width=condition_width, activation=activation)
-            if condition_width
-            else nn.Identity()
-        )
+        self.multiple = max(8, 2 ** (len(channels) - 1))  # steps that plans are padded to a multiple of
+        self.step_embedding = StepEmbedding(embedding_dim)
+        self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=condition_width)
 
         def blocks(width_in: int, width_out: int) -> nn.ModuleList:
             widths = [width_in] + [width_out] * blocks_per_level
             return nn.ModuleList(
-                _Block(a, b, kernel_size, groups, activation) for a, b in zip(widths[:-1], widths[1:], strict=True)
+                _Block(a, b, kernel_size, groups) for a, b in zip(widths[:-1], widths[1:], strict=True)
             )
 
         levels = list(zip((state_dim, *channels[:-1]), channels, strict=True))
@@ -109,38 +89,12 @@ class TemporalUnet(nn.Module):
         self.head = nn.Sequential(
             nn.Conv1d(channels[0], channels[0], kernel_size, padding=kernel_size // 2),
             nn.GroupNorm(groups, channels[0]),
-            ACTIVATIONS[activation](),
+            nn.SiLU(),
             nn.Conv1d(channels[0], state_dim, 1),
         )
         # One matrix product serves the FiLM of all blocks: at batch 1 the number of calls is what costs.
         self._film_sizes = [2 * block.width for block in self._all_blocks()]
-        self.film = nn.Sequential(
-            ACTIVATIONS[activation](),
-            nn.Linear(embedding_dim + (condition_width or condition_dim), sum(self._film_sizes)),
-        )
-
-    @classmethod
-    def released(cls, state_dim: int, condition_dim: int) -> TemporalUnet:
-        """The network of KOAP's first public code.
-
-        It has 11,881,220 parameters for 4 state columns and a history of 2 frames.
-
-        Args:
-            state_dim (int): number ``d`` of columns of the sequence.
-            condition_dim (int): number ``c`` of columns of the condition.
-        """
-        return cls(
-            state_dim,
-            condition_dim,
-            channels=(256, 256, 256),
-            kernel_size=5,
-            blocks_per_level=2,
-            embedding_dim=256,
-            condition_width=0,
-            groups=8,
-            multiple=4,
-            activation="mish",
-        )
+        self.film = nn.Sequential(nn.SiLU(), nn.Linear(embedding_dim + condition_width, sum(self._film_sizes)))
 
     def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
         """Predicts what the schedule asks for, from noisy sequences.
@@ -192,7 +146,7 @@ class TemporalUnet(nn.Module):
 class _Block(nn.Module):
     """Two convolutions with a FiLM between them and a residual path around them."""
 
-    def __init__(self, width_in: int, width: int, kernel_size: int, groups: int, activation: str):
+    def __init__(self, width_in: int, width: int, kernel_size: int, groups: int):
         super().__init__()
         self.width = width
         padding = kernel_size // 2
@@ -201,7 +155,7 @@ class _Block(nn.Module):
         self.second = nn.Conv1d(width, width, kernel_size, padding=padding)
         self.second_norm = nn.GroupNorm(groups, width)
         self.shortcut = nn.Conv1d(width_in, width, 1) if width_in != width else nn.Identity()
-        self.activation = ACTIVATIONS[activation]()
+        self.activation = nn.SiLU()
 
     def forward(self, x: Tensor, film: Tensor) -> Tensor:
         scale, shift = film.chunk(2, 1)  # [N, width, 1] each

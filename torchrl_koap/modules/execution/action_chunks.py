@@ -41,7 +41,6 @@ class ChunkedPolicy(RecedingHorizonPolicy):
             Default: all.
         candidates (int): chunks sampled whenever one is due, of which one that goes on with the chunk in force is taken
             (:mod:`torchrl_koap.modules.execution.candidates`). Defaults to ``1``.
-        choice (str): the rule by which it is taken. Defaults to ``"quarter"``.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -71,7 +70,6 @@ class ChunkedPolicy(RecedingHorizonPolicy):
         replan_interval: int = 4,
         controller_columns: Sequence[int] | None = None,
         candidates: int = 1,
-        choice: str = "quarter",
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -87,7 +85,6 @@ class ChunkedPolicy(RecedingHorizonPolicy):
             chunk_key=ACTION_CHUNK,
             reader="policy",
             candidates=candidates,
-            choice=choice,
             # the rest of a chunk is kept only where the next one is compared with it
             kept_steps=planner.horizon if candidates > 1 else None,
         )
@@ -129,7 +126,6 @@ class ChunkedPolicy(RecedingHorizonPolicy):
             state,
             noise,
             number=self.candidates,
-            rule=self.choice,
             in_force=None if left is None or not left.shape[-2] else left,
             fresh=fresh,
         )

@@ -120,7 +120,7 @@ def exportable(policy: RecedingHorizonPolicy, part: str = "policy", *, observati
         inputs = {"states": example(1, policy.history + planner.horizon, width)}
         return Exportable(_Controller(policy.controller), inputs, "actions")
     condition = planner.encode_history(example(1, planner.history, planner.state_dim))
-    inputs = {"sequence": example(1, *planner.sample_shape), "time": example(1).abs(), "condition": condition}
+    inputs = {"sequence": example(1, *planner.noise_shape), "time": example(1).abs(), "condition": condition}
     return Exportable(planner.denoiser, inputs, "prediction")
 
 

@@ -57,7 +57,6 @@ class PlanThenControl(RecedingHorizonPolicy):
             off the planned widths (:func:`~torchrl_koap.tasks.action_rules.command_gripper`).
         candidates (int): plans sampled whenever one is due, of which one that goes on with the plan in force is taken
             (:mod:`torchrl_koap.modules.execution.candidates`). Defaults to ``1``.
-        choice (str): the rule by which it is taken. Defaults to ``"quarter"``.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -93,7 +92,6 @@ class PlanThenControl(RecedingHorizonPolicy):
         controller_columns: Sequence[int] | None = None,
         action_rule: Callable[[Tensor, Tensor], Tensor] | None = None,
         candidates: int = 1,
-        choice: str = "quarter",
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -111,7 +109,6 @@ class PlanThenControl(RecedingHorizonPolicy):
             cached_key="remaining_plan" if feedback else action_key,
             chunk_key="remaining_plan_chunk" if feedback else "action_chunk",
             candidates=candidates,
-            choice=choice,
         )
         if candidates > 1 and not feedback:
             raise ValueError(f"several candidates need execution 'feedback', which keeps its plan; got {execution!r}")
@@ -147,7 +144,6 @@ class PlanThenControl(RecedingHorizonPolicy):
                 seen,
                 noise,
                 number=self.candidates,
-                rule=self.choice,
                 in_force=None if in_force is None else in_force[..., 0, :, :],
                 fresh=fresh,
                 apart=paths_apart,

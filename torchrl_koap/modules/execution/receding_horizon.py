@@ -80,7 +80,6 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         reader (str): what reads the last frames, in error messages.
         candidates (int): plans or chunks sampled whenever one is due, of which one is taken that goes on with the one
             in force (:mod:`torchrl_koap.modules.execution.candidates`).
-        choice (str): the rule by which it is taken.
         kept_steps (int, optional): entries of a chunk that are kept. Default: those that are executed.
 
     Attributes:
@@ -118,11 +117,10 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
         chunk_key: NestedKey,
         reader: str = "planner",
         candidates: int = 1,
-        choice: str = "quarter",
         kept_steps: int | None = None,
     ):
         super().__init__()
-        check_candidates(candidates, choice)
+        check_candidates(candidates)
         if history < planner.history:
             raise ValueError(f"the {reader} reads {planner.history} observed frames, history is only {history}")
         if not 1 <= replan_interval <= planner.horizon:
@@ -136,7 +134,7 @@ class RecedingHorizonPolicy(TensorDictModuleBase):
             self.state_of, self._widest = self._select, int(max(state_columns))
         self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
         self.history, self.replan_interval = history, replan_interval
-        self.planner, self.candidates, self.choice = planner, candidates, choice
+        self.planner, self.candidates = planner, candidates
         self.register_buffer("action_gain", None, persistent=False)
         self.leash: CommandLeash | None = None
         self._written: TensorDictBase | None = None

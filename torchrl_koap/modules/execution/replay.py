@@ -21,7 +21,7 @@ class EpisodeNoise(TensorDictModuleBase):
 
     Args:
         seeds (sequence of int): one per environment.
-        shape (sequence of int): shape of one draw, ``[H, d]`` or ``[1 + solver steps, H, d]``.
+        shape (sequence of int): shape of one draw, ``[H, d]``.
 
     Keyword Args:
         num_steps (int): control steps to draw for.
