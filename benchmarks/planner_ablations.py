@@ -165,7 +165,6 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=60)
     parser.add_argument("--controller", choices=CONTROLLERS, default="learned")
     parser.add_argument("--candidates", type=int, default=1)
-    parser.add_argument("--choice", default="quarter")
     parser.add_argument("--replan-interval", type=int, default=4)
     parser.add_argument("--blend-decay", type=float, default=BLEND_DECAY)
     parser.add_argument("--command-lead", type=float, help="default: the task's; 0: any distance")
@@ -176,13 +175,14 @@ def main() -> None:
     options = parser.parse_args()
     choices = {
         "candidates": options.candidates,
-        "choice": options.choice if options.candidates > 1 else "",
+        "choice": "quarter" if options.candidates > 1 else "",
         "replan_interval": options.replan_interval,
         "blend_decay": options.blend_decay,
     }
     results = []
     for seed in options.seeds:
-        settings = {**choices, "choice": options.choice, "controller": options.controller}
+        settings = {name: value for name, value in choices.items() if name != "choice"}
+        settings["controller"] = options.controller
         settings |= {"command_lead": options.command_lead, "action_gain": options.action_gain}
         config = EvalConfig(episodes=options.episodes, seed=seed, threads=options.threads, **settings)
         results.append(evaluate(options.run, config))

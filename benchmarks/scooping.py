@@ -4,7 +4,6 @@
     python benchmarks/scooping.py --folder runs/scooping
     python benchmarks/scooping.py --folder runs/scooping --methods koap linear dd --labels 2 5 20 --unlabelled both
     python benchmarks/scooping.py --folder runs/moving --task scooping_moving_bowl
-    python benchmarks/scooping.py --folder runs/scooping --neighbor-recovery 2   # into a table of its own
 
 Records robot and hand, embeds, trains one planner per set of unlabelled demonstrations and one controller per cell, and
 rolls each out. Folder by folder what is there already is not made again, and rows of the table are not run again.
@@ -19,7 +18,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import math
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
@@ -67,17 +65,11 @@ def _name(unlabelled: str, labels: int) -> str:
     return f"{unlabelled}_{labels}" if unlabelled in FEW_ROBOTS else unlabelled
 
 
-def _way(options) -> str:
-    """What runs with recovery are called besides."""
-    return f"_recovery{options.neighbor_recovery:g}" if options.neighbor_recovery else ""
-
-
 def planner_of(folder: Path, unlabelled: str, labels: int, seed: int, options) -> Path:
     """A run that holds the planner of a cell, trained where it is not there."""
-    run = folder / f"planner_{_name(unlabelled, labels)}{_way(options)}_{seed}"
+    run = folder / f"planner_{_name(unlabelled, labels)}_{seed}"
     if not (run / "summary.json").is_file():
         known = {"method": "linear", "steps": options.steps, "seed": seed, "analysis": False, "resume": run.exists()}
-        known["neighbor_recovery"] = options.neighbor_recovery
         train(_config(run, folder, unlabelled, labels, options.task, **known))
     return run
 
@@ -89,11 +81,10 @@ def _config(run: Path, folder: Path, unlabelled: str, labels: int, task: str, **
 
 def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int, options) -> dict:
     """Trains and rolls out one cell."""
-    planner, way = None, ""
+    planner = None
     if not method.startswith("dp"):
-        way = _way(options)
         planner = planner_of(folder, unlabelled, labels, seed, options)
-    run = folder / f"{method}_{unlabelled}_{labels}{way}_{seed}"
+    run = folder / f"{method}_{unlabelled}_{labels}_{seed}"
     if not (run / "summary.json").is_file():
         settings = {"method": method, "seed": seed, "planner_from": planner, "steps": options.steps}
         settings["resume"] = run.exists()
@@ -147,7 +138,6 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--replan-interval", type=int, default=8, help="frames of each plan that are executed")
     parser.add_argument("--execution", choices=EXECUTIONS, default="open_loop", help="of plans")
     parser.add_argument("--blend-decay", type=float, default=0.0, help="of plans; 0 leaves them as they are")
-    parser.add_argument("--neighbor-recovery", type=float, default=0.0, help="of planners, as of koap train")
     parser.add_argument("--fit-projection", action="store_true", help="make the package's projection anew and stop")
     options = parser.parse_args(arguments)
     for name in options.methods:
@@ -161,8 +151,6 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     for labels in options.labels:
         if not 1 <= labels <= options.demonstrations:
             parser.error(f"--labels must be from 1 to the {options.demonstrations} demonstrations, got {labels}")
-    if not 0 <= options.neighbor_recovery < math.inf:
-        parser.error(f"--neighbor-recovery must be at least 0, got {options.neighbor_recovery}")
     if not 0 <= options.blend_decay < 1:
         parser.error(f"--blend-decay must be in [0, 1), got {options.blend_decay}")
     return options
@@ -199,7 +187,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         save_encoder(encoder, SCOOPING.with_stem(options.task), stride=8, fitted_on=fitted_on)
         return
     plans, table = (options.execution, options.blend_decay), TABLE.with_stem(options.task)
-    table = table.with_stem(table.stem + _way(options))
     for seed, unlabelled, labels, method in product(options.seeds, options.unlabelled, options.labels, options.methods):
         if tuple(map(str, (labels, unlabelled, method, *plans, seed, options.episodes))) not in measured(table):
             row = run_cell(options.folder, unlabelled, labels, method, seed, options)

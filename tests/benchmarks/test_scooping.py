@@ -23,7 +23,6 @@ import torch
         (["--episodes", "0"], "--episodes must be at least 1, got 0"),
         (["--controller-steps", "-1"], "--controller-steps must be at least 0, got -1"),
         (["--blend-decay", "1"], "--blend-decay must be in [0, 1), got 1.0"),
-        (["--neighbor-recovery", "nan"], "--neighbor-recovery must be at least 0, got nan"),
         (["--unlabelled", "foot"], "invalid choice: 'foot'"),
     ],
 )
@@ -81,17 +80,6 @@ def test_a_cell_is_trained_rolled_out_and_written_once(study, tmp_path):
     again = run(study, tmp_path, "--unlabelled", "both", "--execution", "feedback", "--blend-decay", "0.8")
     assert [(r["execution"], r["blend_decay"]) for r in again] == [("open_loop", "0.0"), ("feedback", "0.8")]
     assert len(study.asked) == 4 and study.asked[3][1].blend_decay == 0.8  # nothing is trained anew
-
-
-def test_planners_with_recovery_have_runs_and_a_table_of_their_own(study, tmp_path):
-    before = run(study, tmp_path, "--unlabelled", "both")
-    assert run(study, tmp_path, "--unlabelled", "both", "--neighbor-recovery", "0.5") == before
-    with (tmp_path / "scooping_recovery0.5.csv").open(newline="") as file:
-        assert len(list(csv.DictReader(file))) == 1
-    planner, cell = study.asked[3:5]
-    assert (planner.out.name, planner.neighbor_recovery) == ("planner_both_recovery0.5_0", 0.5)
-    assert (cell.out.name, cell.planner_from) == ("koap_both_5_recovery0.5_0", planner.out)
-    assert [config.neighbor_recovery for config in study.asked[:2]] == [0.0, None]
 
 
 def test_where_every_robot_demonstration_is_labelled_there_is_no_action_error(study, tmp_path, monkeypatch):

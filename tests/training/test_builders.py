@@ -155,8 +155,6 @@ def test_environments_and_modes_of_a_task():
     assert mode_index_of(TASK)(flags).tolist() == [23, -1]
 
 
-
-
 def test_absolute_actions_are_centred_and_read_off_the_present_frame():
     entry = resolve(TrainConfig(out=Path("run"), task="scooping")).controller
     assert entry["absolute"] and "absolute" not in resolve(TrainConfig(out=Path("run"), task="stacking")).controller
