@@ -53,7 +53,16 @@ def ddim(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
 
 
 def dpm_solver_2m(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
-    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2); as :func:`ddim`."""
+    """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2).
+
+    Args:
+        denoise (callable): as for :func:`ddim`.
+        x (Tensor): start noise ``[*B, H, d]``.
+        levels (sequence of NoiseLevel): as for :func:`ddim`.
+
+    Returns:
+        Tensor: clean sequences ``[*B, H, d]``.
+    """
     previous, previous_step = None, 0.0
     for level, after in zip(levels[:-1], levels[1:], strict=True):
         sample, _ = denoise(x, level)
