@@ -8,13 +8,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from env_test_base import ContextTestBase, act, recorded_contexts, recorded_state
 from shared_data import SHARED
-from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.envs import AligningEnv
 from torchrl_koap.envs.aligning import INSIDE_REACH, WALLS, mode_index
-from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts, yaw_quaternions
+from torchrl_koap.envs.contexts import yaw_quaternions
 
 RECORDINGS = SHARED / "d3il_reference" / "aligning.npz"
 needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")
@@ -24,11 +23,9 @@ CONTEXT = np.array([[(0.5, -0.15, 0.3), (0.55, 0.3, -0.7)]])
 DOWN = torch.tensor([0.0, 0.0, -0.01], dtype=torch.float64)
 
 
-def act(env, action, mask=None):
-    tensordict = TensorDict({"action": action.expand(env.batch_size[0], 3).to(env._dtype)}, env.batch_size)
-    if mask is not None:
-        tensordict["_step"] = torch.as_tensor(mask).reshape(-1, 1)
-    return env.step(tensordict)["next"]
+class TestAligningEnv(ContextTestBase):
+    ENV = AligningEnv
+    PUSH = DOWN.tolist()
 
 
 def put(env, tray, tcp=None):
@@ -43,15 +40,12 @@ def test_parity_with_the_original():
     recorded = np.load(RECORDINGS)
     lengths, names = recorded["n_steps"], range(4)
     env = AligningEnv(4, max_steps=1000, dtype=torch.float64)
-    contexts = np.stack([recorded[f"ep{i}_context"][:, :3] for i in names])
-    contexts[..., 2] = np.radians(contexts[..., 2])
-    first = env.reset(contexts=contexts)
+    first = env.reset(contexts=recorded_contexts(recorded, 2))
     for i in names:
         np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-14)
         np.testing.assert_allclose(env.sims.data[i].qvel, recorded[f"ep{i}_init_qvel"], rtol=0, atol=1e-12)
         np.testing.assert_allclose(first["observation"][i, 3:], recorded[f"ep{i}_init_obs"], rtol=0, atol=1e-7)
-        state = {name: recorded[f"ep{i}_init_{name}"] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
-        env.set_physics(i, **state)
+        env.set_physics(i, **recorded_state(recorded, i))
     first_contact = np.append(np.flatnonzero(recorded[f"ep{SENSITIVE}_robot_touches_object"]), 10**6)[0]
     success_told = np.zeros(4, dtype=bool)
     for k in range(max(lengths)):
@@ -72,14 +66,6 @@ def test_parity_with_the_original():
             assert observed < 1e-6, where  # recorded in float32
     # the original tells success with the step that reaches it, this environment with the one that ends the episode
     assert out["success"][:, 0].tolist() == success_told.tolist() == [True, False, False, False]
-
-
-@pytest.mark.parametrize("num_envs", [1, 3])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_specs(num_envs, dtype):
-    env = AligningEnv(num_envs, dtype=dtype)
-    check_env_specs(env)
-    assert env.rollout(2)["next", "observation"].dtype == dtype
 
 
 def test_first_observation_and_latency_of_one_step():
@@ -193,94 +179,6 @@ def test_mode_is_that_of_the_last_instant():
         assert env._mode.tolist() == [[mode]], tcp
 
 
-def test_random_contexts_come_from_the_seed():
-    first = [AligningEnv(3, seed=4).reset()["context"] for _ in range(2)]
-    torch.testing.assert_close(first[0], first[1], rtol=0, atol=0)
-    np.testing.assert_allclose(first[0], draw_contexts("aligning", 3, 4), rtol=0, atol=1e-7)
-    env = AligningEnv(3, seed=4)
-    draws = [env.reset()["context"] for _ in range(2)]
-    assert (draws[0] != draws[1]).all()
-    env.set_seed(9)
-    again = env.reset()["context"]
-    env.set_seed(9)
-    torch.testing.assert_close(env.reset()["context"], again, rtol=0, atol=0)
-
-
-def test_a_table_of_contexts_is_taken_in_turn():
-    table = evaluation_contexts("aligning", 5)
-    env = AligningEnv(3, contexts=table, dtype=torch.float64)
-    for turn in range(4):
-        wanted = table[[(row + 3 * turn) % 5 for row in range(3)]]
-        np.testing.assert_array_equal(env.reset()["context"], wanted)
-    env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))  # only this one goes on
-    wanted = table[[(0 + 9) % 5, (1 + 12) % 5, (2 + 9) % 5]]
-    np.testing.assert_array_equal(env._contexts, wanted)
-    np.testing.assert_array_equal(env.reset(contexts=table[:3])["context"], table[:3])
-
-
-def test_wrong_contexts_are_named():
-    env = AligningEnv(2)
-    far = np.repeat(CONTEXT, 2, 0)
-    far[1, 1, 0] = 0.7
-    with pytest.raises(ValueError, match=r"context 1 puts 'target' at \(0.7, 0.3\)"):
-        env.reset(contexts=far)
-    with pytest.raises(ValueError, match=r"\[C, 2, 3\].*got shape \[2, 3, 3\]"):
-        env.reset(contexts=np.zeros((2, 3, 3)))
-    with pytest.raises(ValueError, match="wanted 2, got 1"):
-        env.reset(contexts=CONTEXT)
-    with pytest.raises(ValueError, match="context 1 puts 'target'"):
-        AligningEnv(2, contexts=far)
-
-
-def leaves(env, steps=30):
-    table = evaluation_contexts("aligning", 5)[: env.batch_size[0]]
-    env.reset(contexts=table)
-    generator = torch.Generator().manual_seed(3)
-    actions = (torch.rand(steps, 5, 3, generator=generator) * 0.02 - torch.tensor([0.01, 0.004, 0.014]))[
-        :, : env.batch_size[0]
-    ]
-    return torch.stack([act(env, action) for action in actions])
-
-
-def test_batch_size_and_threads_change_nothing():
-    alone = leaves(AligningEnv(5))
-    torch.testing.assert_close(leaves(AligningEnv(5, num_threads=2)), alone, rtol=0, atol=0)
-    torch.testing.assert_close(leaves(AligningEnv(2)), alone[:, :2], rtol=0, atol=0)
-
-
-def test_partial_reset_leaves_the_others_alone():
-    env, plain = AligningEnv(3, dtype=torch.float64), AligningEnv(3, dtype=torch.float64)
-    contexts = np.repeat(CONTEXT, 3, 0)
-    start = env.reset(contexts=contexts)
-    plain.reset(contexts=contexts)
-    for _ in range(10):
-        act(env, DOWN), act(plain, DOWN)
-    mask = torch.tensor([[False], [True], [False]])
-    out = env.reset(TensorDict({"_reset": mask}, [3]), contexts=CONTEXT)
-    torch.testing.assert_close(out["observation"][1], start["observation"][1], rtol=0, atol=0)
-    for _ in range(10):
-        got, wanted = act(env, DOWN), act(plain, DOWN)
-        torch.testing.assert_close(got[[0, 2]], wanted[[0, 2]], rtol=0, atol=0)
-    assert env._steps.tolist() == [20, 10, 20]
-
-
-def test_full_state_round_trip_takes_the_target_along():
-    env = AligningEnv(2, dtype=torch.float64)
-    other = CONTEXT + np.array([0.04, 0.02, 0.5])
-    env.reset(contexts=np.concatenate([CONTEXT, other]))
-    for _ in range(8):
-        act(env, DOWN)
-    env.set_state(1, env.get_state(0))
-    data = env.sims.data
-    np.testing.assert_array_equal(data[1].mocap_pos, [[0.55, 0.3, 0.0]])
-    np.testing.assert_array_equal(data[1].mocap_quat, data[0].mocap_quat)
-    for _ in range(8):
-        out = act(env, DOWN + torch.tensor([0.0, 0.01, 0.0]))
-        torch.testing.assert_close(out[1], out[0], rtol=0, atol=0)
-        np.testing.assert_array_equal(data[1].qpos, data[0].qpos)
-    np.testing.assert_array_equal(out["context"][1], CONTEXT[0])
-
-
 def drawn_target(env, index):
     """Where pictures show the target's base: position, and direction of its x axis."""
     site, data = env.sims.model.site("target_base").id, env.sims.data[index]
@@ -327,19 +225,3 @@ def test_picture_shows_the_target():
     columns = np.nonzero(changed)[1]
     assert columns.min() > 120  # y grows to the right, both targets lie at y > 0
     env.close()
-
-
-def test_actions_that_cannot_be_executed_are_refused():
-    env = AligningEnv(2)
-    with pytest.raises(RuntimeError, match="before the first reset"):
-        act(env, DOWN)
-    tensordict = env.reset()
-    with pytest.raises(ValueError, match=r"shape \[2, 3\].*got shape \[2, 2\]"):
-        env.step(tensordict.clone().set("action", torch.zeros(2, 2)))
-    with pytest.raises(ValueError, match="'action' must be finite.*environment 0"):
-        act(env, torch.full((3,), float("nan")))
-
-
-def test_truncation():
-    out = AligningEnv(2, max_steps=4, seed=0).rollout(10)
-    assert out.shape == (2, 4) and out["next", "truncated"][:, -1].all() and not out["next", "success"].any()

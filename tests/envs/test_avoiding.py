@@ -9,9 +9,11 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from avoiding_steps import INTO_ROW_1, act
+from env_test_base import EnvTestBase, act, recorded_state
 from shared_data import HUMAN, SHARED
-from torchrl.envs.utils import check_env_specs
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import StepCounter
 
 from torchrl_koap.envs.avoiding import OBSTACLES, AvoidingEnv, mode_index
 
@@ -19,8 +21,16 @@ RECORDINGS = SHARED / "d3il_reference" / "avoiding.npz"
 needs_recordings = pytest.mark.skipif(not RECORDINGS.exists(), reason=f"no recordings at {RECORDINGS}")
 needs_human = pytest.mark.skipif(not HUMAN.exists(), reason=f"no human demonstrations at {HUMAN}")
 
+# head on into the cylinder of the first row
+INTO_ROW_1 = torch.tensor([-0.0010, 0.010], dtype=torch.float64)
 # over y = 0.35 past every cylinder, on the side of large x
 AROUND = torch.tensor([(0.012, 0.004)] * 18 + [(0.0, 0.012)] * 60, dtype=torch.float64)
+
+
+class TestAvoidingEnv(EnvTestBase):
+    ENV = AvoidingEnv
+    PUSH = INTO_ROW_1.tolist()
+    STEPS = 40  # one of them touches a cylinder by then
 
 
 def commanded(env, targets, mask):
@@ -37,8 +47,7 @@ def test_parity_with_the_original(start):
     first = env.reset()
     if start == "recorded state":
         for i in names:
-            state = {name: recorded[f"ep{i}_init_{name}"] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
-            env.set_physics(i, **state)
+            env.set_physics(i, **recorded_state(recorded, i))
     for i in names:
         np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-14)
         np.testing.assert_allclose(env.sims.data[i].qvel, recorded[f"ep{i}_init_qvel"], rtol=0, atol=1e-12)
@@ -86,14 +95,6 @@ def test_human_demonstrations_replay_to_their_own_logs():
     assert deviation["sim_step"].max() == 0 and deviation["time_stamp"].max() < 1e-12
     assert [flags.int().tolist() for flags in out["mode"]] == [modes[path.name] for path in files]
     assert sorted(mode_index(out["mode"]).tolist()) == list(range(24))
-
-
-@pytest.mark.parametrize("num_envs", [1, 3])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_specs(num_envs, dtype):
-    env = AvoidingEnv(num_envs, dtype=dtype)
-    check_env_specs(env)
-    assert env.rollout(2)["next", "observation"].dtype == dtype
 
 
 def test_reset_observation_and_latency_of_one_step():
@@ -169,15 +170,6 @@ def test_crossing_while_touching_is_a_success(monkeypatch):
         assert out["collision"][:, 0].tolist() == [False, True]
 
 
-@pytest.mark.parametrize("max_steps", [1, 4])
-def test_truncation_in_call_number_max_steps(max_steps):
-    env = AvoidingEnv(2, max_steps=max_steps)
-    out = env.rollout(10, lambda td: td.set("action", torch.zeros(2, 2)))
-    assert out.shape == (2, max_steps)
-    assert out["next", "truncated"][:, -1].all() and not out["next", "terminated"].any()
-    assert not out["next", "success"].any() and not out["next", "collision"].any()
-
-
 def test_mode_flags_are_set_once():
     env = AvoidingEnv(1)
     env.reset()
@@ -228,36 +220,6 @@ def test_full_state_round_trip_keeps_the_outcome():
     assert out["collision"].all()
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_actions_that_are_not_finite_are_refused(value):
-    env = AvoidingEnv(3)
-    env.reset()
-    actions = torch.zeros(3, 2)
-    actions[1, 0] = value
-    with pytest.raises(ValueError, match="'action' must be finite.*environment 1"):
-        act(env, actions)
-
-
-def test_actions_of_a_wrong_shape_are_refused():
-    env = AvoidingEnv(3)
-    tensordict = env.reset()
-    with pytest.raises(ValueError, match=r"shape \[3, 2\].*got shape \[3, 3\]"):
-        env.step(tensordict.clone().set("action", torch.zeros(3, 3)))
-    with pytest.raises(ValueError, match="got none"):
-        env.step(tensordict.clone())
-
-
-def test_step_before_reset_is_refused():
-    with pytest.raises(RuntimeError, match="before the first reset"):
-        act(AvoidingEnv(1), torch.zeros(2))
-
-
-@pytest.mark.parametrize("bad", [{"num_envs": 0}, {"num_threads": 0}, {"max_steps": 2.5}, {"dtype": torch.int64}])
-def test_bad_arguments_are_named(bad):
-    with pytest.raises(ValueError, match=next(iter(bad))):
-        AvoidingEnv(**bad)
-
-
 def test_actions_beyond_the_human_range_are_executed_unclipped():
     env = AvoidingEnv(1, dtype=torch.float64)
     start = env.reset()["observation"][0, :2]
@@ -270,3 +232,44 @@ def test_obstacles_lie_where_the_task_says():
     for name, x, y, radius, half_height in OBSTACLES:
         np.testing.assert_allclose(model.body(name).pos, [x, y, 0])
         np.testing.assert_allclose(model.geom(name).size[:2], [radius, half_height])
+
+
+def test_rollout_with_one_episode_per_environment():
+    env = AvoidingEnv(3, max_steps=60, dtype=torch.float64)
+    actions = torch.stack([INTO_ROW_1, 1.2 * INTO_ROW_1, 0 * INTO_ROW_1])
+    data = env.rollout(100, lambda td: td.set("action", actions), break_when_any_done=False, break_when_all_done=True)
+    final = data[:, -1]["next"]
+    assert data.shape == (3, 60)
+    assert final["collision"][:, 0].tolist() == [True, True, False]
+    assert final["truncated"][2].item() and not final["success"].any()
+
+
+def test_collector_restarts_environments_that_end_at_different_times():
+    actions = torch.stack([INTO_ROW_1, 1.3 * INTO_ROW_1, 0 * INTO_ROW_1]).float()
+    env = TransformedEnv(AvoidingEnv(3, max_steps=37), StepCounter())
+    policy = TensorDictPolicy(actions)
+    collector = Collector(
+        env, policy, frames_per_batch=3 * 90, total_frames=3 * 90, auto_register_policy_transforms=False
+    )
+    data = next(iter(collector))
+    collector.shutdown()
+    ends = [row.nonzero().flatten().tolist() for row in data["next", "done"][..., 0]]
+    assert ends[0] != ends[1] and len(ends[0]) >= 2 and ends[2] == [36, 73]
+    start = AvoidingEnv(1).reset()["observation"][0]
+    for row, row_ends in enumerate(ends):
+        for end in row_ends:
+            torch.testing.assert_close(data["observation"][row, end + 1], start, rtol=0, atol=0)
+            assert data["step_count"][row, end + 1].item() == 0
+    # every episode of an environment repeats the first one bit for bit
+    length = ends[0][0] + 1
+    first, second = data["observation"][0, :length], data["observation"][0, length : 2 * length]
+    torch.testing.assert_close(first, second, rtol=0, atol=0)
+
+
+class TensorDictPolicy(torch.nn.Module):
+    def __init__(self, actions):
+        super().__init__()
+        self.register_buffer("actions", actions)
+
+    def forward(self, tensordict):
+        return tensordict.set("action", self.actions)

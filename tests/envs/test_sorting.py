@@ -9,8 +9,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from env_test_base import ContextTestBase, act, recorded_contexts, recorded_state
 from shared_data import SHARED
-from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.envs import SortingEnv
@@ -24,17 +24,9 @@ SENSITIVE = (1, 2)  # episodes in which a change of 1e-8 rad grows to millimetre
 INTO_BOXES = torch.tensor([0.001, 0.010], dtype=torch.float64)
 
 
-def act(env, action, mask=None):
-    tensordict = TensorDict({"action": action.expand(env.batch_size[0], 2).to(env._dtype)}, env.batch_size)
-    if mask is not None:
-        tensordict["_step"] = torch.as_tensor(mask).reshape(-1, 1)
-    return env.step(tensordict)["next"]
-
-
-def recorded_contexts(recorded):
-    contexts = np.stack([recorded[f"ep{i}_context"][:4, :3] for i in range(4)])
-    contexts[..., 2] = np.radians(contexts[..., 2])
-    return contexts
+class TestSortingEnv(ContextTestBase):
+    ENV = SortingEnv
+    PUSH = INTO_BOXES.tolist()
 
 
 def replay(env, recorded, check):
@@ -56,11 +48,10 @@ def packed(mode):
 @needs_recordings
 def test_parity_with_the_original_from_its_state():
     recorded = np.load(RECORDINGS)
-    env = SortingEnv(4, max_steps=1000, dtype=torch.float64, contexts=recorded_contexts(recorded))
+    env = SortingEnv(4, max_steps=1000, dtype=torch.float64, contexts=recorded_contexts(recorded, 4))
     env.reset()
     for i in range(4):
-        state = {name: recorded[f"ep{i}_init_{name}"] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
-        env.set_physics(i, **state)
+        env.set_physics(i, **recorded_state(recorded, i))
     touched = [False] * 4
     worst = {"tcp": np.zeros(4), "objects": np.zeros(4)}
 
@@ -91,7 +82,7 @@ def test_parity_with_the_original_from_its_state():
 def test_reset_from_the_recorded_context():
     recorded = np.load(RECORDINGS)
     env = SortingEnv(4, max_steps=1000, dtype=torch.float64)
-    first = env.reset(contexts=recorded_contexts(recorded))
+    first = env.reset(contexts=recorded_contexts(recorded, 4))
     for i in range(4):
         np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-6)
         expected = recorded[f"ep{i}_init_obs"]
@@ -106,7 +97,7 @@ def test_reset_from_the_recorded_context():
 
 
 @pytest.mark.parametrize("num_boxes", [2, 4, 6])
-def test_specs(num_boxes):
+def test_specs_of_all_numbers_of_boxes(num_boxes):
     for dtype in (torch.float32, torch.float64):
         env = SortingEnv(2, num_boxes=num_boxes, dtype=dtype, seed=1)
         check_env_specs(env)
@@ -130,15 +121,6 @@ def test_contexts_place_the_boxes(num_boxes):
         act(env, torch.zeros(2))
         heights.append(env.sims.object_poses[..., 2])
     np.testing.assert_allclose(heights[-1], 0.13, atol=5e-4)  # pushed out of the platform, as measured
-
-
-def test_random_contexts_differ_and_repeat_with_the_seed():
-    first = SortingEnv(3, seed=5).reset()["context"]
-    assert torch.equal(first, SortingEnv(3, seed=5).reset()["context"])
-    assert not torch.equal(first, SortingEnv(3, seed=6).reset()["context"])
-    assert first[..., :2].flatten(1).unique(dim=0).shape[0] == 3
-    with pytest.raises(ValueError, match="outside its region"):
-        SortingEnv(1, contexts=np.zeros((1, 4, 3)))
 
 
 @pytest.mark.parametrize("num_boxes", [0, 3, 8, "four"])
@@ -215,36 +197,6 @@ def test_success_is_told_one_step_late():
     out = act(env, torch.zeros(2))
     assert out["done"].item() and out["success"].item() and out["terminated"].item() and out["reward"].item() == 1.0
     assert (out["mode"] >= 0).sum() == 2
-
-
-def test_batch_size_and_threads_change_nothing():
-    contexts = draw_contexts("sorting", 5, 3)
-
-    def leaves(count, threads=1):
-        env = SortingEnv(count, threads, contexts=contexts, dtype=torch.float64)
-        push = torch.tensor([[0.001 * index, 0.010] for index in range(count)], dtype=torch.float64)
-        return env.rollout(30, lambda td: td.set("action", push), break_when_any_done=False)
-
-    alone = leaves(5)
-    torch.testing.assert_close(leaves(5, 2), alone, rtol=0, atol=0)
-    torch.testing.assert_close(leaves(2), alone[:2], rtol=0, atol=0)
-
-
-def test_partial_reset_leaves_the_others_alone():
-    contexts = draw_contexts("sorting", 3, 4)
-    env, plain = (SortingEnv(3, contexts=contexts, dtype=torch.float64) for _ in range(2))
-    env.reset(), plain.reset()
-    for _ in range(20):
-        act(env, INTO_BOXES), act(plain, INTO_BOXES)
-    before = [data.qpos.copy() for data in env.sims.data]
-    out = env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]), contexts=contexts[:1])
-    torch.testing.assert_close(out["context"][1], torch.as_tensor(contexts[0]), rtol=0, atol=0)
-    for i in (0, 2):
-        np.testing.assert_array_equal(env.sims.data[i].qpos, before[i])
-    for _ in range(10):
-        got, wanted = act(env, INTO_BOXES), act(plain, INTO_BOXES)
-        torch.testing.assert_close(got[[0, 2]], wanted[[0, 2]], rtol=0, atol=0)
-    assert env._steps.tolist() == [30, 10, 30]
 
 
 def test_full_state_round_trip_keeps_the_arrivals():

@@ -8,12 +8,11 @@ import itertools
 import numpy as np
 import pytest
 import torch
+from env_test_base import ContextTestBase, act, recorded_contexts, recorded_state
 from shared_data import SHARED
-from tensordict import TensorDict
-from torchrl.envs.utils import check_env_specs
 
 from torchrl_koap.envs import StackingEnv
-from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
+from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.stacking import mode_index
 from torchrl_koap.tasks import get_task
 
@@ -24,17 +23,19 @@ STILL_OPEN = torch.tensor([0.0] * 7 + [0.08], dtype=torch.float64)
 STILL_CLOSED = torch.zeros(8, dtype=torch.float64)
 
 
-def act(env, action, mask=None):
-    action = torch.as_tensor(action, dtype=env._dtype).expand(env.batch_size[0], 8)
-    tensordict = TensorDict({"action": action}, env.batch_size)
-    if mask is not None:
-        tensordict["_step"] = torch.as_tensor(mask).reshape(-1, 1)
-    return env.step(tensordict)["next"]
+class TestStackingEnv(ContextTestBase):
+    ENV = StackingEnv
+    PUSH = [0.01] * 7 + [0.08]
 
-
-def recorded_contexts(recorded):
-    poses = np.stack([recorded[f"ep{i}_context"][:3] for i in range(4)])
-    return np.concatenate([poses[..., :2], np.deg2rad(poses[..., 2:3])], axis=-1)
+    def test_ranges_of_actions_and_the_gripper_of_a_step(self):
+        env = self.make(3)
+        bounds = env.action_spec.space
+        assert bounds.low[0].tolist() == pytest.approx([-0.03] * 7 + [0.0])
+        assert bounds.high[0].tolist() == pytest.approx([0.03] * 7 + [0.08])
+        env.reset()
+        act(env, STILL_CLOSED)
+        act(env, self.PUSH, mask=[True, False, False])
+        assert env.sims.grasping.tolist() == [False, True, True]
 
 
 def put_boxes(env, positions, index=0):
@@ -50,13 +51,12 @@ def test_parity_with_the_original(start):
     recorded = np.load(RECORDINGS)
     lengths = recorded["n_steps"]
     env = StackingEnv(4, max_steps=5000, dtype=torch.float64)
-    env.reset(contexts=recorded_contexts(recorded))
+    env.reset(contexts=recorded_contexts(recorded, 3))
     for i in range(4):
         np.testing.assert_allclose(env.sims.data[i].qpos, recorded[f"ep{i}_init_qpos"], rtol=0, atol=1e-14)
         np.testing.assert_allclose(env.sims.data[i].qvel, recorded[f"ep{i}_init_qvel"], rtol=0, atol=1e-12)
         if start == "recorded state":
-            names = ("qpos", "qvel", "qacc_warmstart", "ctrl")
-            env.set_physics(i, **{name: recorded[f"ep{i}_init_{name}"] for name in names})
+            env.set_physics(i, **recorded_state(recorded, i))
     succeeded = np.zeros(4, dtype=bool)
     for k in range(max(lengths)):
         running = lengths > k
@@ -84,18 +84,6 @@ def test_parity_with_the_original(start):
             first, second, _ = recorded[f"ep{i}_success1_success2_meandist"][k]
             assert (arrived >= 1, arrived >= 2) == (bool(first), bool(second)), where
     assert succeeded.tolist() == [True, False, False, False]
-
-
-@pytest.mark.parametrize("num_envs", [1, 3])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_specs(num_envs, dtype):
-    env = StackingEnv(num_envs, dtype=dtype, seed=0)
-    check_env_specs(env)
-    out = env.rollout(2)["next"]
-    assert out["observation"].dtype == dtype and out["mode"].dtype == torch.int64
-    bounds = env.action_spec.space
-    assert bounds.low[0].tolist() == pytest.approx([-0.03] * 7 + [0.0])
-    assert bounds.high[0].tolist() == pytest.approx([0.03] * 7 + [0.08])
 
 
 def test_columns_of_the_observation():
@@ -225,41 +213,6 @@ def test_contexts_place_the_boxes():
     np.testing.assert_allclose(env.sims.object_poses[:, :, 2], 0.011, atol=1e-3)  # popped up onto the table
 
 
-def leaves(env, table, steps=25):
-    generator = torch.Generator().manual_seed(0)
-    actions = (torch.rand(len(table), steps, 8, generator=generator, dtype=torch.float64) - 0.5) * 0.05
-    actions[..., 7] += 0.06
-    actions, count = iter(actions[: env.batch_size[0]].unbind(1)), env.batch_size[0]
-    start = env.reset(contexts=table[:count])
-    return env.rollout(steps, lambda td: td.set("action", next(actions)), auto_reset=False, tensordict=start)
-
-
-def test_batch_size_and_threads_change_nothing():
-    table = draw_contexts("stacking", 4, 0)
-    alone = leaves(StackingEnv(4, dtype=torch.float64), table)
-    torch.testing.assert_close(leaves(StackingEnv(4, 2, dtype=torch.float64), table), alone, rtol=0, atol=0)
-    torch.testing.assert_close(leaves(StackingEnv(2, dtype=torch.float64), table), alone[:2], rtol=0, atol=0)
-
-
-def test_partial_reset_and_step_leave_the_others_alone():
-    env = StackingEnv(3, dtype=torch.float64, seed=0)
-    env.reset()
-    for _ in range(5):
-        act(env, [0.01] * 7 + [0.08])
-    before = [data.qpos.copy() for data in env.sims.data]
-    out = env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
-    for row in (0, 2):
-        np.testing.assert_array_equal(env.sims.data[row].qpos, before[row])
-    np.testing.assert_allclose(out["observation"][1, :7], env.START_JOINTS, atol=1e-6)
-    held = act(env, STILL_CLOSED)["observation"]
-    before = [data.qpos.copy() for data in env.sims.data]
-    out = act(env, [0.01] * 7 + [0.08], mask=[True, False, False])
-    for row in (1, 2):
-        np.testing.assert_array_equal(env.sims.data[row].qpos, before[row])
-        torch.testing.assert_close(out["observation"][row], held[row], rtol=0, atol=0)
-    assert env._steps.tolist() == [7, 1, 6] and env.sims.grasping.tolist() == [False, True, True]
-
-
 def test_raw_log_holds_joints_and_boxes_but_no_pose_command():
     env = StackingEnv(2, dtype=torch.float64, seed=0)
     env.reset()
@@ -271,14 +224,3 @@ def test_raw_log_holds_joints_and_boxes_but_no_pose_command():
     assert list(objects) == ["red", "green", "blue"] and objects["blue"].shape == (2, 7)
     act(env, STILL_OPEN)
     assert env.raw_log()["sim_step"].tolist() == [32, 32]
-
-
-def test_full_state_round_trip():
-    env = StackingEnv(2, dtype=torch.float64, seed=0)
-    env.reset()
-    for _ in range(8):
-        act(env, [0.01] * 7 + [0.0], mask=[True, False])
-    env.set_state(1, env.get_state(0))
-    for _ in range(5):
-        out = act(env, STILL_OPEN)
-        torch.testing.assert_close(out[1], out[0], rtol=0, atol=0)

@@ -1,0 +1,177 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What every environment of D3IL's tasks has to do; a test file per task subclasses it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
+
+
+def act(env, action, mask=None):
+    """One control step of every environment, or of those in the mask."""
+    action = torch.as_tensor(action, dtype=env._dtype).expand(env.batch_size[0], env.task.action_dim)
+    tensordict = TensorDict({"action": action}, env.batch_size)
+    if mask is not None:
+        tensordict["_step"] = torch.as_tensor(mask).reshape(-1, 1)
+    return env.step(tensordict)["next"]
+
+
+def recorded_state(recorded, episode):
+    """Arguments of ``set_physics`` for the first state of a recorded episode."""
+    return {name: recorded[f"ep{episode}_init_{name}"] for name in ("qpos", "qvel", "qacc_warmstart", "ctrl")}
+
+
+def recorded_contexts(recorded, objects):
+    """Contexts of the four recorded episodes, yaw in rad."""
+    contexts = np.stack([recorded[f"ep{episode}_context"][:objects, :3] for episode in range(4)]).astype(np.float64)
+    contexts[..., 2] = np.radians(contexts[..., 2])
+    return contexts
+
+
+class EnvTestBase:
+    """Batches, partial resets and steps, saved states, contexts and refusals."""
+
+    ENV: type  # the environment
+    PUSH: list  # an action under which something moves
+    STEPS = 20  # control steps after which it has
+
+    def make(self, num_envs=1, **options):
+        return self.ENV(num_envs, **({"dtype": torch.float64, "seed": 0} | options))
+
+    def contexts(self, env):
+        return {"contexts": draw_contexts(env.task, 5, 3)[: env.batch_size[0]]} if env.task.objects else {}
+
+    @pytest.mark.parametrize("num_envs", [1, 3])
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_specs(self, num_envs, dtype):
+        env = self.make(num_envs, dtype=dtype)
+        check_env_specs(env)
+        assert env.rollout(2)["next", "observation"].dtype == dtype
+
+    def leaves(self, env):
+        """What a few steps of different pushes lead to."""
+        share = torch.linspace(0.5, 1, 5, dtype=torch.float64)[: env.batch_size[0], None]
+        start = env.reset(**self.contexts(env))
+        push = (share * torch.tensor(self.PUSH, dtype=torch.float64)).to(env._dtype)
+        options = {"auto_reset": False, "tensordict": start, "break_when_any_done": False}
+        steps = env.rollout(self.STEPS, lambda td: td.set("action", push), **options)
+        return steps.exclude("action", "_reset")
+
+    def test_batch_size_and_threads_change_nothing(self):
+        alone = self.leaves(self.make(5))
+        torch.testing.assert_close(self.leaves(self.make(5, num_threads=2)), alone, rtol=0, atol=0)
+        torch.testing.assert_close(self.leaves(self.make(2)), alone[:2], rtol=0, atol=0)
+
+    def test_partial_reset_leaves_the_others_alone(self):
+        env, plain = self.make(3), self.make(3)
+        start = env.reset(**self.contexts(env))
+        plain.reset(**self.contexts(plain))
+        for _ in range(10):
+            act(env, self.PUSH), act(plain, self.PUSH)
+        before = [data.qpos.copy() for data in env.sims.data]
+        mask = TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3])
+        again = {name: values[1:2] for name, values in self.contexts(env).items()}
+        out = env.reset(mask, **again)
+        torch.testing.assert_close(out["observation"][1], start["observation"][1], rtol=0, atol=0)
+        for row in (0, 2):
+            np.testing.assert_array_equal(env.sims.data[row].qpos, before[row])
+        for _ in range(self.STEPS):
+            got, wanted = act(env, self.PUSH), act(plain, self.PUSH)
+            torch.testing.assert_close(got[[0, 2]], wanted[[0, 2]], rtol=0, atol=0)
+        assert env._steps.tolist() == [10 + self.STEPS, self.STEPS, 10 + self.STEPS]
+
+    def test_partial_step_freezes_the_others(self):
+        env = self.make(2)
+        env.reset(**self.contexts(env))
+        held = act(env, self.PUSH)
+        before = env.sims.data[1].qpos.copy()
+        bad_where_skipped = torch.tensor([self.PUSH, [float("nan")] * len(self.PUSH)])
+        out = act(env, bad_where_skipped, mask=[True, False])
+        np.testing.assert_array_equal(env.sims.data[1].qpos, before)
+        torch.testing.assert_close(out["observation"][1], held["observation"][1], rtol=0, atol=0)
+        assert not torch.equal(out["observation"][0], held["observation"][0])
+        assert env._steps.tolist() == [2, 1] and env._ready.all()
+
+    def test_full_state_round_trip(self):
+        env = self.make(2)
+        env.reset(**self.contexts(env))
+        for _ in range(self.STEPS):
+            act(env, self.PUSH, mask=[True, False])
+        env.set_state(1, env.get_state(0))
+        for _ in range(5):
+            out = act(env, self.PUSH)
+            torch.testing.assert_close(out[1], out[0], rtol=0, atol=0)
+            np.testing.assert_array_equal(env.sims.data[0].qpos, env.sims.data[1].qpos)
+        np.testing.assert_array_equal(env.sims.data[0].mocap_pos, env.sims.data[1].mocap_pos)
+
+    @pytest.mark.parametrize("max_steps", [1, 4])
+    def test_truncation_in_call_number_max_steps(self, max_steps):
+        still = torch.zeros(2, len(self.PUSH), dtype=torch.float64)
+        out = self.make(2, max_steps=max_steps).rollout(10, lambda td: td.set("action", still))
+        assert out.shape == (2, max_steps)
+        assert out["next", "truncated"][:, -1].all() and not out["next", "terminated"].any()
+        assert not out["next", "success"].any()
+
+    def test_actions_that_cannot_be_executed_are_refused(self):
+        env, width = self.make(3), len(self.PUSH)
+        with pytest.raises(RuntimeError, match="before the first reset"):
+            act(env, self.PUSH)
+        tensordict = env.reset()
+        with pytest.raises(ValueError, match=rf"shape \[3, {width}\].*got shape \[3, {width + 1}\]"):
+            env.step(tensordict.clone().set("action", torch.zeros(3, width + 1)))
+        with pytest.raises(ValueError, match="got none"):
+            env.step(tensordict.clone())
+        for value in (float("nan"), float("inf")):
+            actions = torch.zeros(3, width)
+            actions[1, 0] = value
+            with pytest.raises(ValueError, match="'action' must be finite.*environment 1"):
+                act(env, actions)
+
+    @pytest.mark.parametrize("bad", [{"num_envs": 0}, {"num_threads": 0}, {"max_steps": 2.5}, {"dtype": torch.int64}])
+    def test_bad_arguments_are_named(self, bad):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            self.ENV(**bad)
+
+
+class ContextTestBase(EnvTestBase):
+    """The same for a task with objects."""
+
+    def test_random_contexts_come_from_the_seed(self):
+        first = self.make(3, seed=4).reset()["context"]
+        torch.testing.assert_close(first, self.make(3, seed=4).reset()["context"], rtol=0, atol=0)
+        env = self.make(3, seed=4)
+        np.testing.assert_allclose(env.reset()["context"], draw_contexts(env.task, 3, 4), rtol=0, atol=1e-7)
+        assert (env.reset()["context"] != first).any(-1).all()
+        env.set_seed(9)
+        again = env.reset()["context"]
+        env.set_seed(9)
+        torch.testing.assert_close(env.reset()["context"], again, rtol=0, atol=0)
+
+    def test_a_table_of_contexts_is_taken_in_turn(self):
+        table = evaluation_contexts(self.make().task, 5)
+        env = self.make(3, contexts=table)
+        for turn in range(4):
+            wanted = table[[(row + 3 * turn) % 5 for row in range(3)]]
+            np.testing.assert_array_equal(env.reset()["context"], wanted)
+        env.reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))  # only this one goes on
+        np.testing.assert_array_equal(env._contexts, table[[(0 + 9) % 5, (1 + 12) % 5, (2 + 9) % 5]])
+        np.testing.assert_array_equal(env.reset(contexts=table[:3])["context"], table[:3])
+
+    def test_wrong_contexts_are_named(self):
+        env, good = self.make(2), evaluation_contexts(self.make().task, 2)
+        objects, last = len(env.task.objects), env.task.objects[-1]
+        far = good.copy()
+        far[1, -1, 0] = 9.0
+        with pytest.raises(ValueError, match=f"context 1 puts '{last}' at .*outside its region"):
+            env.reset(contexts=far)
+        with pytest.raises(ValueError, match=rf"\[C, {objects}, 3\].*got shape \[2, {objects + 1}, 3\]"):
+            env.reset(contexts=np.zeros((2, objects + 1, 3)))
+        with pytest.raises(ValueError, match="wanted 2, got 1"):
+            env.reset(contexts=good[:1])
+        with pytest.raises(ValueError, match="context 1 puts"):
+            self.make(2, contexts=far)
