@@ -1,23 +1,28 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Writes ``pretrained/NAME`` from a run: compact weights, options, and a model card from its evaluation.
 
-    python benchmarks/publish_pretrained.py RUN NAME --seeds 100 1100 2100 --candidates 16
+    python benchmarks/publish_pretrained.py RUN NAME --seeds 100 1100 2100
 
 What is evaluated is the compact policy itself, in 60 episodes per seed.
 """
 
 from __future__ import annotations
 
-import argparse
+import json
+import statistics
 import tempfile
 from pathlib import Path
+from typing import Any
 
-from planner_ablations import row_of
+import tyro
+from tyro.conf import Positional
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
+from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
 from torchrl_koap.runs.pretrained import copy_run
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import compact, load_tensors, save_tensors
+from torchrl_koap.tasks import get_task
 from torchrl_koap.training.digests import write_digests
 
 WEIGHTS = ("planner.safetensors", "controller.safetensors")
@@ -51,6 +56,7 @@ Made by
 """
 
 
+from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
 def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int | None = None) -> Path:
     """Writes a trained policy as the repository holds it: compact weights, options, a model card.
 
@@ -96,27 +102,20 @@ def main() -> None:
     parser.add_argument("--root", type=Path, default=ROOT)
     options = parser.parse_args()
     folder = publish(options.run, options.root / options.name, "", candidates=options.candidates)
+from torchrl_koap.tasks import get_task
     metrics = (folder / "metrics.csv").read_text().splitlines(keepends=True)
     kept = [metrics[0], *metrics[1::5]]  # for the report's curves a fifth of the rows is enough
     (folder / "metrics.csv").write_text("".join(kept))
     with tempfile.TemporaryDirectory() as out:
         results = [
-            evaluate(folder, EvalConfig(out=Path(out) / "run", episodes=60, seed=seed, threads=1))
-            for seed in options.seeds
+            evaluate(folder, EvalConfig(out=Path(out) / "run", episodes=60, seed=seed, threads=1)) for seed in seeds
         ]
-    choices = {"candidates": options.candidates}
-    row = row_of(options.run, results, choices, "") | {"name": options.name, "seeds": options.seeds}
-    source = RunDirectory(options.run).read_json("config.json").get("planner_from")
-    if source:  # the planner was trained by another command
-        row["command"] = f"{RunDirectory(source).read_json('config.json')['command']}\n    {row['command']}"
-    row["recorded"] = "koap demos --task {task} --episodes {demonstrations} --seed 0".format(**row)
-    if row["disturbed"]:
-        row["recorded"] += f" --disturbance {row['disturbed']:g}"
-    row["contexts"] = "the 60 fixed contexts with every seed" if "contexts" in results[0] else "all from the same start"
-    (folder / "README.md").write_text(CARD.format(**row))
+    contexts = "the 60 fixed contexts with every seed" if "contexts" in results[0] else "all from the same start"
+    card = numbers_of(run, results) | {"name": name, "seeds": list(seeds), "candidates": candidates}
+    (folder / "README.md").write_text(CARD.format(**card, contexts=contexts))
     size = sum(file.stat().st_size for file in folder.iterdir())
-    print(f"{folder}: {row['successes']} of {row['n']}, {size / 1e6:.2f} MB")
+    print(f"{folder}: {card['successes']} of {card['n']}, {size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

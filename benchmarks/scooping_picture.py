@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from result_rows import rows_if_measured
 from scooping_rows import scooping_cells
+from tables import read_rows
 
 from torchrl_koap.data.lerobot.images import read_image_episodes
 from torchrl_koap.evaluation.statistics import wilson_interval
@@ -81,7 +81,7 @@ def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], pa
 def bars() -> list[dict[str, Any]]:
     """Cells behind the planners that are the default, and those that have none."""
     without = [cell for cell in scooping_cells() if cell["method"].startswith("dp")]
-    return [*scooping_cells(rows_if_measured("scooping_recovery2")), *without]
+    return [*scooping_cells(read_rows("scooping_recovery2")), *without]
 
 
 def main() -> None:

@@ -202,7 +202,7 @@ def measured_blocks(task: Task) -> list[str]:
         for row in planner_rows(task=task.name, method="koap_mpc")
     ]
     if not rows and not followed:
-        return [heading("Measured", 1), "See :doc:`/results/tasks`."]
+        return [heading("Measured", 1), "See :doc:`/results/planners`."]
     tracked = ("demonstrations", "labels", "planner", "success (95 %)", "entropy")
     return [
         heading("Measured", 1),

@@ -146,32 +146,11 @@ def test_labels_from_play_are_of_no_demonstration(script, demonstrations):
         assert known.tolist() == sorted(numbers[:2].tolist())
 
 
-def test_tables_keep_labels_from_play_apart(benchmark_script):
+def test_rollouts_of_all_seeds_are_counted_together(benchmark_script, monkeypatch):
     rows = benchmark_script("unlabelled_rows")
-    for played in (False, True):
-        regimes = {row[0] for row in rows.followed_rows(["pca"], played=played)}
-        assert regimes and all(("random play" in regime) == played for regime in regimes)
-
-
-def test_successes_of_all_seeds_stand_beside_and_what_was_played_does_not(benchmark_script, monkeypatch):
-    rows = benchmark_script("unlabelled_rows")
-    common = {"method": "koap", "labels": "2", "n": "60"}
-    found = [common | {"regime": "plain", "seed": str(seed), "successes": str(30 + 12 * seed)} for seed in (0, 1)]
-    found += [common | {"regime": "plain, play", "seed": "0", "successes": "0"}]
-    monkeypatch.setattr(rows, "read_rows", lambda name: found)
-    (row,) = rows.followed_beside(["koap", "pca"])
-    assert row == [rows.REGIMES["plain"], "2", "60 % (51-68) of 120", "not run"]
-
-
-def test_what_is_missing_is_named_by_method_regime_and_number(benchmark_script, monkeypatch):
-    rows = benchmark_script("unlabelled_rows")
-    monkeypatch.setattr(rows, "CONTROLS", ("pca", "koap"))
-    monkeypatch.setattr(rows, "REGIMES", {"plain": "positions", "noise": "noisy"})
-    whole = {("pca", number): {0: 1.0} for number in rows.LABELS}
-    known = {"plain": whole | {("koap", number): {0: 1.0} for number in (1, 2, 4)}, "noise": whole}
-    monkeypatch.setattr(rows, "unlabelled_cells", known.get)
-    assert rows.unlabelled_missing() == "* `koap`: noisy. with 8 or 16: positions"
-    monkeypatch.setattr(
-        rows, "unlabelled_cells", lambda regime: {(name, n): {} for name in rows.CONTROLS for n in rows.LABELS}
-    )
-    assert rows.unlabelled_missing() == "* nothing"
+    found = [{"regime": "plain", "method": "koap", "labels": "2", "seed": str(seed), "n": "60"} for seed in (0, 1)]
+    made = [row | {"successes": str(30 + 12 * int(row["seed"]))} for row in found]
+    monkeypatch.setattr(rows, "read_rows", lambda name, **wanted: made)
+    assert rows.followed("plain", 2, "koap") == "60 % (51-68) of 120"
+    assert rows.paired_gain([10.0, 10.0, 10.0]) == "+10 % (+10 to +10)"
+    assert rows.paired_gain([3.0], unit="points") == "+3 points (1 seeds)" and rows.paired_gain([]) == "not run"

@@ -3,20 +3,16 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
+from human_likeness import ridge_error, statistics
 from shared_data import HUMAN
 
 from torchrl_koap.data import read_raw_episode
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.experts.avoiding import _HAND, _HAND_REST, FULL_PUSH, GAPS, AvoidingExpert, mode_gaps
 from torchrl_koap.envs.experts.demonstrations import record_episodes
-
-STATISTICS = Path(__file__).parents[3] / "benchmarks" / "demonstration_statistics.py"
 
 
 def play(expert, count, steps=150):
@@ -109,14 +105,10 @@ def test_bad_input():
 
 
 @pytest.mark.skipif(not HUMAN.is_dir(), reason=f"the human demonstrations are not at {HUMAN}")
-@pytest.mark.skipif(not STATISTICS.is_file(), reason=f"{STATISTICS} is not there")
 def test_scripted_medians_lie_in_the_human_range():
-    specification = importlib.util.spec_from_file_location("demonstration_statistics", STATISTICS)
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    human = [module.statistics(read_raw_episode(file)) for file in sorted(HUMAN.glob("env_*.pkl"))]
+    human = [statistics(read_raw_episode(file)) for file in sorted(HUMAN.glob("env_*.pkl"))]
     raw, _ = record_episodes("avoiding", 48, seed=1)
-    scripted = [module.statistics(episode) for episode in raw]
+    scripted = [statistics(episode) for episode in raw]
     outside = {}
     for name in human[0]:
         low, high = np.percentile([row[name] for row in human], [5, 95])
@@ -124,4 +116,4 @@ def test_scripted_medians_lie_in_the_human_range():
         if not low <= median <= high + 1e-9:
             outside[name] = (low, median, high)
     assert len(outside) <= 1, outside
-    assert module.ridge_error(raw[:24]) == pytest.approx(2.22, abs=0.4)  # 2.22 mm: the human ones
+    assert ridge_error(raw[:24]) == pytest.approx(2.22, abs=0.4)  # 2.22 mm: the human ones

@@ -17,7 +17,7 @@ from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
 PRESETS: dict[str, dict[str, Any]] = {
-    # best measured (benchmarks/RESULTS.md): observables of the frames relative to the current one, an input matrix
+    # best measured (docs/results/avoiding.md): observables of the frames relative to the current one, an input matrix
     # B, no clamped look-ahead, a decoder in closed form
     "default": {
         "latent_dim": 32,

@@ -1,34 +1,23 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How human-like are the scripted demonstrations of Avoiding? Prints a table and draws both sets over the obstacles.
+"""Quantities of a demonstration of Avoiding by which human and scripted ones are compared.
 
-    python benchmarks/demonstration_statistics.py --human d3il_avoiding_human --picture demonstrations.png
-
-Each quantity is computed per demonstration; the table shows the median and the range from the 5th to the 95th
-percentile over demonstrations. Commands are changes of the commanded xy per control step (mm).
+Commands are changes of the commanded xy per control step (mm).
 """
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
-import matplotlib
 import numpy as np
 
-from torchrl_koap.data import RawEpisode, read_raw_episode
+from torchrl_koap.data import RawEpisode
 from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES
 from torchrl_koap.envs.experts.avoiding import ROD_RADIUS
-from torchrl_koap.envs.experts.demonstrations import record_episodes
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402  (the backend comes first)
 
 MOVING = 3.0  # mm per step
 LOOK_AHEAD = 8
 
 
 def statistics(episode: RawEpisode) -> dict[str, float]:
-    """Quantities of one demonstration, by the name they have in the table."""
+    """Quantities of one demonstration, by name."""
     command, measured = paths(episode)
     steps = np.diff(command, axis=0) * 1e3
     speed = np.linalg.norm(steps, axis=1)
@@ -127,75 +116,3 @@ def ridge_error(episodes: list[RawEpisode], strength: float = 1e-6) -> float:
         gram = sum(products) - products[index] + strength * np.eye(x.shape[1])
         errors.append(((x @ np.linalg.solve(gram, sum(moments) - moments[index]) - y) ** 2).ravel())
     return 1e3 * float(np.sqrt(np.concatenate(errors).mean()))
-
-
-def table(sets: dict[str, list[RawEpisode]]) -> str:
-    """Markdown table of the quantities, one column per set."""
-    columns = {name: [statistics(episode) for episode in episodes] for name, episodes in sets.items()}
-    lines = [f"| median (5 to 95 %) | {' | '.join(f'{name}, {len(rows)}' for name, rows in columns.items())} |"]
-    lines.append("|---" * (1 + len(columns)) + "|")
-    for quantity in next(iter(columns.values()))[0]:
-        cells = []
-        for rows in columns.values():
-            low, middle, high = np.percentile([row[quantity] for row in rows], [5, 50, 95])
-            cells.append(f"{middle:.3g} ({low:.3g} to {high:.3g})")
-        lines.append(f"| {quantity} | {' | '.join(cells)} |")
-    errors = [f"{ridge_error(episodes[:24]):.2f}" for episodes in sets.values()]
-    lines.append(f"| linear guess of the command, error on left-out demonstrations of 24 (mm) | {' | '.join(errors)} |")
-    return "\n".join(lines)
-
-
-def mode_of(episode: RawEpisode) -> int:
-    """Number of the mode, from the measured x at the rows."""
-    _, measured = paths(episode)
-    x = [measured[np.argmax(measured[:, 1] >= y), 0] for y in (-0.1, 0.08, 0.26)]
-    edges = ([0.5], [0.425, 0.575], [0.35, 0.5, 0.65])
-    row1, row2, row3 = (int(np.searchsorted(edge, at)) for edge, at in zip(edges, x, strict=True))
-    return 12 * row1 + 4 * row2 + row3
-
-
-def draw(sets: dict[str, list[RawEpisode]], path: Path) -> None:
-    """Draws measured paths over the obstacles, coloured by mode, and four command traces of every set."""
-    figure, axes = plt.subplots(
-        2, len(sets), figsize=(7 * len(sets), 12), height_ratios=(2.2, 1), squeeze=False, layout="constrained"
-    )
-    for (name, episodes), column in zip(sets.items(), axes.T, strict=True):
-        for episode in episodes:
-            _, measured = paths(episode)
-            column[0].plot(*measured.T, ".-", color=plt.cm.hsv(mode_of(episode) / 24), linewidth=0.9, markersize=2.5)
-        for _, x, y, radius, _ in OBSTACLES:
-            column[0].add_patch(plt.Circle((x, y), radius, color="dimgray"))
-        column[0].axhline(FINISH_Y, color="green")
-        column[0].set(xlim=(0.2, 0.8), ylim=(-0.3, 0.52), aspect="equal", xlabel="x (m)", ylabel="y (m)")
-        column[0].set_title(f"{name}: {len(episodes)} demonstrations, coloured by mode")
-        chosen = sorted(episodes, key=mode_of)
-        for offset, index in enumerate(np.linspace(0, len(chosen) - 1, 5).astype(int)):
-            steps = np.diff(paths(chosen[index])[0], axis=0) * 1e3
-            column[1].plot(steps[:, 0] - 40 * offset, color="tab:blue", label="x" if offset == 0 else None)
-            column[1].plot(steps[:, 1] - 40 * offset, color="tab:orange", label="y" if offset == 0 else None)
-            column[1].axhline(-40 * offset, color="black", linewidth=0.4)
-        column[1].set(xlim=(0, 110), xlabel="row", ylabel="command step (mm), five demonstrations", yticks=[])
-        column[1].legend(loc="upper right")
-    figure.savefig(path, dpi=70)
-
-
-def main() -> None:
-    """Prints the table and writes the picture."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--human", type=Path, help="folder of human raw pickles; without it only ours are shown")
-    parser.add_argument("--picture", type=Path, help="file to draw into")
-    parser.add_argument("--episodes", type=int, default=96)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    sets = {}
-    if options.human:
-        sets["human"] = [read_raw_episode(file) for file in sorted(options.human.glob("env_*.pkl"))]
-    sets["scripted"], report = record_episodes("avoiding", options.episodes, seed=options.seed)
-    print(report, end="\n\n")
-    print(table(sets))
-    if options.picture:
-        draw(sets, options.picture)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,8 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The two pictures of the README: the pipeline, and success and entropy against the labels."""
+"""Pictures of the README and of docs/results: pipeline, label curves, the paper's average, unlabelled data."""
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,7 +12,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from matplotlib.ticker import FixedLocator, NullLocator
+from paper_rows import draw_bench_average
+from tables import read_rows
+from unlabelled_rows import REGIMES, Cells, unlabelled_errors, unlabelled_successes
 
+from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, set_title, tidy
 from torchrl_koap.studies.lines import method_styles
 
@@ -24,6 +29,44 @@ _NAMES = {
     "dd": "supervised, next state",
     "dp": "Diffusion Policy",
 }
+_LOOKS = {
+    "semi_supervised": ("#0b6e4f", "-", "o"),
+    "koap": ("#4ba3c3", "-", "v"),
+    "koap_untrained": ("#7a7a7a", "--", "s"),
+    "koap_labelled_only": ("#9b5de5", "--", "P"),
+    "koap_paper": ("#d4a017", "-", "X"),
+    "pca": ("#c1440e", "-.", "D"),
+    "linear_steps": ("#b0b0b0", ":", "^"),
+    "dd_lookahead": ("#2f4b8f", ":", "*"),
+}
+
+
+def draw_all(folder: Path) -> list[Path]:
+    """Draws every picture that is made from committed figures.
+
+    Args:
+        folder (Path): where to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    errors, successes = ({name: cells(name) for name in REGIMES} for cells in (unlabelled_errors, unlabelled_successes))
+    return [
+        draw_label_curves(label_curves(), folder / "success_and_entropy.png"),
+        *(draw_pipeline(folder / f"pipeline.{kind}") for kind in ("svg", "png")),
+        draw_bench_average("table_1", folder / "paper_average.png"),
+        draw_unlabelled(errors, successes, folder / "unlabelled_data.png"),
+    ]
+
+
+def label_curves() -> dict[str, list[dict[str, float]]]:
+    """Success with its interval and entropy against the labels on Avoiding, by method."""
+    lines: dict[str, list[dict[str, float]]] = {method: [] for method in _NAMES}
+    for row in read_rows("label_curves", study="avoiding"):
+        if row["method"] in lines:
+            won, of = int(row["successes"]), int(row["n"])
+            point = dict(zip(("low", "high"), wilson_interval(won, of), strict=True)) | {"success": won / of}
+            point |= {"fraction": float(row["label_fraction"]), "entropy": float(row["entropy"])}
+            lines[row["method"]].append(point)
+    return lines
 
 
 def draw_label_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path: Path) -> Path:
@@ -111,3 +154,58 @@ def _box(x: float, y: float, width: float, height: float, **style) -> FancyBboxP
 
 def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
     axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=11, color=INK, linewidth=1.1))
+
+
+def draw_unlabelled(errors: Mapping[str, Cells], successes: Mapping[str, Cells], path: Path) -> Path:
+    """Mean action errors above success in closed loop, a column per observation setting.
+
+    Args:
+        errors (mapping): by setting, action errors by method and number of labelled trajectories, then by seed.
+        successes (mapping): the same for the share of rollouts that succeed, where there are rollouts.
+        path (Path): png to write.
+    """
+    names = [name for name, cells in errors.items() if cells]
+    figure = Figure(figsize=(2.5 * len(names), 5.2))
+    axes = figure.subplots(2, len(names), squeeze=False, sharex="col")
+    for column, name in enumerate(names):
+        top, bottom = axes[:, column]
+        _draw_lines(top, errors[name])
+        top.set_ylim(bottom=0)
+        top.set_title(REGIMES[name], fontsize=9)
+        rolled_out = {cell: _percent(seeds) for cell, seeds in successes.get(name, {}).items()}
+        _draw_lines(bottom, rolled_out)
+        bottom.set_ylim(-3, 103)
+        if not rolled_out:
+            bottom.text(0.5, 0.5, "not rolled out", transform=bottom.transAxes, ha="center", color="#7a7a7a")
+        bottom.set_xlabel("labelled trajectories")
+        labels = sorted({number for _, number in errors[name]})
+        bottom.set_xscale("log", base=2)
+        bottom.set_xticks(labels, [str(number) for number in labels])
+        bottom.minorticks_off()
+    axes[0, 0].set_ylabel("action error (mm, mrad)")
+    axes[1, 0].set_ylabel("success (%)")
+    handles = {
+        label: handle for axis in axes[0] for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    shown = [method for method in _LOOKS if method in handles]
+    figure.legend([handles[method] for method in shown], shown, loc="lower center", ncols=len(shown), frameon=False)
+    figure.tight_layout(rect=(0, 0.06, 1, 1))
+    figure.savefig(path, dpi=130, metadata={"Software": None})
+    return path
+
+
+def _draw_lines(axis: Axes, cells: Cells) -> None:
+    """A line per method; the range over seeds for the method itself alone, or they would hide each other."""
+    for method, (color, line, marker) in _LOOKS.items():
+        points = sorted((number, list(seeds.values())) for (name, number), seeds in cells.items() if name == method)
+        if not points:
+            continue
+        x = [number for number, _ in points]
+        if method == "semi_supervised":
+            axis.fill_between(x, *([end(e) for _, e in points] for end in (min, max)), color=color, alpha=0.15, lw=0)
+        axis.plot(x, [statistics.fmean(e) for _, e in points], color=color, ls=line, marker=marker, ms=4, label=method)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _percent(seeds: Mapping[int, float]) -> dict[int, float]:
+    return {seed: 100 * share for seed, share in seeds.items()}

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from result_rows import SOURCE, percent, read_rows, share, table
+from tables import SOURCE, percent, share, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper_layout import (
@@ -24,13 +24,10 @@ from torchrl_koap.studies.paper_layout import (
     plot_average,
 )
 from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels
-from torchrl_koap.studies.paper_tables import PAPER_TASKS, PRESETS
+from torchrl_koap.studies.paper_tables import PAPER_TASKS
 from torchrl_koap.studies.table import read_cells
-from torchrl_koap.tasks import get_task
 
 _PLURAL = {"window": "windows", "trajectory": "trajectories"}
-SEEDS = 3  # of `koap bench` by default
-PARTS = ("planners", "demonstrations")  # of what comes before the cells
 CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
 
 
@@ -129,11 +126,15 @@ def bench_defaults(name: str) -> str:
 
 
 def bench_default_mean(name: str, level: int) -> str:
-    """Success of the tasks' default methods averaged over the tasks at a level, and the paper's KOAP."""
-    entries = [entry for entry in default_entries(_entries(name)) if entry.level == level]
+    """Success averaged over the tasks at a level: of the tasks' default methods, of KOAP, of the paper's KOAP."""
+    known = [entry for entry in _entries(name) if entry.level == level]
+    own = [entry for entry in known if entry.method == "koap"]
+    entries = default_entries(known)
     ((_, mean, low, high),) = average_over_tasks(entries)[DEFAULT]
+    ((_, koap, least, most),) = average_over_tasks(own)["koap"]
     paper = sum(entry.paper.success for entry in entries) / len(entries)
-    return f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f}), the paper's KOAP {100 * paper:.1f} %"
+    default = f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f})"
+    return f"{default}, `koap` {100 * koap:.1f} % ({100 * least:.0f}-{100 * most:.0f}), the paper's KOAP {100 * paper:.1f} %"
 
 
 def draw_bench_average(name: str, path: Path) -> Path:
@@ -147,37 +148,6 @@ def first_successes(name: str, task: str, method: str, *, most_labels: bool = Fa
     rows = [row for row in _done(name) if (row["task"], row["method"], row["seed"]) == wanted]
     row = (max if most_labels else min)(rows, key=lambda row: row["fraction"])
     return f"{row['successes']} of {row['episodes']}"
-
-
-def longer_table(name: str, longer: str) -> str:
-    """Cells that were trained again with more updates, beside what they were and the task's default method.
-
-    Args:
-        name (str): file of cells without its ending.
-        longer (str): file of the same cells with more updates.
-    """
-    known: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in _done(name):
-        known.setdefault((row["task"], row["fraction"], row["method"]), []).append(row)
-    body = []
-    for row in _done(longer):
-        place = row["task"], row["fraction"]
-        (before,) = (other for other in known[(*place, row["method"])] if other["seed"] == row["seed"])
-        method = get_task(row["task"]).defaults.method
-        cells = [_pooled([before]), _updates(before), _pooled([row]), _updates(row), _pooled(known[(*place, method)])]
-        body.append([f"`{row['task']}`", share(row["fraction"]), *cells, f"`{method}`"])
-    return table(["task", "labelled", "success", "updates", "success", "updates", "success", "of"], body)
-
-
-def _updates(row: Mapping[str, Any]) -> str:
-    return f"{row['controller_updates']:,.0f}"
-
-
-def _pooled(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Success of all rollouts of some cells, with its interval."""
-    successes, trials = (sum(row[part] for row in rows) for part in ("successes", "episodes"))
-    low, high = wilson_interval(successes, trials)
-    return f"{100 * successes / trials:.1f} % ({100 * low:.0f}-{100 * high:.0f}) of {trials}"
 
 
 def bench_size(name: str) -> str:
@@ -224,67 +194,3 @@ def _together(rows: list[Mapping[str, Any]]) -> str:
     mean = sum(sum(level) / len(level) for level in levels.values()) / len(levels)
     low, high = wilson_interval(round(mean * trials), trials)
     return f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f})"
-
-
-def noise_share(task: str, noise: float) -> str:
-    """Error of decoded actions over their size where frames have so many mm of noise, over the runs of a task."""
-    shares = [float(row["share"]) for row in read_rows("noise_answers", task=task, noise_mm=noise)]
-    return f"{sum(shares) / len(shares):.2f}"
-
-
-def worst_action(task: str) -> str:
-    """The action with the largest error on recorded windows."""
-    return read_rows("noise_answers", task=task, noise_mm=0)[0]["worst"]
-
-
-def plan_error(task: str) -> str:
-    """How far the first step of plans is from what was recorded, in mm."""
-    return read_rows("noise_answers", task=task)[0]["plan_error_mm"]
-
-
-def posture_table() -> str:
-    """Success of a controller of Stacking without joints of which parts are replaced."""
-    words = {"decoded": "by the controller", "planned": "off the planned widths", "posture": "of the posture's steps"}
-    body = []
-    for row in read_rows("hidden_posture"):
-        pull = row["pull"] if float(row["pull"]) else "none"
-        body.append([words[row["gripper"]], words[row["motion"]], pull, f"{percent(row)} of {row['n']}"])
-    return table(["gripper", "motion of the joints", "pull towards the posture", "success"], body)
-
-
-def protocol_cost(name: str, otherwise: str) -> str:
-    """What the first table costs by default on two cores, all of it: cells, planners and demonstrations.
-
-    A cell is taken to cost what the measured ones of its task and method did on average.
-
-    Args:
-        name (str): file of cells that were measured on one machine.
-        otherwise (str): file of cells for tasks and methods that it has none of.
-    """
-    preset = PRESETS["table 1"]
-    methods = preset.methods.split(",")
-    wanted = [(task, method) for task in preset.tasks for method in {*methods, get_task(task).defaults.method}]
-    seconds = _mean_seconds(otherwise) | _mean_seconds(name)
-    each = sum(1 if level in preset.first_seed_only else SEEDS for level in preset.levels)
-    cells = each * sum(seconds[pair] for pair in wanted)
-    before = {part: sum(float(row["seconds"]) for row in read_rows("bench_preparation", part=part)) for part in PARTS}
-    return (
-        f"{(cells + sum(before.values())) / 7200:.1f} hours on two cores: {each * len(wanted)} cells of"
-        f" {cells / each / len(wanted):.0f} seconds on average, {before['planners'] / 60:.0f} minutes of one core for"
-        f" planners, {before['demonstrations'] / 60:.0f} for demonstrations"
-    )
-
-
-def _mean_seconds(name: str) -> dict[tuple[str, str], float]:
-    """Seconds of training and rollouts of a cell on average, by task and method."""
-    found: dict[tuple[str, str], list[float]] = {}
-    for row in _done(name):
-        found.setdefault((row["task"], row["method"]), []).append(row["train_seconds"] + row["eval_seconds"])
-    return {pair: sum(seconds) / len(seconds) for pair, seconds in found.items()}
-
-
-def bench_cost(name: str) -> str:
-    """Hours of one core that the cells of a comparison took, and the mean minutes of one."""
-    rows = _done(name)
-    seconds = sum(row["train_seconds"] + row["eval_seconds"] for row in rows)
-    return f"{seconds / 3600:.1f} hours ({seconds / 60 / len(rows):.1f} minutes a cell)"

@@ -1,0 +1,228 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Figures of the committed CSV files as cells and tables of the pages in docs/results."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torchrl_koap.evaluation.statistics import wilson_interval
+
+SOURCE = Path(__file__).resolve().parent / "results"
+Row = Mapping[str, str]
+WIDE = (
+    "mlp denoiser_width=512 denoiser_depth=4 condition_octaves=1 precision=bfloat16 recovery_sigma=0.004"
+    " planner_learning_rate=0.001"
+)
+# rows of planner_ablations.csv: the planner that a task is trained with unless told otherwise
+_PLANNERS: dict[str, dict[str, Any]] = {
+    "avoiding": {
+        "denoiser": "unet channels=(32, 64) recovery_sigma=0.004 planner_learning_rate=0.003",
+        "labels": "1 trajectory",
+        "demonstrations": 96,
+    },
+    "aligning": {
+        "denoiser": f"{WIDE} observed_frames=1",
+        "labels": "0.02 of windows",
+        "disturbed": 0.5,
+        "updates": 8000,
+    },
+    "sorting": {"denoiser": f"{WIDE} observed_frames=1", "labels": "0.01 of windows"},
+    "po_sorting": {"denoiser": f"{WIDE} observed_frames=1", "labels": "0.01 of windows", "action_gain": 1.15},
+    "stacking": {"labels": "0.01 of windows"},
+    "stacking_unobserved_joints": {"labels": "0.01 of windows"},
+}
+
+
+def read_rows(name: str, **wanted: Any) -> list[dict[str, str]]:
+    """Reads the rows of a CSV file whose columns have the wanted values.
+
+    Args:
+        name (str): file below ``results`` without its ending.
+        **wanted: column to value; numbers are compared as numbers.
+
+    Raises:
+        KeyError: if a column is not in the file.
+    """
+    with (SOURCE / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file, strict=True))
+    return [row for row in rows if all(_same(row[column], value) for column, value in wanted.items())]
+
+
+def _same(text: str, value: Any) -> bool:
+    return text == value if isinstance(value, str) else bool(text) and float(text) == value
+
+
+def percent(row: Mapping[str, Any], digits: int = 1) -> str:
+    """Formats the success of a row in percent with its Wilson interval."""
+    successes, trials = int(row["successes"]), int(row["n"])
+    low, high = (100 * end for end in wilson_interval(successes, trials))
+    return f"{100 * successes / trials:.{digits}f} % ({low:.{digits}f}-{high:.{digits}f})"
+
+
+def success(row: Row) -> str:
+    """Formats the success of a row in percent, its interval in whole percent, and the entropy."""
+    successes, trials = int(row["successes"]), int(row["n"])
+    low, high = (100 * end for end in wilson_interval(successes, trials))
+    entropy = f", {float(row['entropy']):.2f}" if row.get("entropy") else ""
+    return f"{100 * successes / trials:.1f} ({low:.0f}-{high:.0f}){entropy}"
+
+
+def pooled(rows: Sequence[Row]) -> str:
+    """Formats the success of several rows together: interval, number, range of their entropies."""
+    counts = {key: sum(int(row[key]) for row in rows) for key in ("successes", "n")}
+    entropy = sorted(f"{float(row['entropy']):.2f}" for row in rows if row["entropy"])
+    ends = f" (entropy {entropy[0]}{f' to {entropy[-1]}' if entropy[0] != entropy[-1] else ''})" if entropy else ""
+    return f"{percent(counts)} of {counts['n']} rollouts{ends}"
+
+
+def pooled_boxes(rows: Sequence[Row]) -> str:
+    """Formats how many boxes of Stacking several rows together brought to the zone, with Wilson intervals."""
+    n = sum(int(row["n"]) for row in rows)
+    counts = [sum(int(row["stacked"].split()[boxes]) for row in rows) for boxes in range(3)]
+    first, two, three = (percent({"successes": count, "n": n}) for count in counts)
+    return f"the first box in {first} of {n} rollouts, two in {two}, all three in {three}"
+
+
+def share(fraction: str | float) -> str:
+    """Formats a fraction in percent."""
+    return f"{100 * float(fraction):.6g} %"
+
+
+def table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """Formats a markdown table."""
+    lines = ["| " + " | ".join(row) + " |" for row in (head, *body)]
+    return "\n".join([lines[0], "|---" * len(head) + "|", *lines[1:]])
+
+
+def columns(rows: Sequence[Row], **cells: str) -> str:
+    """Formats a markdown table with a column per keyword.
+
+    Args:
+        rows (sequence of mapping): its rows.
+        **cells: heading, with ``_`` for a space, to a format string of the row's columns, such as
+            ``"{error} ({low}-{high})"``. ``{percent}`` is the success with its interval, ``{paired}`` the difference
+            with its interval where there is one; whole numbers may be formatted as such (``"{steps:,}"``).
+    """
+    body = []
+    for row in rows:
+        known: dict[str, Any] = {name: int(text) if text.isdigit() else text for name, text in row.items()}
+        known["percent"] = percent(row) if row.get("successes") else ""
+        known["paired"] = (
+            "{difference} ({difference_low} to {difference_high})".format(**row) if row.get("difference_low") else ""
+        )
+        body.append([cell.format(**known) for cell in cells.values()])
+    return table([name.replace("_", " ") for name in cells], body)
+
+
+def total(rows: Sequence[Row], **first: str) -> list[dict[str, str]]:
+    """Adds a row with the sums of all columns that are whole numbers, and ``first`` in the others."""
+    sums = {name: str(sum(int(row[name]) for row in rows)) for name in rows[0] if rows[0][name].isdigit()}
+    return [*map(dict, rows), dict.fromkeys(rows[0], "") | sums | first]
+
+
+def pivot(rows: Sequence[Row], cell: Any, *, by: str = "label_fraction", head: str = "method") -> str:
+    """Formats a table with a row per method and a column per share of labels.
+
+    Args:
+        rows (sequence of mapping): rows of a file.
+        cell (callable or str): from a row to a text, or a column.
+
+    Keyword Args:
+        by (str): column that tells the columns apart.
+        head (str): heading of the first column.
+    """
+    levels = list(dict.fromkeys(row[by] for row in rows))
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    text = cell if callable(cell) else lambda row: row[cell]
+    found = {(row["method"], row[by]): text(row) for row in rows}
+    body = [[f"`{method}`", *(found.get((method, level), "") for level in levels)] for method in methods]
+    return table([head, *map(share, levels)], body)
+
+
+def difference(row: Row) -> str:
+    """Formats a difference in percentage points with its interval."""
+    return f"{float(row['difference']):+.1f} ({int(row['low']):+d} to {int(row['high']):+d})"
+
+
+def fact(key: str, form: str = "") -> str:
+    """Formats a single figure of ``facts.csv`` with its unit.
+
+    Args:
+        key (str): its key.
+        form (str): ``"count"`` for "k of n", ``"rate"`` for percent with interval, ``"bare"`` for no unit.
+    """
+    (row,) = read_rows("facts", key=key)
+    if form == "rate" or (row["successes"] and not form):
+        return percent(row)
+    if form == "count":
+        return f"{row['successes']} of {row['n']}"
+    return row["value"] if form == "bare" or not row["unit"] else f"{row['value']} {row['unit']}"
+
+
+def label_sizes(study: str) -> str:
+    """Formats a table of what every share of the labels of a study is."""
+    found = {row["label_fraction"]: row for row in read_rows("label_curves", study=study)}
+    rows = [row | {"share": share(fraction)} for fraction, row in found.items()]
+    return columns(
+        rows, share="{share}", demonstrations="{labelled_trajectories}", transitions="{labelled_transitions:,}"
+    )
+
+
+def kills(rows: Sequence[Row]) -> list[dict[str, str]]:
+    """Counts disturbed runs, signals, runs equal to an undisturbed one and files left over, by command."""
+    made = []
+    for command in dict.fromkeys(row["command"] for row in rows):
+        mine = [row for row in rows if row["command"] == command]
+        made.append(
+            {
+                "command": f"`{command}`",
+                "runs": str(len(mine)),
+                "kills": str(sum(len(row["signals"].split()) for row in mine)),
+                "equal": str(sum(row["equal"] == "yes" for row in mine)),
+                "leftovers": str(sum(int(row["leftovers"]) for row in mine)),
+            }
+        )
+    return total(made, command="all")
+
+
+def every(rows: Sequence[Row], count: int = 4) -> list[Row]:
+    """Picks the first row, the last, and a few between."""
+    return [*rows[: -1 : max(1, len(rows) // count)], rows[-1]]
+
+
+def planner_rows(task: str, method: str, **wanted: Any) -> list[dict[str, str]]:
+    """Reads rollouts of a method behind the default planner of a task, one candidate plan, a row per training seed."""
+    known = _PLANNERS[task] | {"task": task, "method": method, "controller": "learned", "candidates": 1} | wanted
+    rows = [row for row in read_rows("planner_ablations", **known) if row["note"] in ("", wanted.get("note", ""))]
+    best = max((row["denoiser"] for row in rows), key=len, default="")  # with fingers that close on nothing
+    return [row for row in rows if row["denoiser"] == best]
+
+
+def planner_table(methods: Mapping[str, Sequence[str]]) -> str:
+    """Formats a row per task and method behind the planner that the task is trained with by default.
+
+    Args:
+        methods (mapping): by task its methods.
+    """
+    body = []
+    for task, names in methods.items():
+        for method in names:
+            presets: dict[str, list[dict[str, str]]] = {}
+            for row in planner_rows(task, method):
+                presets.setdefault(row["preset"], []).append(row)
+            for preset, rows in presets.items():
+                told = f"`{method}`" + (f", `{preset}`" if preset != "default" else "")
+                planner = f"{rows[0]['denoiser'].split()[0]}, {int(rows[0]['updates']):,} x {rows[0]['batch']}"
+                cells = [f"`{task}`", planner, rows[0]["demonstrations"], rows[0]["labels"], told]
+                body.append([*cells, ", ".join(row["training_seed"] for row in rows), pooled(rows)])
+    head = ["task", "planner, updates x batch", "demonstrations", "labels", "method", "training seeds"]
+    return table([*head, "success (95 %), entropy"], body)
+
+
+def commands(rows: Sequence[Row]) -> str:
+    """Formats the commands that made some rows as a block of code."""
+    lines = dict.fromkeys(row["command"] for row in rows if row["command"])
+    return "```bash\n" + "\n".join(lines) + "\n```"
