@@ -56,9 +56,59 @@ Made by
 """
 
 
+<<<<<<< HEAD
 from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
 def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int | None = None) -> Path:
     """Writes a trained policy as the repository holds it: compact weights, options, a model card.
+=======
+def numbers_of(run: Path, results: list[dict[str, Any]]) -> dict[str, Any]:
+    """What a card says of a run and of its evaluations."""
+    config, summary = (RunDirectory(run).read_json(name) for name in ("config.json", "summary.json"))
+    source, trained = run, config
+    while trained.get("planner_from"):  # a planner that was taken over is described by the run that trained it
+        source = trained["planner_from"]
+        trained = RunDirectory(source).read_json("config.json")
+    task = get_task(config["task"])
+    rows = [row for result in results for row in result["episode"]]
+    won = [row for row in rows if row["outcome"] == "success"]
+    low, high = wilson_interval(len(won), len(rows))
+    shown = [row for row in won if row["mode"] >= 0]
+    if rows[0].get("context") is None:
+        entropy = mode_entropy([row["mode"] for row in shown], task.num_modes)
+    else:  # several rollouts in each context
+        groups: dict[int, list[int]] = {row["context"]: [] for row in rows}
+        for row in shown:
+            groups[row["context"]].append(row["mode"])
+        unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
+        entropy = conditional_entropy(list(groups.values()), task.num_modes, unsolved=unsolved)
+    labels = summary["labels"]
+    commands = [config["command"]] if source == run else [trained["command"], config["command"]]
+    disturbance = disturbance_of(Path(trained["dataset"]))
+    recorded = f"koap demos --task {task.name} --episodes {labels['total_trajectories']} --seed 0"
+    seconds = RunDirectory(source).read_json("summary.json")["train_seconds"]
+    return {
+        "task": task.name,
+        "method": config["method"],
+        "successes": len(won),
+        "n": len(rows),
+        "success": len(won) / len(rows),
+        "low": low,
+        "high": high,
+        "by_seed": " ".join(str(sum(row["outcome"] == "success" for row in result["episode"])) for result in results),
+        "entropy": None if entropy is None else round(entropy, 3),
+        "mean_steps": round(statistics.fmean(row["steps"] for row in rows), 1),
+        "mean_steps_won": round(statistics.fmean(row["steps"] for row in won), 1) if won else None,
+        "demonstrations": labels["total_trajectories"],
+        "recorded": recorded + (f" --disturbance {disturbance:g}" if disturbance else ""),
+        "labels": f"{labels['selected_units']} of {labels['total_units']} ({labels['unit']})",
+        "denoiser": trained["denoiser"],
+        "updates": trained["steps"],
+        "batch": trained["batch_size"],
+        "training_seed": config["seed"],
+        "train_seconds": round(seconds["controller" if config["method"] == "dp" else "planner"]),
+        "command": "\n    ".join(commands),
+    }
+>>>>>>> a81bf11 (Model cards read what summaries hold)
 
     Of the places where the run, its data and a planner that it took over were, the last part of the path is kept: where
     they were on another machine tells nobody anything.
