@@ -133,8 +133,11 @@ def bench_default_mean(name: str, level: int) -> str:
     ((_, mean, low, high),) = average_over_tasks(entries)[DEFAULT]
     ((_, koap, least, most),) = average_over_tasks(own)["koap"]
     paper = sum(entry.paper.success for entry in entries) / len(entries)
-    default = f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f})"
-    return f"{default}, `koap` {100 * koap:.1f} % ({100 * least:.0f}-{100 * most:.0f}), the paper's KOAP {100 * paper:.1f} %"
+    default, own_text = (
+        f"{100 * rate:.1f} % ({100 * ends[0]:.0f}-{100 * ends[1]:.0f})"
+        for rate, *ends in ((mean, low, high), (koap, least, most))
+    )
+    return f"{default}, `koap` {own_text}, the paper's KOAP {100 * paper:.1f} %"
 
 
 def draw_bench_average(name: str, path: Path) -> Path:

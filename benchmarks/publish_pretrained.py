@@ -56,11 +56,41 @@ Made by
 """
 
 
-<<<<<<< HEAD
-from torchrl_koap.evaluation.statistics import conditional_entropy, mode_entropy, wilson_interval
 def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int | None = None) -> Path:
     """Writes a trained policy as the repository holds it: compact weights, options, a model card.
-=======
+
+    Of the places where the run, its data and a planner that it took over were, the last part of the path is kept: where
+    they were on another machine tells nobody anything.
+
+    Args:
+        run (str or Path): run directory of ``koap train``.
+        folder (str or Path): folder to write, new or that of an earlier policy; its name is that of the policy.
+        card (str): text of the ``README.md``: data, updates, success, command.
+
+    Keyword Args:
+        candidates (int, optional): plans sampled whenever one is due, unless told otherwise. Default: as trained.
+
+    Returns:
+        Path: the folder.
+    """
+    folder = Path(folder)
+    (folder / "config.json").unlink(missing_ok=True)  # another policy of that name gives way
+    folder = copy_run(run, folder)
+    published = RunDirectory(folder)
+    config = published.read_json("config.json")
+    places = {name: Path(config[name]).name for name in PLACES if config.get(name) is not None}
+    published.write_json("config.json", config | places | ({"candidates": candidates} if candidates else {}))
+    for name in WEIGHTS:
+        if (folder / name).exists():
+            tensors, about = load_tensors(folder / name)
+            # a closed-form decoder was fitted to features of exactly these frequencies: of them nothing is rounded
+            only = ("covariance_root",) if name == "controller.safetensors" and (folder / WEIGHTS[0]).exists() else ()
+            save_tensors(folder / name, compact(tensors, only=only), about)
+    write_digests(published)
+    (folder / "README.md").write_text(card)
+    return folder
+
+
 def numbers_of(run: Path, results: list[dict[str, Any]]) -> dict[str, Any]:
     """What a card says of a run and of its evaluations."""
     config, summary = (RunDirectory(run).read_json(name) for name in ("config.json", "summary.json"))
@@ -108,51 +138,29 @@ def numbers_of(run: Path, results: list[dict[str, Any]]) -> dict[str, Any]:
         "train_seconds": round(seconds["controller" if config["method"] == "dp" else "planner"]),
         "command": "\n    ".join(commands),
     }
->>>>>>> a81bf11 (Model cards read what summaries hold)
 
-    Of the places where the run, its data and a planner that it took over were, the last part of the path is kept: where
-    they were on another machine tells nobody anything.
+
+def disturbance_of(dataset: Path) -> float:
+    """Share of the demonstrations of a data set that were recorded with a disturbed operator."""
+    for about in (dataset / "about.json", dataset / "ted" / "about.json"):
+        if about.is_file():
+            notes = json.loads(about.read_text(encoding="utf-8")).get("notes") or {}
+            return float(notes.get("disturbance", {}).get("share", 0.0))
+    return 0.0
+
+
+def main(
+    run: Positional[Path], name: Positional[str], *, seeds: tuple[int, ...] = (100, 1100, 2100), candidates: int = 1
+) -> None:
+    """Publishes a run, evaluates what was published, and writes its model card.
 
     Args:
-        run (str or Path): run directory of ``koap train``.
-        folder (str or Path): folder to write, new or that of an earlier policy; its name is that of the policy.
-        card (str): text of the ``README.md``: data, updates, success, command.
-
-    Keyword Args:
-        candidates (int, optional): plans sampled whenever one is due, unless told otherwise. Default: as trained.
-
-    Returns:
-        Path: the folder.
+        run: the run directory.
+        name: of the folder below ``pretrained``.
+        seeds: noise seeds, 60 episodes each.
+        candidates: plans of which one is taken.
     """
-    folder = Path(folder)
-    (folder / "config.json").unlink(missing_ok=True)  # another policy of that name gives way
-    folder = copy_run(run, folder)
-    published = RunDirectory(folder)
-    config = published.read_json("config.json")
-    places = {name: Path(config[name]).name for name in PLACES if config.get(name) is not None}
-    published.write_json("config.json", config | places | ({"candidates": candidates} if candidates else {}))
-    for name in WEIGHTS:
-        if (folder / name).exists():
-            tensors, about = load_tensors(folder / name)
-            # a closed-form decoder was fitted to features of exactly these frequencies: of them nothing is rounded
-            only = ("covariance_root",) if name == "controller.safetensors" and (folder / WEIGHTS[0]).exists() else ()
-            save_tensors(folder / name, compact(tensors, only=only), about)
-    write_digests(published)
-    (folder / "README.md").write_text(card)
-    return folder
-
-
-def main() -> None:
-    """Publishes, evaluates what was published, and writes the card."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("name")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[100, 1100, 2100])
-    parser.add_argument("--candidates", type=int, default=1)
-    parser.add_argument("--root", type=Path, default=ROOT)
-    options = parser.parse_args()
-    folder = publish(options.run, options.root / options.name, "", candidates=options.candidates)
-from torchrl_koap.tasks import get_task
+    folder = publish(run, ROOT / name, "", candidates=candidates)
     metrics = (folder / "metrics.csv").read_text().splitlines(keepends=True)
     kept = [metrics[0], *metrics[1::5]]  # for the report's curves a fifth of the rows is enough
     (folder / "metrics.csv").write_text("".join(kept))
