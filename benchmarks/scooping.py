@@ -9,8 +9,7 @@ Records robot and hand, embeds, trains one planner per set of unlabelled demonst
 rolls each out. Folder by folder what is there already is not made again, and rows of the table are not run again.
 
 Unlabelled demonstrations are those of the robot, of the hand (then the robot's labelled ones are all there is of it),
-of the hand with its embeddings aligned to the robot's labelled ones (`koap embed --align-to robot`), both, or none.
-Labelled ones are the robot's first: they begin at the three start positions in turn.
+both, or none. Labelled ones are the robot's first: they begin at the three start positions in turn.
 """
 
 from __future__ import annotations
@@ -37,8 +36,8 @@ from torchrl_koap.vision.projection import SCOOPING, load_encoder, projection_of
 
 TABLE = Path(__file__).parent / "results" / "scooping.csv"
 TASKS = ("scooping", "scooping_moving_bowl")
-UNLABELLED = ("robot", "hand", "both", "hand_aligned", "none")
-FEW_ROBOTS = ("hand", "hand_aligned", "none")  # the labelled demonstrations are all there are of the robot
+UNLABELLED = ("robot", "hand", "both", "none")
+FEW_ROBOTS = ("hand", "none")  # the labelled demonstrations are all there are of the robot
 METHODS = ["koap", "koap_paper", "dd", "vae", "lapo", "dp", "pca", "linear"]
 COLUMNS = (
     "labels", "unlabelled", "method", "execution", "blend_decay", "seed", "n", "successes", "success_low",

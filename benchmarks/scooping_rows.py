@@ -73,7 +73,7 @@ def scooping_table(task: str = "scooping") -> str:
         task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
     """
     cells = [cell for cell in scooping_cells(read_rows(task)) if (cell["execution"], cell["blend_decay"]) == _HOW]
-    order = ("both", "robot", "hand_aligned", "hand", "none")
+    order = ("both", "robot", "hand", "none")
     cells.sort(key=lambda cell: (int(cell["labels"]), order.index(cell["unlabelled"]), -cell["successes"] / cell["n"]))
     body = []
     for cell in cells:

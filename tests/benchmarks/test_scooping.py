@@ -46,7 +46,7 @@ def study(benchmark_script, monkeypatch, tmp_path):
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "evaluate", evaluate)
     monkeypatch.setattr(module, "embed_demonstrations", lambda out, *_, **__: (out / "ted").mkdir(parents=True))
-    monkeypatch.setattr(module, "load_encoder", lambda projection, cache: None)
+    monkeypatch.setattr(module, "load_encoder", lambda projection: None)
     monkeypatch.setattr(module, "TABLE", tmp_path / "scooping.csv")
     for who in ("robot", "hand"):  # recorded before
         (tmp_path / who / "meta").mkdir(parents=True)
@@ -104,18 +104,15 @@ def test_hand_alone_has_a_planner_per_number_of_labels_and_no_analysis(study, tm
 
 
 @pytest.mark.parametrize(
-    ("unlabelled", "whose", "align_to"),
+    ("unlabelled", "whose"),
     [
-        ("both", [("robot", None), ("hand", None)], None),
-        ("robot", [("robot", None)], None),
-        ("hand", [("robot", 2), ("hand", None)], None),
-        ("hand_aligned", [("robot", 2), ("hand", None)], "robot"),
-        ("none", [("robot", 2)], None),
+        ("both", [("robot", None), ("hand", None)]),
+        ("robot", [("robot", None)]),
+        ("hand", [("robot", 2), ("hand", None)]),
+        ("none", [("robot", 2)]),
     ],
 )
-def test_a_data_set_holds_the_demonstrations_it_is_called_after(
-    study, monkeypatch, tmp_path, unlabelled, whose, align_to
-):
+def test_a_data_set_holds_the_demonstrations_it_is_called_after(study, monkeypatch, tmp_path, unlabelled, whose):
     asked = []
     monkeypatch.setattr(
         study, "embed_demonstrations", lambda out, sources, encoder, **how: asked.append((sources, how))
@@ -123,7 +120,7 @@ def test_a_data_set_holds_the_demonstrations_it_is_called_after(
     study.data_set(tmp_path, unlabelled, 2)
     ((sources, how),) = asked
     assert [(source.folder.name, source.episodes) for source in sources] == whose
-    assert how == {"mixed": len(whose) > 1, "align_to": align_to, "task": "scooping"}
+    assert how == {"mixed": len(whose) > 1, "task": "scooping"}
 
 
 def test_cells_pool_seeds_and_take_the_longest_row_of_each(benchmark_script):
