@@ -111,10 +111,10 @@ def test_vector_environment():
 
 
 def test_unknown_render_mode():
-    from torchrl_koap.envs import AvoidingGymEnv
+    from torchrl_koap.envs import ManipulationGymEnv
 
     with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
-        AvoidingGymEnv(render_mode="human")
+        ManipulationGymEnv("avoiding", render_mode="human")
 
 
 def test_bad_action():

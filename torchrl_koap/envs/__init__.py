@@ -4,7 +4,7 @@
 from torchrl_koap.envs.aligning import AligningEnv
 from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.gym import IDS, AvoidingGymEnv, ManipulationGymEnv, register
+from torchrl_koap.envs.gym import IDS, ManipulationGymEnv, register
 from torchrl_koap.envs.registry import make_env, mode_index_of
 from torchrl_koap.envs.scooping import ScoopingEnv
 from torchrl_koap.envs.sorting import SortingEnv
@@ -13,7 +13,6 @@ from torchrl_koap.envs.stacking import StackingEnv
 __all__ = [
     "AligningEnv",
     "AvoidingEnv",
-    "AvoidingGymEnv",
     "ManipulationEnv",
     "ManipulationGymEnv",
     "ScoopingEnv",

@@ -33,34 +33,18 @@ from torchrl_koap.tasks import Task, get_task
 
 
 class ManipulationEnv(EpisodeState, EnvBase):
-    """Simulates a batch of episodes of one of D3IL's tasks, with partial resets and partial steps.
+    """Simulates a batch of episodes of a D3IL task, with partial resets and partial steps.
 
-    A task declares the class attributes below and implements the hooks :meth:`_scene`, :meth:`_command`,
-    :meth:`_observe`, :meth:`_check`, :meth:`_update_mode` and, with objects, :meth:`_place`. Hooks receive ``rows``,
-    the indices of the environments concerned.
-
-    ================ ========================================================================================
-    attribute        meaning
-    ================ ========================================================================================
-    ``TASK``         name of the task
-    ``START_JOINTS`` arm joints [7] after a reset (rad)
-    ``ACTION_BOUND`` half range of random actions, or least and greatest values; actions outside are executed
-    ``MODE_ENTRIES`` entries of the leaf ``mode``; None: one per object
-    ``MODE_VALUES``  entries are -1 (undecided) to ``MODE_VALUES - 1``, int64; None: they are flags, bool
-    ``COLLIDES``     an episode can end by a collision
-    ``MAX_STEPS``    control steps after which an episode is truncated
-    ``SUBSTEPS``     physics steps (1 ms) per control step
-    ``COMMAND_DIM``  numbers that make up a command
-    ``RESET_WIDTH``  finger target during the reset's substep (m)
-    ``ARM_ALPHA``    opacity of the arm in pictures
-    ================ ========================================================================================
+    A task declares the class attributes and implements the hooks :meth:`_scene`, :meth:`_command`, :meth:`_observe`,
+    :meth:`_check`, :meth:`_update_mode` and, with objects, :meth:`_place`. Hooks receive ``rows``, the indices of the
+    environments concerned.
 
     A task with objects has *contexts*, the poses in which an episode starts
     (:mod:`torchrl_koap.envs.contexts`): drawn at random at every reset, taken from a table in turn, or handed over
     by ``reset(contexts=...)``. The leaf ``context`` ``[n, objects, 3]`` holds them (x, y in m, yaw in rad).
 
-    Success and collision are *latched*: whichever is seen first is the outcome of the episode, and at most one of them
-    is ever True. They become True in the frame that also carries ``terminated``, and stay until the reset.
+    Success and collision are *latched*: whichever is seen first is the outcome, becomes True in the frame that also
+    carries ``terminated``, and stays until the reset. The other one stays False.
 
     Args:
         num_envs (int): number of environments, the batch size.
@@ -87,17 +71,17 @@ class ManipulationEnv(EpisodeState, EnvBase):
         ('avoiding', [False, False])
     """
 
-    TASK: str
-    START_JOINTS: tuple[float, ...] = (0.0,) * 7
-    ACTION_BOUND: Any = 0.012
-    MODE_ENTRIES: int | None = 1
-    MODE_VALUES: int | None = None
-    COLLIDES = False
-    MAX_STEPS = 400
-    SUBSTEPS = 35
-    COMMAND_DIM = 7
-    RESET_WIDTH = controller.FINGER_RESET
-    ARM_ALPHA = 0.3
+    TASK: str  # name of the task
+    START_JOINTS: tuple[float, ...] = (0.0,) * 7  # after a reset (rad)
+    ACTION_BOUND: Any = 0.012  # half range of random actions, or least and greatest values; others are executed too
+    MODE_ENTRIES: int | None = 1  # of the leaf ``mode``; None: one per object
+    MODE_VALUES: int | None = None  # its entries are -1 (undecided) to this - 1, int64; None: flags, bool
+    COLLIDES = False  # an episode can end by a collision
+    MAX_STEPS = 400  # control steps after which an episode is truncated
+    SUBSTEPS = 35  # physics steps (1 ms) per control step
+    COMMAND_DIM = 7  # numbers that make up a command
+    RESET_WIDTH = controller.FINGER_RESET  # finger target during the reset's substep (m)
+    ARM_ALPHA = 0.3  # opacity of the arm in pictures
 
     def __init__(
         self,
@@ -113,7 +97,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         task: Task | None = None,
     ):
         max_steps = self.MAX_STEPS if max_steps is None else max_steps
-        for name, value in (("num_envs", num_envs), ("num_threads", num_threads), ("max_steps", max_steps)):
+        for name, value in {"num_envs": num_envs, "num_threads": num_threads, "max_steps": max_steps}.items():
             if not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be an integer of at least 1, got {value!r}")
         if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
@@ -153,13 +137,12 @@ class ManipulationEnv(EpisodeState, EnvBase):
         }
 
     def _make_specs(self) -> None:
-        shape, device = self.batch_size, self.device
+        shape, device, entries = self.batch_size, self.device, self._mode.shape[1]
         flag = {"n": 1, "shape": (*shape, 1), "device": device, "dtype": torch.bool}
-        flags = self._mode.shape[1]
         if self.MODE_VALUES is None:
-            mode = Binary(n=flags, shape=(*shape, flags), device=device, dtype=torch.bool)
+            mode = Binary(n=entries, shape=(*shape, entries), device=device, dtype=torch.bool)
         else:
-            mode = Bounded(-1, self.MODE_VALUES - 1, (*shape, flags), device=device, dtype=torch.int64)
+            mode = Bounded(-1, self.MODE_VALUES - 1, (*shape, entries), device=device, dtype=torch.int64)
         leaves = {
             keys.OBSERVATION: Unbounded((*shape, self.task.observation_dim), device=device, dtype=self._dtype),
             keys.SUCCESS: Binary(**flag),
@@ -178,9 +161,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         self.action_spec = Bounded(low, high, size, device=device, dtype=self._dtype)
         self.reward_spec = Bounded(0.0, 1.0, (*shape, 1), device=device, dtype=self._dtype)
         done = Categorical(2, (*shape, 1), device=device, dtype=torch.bool)
-        self.done_spec = Composite(
-            {"done": done.clone(), "terminated": done.clone(), "truncated": done.clone()}, shape=shape
-        )
+        self.done_spec = Composite({name: done.clone() for name in ("done", "terminated", "truncated")}, shape=shape)
 
     def _begin(self, rows: np.ndarray) -> None:
         """Writes the first command into ``self._commands[rows]`` after a reset: stay, hand straight down."""
@@ -338,7 +319,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
             np.ndarray: uint8 [height, width, 3], RGB.
 
         Raises:
-            RuntimeError: if no OpenGL library can be used; the message says what to install.
+            RuntimeError: if no OpenGL library can be used.
             ValueError: for an unknown camera, an environment outside the batch or a size below 1.
         """
         if not 0 <= index < len(self.sims):
@@ -358,10 +339,10 @@ class ManipulationEnv(EpisodeState, EnvBase):
         super().close(**kwargs)
 
     def raw_log(self) -> dict[str, np.ndarray]:
-        """What D3IL's recorder logs for the last control step, one row per environment (docs/d3il.md, Recordings).
+        """Returns what D3IL's recorder logs for the last control step (docs/d3il.md, Recordings).
 
-        The recorder looks after the *first* substep, so ``c_pos`` (m) is the TCP at the start of the step and
-        ``des_c_pos`` the command of that step. Joints in rad, velocities in rad/s and m/s, ``time_stamp`` in s.
+        It looks after the *first* substep: ``c_pos`` (m) is the TCP at the start of the step, ``des_c_pos`` the command.
+        Joints in rad, velocities in rad/s and m/s, ``time_stamp`` in s.
 
         Returns:
             dict: ``j_pos, j_vel, des_j_pos, des_j_vel, des_j_acc`` [n, 7], ``c_pos, c_vel, des_c_pos`` [n, 3],
@@ -379,10 +360,6 @@ class ManipulationEnv(EpisodeState, EnvBase):
         return {"des_c_pos": self.commands[:, :3], "des_c_quat": self.commands[:, 3:7]}
 
     def raw_objects(self) -> dict[str, np.ndarray]:
-        """Poses of the task's objects as D3IL's recorder logs them, after the first substep of the last control step.
-
-        Returns:
-            dict: pose [n, 7] (m, quaternion) per object, in the order and with the names of ``task.objects``.
-        """
+        """Poses [n, 7] (m, quaternion) of the task's objects by name, as D3IL's recorder logs them."""
         poses = self.sims.log[:, controller.LOG_WIDTH :].reshape(len(self.sims), -1, 7)
         return {name: poses[:, index].copy() for index, name in enumerate(self.task.objects[: poses.shape[1]])}

@@ -133,24 +133,6 @@ class ManipulationGymEnv(gymnasium.Env):
         return data[keys.OBSERVATION][0].numpy(), info
 
 
-class AvoidingGymEnv(ManipulationGymEnv):
-    """:class:`ManipulationGymEnv` of Avoiding.
-
-    Args:
-        render_mode (str, optional): ``"rgb_array"`` or None.
-        **options: as for :class:`ManipulationGymEnv`.
-
-    Examples:
-        >>> from torchrl_koap.envs import AvoidingGymEnv
-        >>> observation, info = AvoidingGymEnv(max_steps=50).reset(seed=0)
-        >>> observation.shape, info["collision"]
-        ((4,), False)
-    """
-
-    def __init__(self, render_mode: str | None = None, **options: Any):
-        super().__init__("avoiding", render_mode, **options)
-
-
 def register(env_id: str, task: str) -> None:
     """Registers a task with Gymnasium, unless the id is taken; importing ``torchrl_koap.envs`` does so for D3IL's.
 
