@@ -341,7 +341,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
     def raw_log(self) -> dict[str, np.ndarray]:
         """Returns what D3IL's recorder logs for the last control step (docs/d3il.md, Recordings).
 
-        It looks after the *first* substep: ``c_pos`` (m) is the TCP when the step begins, ``des_c_pos`` the command of it.
+        It looks after the *first* substep: ``c_pos`` (m) is the TCP when the step begins, ``des_c_pos`` its command.
         Joints in rad, velocities in rad/s and m/s, ``time_stamp`` in s.
 
         Returns:
