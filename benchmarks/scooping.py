@@ -95,7 +95,7 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
     result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1, **ways))
     summary = json.loads((run / "summary.json").read_text())
     n = options.episodes
-    successes, rims = round(result["success_rate"] * n), round(result["rim_rate"] * n)
+    successes, rims = round(result["success_rate"] * n), round(result["rates"]["spoon over the bowl"]["rate"] * n)
     spans = [f"{value:.4f}" for count in (successes, rims) for value in wilson_interval(count, n)]
     errors = summary.get("action_error_mrad") or {}
     made = json.loads(((planner or run) / "summary.json").read_text())["planner"]
@@ -105,7 +105,7 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
             (
                 labels, unlabelled, method, options.execution, options.blend_decay, seed, n, successes, *spans[:2],
                 rims, *spans[2:],
-                *(f"{result[f'success_{start}']:.3f}" for start in ("left", "near", "right")),
+                *(f"{result['rates'][f'success from {start}']['rate']:.3f}" for start in ("left", "near", "right")),
                 f"{errors['controller']:.1f}" if "controller" in errors else "", options.steps,
                 f"{made.get('loss_planner', float('nan')):.4f}",
             ),

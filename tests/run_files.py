@@ -7,8 +7,10 @@ import json
 from pathlib import Path
 
 import numpy as np
-import torch
-from safetensors.torch import save_file
+from matplotlib.collections import LineCollection
+from safetensors.numpy import save_file
+
+from torchrl_koap.tasks import get_task
 
 LABELS = {
     "unit": "trajectory",
@@ -22,6 +24,7 @@ LABELS = {
     "seed": 7,
 }
 EVALUATION = {
+    "rates": {"success": {"rate": 0.5, "low": 0.15, "high": 0.85}},
     "success_rate": 0.5,
     "success_low": 0.15,
     "success_high": 0.85,
@@ -38,21 +41,21 @@ EVALUATION = {
 }
 
 
-def make_rollouts(episodes: int = 4, steps: int = 20) -> dict[str, torch.Tensor]:
+def make_rollouts(episodes: int = 4, steps: int = 20) -> dict[str, np.ndarray]:
     """Straight paths from the start to the line, beside each other; the last two collide and run out of time."""
-    share = torch.linspace(0, 1, steps)[:, None]
-    goals = torch.stack([torch.linspace(0.26, 0.72, episodes), torch.full((episodes,), 0.36)], 1)
-    position = torch.tensor([0.525, -0.28]) + share * (goals[:, None] - torch.tensor([0.525, -0.28]))
-    length = torch.full((episodes,), steps)
+    share = np.linspace(0, 1, steps)[:, None]
+    start, goals = np.array([0.525, -0.28]), np.stack([np.linspace(0.26, 0.72, episodes), np.full(episodes, 0.36)], 1)
+    position = start + share * (goals[:, None] - start)
+    length = np.full(episodes, steps)
     length[-1] = steps // 2
-    position[-1, steps // 2 :] = torch.nan
-    plan = torch.full((episodes, steps // 4, 14, 2), torch.nan)
-    plan_step = torch.full((episodes, steps // 4), -1)
+    position[-1, steps // 2 :] = np.nan
+    plan = np.full((episodes, steps // 4, 14, 2), np.nan)
+    plan_step = np.full((episodes, steps // 4), -1)
     for row in range(steps // 4 - 1):
         plan[:, row, :4] = position[:, 4 * row + 1 : 4 * row + 5]
         plan_step[:, row] = 4 * row
-    outcome = torch.tensor([1] * (episodes - 2) + [0, 2])
-    mode = torch.where(outcome == 1, torch.arange(episodes), -1)
+    outcome = np.array([1] * (episodes - 2) + [0, 2])
+    mode = np.where(outcome == 1, np.arange(episodes), -1)
     return {
         "position": position,
         "length": length,
@@ -63,30 +66,26 @@ def make_rollouts(episodes: int = 4, steps: int = 20) -> dict[str, torch.Tensor]
     }
 
 
-def make_object_rollouts(task: str, episodes: int = 4, steps: int = 20) -> dict[str, torch.Tensor]:
+def make_object_rollouts(task: str, episodes: int = 4, steps: int = 20) -> dict[str, np.ndarray]:
     """:func:`make_rollouts` with bodies that are pushed 0.3 m away from the robot's side, and contexts."""
-    from torchrl_koap.tasks import get_task
-
     facts = get_task(task)
-    rollouts = make_rollouts(max(episodes, 4), steps)
-    rollouts = {key: value[:episodes] for key, value in rollouts.items()}
-    number = len(facts.objects)
-    generator = torch.Generator().manual_seed(0)
-    start = torch.tensor([0.4, -0.2]) + 0.2 * torch.rand(episodes, number, 2, generator=generator)
-    moved = torch.linspace(0, 0.3, steps)[:, None, None] * torch.tensor([0.0, 1.0])
-    rollouts["object_position"] = start[:, None] + moved  # [E, T, objects, 2]
-    rollouts["object_position"][rollouts["position"].isnan().any(-1)] = torch.nan
-    rollouts["context"] = torch.cat([start, torch.rand(episodes, number, 1, generator=generator)], -1).double()
-    rollouts["action"] = torch.zeros(episodes, steps, facts.action_dim)
+    rollouts = {key: value[:episodes] for key, value in make_rollouts(max(episodes, 4), steps).items()}
+    number, generator = len(facts.bodies), np.random.default_rng(0)
+    start = np.array([0.4, -0.2]) + 0.2 * generator.random((episodes, number, 2))
+    moved = np.linspace(0, 0.3, steps)[:, None, None] * np.array([0.0, 1.0])
+    rollouts["object_position"] = start[:, None] + moved  # [E, T, bodies, 2]
+    rollouts["object_position"][np.isnan(rollouts["position"]).any(-1)] = np.nan
+    rollouts["context"] = np.concatenate([start, generator.random((episodes, number, 1))], -1)
+    rollouts["action"] = np.zeros((episodes, steps, facts.action_dim))
     return rollouts
 
 
-def make_demonstrations() -> dict[str, torch.Tensor]:
+def make_demonstrations() -> dict[str, np.ndarray]:
     """Two straight demonstrations of 20 steps, the first one labelled."""
-    y = torch.linspace(-0.28, 0.36, 20)
-    state = torch.cat([torch.stack([torch.full((20,), x), y], 1) for x in (0.3, 0.7)])
-    episode = torch.arange(2).repeat_interleave(20)
-    return {"state": state, "episode": episode, "labelled": episode == 0, "mode": torch.tensor([0, 23])}
+    y = np.linspace(-0.28, 0.36, 20)
+    position = np.concatenate([np.stack([np.full(20, x), y], 1) for x in (0.3, 0.7)])
+    episode = np.arange(2).repeat(20)
+    return {"position": position, "episode": episode, "labelled": episode == 0, "mode": np.array([0, 23])}
 
 
 def write_run(folder: Path) -> Path:
@@ -101,9 +100,19 @@ def write_run(folder: Path) -> Path:
     rows = [f"planner,{step},{1 / step},,,,0.001,30\n" for step in range(1, 50)]
     rows += [f"controller,{step},,{1 / step},{2 / step},0,0.001,30\n" for step in range(1, 50)]
     (folder / "metrics.csv").write_text(head + "".join(rows))
-    true = torch.from_numpy(np.random.default_rng(0).normal(size=(20, 2)) * 0.005)
+    true = np.random.default_rng(0).normal(size=(20, 2)) * 0.005
     save_file(make_rollouts(), folder / "rollouts.safetensors")
     save_file(make_demonstrations(), folder / "demonstrations.safetensors")
-    save_file({"real": torch.linspace(0, 1, 8), "imag": torch.zeros(8)}, folder / "eigenvalues.safetensors")
+    save_file({"real": np.linspace(0, 1, 8), "imag": np.zeros(8)}, folder / "eigenvalues.safetensors")
     save_file({"predicted": true + 0.001, "true": true}, folder / "actions.safetensors")
     return folder
+
+
+def titles(figure) -> list[str]:
+    """Titles of the panels of a figure."""
+    return [axes.get_title(loc="left") for axes in figure.axes]
+
+
+def drawn_lines(axes) -> list[np.ndarray]:
+    """Every line of the collections of a panel."""
+    return [line for item in axes.collections if isinstance(item, LineCollection) for line in item.get_segments()]

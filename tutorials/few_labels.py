@@ -18,6 +18,8 @@ Run it with ``python tutorials/few_labels.py``; it takes about a minute and leav
 # Scripted players steer the Panda's rod around six cylinders. The label budget keeps the actions of two of the 48
 # trajectories. Everywhere else the action is NaN and ``has_action`` is False: a leak would be loud.
 
+from pathlib import Path
+
 import torch
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
@@ -36,7 +38,8 @@ from torchrl_koap.evaluation.rollouts import make_policy, roll_out, rollouts_to_
 from torchrl_koap.evaluation.scores import score
 from torchrl_koap.modules import Normalizer, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
-from torchrl_koap.reports.rollout_plots import plot_rollouts
+from torchrl_koap.reports.rollout_plots import draw_rollouts
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.closed_form import fit_closed_form
 
@@ -107,7 +110,8 @@ episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
 mode_index = mode_index_of(task)
 result = score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index)
 rollouts = rollouts_to_tensors(episodes, position=task.observation[task.position], mode_index=mode_index, interval=4)
-plot_rollouts(rollouts, "few_labels.png", task="avoiding", num_modes=task.num_modes)
+rollouts = {name: tensor.numpy() for name, tensor in rollouts.items()}
+draw_rollouts(rollouts, RunFacts(Path(), task)).savefig("few_labels.png", dpi=150)
 low, high = (100 * result[f"success_{end}"] for end in ("low", "high"))
 print(f"success {100 * result['success_rate']:.1f} % ({low:.0f}-{high:.0f}) of {len(seeds)} rollouts")
 print(f"{result['distinct_modes']} of {task.num_modes} ways taken, entropy {result['mode_entropy']:.2f}")

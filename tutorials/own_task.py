@@ -210,7 +210,7 @@ figure = Figure(figsize=(8, 3.9), layout="constrained")
 for axes, key, title in zip(
     figure.subplots(1, 2), ("position", "object_position"), ("robot", "puck: starts and paths"), strict=True
 ):
-    draw_scene(axes, task.name)
+    draw_scene(axes, task)
     for path, mode in zip(rollouts[key].reshape(40, -1, 2).numpy(), rollouts["mode"].tolist(), strict=True):
         axes.plot(*path.T, color={0: "#1f6feb", 1: "#d9730d"}.get(mode, "black"), linewidth=0.8)
         axes.plot(*path[0], "o", color="#8a929e", markersize=3)

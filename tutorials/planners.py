@@ -99,7 +99,7 @@ from torchrl_koap.reports.scenes import draw_scene  # noqa: E402
 figure = Figure(figsize=(9, 3.6), layout="constrained")
 few, many, curve = figure.subplots(1, 3, width_ratios=(1, 1, 1.2))
 for axes, steps in ((few, 1), (many, 10)):
-    for words in draw_scene(axes, "avoiding").texts:
+    for words in draw_scene(axes, task).texts:
         words.remove()  # beside the part that is shown
     for plan in plans_with("dpm++2m", steps)[0][:60].numpy():
         axes.plot(*plan.T, color="#1f6feb", linewidth=0.6, alpha=0.5)

@@ -227,7 +227,7 @@ def draw(task: Task) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     figure = Figure(figsize=(4.6, 4), layout="constrained")
-    axes = draw_scene(figure.add_subplot(), task.name)
+    axes = draw_scene(figure.add_subplot(), task)
     for index, body in enumerate(task.bodies):
         for (x0, x1), (y0, y1) in task.scene.starts_of(index):
             color = color_of(body.color)

@@ -40,8 +40,9 @@ def study(benchmark_script, monkeypatch, tmp_path):
 
     def evaluate(run, config):
         asked.append((run, config))
-        starts = {"success_left": 1.0, "success_near": 0.5, "success_right": 0.0}
-        return {"success_rate": 6 / 15, "rim_rate": 9 / 15, **starts}
+        rates = {"left": 1.0, "near": 0.5, "right": 0.0}
+        rates = {f"success from {name}": {"rate": value} for name, value in rates.items()}
+        return {"success_rate": 6 / 15, "rates": rates | {"spoon over the bowl": {"rate": 9 / 15}}}
 
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "evaluate", evaluate)

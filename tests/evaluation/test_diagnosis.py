@@ -31,7 +31,8 @@ from torchrl_koap.evaluation.diagnosis import (
 )
 from torchrl_koap.evaluation.inspection import verdict
 from torchrl_koap.evaluation.trained_run import load_run
-from torchrl_koap.reports.diagnosis_plot import plot_inspection
+from torchrl_koap.reports.inspection_plots import draw_experiments
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 
 AVOIDING = get_task("avoiding")
@@ -177,7 +178,7 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_judged_without_a_
         assert policy.action_gain.tolist() == pytest.approx([1.2, 1.2]) and policy.leash.lead == 0.05
     assert "imagined" not in result and result["closed_loop"]["episodes"] == 2
     assert result["plan_to_execution"] == {}  # actions are kept, not plans
-    assert plot_inspection(result, task, tmp_path / "inspect.png").exists()
+    assert len(draw_experiments(result, RunFacts(tmp_path, task)).axes) == 2
     inspection.inspect(trained_run, replace(config, replan_interval=4))
     assert made[-1]["replan_interval"] == 4 and made[-1]["execution"] == "open_loop"
     several = replace(trained, config=trained.config | {"candidates": 3})

@@ -33,7 +33,8 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
 )
 from torchrl_koap.modules.koopman.latent_action import LatentActionModule
-from torchrl_koap.reports.latent_plot import plot_latent
+from torchrl_koap.reports.inspection_plots import draw_latent
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 
 
@@ -206,10 +207,9 @@ def test_what_blew_up_is_drawn_all_the_same(tmp_path):
     result = analyse_latent(controller, data, data["episode"] == 0, {"measured_xy": [0, 1]})
     assert result["multi_step"]["steps"] == 10
     assert not math.isfinite(result["multi_step"]["koopman"]["measured_xy"][-1])
-    path = plot_latent(
-        result, tmp_path / "latent.png", task=get_task("avoiding"), eigenvalues=controller.operator.eigenvalues()
-    )
-    assert path.stat().st_size > 10000
+    figure = draw_latent({"latent": result}, RunFacts(tmp_path, get_task("avoiding")))
+    drawn = figure.axes[0].lines[0].get_ydata()
+    assert math.isfinite(drawn[0]) and not math.isfinite(drawn[-1])
 
 
 def test_verdict_without_experiments_says_whose_labels_were_read():

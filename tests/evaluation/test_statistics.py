@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchrl_koap.evaluation.statistics import mode_entropy, wilson_interval
+from torchrl_koap.evaluation.statistics import expected_entropy, mode_entropy, wilson_interval
 
 Z = 1.959963984540054
 
@@ -62,3 +63,10 @@ def test_entropy_is_between_0_and_1_and_blind_to_order_and_names(modes, random):
 def test_a_mode_out_of_range_is_named(mode):
     with pytest.raises(ValueError, match=f"mode {mode} is not in 0..23"):
         mode_entropy([0, mode], 24)
+
+
+@pytest.mark.parametrize(("episodes", "number"), [(3, 2), (5, 3), (4, 4)])
+def test_expected_entropy_is_the_mean_over_all_draws(episodes, number):
+    draws = np.stack(np.meshgrid(*[range(number)] * episodes), -1).reshape(-1, episodes)
+    entropies = [mode_entropy(draw.tolist(), number) for draw in draws]
+    assert expected_entropy(episodes, number) == pytest.approx(np.mean(entropies), abs=1e-12)

@@ -24,11 +24,10 @@ from torchrl_koap.envs.gym import register
 from torchrl_koap.evaluation.diagnosis import contexts_of
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.keys import validate
-from torchrl_koap.reports.objects import object_looks
 from torchrl_koap.reports.pictures import all_pictures
-from torchrl_koap.reports.scenes import BLUE, draw_scene
+from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.reports.scenes import BLUE, bodies_of, draw_scene
 from torchrl_koap.tasks import TASKS, Task, get_task
-from torchrl_koap.tasks.modes import mode_name
 
 HERE = Path(__file__).parent
 
@@ -94,24 +93,25 @@ def test_contexts_come_from_the_task():
 
 def test_modes_scores_and_goal():
     task = get_task("puck")
-    assert [mode_name(mode, "puck") for mode in (0, 1, -1)] == ["left", "right", "no mode"]
+    assert [task.modes.name_of(mode) for mode in (0, 1, -1)] == ["left", "right", "no mode"]
     assert mode_index_of("puck")(torch.tensor([[1], [-1]])).tolist() == [1, -1]
     env = make_env(task, 4, max_steps=5)
     episodes = list(env.rollout(5, break_when_any_done=False))
     result = score(episodes, range(4), num_modes=2, mode_index=mode_index_of(task), contexts=[0, 0, 1, 1])
     assert result["success_rate"] == 0.0 and result["episodes"] == 4
-    assert task_scores(task, result, episodes, [0, 0, 1, 1]) == {"left_rate": 0.0}
+    assert task_scores(task, result, episodes, [0, 0, 1, 1])["rates"]["passed on the left"]["rate"] == 0.0
     assert task.goal_reached(torch.tensor([[0.0, 0.0, 0.5, 0.4], [0.5, 0.4, 0.0, 0.0]])).tolist() == [True, False]
 
 
 def test_it_is_drawn():
-    axes = draw_scene(Figure().add_subplot(), "puck")
+    run = RunFacts(Path(), get_task("puck"))
+    axes = draw_scene(Figure().add_subplot(), run.task)
     assert [round(patch.get_radius(), 3) for patch in axes.patches] == [0.05, 0.01]
     assert axes.texts[0].get_text() == "goal" and axes.get_xlim() == (0.2, 0.8)
-    (look,) = object_looks("puck", 1)
+    (look,) = bodies_of(run.task, 1)
     assert look.label == "puck" and to_rgb(look.color) == to_rgb(BLUE)
-    assert all_pictures()["rollouts.png"].caption_for("puck").endswith("passes the post on one side.")
-    assert "Squares are the objects" in all_pictures()["rollouts.gif"].caption_for("puck")
+    assert all_pictures()["rollouts.png"].caption_for(run).endswith("passes the post on one side.")
+    assert "Squares are the objects" in all_pictures()["rollouts.gif"].caption_for(run)
 
 
 def test_gymnasium_knows_it():
@@ -135,7 +135,7 @@ def test_a_robot_without_simulator():
         task.goal_reached(torch.zeros(1, 9))
     with pytest.raises(ValueError, match="task 'arm_data' has no contexts"):
         evaluation_contexts(task)
-    draw_scene(Figure().add_subplot(), "arm_data")
+    draw_scene(Figure().add_subplot(), task)
 
 
 @pytest.mark.parametrize("name", ["puck", "arm_data"])

@@ -3,9 +3,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from torchrl_koap.reports.advice import RULES, Numbers, advice
+from torchrl_koap.reports.advice import RULES, advice
+from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.tasks import get_task
 
 
 def inspected(imagined, followed, closed):
@@ -16,18 +20,23 @@ def inspected(imagined, followed, closed):
     }
 
 
+def found(**numbers):
+    return advice(RunFacts(Path("run"), **numbers))
+
+
 def commands(**numbers):
-    return [item.command for item in advice(Numbers(**numbers))]
+    return [item.command for item in found(**numbers)]
 
 
 def test_nothing_is_known_and_nothing_is_said():
-    assert advice(Numbers()) == []
+    assert found() == []
 
 
 def test_a_run_that_succeeds_in_many_ways_needs_nothing():
     evaluation = {"success_rate": 0.95, "success_low": 0.86, "success_high": 0.98, "episodes": 60, "mode_entropy": 0.9}
     summary = {"labels": {"labelled_transitions": 80}, "action_error_mm": {"controller": 1.0, "ridge": 3.0}}
-    assert commands(config={"method": "koap"}, summary=summary, evaluation=evaluation, even_entropy=0.93) == []
+    run = {"task": get_task("avoiding"), "config": {"method": "koap"}}
+    assert commands(summary=summary, evaluation=evaluation, **run) == []
 
 
 def test_failure_without_inspection_asks_for_one():
@@ -47,8 +56,8 @@ def test_a_policy_of_its_own_cannot_be_inspected():
     ],
 )
 def test_the_part_that_fails_is_named(rates, words):
-    (found,) = advice(Numbers(evaluation={"success_rate": rates[2], "episodes": 60}, inspection=inspected(*rates)))
-    assert words in found.finding
+    (item,) = found(evaluation={"success_rate": rates[2], "episodes": 60}, inspection=inspected(*rates))
+    assert words in item.finding
 
 
 def test_more_labels_are_not_proposed_where_the_planner_fails():
@@ -64,27 +73,28 @@ def test_more_labels_are_not_proposed_where_the_planner_fails():
 @pytest.mark.parametrize(("candidates", "command"), [(8, "koap eval {run} --candidates 1"), (1, "koap inspect {run}")])
 def test_low_entropy(candidates, command):
     evaluation = {"success_rate": 0.95, "episodes": 60, "mode_entropy": 0.3, "candidates": candidates}
-    assert commands(evaluation=evaluation, even_entropy=0.93) == [command]
-    assert commands(evaluation=evaluation | {"mode_entropy": 0.8}, even_entropy=0.93) == []
+    task = get_task("avoiding")  # in which 57 episodes without preferences have an entropy of 0.93
+    assert commands(task=task, evaluation=evaluation) == [command]
+    assert commands(task=task, evaluation=evaluation | {"mode_entropy": 0.8}) == []
+    assert commands(evaluation=evaluation) == []  # modes of which nothing is known
 
 
 def test_a_ridge_that_errs_less_is_pointed_out():
-    numbers = Numbers(config={"method": "koap"}, summary={"action_error_mm": {"controller": 3.2, "ridge": 3.1}})
-    assert [item.finding for item in advice(numbers)] == [
-        "the action error of koap is 3.2 mm, that of a plain ridge 3.1 mm"
-    ]
-    assert not advice(Numbers(config={"method": "linear"}, summary={"action_error_mm": {"controller": 3, "ridge": 3}}))
+    (item,) = found(config={"method": "koap"}, summary={"action_error_mm": {"controller": 3.2, "ridge": 3.1}})
+    assert item.finding == "the action error of koap is 3.2 mm, that of a plain ridge 3.1 mm"
+    assert not found(config={"method": "linear"}, summary={"action_error_mm": {"controller": 3, "ridge": 3}})
 
 
 def test_recorded_data():
-    assert "1.20 times as far" in advice(Numbers(evaluation={"relative_plan_error": 1.2}))[0].finding
-    assert "1.10 times as much" in advice(Numbers(evaluation={"relative_action_error": 1.1}))[0].finding
-    assert not advice(Numbers(evaluation={"relative_plan_error": 0.4, "relative_action_error": 0.2}))
+    assert "1.20 times as far" in found(evaluation={"relative_plan_error": 1.2})[0].finding
+    assert "1.10 times as much" in found(evaluation={"relative_action_error": 1.1})[0].finding
+    assert not found(evaluation={"relative_plan_error": 0.4, "relative_action_error": 0.2})
 
 
 def test_slow_plans():
-    assert commands(config={"control_hz": 30}, evaluation={"plan_ms": 40.0}) == ["koap latency {run}"]
-    assert commands(config={"control_hz": 20}, evaluation={"plan_ms": 40.0}) == []
+    task = get_task("avoiding")  # a control step takes 35 ms
+    assert commands(task=task, evaluation={"plan_ms": 40.0}) == ["koap latency {run}"]
+    assert commands(task=task, evaluation={"plan_ms": 30.0}) == []
 
 
 def test_wide_intervals_come_last():

@@ -6,23 +6,33 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 from run_files import write_run
 
 from torchrl_koap.reports import pictures
-from torchrl_koap.reports.mode_plots import recorded_modes
 from torchrl_koap.reports.pictures import NothingToDraw, all_pictures, draw_pictures, picture
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.run_report import write_report
-from torchrl_koap.reports.style import thousandths
+from torchrl_koap.tasks.units import thousandths
 
 PLUGIN = """
+from matplotlib.figure import Figure
 from torchrl_koap.reports.pictures import picture
 
+SEEN = []
+
 @picture("speed.png", source="rollouts.safetensors", title="How fast <it> is", caption="Metres per step & more.")
-def plot_speed(rollouts, path, *, control_hz, num_modes):
-    path.write_text(f"{rollouts['position'].ndim} {control_hz:.1f} {num_modes}")
+def draw_speed(rollouts, run):
+    figure = Figure()
+    figure.suptitle(f"{rollouts['position'].ndim} {run.control_hz:.1f} {run.modes.number}")
+    SEEN.append(figure.get_suptitle())
+    return figure
 """
 
 
@@ -35,11 +45,11 @@ def register(monkeypatch):
 def test_a_module_from_elsewhere_registers_a_picture_of_the_report(tmp_path, monkeypatch):
     (tmp_path / "my_pictures.py").write_text(PLUGIN)
     monkeypatch.syspath_prepend(tmp_path)
-    __import__("my_pictures")
+    seen = __import__("my_pictures").SEEN
     (tmp_path / "run").mkdir()
     run = write_run(tmp_path / "run")
     page = write_report(run, animation=False).read_text()
-    assert (run / "plots" / "speed.png").read_text() == "3 28.6 24"
+    assert seen == ["3 28.6 24"] and (run / "plots" / "speed.png").exists()
     assert (
         "How fast &lt;it&gt; is" in page and "Metres per step &amp; more." in page and 'src="plots/speed.png"' in page
     )
@@ -47,20 +57,15 @@ def test_a_module_from_elsewhere_registers_a_picture_of_the_report(tmp_path, mon
 
 
 def test_a_second_picture_of_the_same_name_is_an_error():
-    def mine(rollouts, path): ...
+    def mine(rollouts, run): ...
 
-    with pytest.raises(ValueError, match=r"'modes.png' is registered already, by torchrl_koap.*_draw_modes; .*mine"):
+    with pytest.raises(ValueError, match=r"'modes.png' is registered already, by torchrl_koap.*draw_modes; .*mine"):
         picture("modes.png", source="rollouts.safetensors", title="", caption="")(mine)
-
-
-def test_an_unknown_fact_is_an_error():
-    with pytest.raises(ValueError, match="wants 'colour', there are only task, num_modes"):
-        picture("a.png", source="eval.json", title="", caption="")(lambda data, path, *, colour: None)
 
 
 def test_a_failure_is_told_and_the_others_are_drawn(tmp_path):
     @picture("broken.png", source="eval.json", title="Broken", caption="")
-    def draw(evaluation, path):
+    def draw(evaluation, run):
         raise ValueError(f"no entry in {len(evaluation)}")
 
     problems = draw_pictures(write_run(tmp_path), animation=False)
@@ -70,7 +75,7 @@ def test_a_failure_is_told_and_the_others_are_drawn(tmp_path):
 
 def test_nothing_to_draw_removes_an_earlier_picture(tmp_path):
     @picture("none.png", source="eval.json", title="None", caption="", empty="the evaluation is short")
-    def draw(evaluation, path):
+    def draw(evaluation, run):
         raise NothingToDraw
 
     run = write_run(tmp_path)
@@ -92,9 +97,40 @@ def test_films_of_an_earlier_evaluation_do_not_stay_beside_the_figures_of_anothe
     assert film.exists() == stays
 
 
+def test_pictures_are_written_whole_and_leave_no_state(tmp_path):
+    before = dict(matplotlib.rcParams)
+    assert draw_pictures(write_run(tmp_path), names=("losses.png", "eigenvalues.png", "rollouts.png")) == {}
+    files = sorted((tmp_path / "plots").iterdir())
+    assert [file.name for file in files] == ["eigenvalues.png", "losses.png", "rollouts.png"]  # nothing half-written
+    for file in files:
+        image = np.asarray(Image.open(file).convert("L"))
+        assert min(image.shape) > 300 and image.std() > 5
+    assert dict(matplotlib.rcParams) == before
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    assert pyplot is None or not pyplot.get_fignums()
+
+
+def test_earlier_picture_survives_a_failure(tmp_path, monkeypatch):
+    draw_pictures(write_run(tmp_path), names=("losses.png",))
+    before = (tmp_path / "plots" / "losses.png").read_bytes()
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", full)
+    assert "No space left" in draw_pictures(tmp_path, names=("losses.png",))["losses.png"]
+    (kept,) = (tmp_path / "plots").iterdir()
+    assert kept.read_bytes() == before
+
+
 def test_every_picture_has_words_and_a_command():
     for item in all_pictures().values():
-        assert item.title and len(item.caption) > 40 and item.command.startswith("koap ") and "{run}" in item.command
+        assert (
+            item.title
+            and len(item.caption_for(RunFacts(Path("run")))) > 40
+            and item.command.startswith("koap ")
+            and "{run}" in item.command
+        )
 
 
 def test_drawing_needs_neither_training_nor_simulator():
@@ -105,17 +141,6 @@ def test_drawing_needs_neither_training_nor_simulator():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.strip() == "[]"
-
-
-def test_modes_of_recorded_paths_are_those_of_the_rule():
-    """The black ticks: rows are passed left or right of the cylinders, whatever the frames between."""
-    left = [[0.45, -0.2], [0.44, -0.11], [0.4, 0.0], [0.4, 0.07], [0.3, 0.2], [0.3, 0.27], [0.3, 0.36]]
-    right = [[0.55, -0.09], [0.6, 0.1], [0.7, 0.3]]
-    short = [[0.5, -0.3], [0.5, -0.2]]
-    data = {"position": np.array(left + right + short), "episode": np.repeat([0, 1, 2], [7, 3, 2])}
-    assert recorded_modes(data, "avoiding").tolist() == [0, 23, -1]
-    assert recorded_modes(data, "aligning") is None
-    assert recorded_modes({"mode": np.array([4, 2])}, "aligning").tolist() == [4, 2]
 
 
 def test_units():

@@ -9,8 +9,8 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from torchrl_koap.reports import objects, scenes
-from torchrl_koap.tasks import TASKS
+from torchrl_koap.reports import scenes
+from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.tasks.avoiding import OBSTACLES
 
 
@@ -40,15 +40,10 @@ def test_avoiding_is_that_of_the_environment(models):
 
 
 def test_scene_has_true_radii():
-    axes = scenes.draw_scene(Figure().add_subplot(), "avoiding")
+    axes = scenes.draw_scene(Figure().add_subplot(), get_task("avoiding"))
     sizes = sorted(round(patch.get_radius(), 3) for patch in axes.patches)
     assert sizes == [0.025] * 5 + [0.03] + [0.035] * 5 + [0.04]
     assert axes.get_aspect() == 1
-
-
-def test_unknown_scene_suggests_the_nearest():
-    with pytest.raises(ValueError, match="did you mean 'avoiding'"):
-        scenes.draw_scene(Figure().add_subplot(), "avoidin")
 
 
 @pytest.mark.parametrize("task", ["sorting", "sorting_2", "sorting_6", "po_sorting"])
@@ -64,7 +59,7 @@ def test_sorting_is_that_of_the_environment(task, models):
         walls = [(*body.pos[:2] + model.geom_pos[geom][:2], *model.geom_size[geom][:2]) for geom in geoms]
         found = [(*shape.center, *shape.half) for shape in shapes(task, "wall") if shape.color == name]
         np.testing.assert_allclose(sorted(walls), sorted(found), atol=1e-12)
-    colors = {patch.get_facecolor()[:3] for patch in scenes.draw_scene(Figure().add_subplot(), task).patches[1:]}
+    colors = {patch.get_facecolor()[:3] for patch in scenes.draw_scene(Figure().add_subplot(), TASKS[task]).patches[1:]}
     assert colors == {to_rgb(scenes.RED), to_rgb(scenes.BLUE)}
 
 
@@ -87,23 +82,23 @@ def test_regions_of_aligning_are_those_of_the_contexts():
 
 @pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].objects and TASKS[task].converter])
 def test_bodies_have_the_sizes_and_colours_of_the_environment(task, models):
-    model, looks = models[task], objects.object_looks(task, len(TASKS[task].objects))
-    assert len(looks) == len(TASKS[task].objects)
-    for name, look in zip(TASKS[task].objects, looks, strict=True):
+    model, bodies = models[task], scenes.bodies_of(TASKS[task], len(TASKS[task].objects))
+    assert len(bodies) == len(TASKS[task].objects)
+    for name, body in zip(TASKS[task].objects, bodies, strict=True):
         if name == "target":
-            assert look.still
-            np.testing.assert_allclose(model.site("target_base").size[:2], look.half)
+            assert body.still
+            np.testing.assert_allclose(model.site("target_base").size[:2], body.half)
             continue
         geom = int(model.body(name).geomadr[0])
-        assert not look.still and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
-        np.testing.assert_allclose(model.geom_size[geom][:2], look.half)
+        assert not body.still and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
+        np.testing.assert_allclose(model.geom_size[geom][:2], body.half)
         if task != "aligning":
-            assert np.argmax(to_rgb(look.color)) == np.argmax(model.geom_rgba[geom][:3])
+            assert np.argmax(to_rgb(body.color)) == np.argmax(model.geom_rgba[geom][:3])
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_start_lies_inside_the_picture(task):
-    axes = scenes.draw_scene(Figure().add_subplot(), task)
+    axes = scenes.draw_scene(Figure().add_subplot(), TASKS[task])
     if TASKS[task].objects:
         contexts = pytest.importorskip("torchrl_koap.envs.contexts").draw_contexts(task, 200, 0)
         low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
@@ -114,7 +109,7 @@ def test_outlines_turn_with_the_body():
     from torchrl_koap.envs.contexts import yaw_quaternions
 
     poses, half = np.array([[0.4, -0.2, 0.7], [0.5, 0.1, -1.2]]), (0.03, 0.05)
-    for pose, outline in zip(poses, objects.outlines(poses, half), strict=True):
+    for pose, outline in zip(poses, scenes.outlines(poses, half), strict=True):
         np.testing.assert_allclose(outline[0], outline[4])
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, yaw_quaternions(pose[2]))
@@ -126,9 +121,9 @@ def test_outlines_turn_with_the_body():
 @pytest.mark.parametrize("number", [3, 21])
 def test_orientation_is_drawn(number):
     """Outlines with a thick far side, of many the centre and a line to the far side."""
-    axes, looks = Figure().add_subplot(), objects.object_looks("aligning", 2)
+    axes, bodies = Figure().add_subplot(), scenes.bodies_of(get_task("aligning"), 2)
     contexts = np.tile([[0.5, -0.2, 0.0], [0.5, 0.3, np.pi / 2]], (number, 1, 1))
-    objects.draw_starts(axes, contexts, looks)
+    scenes.draw_starts(axes, contexts, bodies)
     lines = [line for item in axes.collections if hasattr(item, "get_segments") for line in item.get_segments()]
     if number == 3:
         assert [len(line) for line in lines] == [5] * 3 + [2] * 3 + [5] * 3 + [2] * 3
@@ -140,11 +135,18 @@ def test_orientation_is_drawn(number):
 
 
 def test_objects_of_an_unknown_task_are_grey():
-    looks = objects.object_looks(None, 5)
-    assert len(looks) == 5 and {look.color for look in looks} == {scenes.MUTED}
-    assert objects.object_looks("stacking", 2) == looks[:2]
+    bodies = scenes.bodies_of(None, 5)
+    assert len(bodies) == 5 and {body.color for body in bodies} == {scenes.MUTED}
+    assert scenes.bodies_of(get_task("stacking"), 2) == bodies[:2]
 
 
 def test_bad_contexts():
     with pytest.raises(ValueError, match=r"'context' must have shape \[any, 2, 3\], got \[4, 2\]"):
-        objects.draw_starts(Figure().add_subplot(), np.zeros((4, 2)), objects.object_looks("aligning", 2))
+        scenes.draw_starts(Figure().add_subplot(), np.zeros((4, 2)), scenes.bodies_of(get_task("aligning"), 2))
+
+
+def test_executed_paths_end_where_the_episode_does():
+    data = {"position": np.zeros((2, 9, 2)), "length": np.array([4, 9]), "object_position": np.zeros((2, 9, 1, 2))}
+    assert [len(path) for path in scenes.executed_paths(data)] == [4, 9]
+    assert [len(path) for path in scenes.body_paths(data)] == [5, 9]  # with the state after the last step
+    assert scenes.body_paths({"position": data["position"]}) == []

@@ -10,9 +10,7 @@ import tyro
 
 from torchrl_koap.commands.command import Command, Options
 from torchrl_koap.evaluation import InspectConfig, inspect
-from torchrl_koap.reports.diagnosis_plot import plot_inspection
-from torchrl_koap.reports.latent_plot import plot_latent
-from torchrl_koap.reports.pictures import FOLDER
+from torchrl_koap.reports.pictures import draw_pictures
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.run_directory import RunDirectory
 
@@ -33,12 +31,8 @@ class Inspect(Command):
         """Inspects, draws, and writes ``inspect.json``."""
         found = inspect(self.run, self.config)
         result, folder = found.result, found.folder
-        pictures = folder / FOLDER
-        if "multi_step" in result["latent"]:
-            plot_latent(result["latent"], pictures / "latent.png", task=found.task, eigenvalues=found.eigenvalues)
         RunDirectory(folder).write_json("inspect.json", result)
-        if not self.config.latent_only:
-            plot_inspection(result, found.task, pictures / "inspect.png")
+        draw_pictures(folder, names=("inspect.png", "latent.png"))
         if (folder / "index.html").exists():
             write_report(folder, draw=False)
         return result

@@ -9,7 +9,7 @@ leave the plans, and how far they leave the demonstrations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -19,7 +19,6 @@ from torch import Tensor
 from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.evaluation.rollouts import make_policy, roll_out
 from torchrl_koap.evaluation.scores import outcome_of
-from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.execution.replay import RecordedPlanner
@@ -237,12 +236,6 @@ def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase, *
         "demonstrated_median": figures[1].median().item(),
         "demonstrated_95": figures[1].quantile(0.95).item(),
     }
-
-
-def rate(good: Sequence[bool]) -> Mapping[str, float]:
-    """Success rate with its 95 % Wilson interval and n."""
-    low, high = wilson_interval(sum(good), len(good))
-    return {"rate": sum(good) / len(good), "low": low, "high": high, "episodes": len(good)}
 
 
 def imagined_success(task: Task, imagined: Tensor) -> list[bool]:

@@ -20,13 +20,13 @@ from torchrl_koap.evaluation.diagnosis import (
     imagine,
     imagined_success,
     left_recordings,
-    rate,
     tracking_errors,
 )
 from torchrl_koap.evaluation.latent_space import analyse_latent
 from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET, error_unit, judge_latent_model
 from torchrl_koap.evaluation.places import choose_contexts
 from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy, roll_out
+from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_run
 from torchrl_koap.evaluation.training_data import load_training_data
 from torchrl_koap.modules import KoopmanInverseDynamics

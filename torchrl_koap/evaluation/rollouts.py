@@ -17,7 +17,8 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_koap.evaluation.scores import OUTCOMES, outcome_of
+from torchrl_koap.evaluation.scores import outcome_of
+from torchrl_koap.evaluation.statistics import OUTCOMES
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
 from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.execution.command_leash import CommandLeash

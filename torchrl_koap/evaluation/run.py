@@ -90,7 +90,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         unsolved=unsolved,
     )
     if config.env is None:
-        result |= task_scores(task, result, episodes, place.numbers)
+        result = task_scores(task, result, episodes, place.numbers)
     rows = result.pop("episode")
     timed = policy if config.controller == "learned" else load_policy(trained, replace(config, controller="learned"))
     result |= measure_latency(timed, task.observation_dim)

@@ -15,12 +15,10 @@ from typing import Any
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, mode_entropy, wilson_interval
+from torchrl_koap.evaluation.statistics import bootstrap_interval, conditional_entropy, mode_entropy, rate
 from torchrl_koap.keys import COLLISION, MODE, SUCCESS
 from torchrl_koap.lookup import resolve
 from torchrl_koap.tasks import Task
-
-OUTCOMES = ("timeout", "success", "collision")
 
 
 def outcome_of(episode: TensorDict) -> str:
@@ -64,7 +62,9 @@ def score(
         rows.append({"seed": seed, "outcome": outcome_of(episode), "mode": mode, "steps": len(episode)})
     won = [row for row in rows if row["outcome"] == "success"]
     modes = [row["mode"] for row in won if row["mode"] >= 0]
-    result = _rate("success", len(won), len(rows), {"episodes": len(rows)})
+    success = rate([row["outcome"] == "success" for row in rows])
+    result: dict[str, Any] = {"episodes": success.pop("episodes"), "rates": {"success": success}}
+    result |= {f"success_{name}": value for name, value in success.items()}
 
     def pooled(sample: Sequence[int]) -> float | None:
         return mode_entropy(sample, num_modes) if num_modes > 1 else None
@@ -96,11 +96,6 @@ def score(
     }
 
 
-def _rate(name: str, good: int, total: int, first: dict[str, Any]) -> dict[str, Any]:
-    low, high = wilson_interval(good, total)
-    return first | {f"{name}_rate": good / total, f"{name}_low": low, f"{name}_high": high}
-
-
 def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float | None]:
     known = len(units) and statistic(units) is not None
     interval = (bootstrap_interval(units, statistic) if known else None) or (None, None)
@@ -111,9 +106,10 @@ def _entropy(name: str, units: Sequence, statistic: Callable) -> dict[str, float
 def task_scores(
     task: Task, result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int] | None
 ) -> dict[str, Any]:
-    """The figures that a task adds to those of :func:`score`, by the function that ``Task.score`` names.
+    """Returns the figures of :func:`score` with those that a task adds, by the function that ``Task.score`` names.
 
-    ``d3il_score`` among them is the single figure D3IL ranks methods by, where it is defined.
+    ``d3il_score`` among them is the single figure D3IL ranks methods by, where it is defined. What the function returns
+    as ``rates``, a name in words to a bool per rollout, joins the success in ``rates``, with an interval.
 
     Args:
         task (Task): the task.
@@ -124,11 +120,13 @@ def task_scores(
     Examples:
         >>> from torchrl_koap.evaluation.scores import task_scores
         >>> from torchrl_koap.tasks import get_task
-        >>> task_scores(get_task("aligning"), {"success_rate": 0.5, "mode_entropy": 1.0}, [], [])
-        {'d3il_score': 0.75}
+        >>> task_scores(get_task("aligning"), {"success_rate": 0.5, "mode_entropy": 1.0}, [], [])["d3il_score"]
+        0.75
     """
     rule = resolve(task.score, f"score of task {task.name!r}")
-    return {} if rule is None else rule(result, episodes, contexts)
+    found = {} if rule is None else dict(rule(result, episodes, contexts))
+    rates = {name: rate(good) for name, good in found.pop("rates", {}).items()}
+    return result | found | {"rates": result.get("rates", {}) | rates}
 
 
 def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
@@ -140,11 +138,11 @@ def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], cont
         contexts (sequence of int): number of the context of every episode.
 
     Returns:
-        dict: ``stacked_1_rate``, ``stacked_2_rate``, ``stacked_3_rate`` with intervals, entropies of the first one, two
-        and three letters (bases 3, 6, 6) over contexts, and ``d3il_score``, the sum of the three rates.
+        dict: ``rates`` of one, two and three boxes, entropies of the first one, two and three letters (bases 3, 6, 6)
+        over contexts, and ``d3il_score``, the sum of the three rates.
     """
     found = _stacked(episodes, contexts, most=3)
-    return found | {"d3il_score": sum(found[f"stacked_{count}_rate"] for count in (1, 2, 3))}
+    return found | {"d3il_score": sum(sum(good) / len(good) for good in found["rates"].values())}
 
 
 def first_box_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
@@ -163,12 +161,13 @@ def first_box_scores(result: dict[str, Any], episodes: Sequence[TensorDict], con
 
 def _stacked(episodes: Sequence[TensorDict], contexts: Sequence[int], *, most: int) -> dict[str, Any]:
     letters = [tuple(int(letter) for letter in episode[-1]["next", MODE] if letter >= 0) for episode in episodes]
-    result: dict[str, Any] = {}
+    result: dict[str, Any] = {"rates": {}}
+    names = ("one box stacked", "two boxes stacked", "three boxes stacked")
     for count, base in ((1, 3), (2, 6), (3, 6))[:most]:
         good = [len(order) >= count for order in letters]
         if count == 3:  # three letters are not yet a stack
             good = [episode[-1]["next", SUCCESS].item() for episode in episodes]
-        result |= _rate(f"stacked_{count}", sum(good), len(good), {})
+        result["rates"][names[count - 1]] = good
         orders = {order: index for index, order in enumerate(itertools.permutations(range(3), count))}
         groups: dict[int, list[int]] = {context: [] for context in contexts}
         for order, fine, context in zip(letters, good, contexts, strict=True):

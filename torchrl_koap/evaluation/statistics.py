@@ -11,6 +11,8 @@ import numpy as np
 from scipy.special import entr
 from scipy.stats import binomtest
 
+OUTCOMES = ("timeout", "success", "collision")  # of an episode, by number
+
 
 def wilson_interval(successes: int, trials: int, *, level: float = 0.95) -> tuple[float, float]:
     """Wilson score interval of a success rate.
@@ -39,6 +41,21 @@ def wilson_interval(successes: int, trials: int, *, level: float = 0.95) -> tupl
     return float(interval.low), float(interval.high)
 
 
+def rate(good: Sequence[bool]) -> dict[str, float]:
+    """Returns the share of trials that succeeded, its 95 % Wilson interval and their number.
+
+    Args:
+        good (sequence of bool): whether each trial succeeded.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.statistics import rate
+        >>> rate([True, True])["rate"], round(rate([True, True])["low"], 3), rate([True, True])["episodes"]
+        (1.0, 0.342, 2)
+    """
+    low, high = wilson_interval(sum(good), len(good))
+    return {"rate": sum(good) / len(good), "low": low, "high": high, "episodes": len(good)}
+
+
 def mode_entropy(modes: Sequence[int], num_modes: int) -> float:
     """Entropy of the modes seen, logarithm base ``num_modes``: 1 if all are equally frequent, 0 for a single one.
 
@@ -61,6 +78,30 @@ def mode_entropy(modes: Sequence[int], num_modes: int) -> float:
         return 0.0
     shares = np.bincount(np.asarray(modes, dtype=int)) / len(modes)
     return float(entr(shares).sum() / math.log(num_modes))  # scipy.stats.entropy would be ten times slower
+
+
+def expected_entropy(episodes: int, num_modes: int) -> float:
+    """Exact mean of the mode entropy of that many episodes whose modes are drawn uniformly.
+
+    A few episodes cannot fill all modes evenly, so this is below 1: what a policy without preferences scores.
+
+    Args:
+        episodes (int): number of episodes.
+        num_modes (int): number of modes, and base of the logarithm.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.statistics import expected_entropy
+        >>> expected_entropy(1, 24), round(expected_entropy(60, 24), 3), round(expected_entropy(10_000, 24), 3)
+        (0.0, 0.932, 1.0)
+    """
+    if episodes < 1 or num_modes < 2:
+        return 0.0
+    total = 0.0
+    for count in range(1, episodes + 1):
+        log_chance = math.lgamma(episodes + 1) - math.lgamma(count + 1) - math.lgamma(episodes - count + 1)
+        log_chance += count * math.log(1 / num_modes) + (episodes - count) * math.log(1 - 1 / num_modes)
+        total -= math.exp(log_chance) * count / episodes * math.log(count / episodes)
+    return num_modes * total / math.log(num_modes)
 
 
 def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsolved: str = "skip") -> float | None:

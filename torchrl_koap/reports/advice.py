@@ -7,16 +7,15 @@ that tells more or a change that was measured to matter (``docs/results``); that
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-from torchrl_koap.reports.html import number
+from torchrl_koap.reports.run_facts import RunFacts, number
 
 GOOD = 0.9  # a success rate above which nothing is looked for
 APART = 0.2  # success rates that differ by more than chance of a few dozen rollouts
 WIDE = 0.25  # width of a 95 % interval that hardly tells two methods apart
-FEW_MODES = 0.7  # of the entropy that an even choice would have
+FEW_MODES = 0.7  # of the entropy that a uniform choice would have
 FEW_LABELS = 300  # labelled transitions
 CONTROLS = ("koap_untrained", "linear_steps", "linear")
 
@@ -41,76 +40,34 @@ class Advice:
     command: str = ""
 
 
-@dataclass(frozen=True)
-class Numbers:
-    """What is known of a run; absent files are empty.
+def advice(run: RunFacts) -> list[Advice]:
+    """Returns everything that the rules have to say about a run, most telling first.
 
     Args:
-        config (mapping): ``config.json``.
-        summary (mapping): ``summary.json``.
-        evaluation (mapping): ``eval.json``.
-        inspection (mapping): ``inspect.json``.
-        even_entropy (float, optional): entropy that an even choice of modes would average with as many successes.
+        run (RunFacts): what is known of the run.
 
     Examples:
-        >>> from torchrl_koap.reports.advice import Numbers
-        >>> Numbers(evaluation={"success_rate": 0.5}).of("success_rate")
-        0.5
-    """
-
-    config: Mapping[str, Any] = ()  # type: ignore[assignment]
-    summary: Mapping[str, Any] = ()  # type: ignore[assignment]
-    evaluation: Mapping[str, Any] = ()  # type: ignore[assignment]
-    inspection: Mapping[str, Any] = ()  # type: ignore[assignment]
-    even_entropy: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("config", "summary", "evaluation", "inspection"):
-            object.__setattr__(self, name, dict(getattr(self, name)))
-
-    def of(self, name: str) -> float | None:
-        """A number of the evaluation, None if it is not there."""
-        return number(self.evaluation.get(name))
-
-    def rate(self, experiment: str) -> float | None:
-        """Success of an experiment of ``koap inspect``, None if it was not made."""
-        found = self.inspection.get(experiment)
-        return number(found.get("rate")) if isinstance(found, Mapping) else None
-
-    @property
-    def labels(self) -> float | None:
-        """Labelled transitions, None if nobody counted."""
-        account = self.summary.get("labels")
-        return number(account.get("labelled_transitions")) if isinstance(account, Mapping) else None
-
-
-def advice(numbers: Numbers) -> list[Advice]:
-    """Everything that the rules have to say, most telling first.
-
-    Args:
-        numbers (Numbers): what is known of the run.
-
-    Examples:
-        >>> from torchrl_koap.reports.advice import Numbers, advice
-        >>> numbers = Numbers(evaluation={"success_rate": 0.5, "success_low": 0.2, "success_high": 0.8, "episodes": 8})
-        >>> [item.command for item in advice(numbers)][-1]
+        >>> from pathlib import Path
+        >>> from torchrl_koap.reports.advice import RunFacts, advice
+        >>> evaluation = {"success_rate": 0.5, "success_low": 0.2, "success_high": 0.8, "episodes": 8}
+        >>> [item.command for item in advice(RunFacts(Path("runs/koap"), evaluation=evaluation))][-1]
         'koap eval {run} --episodes 60 --seed 100'
     """
-    return [item for rule in RULES for item in [rule(numbers)] if item is not None]
+    return [item for rule in RULES for item in [rule(run)] if item is not None]
 
 
-def which_part(numbers: Numbers) -> Advice | None:
+def which_part(run: RunFacts) -> Advice | None:
     """The closed loop fails and nobody has looked where."""
-    success = numbers.of("success_rate")
-    if success is None or success >= GOOD or numbers.rate("closed_loop") is not None or _is_policy(numbers):
+    success = run.evaluated("success_rate")
+    if success is None or success >= GOOD or run.experiment("closed_loop") is not None or _is_policy(run):
         return None
     finding = f"success is {_percent(success)}; whether planner or controller fails is not known"
     return Advice(finding, "let each of them work alone", "koap inspect {run}")
 
 
-def planner_imagines_failure(numbers: Numbers) -> Advice | None:
+def planner_fails(run: RunFacts) -> Advice | None:
     """The planner does not reach the goal even when its plans come true."""
-    imagined = numbers.rate("imagined")
+    imagined = run.experiment("imagined")
     if imagined is None or imagined >= GOOD:
         return None
     return Advice(
@@ -119,9 +76,9 @@ def planner_imagines_failure(numbers: Numbers) -> Advice | None:
     )
 
 
-def plans_are_not_followed(numbers: Numbers) -> Advice | None:
+def plans_are_not_followed(run: RunFacts) -> Advice | None:
     """Imagined high, closed loop low: what lies between a plan and its execution."""
-    imagined, followed, closed = (numbers.rate(name) for name in ("imagined", "followed", "closed_loop"))
+    imagined, followed, closed = (run.experiment(name) for name in ("imagined", "followed", "closed_loop"))
     if imagined is None or closed is None or imagined < GOOD or imagined - closed < APART:
         return None
     seen = f"plans alone reach the goal in {_percent(imagined)}, the closed loop in {_percent(closed)}"
@@ -137,20 +94,20 @@ def plans_are_not_followed(numbers: Numbers) -> Advice | None:
     )
 
 
-def one_way_only(numbers: Numbers) -> Advice | None:
+def one_way_only(run: RunFacts) -> Advice | None:
     """Low entropy of the modes."""
-    entropy = numbers.of("mode_entropy")
-    entropy = numbers.of("pooled_mode_entropy") if entropy is None else entropy
-    success, even = numbers.of("success_rate"), numbers.even_entropy
+    entropy = run.evaluated("mode_entropy")
+    entropy = run.evaluated("pooled_mode_entropy") if entropy is None else entropy
+    success, even = run.evaluated("success_rate"), run.expected_entropy
     if entropy is None or not even or not success or entropy >= FEW_MODES * even:
         return None
-    seen = f"the entropy of the modes is {entropy:.2f}, an even choice would average {even:.2f}"
-    if _is_policy(numbers):
+    seen = f"the entropy of the modes is {entropy:.2f}, a uniform choice would average {even:.2f}"
+    if _is_policy(run):
         return Advice(
             f"{seen}: a policy of its own knows the labelled ways only",
             "a method that plans learns the ways from all demonstrations (--method koap)",
         )
-    candidates = numbers.of("candidates") or 1
+    candidates = run.evaluated("candidates") or 1
     if candidates > 1:
         return Advice(
             f"{seen}, with {candidates:.0f} candidates per plan",
@@ -164,30 +121,28 @@ def one_way_only(numbers: Numbers) -> Advice | None:
     )
 
 
-def control_is_as_good(numbers: Numbers) -> Advice | None:
+def control_is_as_good(run: RunFacts) -> Advice | None:
     """A plain ridge errs no more than the method."""
-    method = numbers.config.get("method")
-    for name, errors in numbers.summary.items():
-        if not (name.startswith("action_error") and isinstance(errors, Mapping)):
-            continue
-        own, ridge = number(errors.get("controller")), number(errors.get("ridge"))
-        if own is not None and ridge is not None and own >= ridge and method not in CONTROLS:
-            unit = name.removeprefix("action_error").removeprefix("_")
-            return Advice(
-                f"the action error of {method} is {own:.3g} {unit}, that of a plain ridge {ridge:.3g} {unit}".strip(),
-                "the ridge is simpler; compare both in closed loop before keeping either",
-                "koap curve --methods koap,koap_untrained,linear_steps,linear --out curves/compare",
-            )
-    return None
-
-
-def few_labels(numbers: Numbers) -> Advice | None:
-    """Little is labelled, and it does not succeed yet."""
-    labels, success = numbers.labels, numbers.of("success_rate")
-    planner_fails = (numbers.rate("imagined") or 1.0) < GOOD
-    if labels is None or labels >= FEW_LABELS or success is None or success >= GOOD or planner_fails:
+    method, (errors, unit) = run.config.get("method"), run.action_errors
+    own, ridge = number(errors.get("controller")), number(errors.get("ridge"))
+    if own is None or ridge is None or own < ridge or method in CONTROLS:
         return None
-    if not str(numbers.config.get("method", "")).startswith("koap"):
+    return Advice(
+        f"the action error of {method} is {own:.3g} {unit}, that of a plain ridge {ridge:.3g} {unit}".strip(),
+        "the ridge is simpler; compare both in closed loop before keeping either",
+        "koap curve --methods koap,koap_untrained,linear_steps,linear --out curves/compare",
+    )
+
+
+def few_labels(run: RunFacts) -> Advice | None:
+    """Little is labelled, and it does not succeed yet."""
+    labels, success = run.labels, run.evaluated("success_rate")
+    planner = run.experiment("imagined")
+    if labels is None or labels >= FEW_LABELS or success is None or success >= GOOD:
+        return None
+    if planner is not None and planner < GOOD:  # more labels would not help
+        return None
+    if not str(run.config.get("method", "")).startswith("koap"):
         return None
     return Advice(
         f"{labels:,.0f} transitions are labelled",
@@ -196,9 +151,9 @@ def few_labels(numbers: Numbers) -> Advice | None:
     )
 
 
-def worse_than_standing_still(numbers: Numbers) -> Advice | None:
-    """Judged on recorded data: plans or actions are no better than a trivial guess."""
-    plan, action = numbers.of("relative_plan_error"), numbers.of("relative_action_error")
+def worse_than_a_guess(run: RunFacts) -> Advice | None:
+    """On recorded data plans or actions are no better than a trivial guess."""
+    plan, action = run.evaluated("relative_plan_error"), run.evaluated("relative_action_error")
     if plan is not None and plan >= 1:
         return Advice(
             f"plans lie {plan:.2f} times as far from the recordings as standing still would",
@@ -213,9 +168,9 @@ def worse_than_standing_still(numbers: Numbers) -> Advice | None:
     return None
 
 
-def too_slow(numbers: Numbers) -> Advice | None:
+def too_slow(run: RunFacts) -> Advice | None:
     """A plan takes longer than the robot waits."""
-    plan, control = numbers.of("plan_ms"), number(numbers.config.get("control_hz"))
+    plan, control = run.evaluated("plan_ms"), run.control_hz
     if plan is None or control is None or plan < 1000 / control:
         return None
     return Advice(
@@ -225,9 +180,9 @@ def too_slow(numbers: Numbers) -> Advice | None:
     )
 
 
-def few_rollouts(numbers: Numbers) -> Advice | None:
+def few_rollouts(run: RunFacts) -> Advice | None:
     """The interval is too wide to tell anything from anything."""
-    low, high, episodes = (numbers.of(name) for name in ("success_low", "success_high", "episodes"))
+    low, high, episodes = (run.evaluated(name) for name in ("success_low", "success_high", "episodes"))
     if low is None or high is None or episodes is None or high - low <= WIDE or episodes >= 60:
         return None
     return Advice(
@@ -237,9 +192,9 @@ def few_rollouts(numbers: Numbers) -> Advice | None:
     )
 
 
-RULES: tuple[Callable[[Numbers], Advice | None], ...] = (
-    worse_than_standing_still,
-    planner_imagines_failure,
+RULES: tuple[Callable[[RunFacts], Advice | None], ...] = (
+    worse_than_a_guess,
+    planner_fails,
     plans_are_not_followed,
     which_part,
     few_labels,
@@ -250,9 +205,9 @@ RULES: tuple[Callable[[Numbers], Advice | None], ...] = (
 )
 
 
-def _is_policy(numbers: Numbers) -> bool:
+def _is_policy(run: RunFacts) -> bool:
     """Whether the method acts without a planner, as far as the summary tells."""
-    return number(numbers.summary.get("planner_parameters")) == 0
+    return number(run.summary.get("planner_parameters")) == 0
 
 
 def _percent(rate: float) -> str:

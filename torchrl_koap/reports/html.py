@@ -14,10 +14,11 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from torchrl_koap.files import replacing_file
+
 _UNITS = {"_ms": "ms", "_mm": "mm", "_mrad": "mrad", "_hz": "Hz", "_seconds": "s"}
-_SHARES = ("success", "stacked_1", "stacked_2", "stacked_3")
-_PERCENT = {f"{name}_{part}" for name in _SHARES for part in ("rate", "low", "high")}
-_PLAIN = {"seed", "mode"}
+_SHARES = ("success_rate", "success_low", "success_high")
+_PLAIN = ("seed", "mode")
 _WORDS = {
     "success_low": "success, 95 % from",
     "success_high": "success, 95 % to",
@@ -26,21 +27,8 @@ _WORDS = {
 }
 
 
-def number(value: Any) -> float | int | None:
-    """The value if it is a finite number, else None.
-
-    Examples:
-        >>> from torchrl_koap.reports.html import number
-        >>> number(0.5), number(True), number("0.5"), number(float("nan"))
-        (0.5, None, None, None)
-    """
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        return None
-    return value
-
-
 def duration(seconds: float) -> str:
-    """A time in words.
+    """Returns a time in words.
 
     Examples:
         >>> from torchrl_koap.reports.html import duration
@@ -54,7 +42,7 @@ def duration(seconds: float) -> str:
 
 
 def show(value: Any, key: str = "") -> str:
-    """A single value as text, not escaped: the template does that.
+    """Returns a single value as text, not escaped: the template does that.
 
     Args:
         value: a value of a JSON file that is no container.
@@ -74,12 +62,12 @@ def show(value: Any, key: str = "") -> str:
     if isinstance(value, float):
         if not math.isfinite(value):
             return "not a number" if math.isnan(value) else "infinite"
-        return f"{100 * value:.1f} %" if key in _PERCENT else f"{value:.4g}"
+        return f"{100 * value:.1f} %" if key in _SHARES else f"{value:.4g}"
     return str(value)
 
 
 def label(key: Any) -> str:
-    """A key as words, with its unit.
+    """Returns a key as words, with its unit.
 
     Examples:
         >>> from torchrl_koap.reports.html import label
@@ -96,13 +84,13 @@ def label(key: Any) -> str:
 
 
 def columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Every key of some mappings, in the order in which they first occur."""
+    """Returns every key of some mappings, in the order in which they first occur."""
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
 @cache
 def templates() -> Environment:
-    """The templates of this package; names that are not handed in are errors, everything else is escaped."""
+    """Returns the templates of this package; names that are not handed in are errors, everything else is escaped."""
     environment = Environment(
         loader=PackageLoader("torchrl_koap.reports"),
         autoescape=lambda name: name is None or name.endswith(".html"),
@@ -116,65 +104,19 @@ def templates() -> Environment:
     return environment
 
 
-def definition(key: str, value: Any) -> str:
-    """Markup of any JSON value: mappings and lists of mappings become tables, short lists a line.
-
-    Args:
-        key (str): the value's key.
-        value: the value.
-
-    Examples:
-        >>> from torchrl_koap.reports.html import definition
-        >>> str(definition("scores", [1, 2])), definition("a", {"b": {"c": "<b>"}}).count("<table>")
-        ('1, 2', 2)
-    """
-    return templates().get_template("pieces.html").module.definition(key, value)
-
-
-def interval_bar(value: float, low: float, high: float) -> str:
-    """A share with its interval on a line from 0 to 100 %, as a drawing inside the page.
-
-    Args:
-        value (float): the share, in 0..1.
-        low (float): lower end of its interval.
-        high (float): upper end.
-
-    Examples:
-        >>> from torchrl_koap.reports.html import interval_bar
-        >>> 'x="80.0"' in interval_bar(0.9, 0.8, 0.96)
-        True
-    """
-    return templates().get_template("pieces.html").module.interval_bar(*bar(value, low, high))
-
-
-def bar(value: float, low: float, high: float) -> tuple[float, float, float]:
-    """A share and its interval in percent, cut to 0..100.
-
-    Args:
-        value (float): the share, 0 to 1.
-        low (float): lower end of its interval.
-        high (float): upper end.
-
-    Returns:
-        tuple of float: the three in percent.
-    """
-    value, low, high = (100 * min(max(part, 0.0), 1.0) for part in (value, low, high))
-    return value, low, high
+def bar(value: float, low: float, high: float) -> tuple[float, ...]:
+    """Returns a share (0 to 1) and the ends of its interval in percent, cut to 0..100."""
+    return tuple(100 * min(max(part, 0.0), 1.0) for part in (value, low, high))
 
 
 def write_page(template: str, path: str | Path, **content: Any) -> Path:
-    """Fills a template and writes the page, aside first.
+    """Fills a template of ``reports/templates``, writes the page aside first, and returns its file.
 
     Args:
-        template (str): its file name in ``reports/templates``.
+        template (str): file name of the template.
         path (str or Path): the page.
         **content: what the template names.
-
-    Returns:
-        Path: the page.
     """
-    from torchrl_koap.files import replacing_file  # imports torch: only when something is written
-
     path, page = Path(path), templates().get_template(template).render(**content)
     with replacing_file(path) as aside:
         aside.write_text(page, encoding="utf-8")

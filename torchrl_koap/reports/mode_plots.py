@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which modes occurred: a chart, a table for other pictures, and what to compare their entropy with."""
+"""Which modes occurred: a chart, a table for other pictures, and a colour for each mode."""
 
 from __future__ import annotations
 
@@ -10,47 +10,20 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 from safetensors.numpy import load_file
 
-from torchrl_koap.evaluation.statistics import mode_entropy
-from torchrl_koap.reports.mode_colors import initials, mode_colors
-from torchrl_koap.reports.pictures import picture
-from torchrl_koap.reports.style import FAINT, INK, MUTED, SUCCESS, as_array, legend_beside, save_figure, set_title, tidy
-from torchrl_koap.tasks.avoiding import OBSTACLES
-from torchrl_koap.tasks.modes import mode_choices
+from torchrl_koap.evaluation.statistics import expected_entropy, mode_entropy
+from torchrl_koap.reports.pictures import NothingToDraw, picture
+from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.reports.style import BLUE, FAINT, GREY, INK, MUTED, SUCCESS, entry, legend_beside, set_title, tidy
+from torchrl_koap.tasks import Modes
+from torchrl_koap.tasks.import_strings import resolve
 
-_ROW_REACH = 0.03  # m before and behind a row of cylinders: the gap is the one at the first frame within it
-
-
-def even_entropy(episodes: int, num_modes: int) -> float:
-    """Expected mode entropy of that many episodes whose modes are drawn evenly.
-
-    A few episodes cannot fill all modes evenly, so this is below 1: what a policy without preferences scores on
-    average. It is the exact mean over the binomial counts.
-
-    Args:
-        episodes (int): number of episodes.
-        num_modes (int): number of modes, and base of the logarithm.
-
-    Returns:
-        float: 0 to 1.
-
-    Examples:
-        >>> from torchrl_koap.reports.mode_plots import even_entropy
-        >>> even_entropy(1, 24), round(even_entropy(60, 24), 3), round(even_entropy(10_000, 24), 3)
-        (0.0, 0.932, 1.0)
-    """
-    if episodes < 1 or num_modes < 2:
-        return 0.0
-    total = 0.0
-    for count in range(1, episodes + 1):
-        log_chance = math.lgamma(episodes + 1) - math.lgamma(count + 1) - math.lgamma(episodes - count + 1)
-        log_chance += count * math.log(1 / num_modes) + (episodes - count) * math.log(1 - 1 / num_modes)
-        total -= math.exp(log_chance) * count / episodes * math.log(count / episodes)
-    return num_modes * total / math.log(num_modes)
+_LISTED = 10  # modes of a single choice: from here on names are short
 
 
 @picture(
@@ -58,174 +31,152 @@ def even_entropy(episodes: int, num_modes: int) -> float:
     source="rollouts.safetensors",
     title="Modes of the successful rollouts",
     caption="One bar per mode. Black ticks: the share of each mode in the demonstrations, where they say which they"
-    " took. Entropy is 1 when all modes are equally frequent; a handful of rollouts cannot reach 1 even with an even"
+    " took. Entropy is 1 when all modes are equally frequent; a handful of rollouts cannot reach 1 even with a uniform"
     " choice, the title says what to expect.",
-    place=40,
+    order=40,
 )
-def _draw_modes(rollouts: Mapping[str, Any], path: Path, *, task: str | None, num_modes: int, run_dir: Path) -> Path:
-    demonstrations = run_dir / "demonstrations.safetensors"
-    reference = recorded_modes(load_file(demonstrations), task) if demonstrations.exists() else None
-    mode = rollouts["mode"][rollouts["outcome"] == SUCCESS]
-    return plot_modes(mode, path, task=task, num_modes=num_modes, reference=reference)
-
-
-def plot_modes(
-    mode: Any,
-    path: str | Path,
-    *,
-    task: str | None = "avoiding",
-    num_modes: int | None = None,
-    reference: Any = None,
-) -> Path:
-    """How often each mode occurred, with the entropy of the distribution.
+def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
+    """Draws how often each mode occurred among the successes, with the entropy of the distribution.
 
     Args:
-        mode (torch.Tensor or array): modes of the *successful* rollouts [n]; -1 (no mode) is counted in the title.
-        path (str or Path): png to write.
-        task (str, optional): task whose choices order and colour the bars.
-        num_modes (int, optional): number of modes, needed where the task names no choices.
-        reference (torch.Tensor or array, optional): modes of the demonstrations; drawn as black ticks, scaled to the
-            number of rollouts.
+        rollouts (mapping): ``mode`` ``[E]`` (-1: no mode, counted in the title) and ``outcome`` ``[E]``.
+        run (RunFacts): the run; the modes of its demonstrations are drawn as ticks, scaled to the number of rollouts.
 
     Raises:
-        ValueError: if a shape is wrong, or the task names no modes and their number is not given.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_koap.reports.mode_plots import plot_modes
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     plot_modes([0, 5, 5, 23], f"{folder}/modes.png").name
-        'modes.png'
+        NothingToDraw: if the task can be done in one way only.
     """
-    mode = as_array("mode", mode, [None]).astype(int)
-    choices = mode_choices(task, num_modes)
-    colors = mode_colors(task, num_modes)
-    number = len(colors)
-    mode, lost = mode[(mode >= 0) & (mode < number)], int(((mode < 0) | (mode >= number)).sum())
+    modes, number = run.modes, run.modes.number
+    if number < 2:
+        raise NothingToDraw("there is no choice")
+    mode = entry(rollouts, "mode", [None]).astype(int)
+    mode = mode[entry(rollouts, "outcome", [len(mode)]) == SUCCESS]
+    lost = int(((mode < 0) | (mode >= number)).sum())
+    mode = mode[(mode >= 0) & (mode < number)]
     counts = np.bincount(mode, minlength=number)
-    last = len(choices[-1][1])
-    places = np.arange(number) + 0.7 * (np.arange(number) // last) if len(choices) > 1 else np.arange(number) * 1.0
+    *heads, (last, names) = modes.choices
+    places = np.arange(number) + (0.7 * (np.arange(number) // len(names)) if heads else 0.0)
 
-    few = len(choices) == 1 and number <= 10
+    few = not heads and number <= _LISTED
     figure = Figure(figsize=(max(5.6, 0.85 * number + 1.2) if few else 8.4, 3.3), layout="constrained")
     axes = figure.add_subplot()
-    axes.bar(places, counts, width=0.86, color=colors, zorder=2)
-    if reference is not None:
-        reference = as_array("reference", reference, [None]).astype(int)
-        reference = reference[(reference >= 0) & (reference < number)]
-        if len(reference):
-            level = np.bincount(reference, minlength=number) * len(mode) / len(reference)
-            label = f"{len(reference)} demonstrations, scaled"
-            axes.hlines(level, places - 0.46, places + 0.46, color=INK, linewidth=1.3, zorder=3, label=label)
-            legend_beside(axes)
+    axes.bar(places, counts, width=0.86, color=mode_colors(modes), zorder=2)
+    reference = recorded_modes(run.folder / "demonstrations.safetensors", modes)
+    if len(reference):
+        level = np.bincount(reference, minlength=number) * len(mode) / len(reference)
+        label = f"{len(reference)} demonstrations, scaled"
+        axes.hlines(level, places - 0.46, places + 0.46, color=INK, linewidth=1.3, zorder=3, label=label)
+        legend_beside(axes)
     axes.set_ylabel("successful rollouts")
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.set_ylim(0, 1.2 * max(1, axes.dataLim.y1))
     axes.set_xlim(places[0] - 0.8, places[-1] + 0.8)
-    if len(choices) > 1:
-        axes.set_xticks(places, [name.split()[-1] for name in choices[-1][1]] * (number // last))
-        for group in range(number // last):
-            middle = places[group * last : (group + 1) * last].mean()
-            text = " / ".join(_words(group, choices[:-1]))
+    if heads:
+        axes.set_xticks(places, [name.split()[-1] for name in names] * (number // len(names)))
+        for group in range(number // len(names)):
+            middle = places[group * len(names) : (group + 1) * len(names)].mean()
+            text = _group_name(modes, group)
             axes.annotate(text, (middle, 0), (0, -22), textcoords="offset points", ha="center", size=8.5, color=INK)
-        axes.set_xlabel(" / ".join(name for name, _ in choices[:-1]) + f", and above it {choices[-1][0]}", labelpad=19)
+        axes.set_xlabel(" / ".join(name for name, _ in heads) + f", and above it {last}", labelpad=19)
     else:
-        axes.set_xticks(places, [name.replace(", ", "\n") for name in choices[0][1]])
-        axes.set_xlabel(choices[0][0])
+        axes.set_xticks(places, [name.replace(", ", "\n") for name in names])
+        axes.set_xlabel(last)
     occurred = f"{int((counts > 0).sum())} of {number} modes, entropy {mode_entropy(mode.tolist(), number):.2f}"
-    even = f"an even choice gives {even_entropy(len(mode), number):.2f} on average at n = {len(mode)}"
-    parts = [occurred] + [even] * bool(len(mode)) + [f"{lost} without a mode"] * bool(lost)
+    uniform = f"a uniform choice gives {expected_entropy(len(mode), number):.2f} on average at n = {len(mode)}"
+    parts = [occurred] + [uniform] * bool(len(mode)) + [f"{lost} without a mode"] * bool(lost)
     set_title(axes, ";\n".join((parts[0], "; ".join(parts[1:]))) if few and parts[1:] else "; ".join(parts))
     tidy(axes)
     axes.tick_params(axis="x", length=0)
-    return save_figure(figure, path)
+    return figure
 
 
-def recorded_modes(demonstrations: Mapping[str, Any], task: str | None) -> np.ndarray | None:
-    """Modes of the demonstrations: those recorded, or for Avoiding those that their paths show.
+def recorded_modes(demonstrations: Path, modes: Modes) -> np.ndarray:
+    """Returns the modes of the demonstrations that are decided; none where paths do not tell them.
 
     Args:
-        demonstrations (mapping): ``mode`` [episodes], or ``position`` [N, 2] (m) with ``episode`` [N].
-        task (str, optional): the task.
+        demonstrations (Path): file with ``mode`` ``[episodes]``, or ``position`` ``[N, 2]`` (m), ``episode`` ``[N]``.
+        modes (Modes): those of the task.
+    """
+    data = load_file(demonstrations) if demonstrations.exists() else {}
+    found = entry(data, "mode", [None]).astype(int) if "mode" in data else np.zeros(0, int)
+    mode_of_path = resolve(modes.of_path, "of_path of the modes")
+    if "mode" not in data and mode_of_path is not None and "position" in data:
+        position = entry(data, "position", [None, 2])
+        episode = entry(data, "episode", [len(position)])
+        paths = np.split(position, np.flatnonzero(np.diff(episode) != 0) + 1)
+        found = np.array([mode_of_path(path) for path in paths], int)
+    return found[(found >= 0) & (found < modes.number)]
+
+
+def mode_colors(modes: Modes) -> np.ndarray:
+    """Returns a colour for each mode: hue tells the last choice apart, lightness all choices before it.
+
+    Args:
+        modes (Modes): those of a task.
 
     Returns:
-        np.ndarray or None: a mode per demonstration, -1 where a row was not passed; None if they cannot be known.
+        np.ndarray: sRGB colours in 0..1 ``[num_modes, 3]``.
 
     Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.reports.mode_plots import recorded_modes
-        >>> path = np.array([[0.55, -0.1], [0.5, 0.08], [0.6, 0.27]])
-        >>> recorded_modes({"position": path, "episode": np.zeros(3)}, "avoiding").tolist()
-        [18]
+        >>> from torchrl_koap.reports.mode_plots import mode_colors
+        >>> from torchrl_koap.tasks import get_task
+        >>> mode_colors(get_task("avoiding").modes).shape
+        (24, 3)
     """
-    if "mode" in demonstrations:
-        return as_array("mode", demonstrations["mode"], [None]).astype(int)
-    if task != "avoiding" or "position" not in demonstrations:
-        return None
-    position = as_array("position", demonstrations["position"], [None, 2])
-    episode = as_array("episode", demonstrations["episode"], [len(position)])
-    rows: dict[float, list[float]] = {}
-    for _, x, y, *_ in OBSTACLES:
-        rows.setdefault(y, []).append(x)
-    modes = []
-    for path in np.split(position, np.flatnonzero(np.diff(episode) != 0) + 1):
-        mode = 0
-        for number, (y, cylinders) in enumerate(sorted(rows.items())):
-            last = number == len(rows) - 1
-            near = path[:, 1] >= y if last else abs(path[:, 1] - y) <= _ROW_REACH
-            gap = int((path[near.argmax(), 0] > cylinders).sum())
-            mode = mode * (len(cylinders) + 1) + gap if near.any() and mode >= 0 else -1
-        modes.append(mode)
-    return np.array(modes)
+    if modes.number < 2:
+        return np.array([to_rgb(BLUE)])
+    hues = len(modes.choices[-1][1])
+    shades = modes.number // hues
+    hue = np.tile((0.6 - np.arange(hues) * min(0.27, 1 / hues)) % 1, shades)
+    if shades > 1:
+        lightness = np.repeat(np.linspace(0.42, 1.3, shades), hues)
+    else:  # neighbours among many hues need another lightness too
+        lightness = np.where(np.arange(hues) % 2, 0.8 if hues <= 8 else 1.15, 0.8)
+    pure = hsv_to_rgb(np.stack([hue, np.full_like(hue, 0.8), np.minimum(lightness, 0.95)], 1))
+    return 1 - (1 - pure) * np.clip(2 - lightness, 0, 1)[:, None]
 
 
-def draw_mode_table(axes: Axes, mode: np.ndarray, choices: tuple, colors: np.ndarray) -> None:
-    """A cell per mode in its colour, with the number of rollouts.
+def draw_mode_table(axes: Axes, mode: np.ndarray, modes: Modes) -> None:
+    """Draws a cell per mode in its colour, with the number of rollouts.
 
     Columns are the last of several choices. A single choice becomes a list with the names beside the cells (initials
-    from 11 on), or a compact grid if its names are numbers.
+    from 11 on).
 
     Args:
         axes (Axes): panel to fill.
-        mode (np.ndarray): modes to count [n]; those out of range are left out.
-        choices (tuple): see :func:`~torchrl_koap.tasks.modes.mode_choices`.
-        colors (np.ndarray): a colour per mode [num_modes, 3].
+        mode (np.ndarray): modes to count ``[n]``; those out of range are left out.
+        modes (Modes): those of the task.
     """
-    names = choices[-1][1]
-    number = len(colors)
-    listed = len(choices) == 1 and not names[0].isdigit()
+    *heads, (last, names) = modes.choices
+    number, listed = modes.number, not heads
     if listed:
-        down, step = (number, 4.0) if number <= 10 else (math.ceil(number / 2), 4.6)
+        down, step = (number, 4.0) if number <= _LISTED else (math.ceil(number / 2), 4.6)
         places = [(step * (index // down), index % down) for index in range(number)]
     else:
-        across = min(len(names), 6) if len(choices) == 1 else len(names)
-        down, step = math.ceil(number / across), 1.0
+        across, step = len(names), 1.0
+        down = number // across
         places = [(index % across, index // across) for index in range(number)]
     counts = np.bincount(mode[(mode >= 0) & (mode < number)].astype(int), minlength=number)
     top, label = 1.0, {"size": 8, "color": MUTED}
-    for index, (color, (column, row)) in enumerate(zip(colors, places, strict=True)):
+    for index, (color, (column, row)) in enumerate(zip(mode_colors(modes), places, strict=True)):
         used = counts[index] > 0
         style = {"facecolor": color, "edgecolor": "white"} if used else {"facecolor": "none", "edgecolor": FAINT}
         axes.add_patch(Rectangle((column, top - row - 1), 0.92, 0.9, linewidth=0.8, **style))
-        shade = "white" if used else FAINT
-        text = {"ha": "center", "va": "center", "size": 9, "color": shade}
+        text = {"ha": "center", "va": "center", "size": 9, "color": "white" if used else FAINT}
         axes.text(column + 0.46, top - row - 0.56, str(counts[index]), **text)
         if listed:
-            name = names[index] if number <= 10 else initials(names[index])
+            name = names[index] if number <= _LISTED else " ".join(word[0] for word in names[index].split(", "))
             axes.text(column + 1.1, top - row - 0.56, name, ha="left", va="center", **label)
     if listed:
-        axes.text(0, top + 0.12, choices[0][0], ha="left", va="bottom", **label)
-    elif len(choices) > 1:
+        axes.text(0, top + 0.12, last, ha="left", va="bottom", **label)
+    else:
         for column, name in enumerate(names):
             axes.text(column + 0.46, top + 0.12, name.split()[-1], ha="center", va="bottom", **label)
-        axes.text(0, top + 0.62, f"{choices[-1][0]}: gap from left to right", ha="left", va="bottom", **label)
+        axes.text(0, top + 0.62, last, ha="left", va="bottom", **label)
         for row in range(down):
-            words = " / ".join(_words(row, choices[:-1]))
-            axes.text(-0.15, top - row - 0.56, words, ha="right", va="center", **label)
-        heads = " / ".join(name for name, _ in choices[:-1])
-        axes.text(-0.15, top + 0.12, heads, ha="right", va="bottom", **label)
+            axes.text(-0.15, top - row - 0.56, _group_name(modes, row), ha="right", va="center", **label)
+        axes.text(-0.15, top + 0.12, " / ".join(name for name, _ in heads), ha="right", va="bottom", **label)
     width = 1 + max(column for column, _ in places) + (step if listed else 0)
-    axes.set_xlim(-2.1 if len(choices) > 1 else -0.1, width + 0.1)
+    axes.set_xlim(-0.1 if listed else -2.1, width + 0.1)
     axes.set_ylim(top - down - 4, top + 1.6)
     axes.set_aspect("equal")
     axes.set_anchor("NW")
@@ -233,10 +184,16 @@ def draw_mode_table(axes: Axes, mode: np.ndarray, choices: tuple, colors: np.nda
     set_title(axes, "successes by mode")
 
 
-def _words(index: int, choices: tuple) -> list[str]:
-    """Names of the values of all choices, the slowest first."""
-    words = []
-    for _, names in reversed(choices):
-        index, digit = divmod(index, len(names))
-        words.append(names[digit])
-    return words[::-1]
+def color_of_mode(mode: int, colors: np.ndarray) -> Any:
+    """Returns the colour of a mode, grey where it has none.
+
+    Args:
+        mode (int): number of the mode, -1 if it is not decided.
+        colors (np.ndarray): a colour per mode.
+    """
+    return colors[mode] if 0 <= mode < len(colors) else GREY
+
+
+def _group_name(modes: Modes, group: int) -> str:
+    """Names of all choices but the last, for a group of modes that share them."""
+    return Modes(modes.choices[:-1]).name_of(group).replace(", ", " / ")

@@ -8,26 +8,23 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.reports.advice import Numbers, advice
-from torchrl_koap.reports.html import bar, duration, number, write_page
-from torchrl_koap.reports.mode_plots import even_entropy
-from torchrl_koap.reports.pictures import FOLDER, all_pictures, draw_pictures, run_facts
-from torchrl_koap.reports.style import thousandths
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.reports.advice import advice
+from torchrl_koap.reports.html import write_page
+from torchrl_koap.reports.pictures import FOLDER, all_pictures, draw_pictures
+from torchrl_koap.reports.run_facts import RunFacts, number
+from torchrl_koap.reports.tiles import tiles
 
-ENTROPIES = {"mode_entropy": "mode entropy", "pooled_mode_entropy": "mode entropy, all contexts together"}
 _SIMULATED = ("rollouts.safetensors", "inspect.json")
 _BESIDE_LABELS = "demonstrations.png"
 _COMMANDS = {"train": "koap train --out {run}", "eval": "koap eval {run} --episodes 60 --seed 100"}
 _OFFLINE_COMMANDS = _COMMANDS | {"eval": "koap eval {run}"}
-_PLAN_BASELINES = ("standing_still", "constant_velocity")
 _SUMMARY_ELSEWHERE = ("labels",)
-_EVAL_ELSEWHERE = ("episode", "command", "trajectory", "faults")
+_EVAL_ELSEWHERE = ("episode", "command", "trajectory", "faults", "rates")
 _CONFIG_ELSEWHERE = ("versions", "command")
 
 
 def write_report(
-    run_dir: str | Path,
+    folder: str | Path,
     *,
     draw: bool = True,
     animation: bool = True,
@@ -36,10 +33,12 @@ def write_report(
     """Writes ``index.html`` into a run directory; sections whose files are absent say which command makes them.
 
     Args:
-        run_dir (str or Path): the run directory. Read are ``config.json``, ``summary.json``, ``eval.json`` and the
-            files behind the pictures, all optional.
+        folder (str or Path): the run directory. Read are ``config.json``, ``summary.json``, ``eval.json`` and the files
+            behind the pictures, all optional.
+
+    Keyword Args:
         draw (bool): draw the pictures first. Otherwise those already there are shown.
-        animation (bool): draw the moving picture too.
+        animation (bool): draw the moving pictures too.
         progress (callable, optional): see :func:`~torchrl_koap.reports.pictures.draw_pictures`.
 
     Returns:
@@ -57,41 +56,40 @@ def write_report(
         ...     "50.0 %" in write_report(folder).read_text()
         True
     """
-    run_dir = Path(run_dir)
-    if not run_dir.is_dir():
-        raise FileNotFoundError(f"there is no run directory {str(run_dir)!r}")
-    problems = draw_pictures(run_dir, animation=animation, progress=progress) if draw else {}
-    files, notes = {}, list(problems.values())
-    for name in ("config", "summary", "eval", "inspect"):
-        files[name], note = _read(run_dir, f"{name}.json")
-        notes += note
-    config, summary, evaluation = files["config"], files["summary"], files["eval"]
-    facts = run_facts(run_dir)
-    offline = facts["columns"] is not None
-    notes += evaluation.get("faults") or []
-    note = _action_errors(summary)[0].get("note")  # why the training left no actions to draw
-    reasons = {"actions.safetensors": note} if isinstance(note, str) else {}
-    figures, missing = _figures(run_dir, problems, facts["task"], reasons, offline=offline)
+    run = RunFacts.read(folder)
+    problems = draw_pictures(run.folder, animation=animation, progress=progress) if draw else {}
+    config, summary, evaluation = run.config, run.summary, run.evaluation
+    errors, _ = run.action_errors
+    figures, missing = _figures(run, problems, errors.get("note"))
+    commands = _OFFLINE_COMMANDS if run.offline else _COMMANDS
     return write_page(
         "run.html",
-        run_dir / "index.html",
-        title=_title(config),
-        subtitle=_subtitle(run_dir, config),
-        notes=notes,
-        tiles=_tiles(config, summary, evaluation, facts["num_modes"]),
+        run.folder / "index.html",
+        title=" on ".join(str(config[key]) for key in ("method", "task") if config.get(key)) or "run",
+        subtitle=_subtitle(run),
+        notes=[*problems.values(), *run.damaged, *(evaluation.get("faults") or ())],
+        tiles=tiles(run),
         evaluated=bool(evaluation),
-        commands={
-            name: _filled(command, run_dir) for name, command in (_OFFLINE_COMMANDS if offline else _COMMANDS).items()
-        },
-        advice=_advice(run_dir, files, facts),
+        commands={name: _filled(command, run) for name, command in commands.items()},
+        advice=[
+            {"finding": item.finding, "proposal": item.proposal, "command": _filled(item.command, run)}
+            for item in advice(run)
+        ],
         labels=summary.get("labels"),
-        labels_read=number(_action_errors(summary)[0].get("analysis_labels_read")),
-        label_figure=next((item for item in figures if item.get("name") == _BESIDE_LABELS), None),
+        labels_read=number(errors.get("analysis_labels_read")),
+        label_figure=next((item for item in figures if item["name"] == _BESIDE_LABELS), None),
         figures=[item for item in figures if item["name"] != _BESIDE_LABELS],
         missing=missing,
-        numbers=_numbers(summary, evaluation),
+        numbers=[
+            (head, shown)
+            for head, source, elsewhere in (
+                ("Evaluation", evaluation, _EVAL_ELSEWHERE),
+                ("Training", summary, _SUMMARY_ELSEWHERE),
+            )
+            if (shown := {key: value for key, value in source.items() if key not in elsewhere})
+        ],
         episodes=evaluation.get("episode") or evaluation.get("trajectory"),
-        again=_commands(run_dir, config, evaluation),
+        again=_again(run),
         configured=bool(config),
         has_command=_given(config, "command"),
         versions=config.get("versions"),
@@ -99,198 +97,45 @@ def write_report(
     )
 
 
-def _advice(run_dir: Path, files: Mapping[str, Mapping[str, Any]], facts: Mapping[str, Any]) -> list[dict[str, str]]:
-    """What the numbers say to try next, command lines filled in."""
-    evaluation = files["eval"]
-    rate, episodes = number(evaluation.get("success_rate")), number(evaluation.get("episodes"))
-    successes = round(rate * episodes) if rate and episodes else 0
-    found = advice(
-        Numbers(
-            config={**files["config"], "control_hz": facts["control_hz"]},
-            summary=files["summary"],
-            evaluation=evaluation,
-            inspection=files["inspect"],
-            even_entropy=even_entropy(successes, facts["num_modes"]) if successes else None,
-        )
-    )
-    return [
-        {"finding": item.finding, "proposal": item.proposal, "command": _filled(item.command, run_dir)}
-        for item in found
-    ]
-
-
-def _read(run_dir: Path, name: str) -> tuple[dict[str, Any], list[str]]:
-    """Content of a JSON file, empty if it is absent or damaged, and what was wrong."""
-    if not (run_dir / name).exists():
-        return {}, []
-    try:
-        content: Any = RunDirectory(run_dir).read_json(name)
-    except (RunDirectoryError, OSError) as error:
-        return {}, [str(error)]
-    if not isinstance(content, dict):
-        return {}, [f"{run_dir / name}: wanted a JSON object, got {type(content).__name__}"]
-    return content, []
-
-
-def _title(config: Mapping[str, Any]) -> str:
-    method, task = config.get("method"), config.get("task")
-    return f"{method} on {task}" if method and task else str(task or method or "run")
-
-
-def _subtitle(run_dir: Path, config: Mapping[str, Any]) -> str:
-    shown = [f"{key.replace('_', ' ')} {config[key]}" for key in ("preset", "dataset", "seed") if _given(config, key)]
-    return " · ".join([str(run_dir), *shown])
-
-
-def _tile(name: str, value: str, note: str, bar: tuple[float, float, float] | None = None) -> dict[str, Any]:
-    return {"name": name, "value": value, "note": note, "bar": bar}
-
-
-def _tiles(config: Mapping, summary: Mapping, evaluation: Mapping, num_modes: int) -> list[dict[str, Any]]:
-    """The headline numbers, those that there are."""
-    tiles = _offline_tiles(evaluation)
-    rate, episodes = number(evaluation.get("success_rate")), number(evaluation.get("episodes"))
-    contexts = number(evaluation.get("contexts"))
-    among = f" in {contexts:g} contexts" if contexts else ""
-    tiles += _rate(evaluation, "success", "success", f" rollouts{among}")
-    for count, what in ((1, "one box"), (2, "two boxes"), (3, "three boxes")):
-        tiles += _rate(evaluation, f"stacked_{count}", f"{what} stacked", " rollouts")
-    given = next((key for key in ENTROPIES if number(evaluation.get(key)) is not None), None)
-    if given is not None:
-        seen = f"{evaluation['distinct_modes']} of {num_modes} modes" if _given(evaluation, "distinct_modes") else ""
-        successes = round(rate * episodes) if rate is not None and episodes else 0
-        if contexts and given == "mode_entropy":
-            even = f"mean over contexts, {episodes / contexts:g} rollouts each" if episodes else ""
-        else:
-            even = f"an even choice averages {even_entropy(successes, num_modes):.2f}, n = {successes}"
-        notes = (_between(evaluation, given, "{:.2f}"), seen, even if successes else "")
-        head = f"{ENTROPIES[given]}, base {num_modes}"
-        tiles.append(_tile(head, f"{number(evaluation[given]):.2f}", "; ".join(filter(None, notes))))
-    errors, unit = _action_errors(summary)
-    if errors:
-        values = {key: number(value) for key, value in errors.items() if key != "analysis_labels_read"}
-        values = {key: value for key, value in values.items() if value is not None}
-        own = config.get("method") if config.get("method") in values else next(iter(values), None)
-        if own is not None:
-            others = [f"{key} {value:.2f} {unit}" for key, value in values.items() if key != own]
-            read = number(errors.get("analysis_labels_read"))
-            others += [f"n = {read:,.0f} unlabelled steps"] if read else []
-            tiles.append(_tile(f"action error, {own}", f"{values[own]:.2f} {unit}", ", ".join(others)))
-    labels = summary.get("labels")
-    if isinstance(labels, Mapping) and number(labels.get("labelled_transitions")) is not None:
-        tiles.append(_tile("action labels", f"{labels['labelled_transitions']:,.0f}", _share(labels)))
-    control = number(evaluation.get("control_hz"))
-    if control is not None:
-        parts = [("plan_ms", "ms per plan"), ("control_ms", "ms per control step")]
-        latency = [f"{number(evaluation[key]):.3g} {what}" for key, what in parts if number(evaluation.get(key))]
-        tiles.append(_tile("control rate", f"{control:.0f} Hz", ", ".join(latency)))
-    seconds = summary.get("train_seconds")
-    spent = {"": seconds} if not isinstance(seconds, Mapping) else seconds
-    spent = {key: number(value) for key, value in spent.items() if number(value) is not None}
-    if spent:
-        each = ", ".join(f"{key} {duration(value)}" for key, value in spent.items() if key)
-        whole = sum(value for key, value in spent.items() if key != "total")
-        tiles.append(_tile("training time", duration(whole), each))
-    return tiles
-
-
-def _offline_tiles(evaluation: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Errors of plans and actions, of an evaluation without an environment."""
-    tiles = []
-    for row in evaluation.get("plan_errors", {}).get("unit", ()):
-        shown, factor = thousandths(row["unit"])
-        values = {name: factor * row[name]["energy_score"]["overall"] for name in ("planner", *_PLAN_BASELINES)}
-        note = ", ".join(f"{name.replace('_', ' ')} {values[name]:.3g}" for name in _PLAN_BASELINES)
-        head = f"plan error, energy score, {len(row['columns'])} columns"
-        tiles.append(_tile(head, f"{values['planner']:.3g} {shown}".rstrip(), note))
-    errors = evaluation.get("action_errors", {})
-    split = evaluation.get("action_errors_on")
-    for row in errors.get(split, {}).get("unit", ()) if split else ():
-        shown, factor = thousandths(row["unit"])
-        others = [f"{name.replace('_', ' ')} {factor * row[name]:.3g}" for name in ("ridge", "mean_action")]
-        others.append(f"n = {errors[split]['labels']:,} labels, {split.replace('_', ' ')}")
-        head = f"action error, {len(row['columns'])} columns"
-        tiles.append(_tile(head, f"{factor * row['controller']:.3g} {shown}".rstrip(), ", ".join(others)))
-    return tiles
-
-
-def _between(evaluation: Mapping[str, Any], name: str, form: str) -> str:
-    """The interval of an entry in words, empty if it has none."""
-    low, high = (number(evaluation.get(f"{name}_{end}")) for end in ("low", "high"))
-    return "" if low is None or high is None else f"95 % interval {form.format(low)} to {form.format(high)}"
-
-
-def _rate(evaluation: Mapping[str, Any], name: str, head: str, what: str) -> list[dict[str, Any]]:
-    """Tile of a share of the rollouts with its interval, if it was measured."""
-    rate, episodes = number(evaluation.get(f"{name}_rate")), number(evaluation.get("episodes"))
-    if rate is None:
-        return []
-    low, high = (number(evaluation.get(f"{name}_{end}")) for end in ("low", "high"))
-    between, drawn = "", None
-    if low is not None and high is not None:
-        between, drawn = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %", bar(rate, low, high)
-    count = f"{round(rate * episodes)} of {episodes:g}{what}" if episodes else ""
-    return [_tile(head, f"{100 * rate:.1f} %", ", ".join(filter(None, (between, count))), drawn)]
-
-
-def _action_errors(summary: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
-    """Errors of the predicted actions, empty if there are none, and their unit."""
-    for name, errors in summary.items():
-        if name.startswith("action_error") and isinstance(errors, Mapping):
-            return errors, name.removeprefix("action_error").removeprefix("_")
-    return {}, ""
-
-
-def _share(labels: Mapping[str, Any]) -> str:
-    labelled, total = number(labels.get("labelled_transitions")), number(labels.get("total_transitions"))
-    touched, trajectories = number(labels.get("trajectories_touched")), number(labels.get("total_trajectories"))
-    parts = [f"{labelled / total:.2%} of {total:,.0f} transitions".replace("%", " %")] if total else []
-    parts += [f"in {touched:g} of {trajectories:g} demonstrations"] if touched is not None and trajectories else []
-    return ", ".join(parts)
+def _subtitle(run: RunFacts) -> str:
+    shown = [f"{key} {run.config[key]}" for key in ("preset", "dataset", "seed") if _given(run.config, key)]
+    return " · ".join([str(run.folder), *shown])
 
 
 def _figures(
-    run_dir: Path, problems: Mapping[str, str], task: str | None, reasons: Mapping[str, str], *, offline: bool
+    run: RunFacts, problems: Mapping[str, str], no_actions: Any
 ) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
-    """What is to be shown, and for each command the titles of the pictures whose source it would leave."""
+    """What is to be shown, and for each command the titles of the pictures whose source it would leave.
+
+    ``no_actions`` says why the training left no actions to draw, if it is a string.
+    """
     figures: list[dict[str, Any]] = []
     missing: dict[str, list[str]] = {}
     for name, item in all_pictures().items():
-        file = next((n for n in (name, Path(name).stem + ".mp4") if (run_dir / FOLDER / n).exists()), None)
+        names = (name, Path(name).stem + ".mp4")
+        file = next((own for own in names if (run.folder / FOLDER / own).exists()), None)
+        source = (run.folder / item.source).exists()
+        figure: dict[str, Any] = {"name": name, "title": item.title, "caption": item.caption_for(run), "empty": ""}
         if name in problems:
             continue
-        figure: dict[str, Any] = {"name": name, "title": item.title, "caption": item.caption_for(task), "empty": ""}
         if file is not None:
-            moving = file.endswith((".gif", ".mp4"))
-            figures.append(figure | {"source": f"{FOLDER}/{file}", "beside": moving})
-        elif (item.source in _SIMULATED) if offline else item.recorded:
+            figures.append(figure | {"source": f"{FOLDER}/{file}", "beside": file.endswith((".gif", ".mp4"))})
+        elif (item.source in _SIMULATED) if run.offline else item.offline:
             continue  # no command makes it for this task
-        elif not (run_dir / item.source).exists() and item.source in reasons:
-            figures.append(figure | {"empty": reasons[item.source]})  # no command would make it
-        elif not (run_dir / item.source).exists():
-            missing.setdefault(_filled(item.command, run_dir), []).append(item.title)
+        elif item.source == "actions.safetensors" and not source and isinstance(no_actions, str):
+            figures.append(figure | {"empty": no_actions})  # no command would make it
+        elif not source:
+            missing.setdefault(_filled(item.command, run), []).append(item.title)
         elif item.empty:
             figures.append(figure | {"empty": item.empty})
     return figures, missing
 
 
-def _numbers(summary: Mapping[str, Any], evaluation: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    """Everything else in the files, under a heading each."""
-    return [
-        (head, shown)
-        for head, source, elsewhere in (
-            ("Evaluation", evaluation, _EVAL_ELSEWHERE),
-            ("Training", summary, _SUMMARY_ELSEWHERE),
-        )
-        if (shown := {key: value for key, value in source.items() if key not in elsewhere})
-    ]
-
-
-def _commands(run_dir: Path, config: Mapping[str, Any], evaluation: Mapping[str, Any]) -> list[str]:
+def _again(run: RunFacts) -> list[str]:
     """Command lines that train and evaluate the run again."""
-    commands = [_command(source["command"]) for source in (config, evaluation) if _given(source, "command")]
-    if evaluation and not _given(evaluation, "command"):
-        commands.append(_eval_command(run_dir, evaluation))
+    commands = [_command(source["command"]) for source in (run.config, run.evaluation) if _given(source, "command")]
+    if run.evaluation and not _given(run.evaluation, "command"):
+        commands.append(_eval_command(run))
     return commands
 
 
@@ -298,8 +143,9 @@ def _command(command: Any) -> str:
     return shlex.join(map(str, command)) if isinstance(command, (list, tuple)) else str(command)
 
 
-def _eval_command(run_dir: Path, evaluation: Mapping[str, Any]) -> str:
-    words = ["koap", "eval", str(run_dir)]
+def _eval_command(run: RunFacts) -> str:
+    evaluation = run.evaluation
+    words = ["koap", "eval", str(run.folder)]
     if evaluation.get("kind") == "offline":
         evaluation = {name: evaluation.get(name) for name in ("seed",)}
     episode = evaluation.get("episode")
@@ -313,8 +159,8 @@ def _eval_command(run_dir: Path, evaluation: Mapping[str, Any]) -> str:
     return shlex.join(words)
 
 
-def _filled(command: str, run_dir: Path) -> str:
-    return command.format(run=shlex.quote(str(run_dir)))
+def _filled(command: str, run: RunFacts) -> str:
+    return command.format(run=shlex.quote(str(run.folder)))
 
 
 def _given(source: Mapping[str, Any], key: str) -> bool:

@@ -1,16 +1,33 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Draws what stands still in a task, from above (:class:`~torchrl_koap.tasks.Scene`)."""
+"""Draws a task from above: what stands still, its bodies, paths of tool and bodies."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.reports.style import BLUE, FAINT, GREEN, MUTED, RED, tidy
-from torchrl_koap.tasks import Shape, get_task
+from torchrl_koap.reports.style import (
+    BLUE,
+    FAILURE_MARKS,
+    FAINT,
+    GREEN,
+    INK,
+    MUTED,
+    RED,
+    as_array,
+    entry,
+    tidy,
+)
+from torchrl_koap.tasks import Body, Shape, Task
 
-_NAMED = {"red": RED, "green": GREEN, "blue": BLUE, "grey": MUTED}
 # how a role is drawn; a shape's own colour goes before the role's
 ROLES = {
     "clearance": {"facecolor": "#e9ebee", "edgecolor": "none", "zorder": 0.5},
@@ -22,12 +39,47 @@ ROLES = {
     "zone": {"facecolor": "#fff3e0", "edgecolor": "#d9730d", "linewidth": 0.8, "zorder": 0.5},
     "target": {"facecolor": "#ffe0b8", "edgecolor": "none", "zorder": 0.6},
 }
+MANY = 20  # contexts: from here on only centres are drawn
+_NAMED = {"red": RED, "green": GREEN, "blue": BLUE, "grey": MUTED}
 _LABEL_COLORS = {"finish": GREEN, "zone": "#9a5b13"}
+_MOST_ROOM = 0.5  # of the scene's own size is added on a side where paths leave it, at most
+_UNKNOWN = Body("objects", position="")
 
 
 def color_of(name: str) -> str:
-    """The colour that pictures use for a name such as ``"red"``; others, such as ``"#9a5b13"``, as they are."""
+    """Returns the colour that pictures use for a name such as ``"red"``; others, such as ``"#9a5b13"``, as they are."""
     return _NAMED.get(name, name)
+
+
+def draw_scene(axes: Axes, task: Task | None) -> Axes:
+    """Draws the still shapes of a task to scale, with axes in metres.
+
+    Args:
+        axes (Axes): where to draw.
+        task (Task, optional): the task. None draws the axes only.
+
+    Returns:
+        Axes: the same axes.
+
+    Examples:
+        >>> from matplotlib.figure import Figure
+        >>> from torchrl_koap.reports.scenes import draw_scene
+        >>> from torchrl_koap.tasks import get_task
+        >>> axes = draw_scene(Figure().add_subplot(), get_task("avoiding"))
+        >>> len(axes.patches)  # six cylinders, each with a ring where the rod touches it
+        12
+    """
+    if task is not None:
+        for shape in task.scene.shapes:
+            _draw_shape(axes, shape)
+        if task.scene.x is not None:
+            axes.set_xlim(*task.scene.x)
+        if task.scene.y is not None:
+            axes.set_ylim(*task.scene.y)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    return tidy(axes)
 
 
 def _draw_shape(axes: Axes, shape: Shape) -> None:
@@ -50,36 +102,190 @@ def _draw_shape(axes: Axes, shape: Shape) -> None:
             axes.text(x, y + depth + 0.004, shape.label, ha="center", **word)
 
 
-def draw_scene(axes: Axes, task: str | None) -> Axes:
-    """Draws what stands still in a task, to scale and from above, and labels the axes in metres.
+def keep_inside(axes: Axes, paths: Sequence[np.ndarray]) -> None:
+    """Widens a panel until paths lie inside it, on every side by at most half of what it showed before.
+
+    Args:
+        axes (Axes): the panel; one that shows no scene yet is fitted to the paths.
+        paths (sequence): positions ``[n, 2]`` (m) each.
+    """
+    points = np.concatenate([np.zeros((0, 2)), *paths])
+    points = points[np.isfinite(points).all(1)]
+    if not len(points):
+        return
+    fresh = axes.get_autoscale_on()  # nobody has set limits
+    low, high = points.min(0), points.max(0)
+    margin = 0.03 * np.maximum(high - low, 1e-3)
+    for now, change, start, end in (
+        (axes.get_xlim(), axes.set_xlim, low[0] - margin[0], high[0] + margin[0]),
+        (axes.get_ylim(), axes.set_ylim, low[1] - margin[1], high[1] + margin[1]),
+    ):
+        if fresh:
+            change(start, end)
+        else:
+            room = _MOST_ROOM * (now[1] - now[0])
+            change(max(min(now[0], start), now[0] - room), min(max(now[1], end), now[1] + room), auto=False)
+
+
+def executed_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
+    """Returns the positions of each episode without the padding, ``[length, 2]`` each.
+
+    Args:
+        rollouts (mapping): ``position`` ``[E, T, 2]`` (m) and ``length`` ``[E]``.
+
+    Raises:
+        ValueError: if an entry is missing or has a wrong shape.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.reports.scenes import executed_paths
+        >>> [len(path) for path in executed_paths({"position": np.zeros((2, 9, 2)), "length": np.array([4, 9])})]
+        [4, 9]
+    """
+    position = entry(rollouts, "position", [None, None, 2])
+    length = entry(rollouts, "length", [len(position)])
+    paths = [row[: max(int(number), 0)] for row, number in zip(position, length, strict=True)]
+    return [path[np.isfinite(path).all(1)] for path in paths]
+
+
+def body_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
+    """Returns the paths of the bodies of each episode, the state after the last step included.
+
+    Args:
+        rollouts (mapping): ``object_position`` ``[E, T, bodies, 2]`` (m) and ``length`` ``[E]``.
+
+    Returns:
+        list: an array ``[frames, bodies, 2]`` per episode; empty if there is no such entry.
+
+    Raises:
+        ValueError: if an entry has a wrong shape.
+    """
+    if "object_position" not in rollouts:
+        return []
+    position = entry(rollouts, "object_position", [None, None, None, 2])
+    length = entry(rollouts, "length", [len(position)])
+    paths = [row[: max(int(number), 0) + 1] for row, number in zip(position, length, strict=True)]
+    return [path[np.isfinite(path).all((1, 2))] for path in paths]
+
+
+def bodies_of(task: Task | None, number: int) -> tuple[Body, ...]:
+    """Returns a body to draw for each of ``number``; grey ones where the task is not known or has another number.
+
+    Args:
+        task (Task, optional): the task.
+        number (int): number of bodies.
+    """
+    bodies = task.bodies if task is not None and len(task.bodies) == number else (_UNKNOWN,) * number
+    return tuple(replace(body, color=color_of(body.color)) for body in bodies)
+
+
+def draw_bodies(
+    axes: Axes, paths: Sequence[np.ndarray], task: Task | None, good: Sequence[bool], contexts: Any = None
+) -> None:
+    """Draws the bodies of a task: start outlines (if there are contexts), paths in their colours, ends.
 
     Args:
         axes (Axes): where to draw.
-        task (str, optional): name of the task. None draws the axes only.
-
-    Returns:
-        Axes: the same axes.
+        paths (sequence): positions ``[frames, bodies, 2]`` (m) of each episode.
+        task (Task, optional): the task.
+        good (sequence of bool): whether each episode succeeded: its bodies end in a dot, otherwise in a cross.
+        contexts (array, optional): starts ``[E, bodies, 3]``: x, y (m), yaw (rad).
 
     Raises:
-        ValueError: if the task is unknown; the message suggests the nearest name.
+        ValueError: if the contexts have another shape.
+    """
+    bodies = bodies_of(task, paths[0].shape[1] if len(paths) else 0)
+    if contexts is not None:
+        draw_starts(axes, contexts, bodies)
+    opacity = float(np.clip(8 / max(len(paths), 1), 0.3, 0.9))
+    shown = [(path, fine) for path, fine in zip(paths, good, strict=True) if len(path)]
+    for index, body in enumerate(bodies):
+        if body.still:
+            continue
+        lines = [path[:, index] for path, _ in shown]
+        axes.add_collection(LineCollection(lines, colors=body.color, linewidths=0.7, alpha=opacity, zorder=2))
+        for fine, mark in ((True, "o"), (False, "X")):
+            ends = np.array([path[-1, index] for path, kind in shown if bool(kind) is fine]).reshape(-1, 2)
+            style = {"s": 20 if fine else 32, "marker": mark, "linewidths": 0.5, "zorder": 3 if fine else 4}
+            axes.scatter(*ends.T, color=body.color, edgecolors="white" if fine else INK, **style)
+    keep_inside(axes, [path.reshape(-1, 2) for path in paths])
+
+
+def draw_starts(axes: Axes, contexts: Any, bodies: Sequence[Body]) -> None:
+    """Draws outlines of the bodies as the contexts place them, paler the more there are.
+
+    The far side of a body whose orientation matters is thick; of more than 20 only the centres are drawn, each with a
+    line to its far side.
+
+    Args:
+        axes (Axes): where to draw.
+        contexts (array): ``[E, bodies, 3]``: x, y (m), yaw (rad).
+        bodies (sequence of Body): what to draw.
+
+    Raises:
+        ValueError: if the contexts have another shape.
+    """
+    contexts = as_array("context", contexts, [None, len(bodies), 3]).astype(float)
+    many = len(contexts) > MANY
+    opacity = float(np.clip(4 / max(len(contexts), 1), 0.13, 0.8))
+    for index, body in enumerate(bodies):
+        outline = outlines(contexts[:, index], body.half)
+        style = {"colors": body.color, "zorder": 1.5}
+        if body.front and many:
+            centre, front = outline[:, :4].mean(1), outline[:, 2:4].mean(1)
+            axes.add_collection(LineCollection(np.stack([centre, front], 1), alpha=0.5, linewidths=0.9, **style))
+            axes.scatter(*centre.T, s=7, color=body.color, alpha=0.5, linewidths=0, zorder=1.5)
+            continue
+        dashes = "--" if body.still else "-"
+        axes.add_collection(LineCollection(outline, alpha=opacity, linewidths=0.8, linestyles=dashes, **style))
+        if body.front:
+            axes.add_collection(LineCollection(outline[:, 2:4], alpha=opacity, linewidths=2.2, **style))
+
+
+def outlines(poses: np.ndarray, half: tuple[float, float]) -> np.ndarray:
+    """Returns closed outlines ``[..., 5, 2]`` of rectangles (m); the side from point 2 to point 3 is the far one.
+
+    Args:
+        poses (np.ndarray): ``[..., 3]``: x, y (m), yaw (rad).
+        half (tuple of float): half width and half depth (m).
 
     Examples:
-        >>> from matplotlib.figure import Figure
-        >>> from torchrl_koap.reports.scenes import draw_scene
-        >>> axes = draw_scene(Figure().add_subplot(), "avoiding")
-        >>> len(axes.patches)  # six cylinders, each with a ring where the rod touches it
-        12
+        >>> import numpy as np
+        >>> from torchrl_koap.reports.scenes import outlines
+        >>> outlines(np.array([1.0, 2.0, np.pi / 2]), (0.5, 0.25))[2:4].round(6).tolist()
+        [[0.75, 2.5], [0.75, 1.5]]
     """
-    if task is not None:
-        scene = get_task(task).scene
-        for shape in scene.shapes:
-            _draw_shape(axes, shape)
-        if scene.x is not None:
-            axes.set_xlim(*scene.x)
-        if scene.y is not None:
-            axes.set_ylim(*scene.y)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x (m)")
-    axes.set_ylabel("y (m)")
-    tidy(axes)
-    return axes
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half
+    cosine, sine = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    turn = np.stack([np.stack([cosine, sine], -1), np.stack([-sine, cosine], -1)], -2)
+    return corners @ turn + poses[..., None, :2]
+
+
+def body_handles(bodies: Sequence[Body], good: Sequence[bool] = ()) -> list[Line2D]:
+    """Returns handles of a legend: every kind of body once, and the marks of :func:`draw_bodies` that occur.
+
+    Args:
+        bodies (sequence of Body): bodies that are drawn.
+        good (sequence of bool): whether each drawn episode succeeded.
+    """
+    handles: dict[str, Line2D] = {}
+    for body in bodies:
+        style = {"linestyle": "--" if body.still else "-", "linewidth": 1.6}
+        handles.setdefault(body.label, Line2D([], [], color=body.color, label=body.label, **style))
+    for fine, mark, label in ((True, "o", "end"), (False, "X", "end of a failure")):
+        if any(bool(kind) is fine for kind in good):
+            handles[label] = Line2D([], [], color=MUTED, marker=mark, linestyle="none", markersize=5, label=label)
+    return list(handles.values())
+
+
+def draw_failure_end(axes: Axes, path: np.ndarray, outcome: int) -> None:
+    """Marks where an episode that failed has ended.
+
+    Args:
+        axes (Axes): where to draw.
+        path (np.ndarray): positions ``[n, 2]`` (m).
+        outcome (int): number of the outcome.
+    """
+    if len(path):
+        mark = FAILURE_MARKS.get(int(outcome), "D")
+        axes.scatter(*path[-1], s=75, marker=mark, color=INK, edgecolors="white", linewidths=0.9, zorder=6)

@@ -1,26 +1,23 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The look that all pictures share: colours, marks, frames, units, how arrays come in and files go out."""
+"""The look that all pictures share: colours, marks, frames, and how arrays come in."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from torchrl_koap.tasks.units import thousandths as thousandths
+from torchrl_koap.evaluation.statistics import OUTCOMES as _OUTCOMES
 
 INK, MUTED, FAINT, PALE = "#1f2328", "#6b7280", "#c9ced6", "#f4f5f7"
 RED, GREEN, BLUE, ORANGE = "#cf222e", "#1a7f37", "#1f6feb", "#d9730d"
-PALE_BLUE, WARNING = "#9cc3f5", "#9a3412"
+PALE_BLUE, WARNING, GREY = "#9cc3f5", "#9a3412", "#9aa1ab"
 SERIES = (BLUE, ORANGE, GREEN, "#8250df", "#bf3989", "#0a7f7f", MUTED)
-TIMEOUT, SUCCESS, COLLISION = 0, 1, 2
+TIMEOUT, SUCCESS, COLLISION = (_OUTCOMES.index(name) for name in ("timeout", "success", "collision"))
 OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision"}
 FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X"}
-NO_MODE = "#8a919c"
 
 
 def as_array(name: str, value: Any, shape: Sequence[int | None]) -> np.ndarray:
@@ -40,8 +37,6 @@ def as_array(name: str, value: Any, shape: Sequence[int | None]) -> np.ndarray:
         >>> as_array("real", torch.ones(3), [None]).tolist()
         [1.0, 1.0, 1.0]
     """
-    if hasattr(value, "detach"):  # a tensor; torch itself is not imported, that takes seconds
-        value = value.detach().cpu().numpy()
     value = np.asarray(value)
     if value.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, value.shape, strict=False)):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
@@ -49,27 +44,24 @@ def as_array(name: str, value: Any, shape: Sequence[int | None]) -> np.ndarray:
     return value
 
 
-def save_figure(figure: Figure, path: str | Path, *, dpi: int = 150) -> Path:
-    """Writes a figure as png, aside first, so that an earlier picture is replaced whole or not at all.
+def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.ndarray:
+    """Returns an entry that has to be there as an array of a shape.
 
     Args:
-        figure (Figure): what was drawn.
-        path (str or Path): png to write.
-        dpi (int): dots per inch.
+        data (mapping): the entries.
+        key (str): its name.
+        shape (sequence of int or None): see :func:`as_array`.
 
-    Returns:
-        Path: the file.
+    Raises:
+        ValueError: if it is missing (the message lists those that are there) or has another shape.
     """
-    from torchrl_koap.files import replacing_file  # imports torch: only when something is written
-
-    path = Path(path)
-    with replacing_file(path) as aside:
-        figure.savefig(aside, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
-    return path
+    if key not in data:
+        raise ValueError(f"missing entry {key!r}; got {', '.join(sorted(map(str, data))) or 'nothing'}")
+    return as_array(key, data[key], shape)
 
 
 def tidy(axes: Axes) -> Axes:
-    """Light frame, small ticks and labels."""
+    """Gives a panel a light frame, small ticks and labels."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
@@ -82,21 +74,28 @@ def tidy(axes: Axes) -> Axes:
 
 
 def set_title(axes: Axes, text: str) -> None:
-    """Title of a panel, flush left.
-
-    Args:
-        axes (Axes): the panel.
-        text (str): one or several lines.
-    """
+    """Sets the title of a panel, flush left; it may have several lines."""
     axes.set_title(text, loc="left", fontsize=9.5, color=INK, linespacing=1.35)
 
 
 def legend_beside(axes: Axes, **options: Any) -> None:
-    """Legend to the right of a panel, where it hides nothing.
+    """Puts the legend to the right of a panel, where it hides nothing.
 
     Args:
         axes (Axes): the panel; artists with a label become entries.
         **options: further arguments of ``Axes.legend``.
     """
     place = {"loc": "upper left", "bbox_to_anchor": (1.01, 1), "borderaxespad": 0}
+    axes.legend(**({"frameon": False, "fontsize": 8} | place | options))
+
+
+def legend_below(axes: Axes, offset: float, **options: Any) -> None:
+    """Puts the legend below a panel, in two columns.
+
+    Args:
+        axes (Axes): the panel.
+        offset (float): how far below, as a share of its height.
+        **options: further arguments of ``Axes.legend``.
+    """
+    place = {"loc": "upper center", "bbox_to_anchor": (0.5, -offset), "ncols": 2}
     axes.legend(**({"frameon": False, "fontsize": 8} | place | options))

@@ -1,15 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Charts of training and controller: losses, eigenvalues, predicted actions.
-
-Every function takes plain tensors or arrays and a file, draws into a figure of its own (no pyplot, no global state),
-writes aside, renames, and returns the file.
-"""
+"""Charts of the training: losses, and predicted against recorded actions."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,20 +13,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from torchrl_koap.reports.pictures import picture
-from torchrl_koap.reports.spectrum_plot import as_spectrum, draw_distances, draw_spectrum
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import (
     BLUE,
     FAINT,
     MUTED,
     SERIES,
     WARNING,
-    as_array,
+    entry,
     legend_beside,
-    save_figure,
     set_title,
-    thousandths,
     tidy,
 )
+from torchrl_koap.tasks.units import thousandths
 
 _ROUND = (1, 2, 5, 10)
 TERMS = {
@@ -47,46 +41,28 @@ TERMS = {
     source="metrics.csv",
     title="Losses",
     caption="Pale: logged values; line: running mean, its last value in the corner. Logarithmic. A planner's loss says"
-    " little about its rollouts: judge it by the pictures above.",
-    place=100,
+    " little about its rollouts: look at the pictures above.",
+    order=100,
 )
-def _draw_losses(rows: Sequence[Mapping[str, str]], path: Path) -> Path:
-    if not rows:
-        raise ValueError("no row has been logged yet")
-    columns = {}
-    for name in rows[0]:
-        if name == "step" or (name or "").startswith("loss_"):
-            columns[name] = [float(row[name]) if row[name] else np.nan for row in rows]
-    return plot_losses(columns, path)
-
-
-def plot_losses(metrics: Mapping[str, Sequence[float]], path: str | Path) -> Path:
-    """Loss curves, a panel per term, logarithmic; raw values pale, a running mean on top.
+def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
+    """Draws loss curves, a panel per term, logarithmic; raw values pale, a running mean on top.
 
     Args:
-        metrics (mapping): columns of ``metrics.csv``: ``step`` and any number of ``loss_*``, all of the same length;
-            NaN where a term does not belong to the row.
-        path (str or Path): png to write.
+        rows (sequence): rows of ``metrics.csv`` with ``step`` and any number of ``loss_*``, empty where a term does not
+            belong to the row.
+        run (RunFacts): the run.
 
     Raises:
-        ValueError: if ``step`` or every loss is missing, or lengths differ.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_koap.reports.training_plots import plot_losses
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     plot_losses({"step": [0, 1, 2], "loss_planner": [1.0, 0.5, 0.4]}, f"{folder}/losses.png").name
-        'losses.png'
+        ValueError: if there is no row, or no value of any loss.
     """
-    if "step" not in metrics:
-        raise ValueError(f"metrics need the column 'step', got {', '.join(metrics) or 'none'}")
-    step = as_array("step", metrics["step"], [None]).astype(float)
-    known = [name for name in TERMS if name in metrics]
-    names = known + sorted(name for name in metrics if name.startswith("loss_") and name not in TERMS)
-    columns = {name: as_array(name, metrics[name], [len(step)]).astype(float) for name in names}
+    if not rows:
+        raise ValueError("no row has been logged yet")
+    names = [name for name in TERMS if name in rows[0]]
+    names += sorted(name for name in rows[0] if (name or "").startswith("loss_") and name not in TERMS)
+    step, columns = _column(rows, "step"), {name: _column(rows, name) for name in names}
     columns = {name: values for name, values in columns.items() if np.isfinite(values).any()}
     if not columns:
-        raise ValueError(f"metrics hold no value of any loss_* column, got the columns {', '.join(metrics)}")
+        raise ValueError(f"metrics hold no value of any loss_* column, got the columns {', '.join(map(str, rows[0]))}")
 
     across = min(len(columns), 2)
     down = math.ceil(len(columns) / across)
@@ -118,7 +94,11 @@ def plot_losses(metrics: Mapping[str, Sequence[float]], path: str | Path) -> Pat
             axes.set_yticks([])
         axes.xaxis.set_major_locator(MaxNLocator(5, integer=True, steps=_ROUND))
         tidy(axes)
-    return save_figure(figure, path)
+    return figure
+
+
+def _column(rows: Sequence[Mapping[str, str]], name: str) -> np.ndarray:
+    return np.array([float(row[name]) if row[name] else np.nan for row in rows])
 
 
 def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
@@ -147,106 +127,34 @@ def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
 
 
 @picture(
-    "eigenvalues.png",
-    source="eigenvalues.safetensors",
-    title="Koopman eigenvalues",
-    caption="Left: eigenvalues of the latent operator in the complex plane; orange ones lie outside the unit circle,"
-    " where predictions grow, pale ones on it within a thousandth. Right: how far each lies from the circle, on an axis"
-    " that is linear within a thousandth of it and logarithmic beyond, with the time in which such a part of the state"
-    " fades.",
-    place=110,
-)
-def _draw_eigenvalues(values: Mapping[str, Any], path: Path, *, control_hz: float | None) -> Path:
-    return plot_eigenvalues(values["real"], values["imag"], path, control_hz=control_hz)
-
-
-def plot_eigenvalues(real: Any, imag: Any, path: str | Path, *, control_hz: float | None = None) -> Path:
-    """Eigenvalues of the Koopman operator in the complex plane, and how far each lies from the unit circle.
-
-    Args:
-        real (torch.Tensor or array): real parts [m].
-        imag (torch.Tensor or array): imaginary parts [m].
-        path (str or Path): png to write.
-        control_hz (float, optional): control steps per second; adds the time in which a mode fades to 1/e.
-
-    Raises:
-        ValueError: if there is none, or one is not finite.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_koap.reports.training_plots import plot_eigenvalues
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     plot_eigenvalues([0.9, 0.5], [0.1, 0.0], f"{folder}/eigenvalues.png").name
-        'eigenvalues.png'
-    """
-    values = as_spectrum(real, imag)
-    figure = Figure(figsize=(9.4, 4.2), layout="constrained")
-    plane, rank = figure.subplots(1, 2, width_ratios=(1, 1.15))
-    draw_spectrum(plane, values)
-    draw_distances(rank, values, control_hz=control_hz)
-    return save_figure(figure, path)
-
-
-@picture(
     "actions.png",
     source="actions.safetensors",
     title="Predicted against recorded actions",
     caption="For analysis only: the recorded actions of unlabelled demonstrations lie outside the label budget and were"
     " not used for training or selection. Points on the diagonal are exact; a slope below 1 means timid actions, an"
     " offset in the error histogram means drift.",
-    place=90,
+    order=90,
 )
-def _draw_actions(data: Mapping[str, Any], path: Path, *, actions: Sequence[tuple[str, str, bool]] | None) -> Path:
-    if not actions or len(actions) != data["true"].shape[-1]:
-        return plot_actions(data["predicted"], data["true"], path)
-    names, units, _ = zip(*actions, strict=True)
-    levels = [name for name, _, level in actions if level]  # a number that is set, not a change per step
-    return plot_actions(data["predicted"], data["true"], path, names=names, units=units, absolute=levels)
-
-
-def plot_actions(
-    predicted: Any,
-    true: Any,
-    path: str | Path,
-    *,
-    names: Sequence[str] | None = None,
-    units: Sequence[str] | None = None,
-    absolute: Sequence[str] = (),
-) -> Path:
-    """Predicted against recorded actions, a panel per dimension, and the distribution of the errors.
+def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
+    """Draws predicted against recorded actions, a panel per dimension, and the distribution of the errors.
 
     The recorded actions are those of unlabelled demonstrations: reading them spends labels outside the budget, which
-    only an analysis may do. The title says so.
+    only an analysis may do. The title says so. Metres, radians, seconds and newtons are shown in thousandths.
 
     Args:
-        predicted (torch.Tensor or array): actions the controller gives [N, d].
-        true (torch.Tensor or array): recorded actions [N, d].
-        path (str or Path): png to write.
-        names (sequence of str, optional): name of each column. Default: numbers.
-        units (sequence of str, optional): unit of each column in the data, ``""`` for none; metres, radians, seconds
-            and newtons are shown in thousandths.
-        absolute (sequence of str): columns that are no change per step, by name. They, and columns of another unit
-            than the first, are left out of the distribution of the errors.
+        data (mapping): ``predicted`` and ``true`` actions ``[N, d]``.
+        run (RunFacts): the run, whose task names the columns. Those that are no change per step, and those of another
+            unit than the first, are left out of the distribution of the errors.
 
     Raises:
-        ValueError: if shapes differ, names or units are not one per column, or no row is finite in both.
-
-    Examples:
-        >>> import tempfile
-        >>> import torch
-        >>> from torchrl_koap.reports.training_plots import plot_actions
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     plot_actions(torch.zeros(5, 2), torch.full((5, 2), 1e-3), f"{folder}/actions.png").name
-        'actions.png'
+        ValueError: if shapes differ, or no row is finite in both.
     """
-    true = as_array("true", true, [None, None])
-    predicted = as_array("predicted", predicted, true.shape)
-    width = true.shape[1]
-    names = [f"action {index + 1}" for index in range(width)] if names is None else list(names)
-    units = [""] * width if units is None else list(units)
-    for what, given in (("names", names), ("units", units)):
-        if len(given) != width:
-            raise ValueError(f"{what!r} must be one per action column, {width} in all, got {len(given)}")
+    true = entry(data, "true", [None, None])
+    predicted, width = entry(data, "predicted", true.shape), true.shape[1]
+    names, units, absolute = [f"action {index + 1}" for index in range(width)], [""] * width, ()
+    if run.task is not None and run.task.action_dim == width:
+        names, units = list(run.task.actions), [action.unit for action in run.task.actions.values()]
+        absolute = tuple(name for name, action in run.task.actions.items() if action.kind != "delta")
     there = np.isfinite(true).all(1) & np.isfinite(predicted).all(1)
     if not there.any():
         raise ValueError(f"'predicted' and 'true' have no row of {len(true)} that is finite in both")
@@ -269,7 +177,7 @@ def plot_actions(
     _histogram(axes, error[:, same], [names[index] for index in same], shown[same[0]], left_out)
     title = f"{len(true):,} steps of unlabelled demonstrations - for analysis only: reads labels outside the budget"
     figure.suptitle(title, fontsize=10, color=WARNING, x=0.01, ha="left")
-    return save_figure(figure, path)
+    return figure
 
 
 def _scatter(axes: Axes, true: np.ndarray, predicted: np.ndarray) -> None:

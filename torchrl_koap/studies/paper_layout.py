@@ -12,7 +12,8 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from torchrl_koap.files import replacing_file
-from torchrl_koap.reports.style import FAINT, save_figure, set_title, tidy
+from torchrl_koap.reports.style import FAINT, set_title, tidy
+from torchrl_koap.reports.writing import save_figure
 from torchrl_koap.studies.lines import Line, draw_lines, method_styles, name_lines
 from torchrl_koap.studies.paper_results import PaperCell, paper_cell, paper_levels
 from torchrl_koap.studies.summary import Summary, percent, summarise

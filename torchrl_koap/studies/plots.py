@@ -15,7 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
-from torchrl_koap.reports.style import FAINT, INK, save_figure, set_title, tidy
+from torchrl_koap.reports.style import FAINT, INK, set_title, tidy
+from torchrl_koap.reports.writing import save_figure
 from torchrl_koap.studies.lines import DASHES, MARKERS, Line, draw_lines, method_styles, name_lines
 from torchrl_koap.studies.summary import Summary, percent
 

@@ -11,13 +11,13 @@ from typing import Any
 
 from torchrl_koap.files import replacing_file
 from torchrl_koap.reports.html import duration, write_page
-from torchrl_koap.reports.style import thousandths
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, compare_cells, p_text
 from torchrl_koap.studies.plots import plot_action_error, plot_entropy, plot_success
 from torchrl_koap.studies.summary import Summary, cell_name, percent, plural, summarise
 from torchrl_koap.studies.table import markdown_table, table_rows, why_not_done
 from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks.units import thousandths
 from torchrl_koap.training.methods import METHODS
 
 FOLDER = "plots"

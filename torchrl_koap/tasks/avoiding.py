@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from torchrl_koap.tasks.action_rules import Action
@@ -15,6 +16,7 @@ from torchrl_koap.tasks.task import Defaults, Modes, Task
 FINISH_Y = 0.35  # m
 ROD_RADIUS = 0.01  # m
 ROW_Y = (-0.1, 0.08, 0.26)  # y of the rows of cylinders (m)
+_ROW_REACH = 0.03  # m before and behind a row of cylinders: the gap is the one at the first frame within it
 # name, x, y, radius, half height (m)
 OBSTACLES = (
     ("row1", 0.5, ROW_Y[0], 0.03, 0.07),
@@ -37,6 +39,28 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
         Tensor: bool ``[*B]``.
     """
     return state[..., 1] > FINISH_Y
+
+
+def mode_of_path(path: np.ndarray) -> int:
+    """Returns the mode of a recorded path: on which side of its cylinders it passes each row.
+
+    Args:
+        path (np.ndarray): positions ``[T, 2]`` of the tool (m).
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.tasks.avoiding import mode_of_path
+        >>> mode_of_path(np.array([[0.55, -0.1], [0.5, 0.08], [0.6, 0.27]]))
+        18
+    """
+    mode = 0
+    for y in ROW_Y:
+        cylinders = [x for _, x, row, *_ in OBSTACLES if row == y]
+        near = path[:, 1] >= y if y == ROW_Y[-1] else abs(path[:, 1] - y) <= _ROW_REACH
+        if not near.any():
+            return -1
+        mode = mode * (len(cylinders) + 1) + int((path[near.argmax(), 0] > cylinders).sum())
+    return mode
 
 
 def score(result: dict[str, Any], episodes: Any = None, contexts: Any = None) -> dict[str, float]:
@@ -82,6 +106,7 @@ register_task(
                 ("row 3", ("gap 1", "gap 2", "gap 3", "gap 4")),
             ),
             index="torchrl_koap.envs.avoiding:mode_index",
+            of_path="torchrl_koap.tasks.avoiding:mode_of_path",
         ),
         score="torchrl_koap.tasks.avoiding:score",
         env="torchrl_koap.envs.avoiding:AvoidingEnv",

@@ -48,8 +48,8 @@ def start_of(context: np.ndarray) -> int:
 
 def scores(
     result: dict[str, Any], episodes: Sequence[TensorDictBase], contexts: Sequence[int] | None
-) -> dict[str, float]:
-    """How often the spoon came over the bowl, and how often it left with a piece from each start position.
+) -> dict[str, Any]:
+    """Returns how often the spoon came over the bowl, and how often it left with a piece from each start position.
 
     Args:
         result (dict): the scores so far.
@@ -57,20 +57,16 @@ def scores(
         contexts (sequence of int, optional): not looked at.
 
     Returns:
-        dict: ``rim_rate``, ``success_left``, ``success_near``, ``success_right``; a start position that no episode had
-        is left out.
+        dict: ``rates``, by name a bool per rollout; a start position that no episode had is left out.
     """
-    rates = {"rim_rate": sum(float(episode[-1]["next", "mode"][0]) for episode in episodes) / len(episodes)}
-    starts = [start_of(episode[-1]["next", "context"].numpy()) for episode in episodes]
+    last = [episode[-1]["next"] for episode in episodes]
+    rates = {"spoon over the bowl": [bool(end["mode"][0]) for end in last]}
+    starts = [start_of(end["context"].numpy()) for end in last]
     for number, name in enumerate(STARTS):
-        own = [
-            float(episode[-1]["next", "success"])
-            for episode, start in zip(episodes, starts, strict=True)
-            if start == number
-        ]
+        own = [bool(end["success"]) for end, start in zip(last, starts, strict=True) if start == number]
         if own:
-            rates[f"success_{name}"] = sum(own) / len(own)
-    return rates
+            rates[f"success from {name}"] = own
+    return {"rates": rates}
 
 
 _START_REGIONS = tuple(((x - START_HALF, x + START_HALF), (y - START_HALF, y + START_HALF)) for x, y in STARTS.values())

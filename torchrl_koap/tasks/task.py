@@ -43,16 +43,20 @@ class Modes:
             ``[*B]``, int64, -1 while it is not decided.
         entropy (str): over which episodes the entropy of the modes is taken: ``"all"`` successful ones together, or
             per context and then averaged over ``"contexts"`` or ``"solved_contexts"`` (those with a success).
+        of_path (str, optional): import string of the function from recorded positions of the tool ``[T, 2]`` (numpy, m)
+            to the number of the mode, -1 while it is not decided; None where the path does not tell.
 
     Examples:
         >>> from torchrl_koap.tasks import Modes
-        >>> Modes((("row 1", ("left", "right")), ("row 2", ("left", "middle", "right")))).number
-        6
+        >>> modes = Modes((("row 1", ("left", "right")), ("row 2", ("left", "middle", "right"))))
+        >>> modes.number, modes.name_of(5), modes.name_of(-1)
+        (6, 'right, right', 'no mode')
     """
 
     choices: tuple[tuple[str, tuple[str, ...]], ...] = ()
     index: str | None = None
     entropy: str = "all"
+    of_path: str | None = None
 
     @property
     def number(self) -> int:

@@ -112,7 +112,8 @@ def test_scores_tell_the_starts_apart():
     episodes = list(env.rollout(2))
     from torchrl_koap.tasks.scooping import scores
 
-    assert scores({}, episodes, None) == {"rim_rate": 0.0, "success_left": 0.0, "success_near": 0.0}
+    starts = {"success from left": [False], "success from near": [False]}
+    assert scores({}, episodes, None) == {"rates": {"spoon over the bowl": [False, False], **starts}}
 
 
 @pytest.mark.parametrize("embodiment", ["robot", "hand"])

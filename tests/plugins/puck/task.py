@@ -25,7 +25,7 @@ def mode_index(mode):
 def score(result, episodes, contexts):
     """The share of the episodes that took the left side."""
     sides = [int(episode[-1]["next", "mode"]) for episode in episodes]
-    return {"left_rate": sides.count(0) / len(sides)}
+    return {"rates": {"passed on the left": [side == 0 for side in sides]}}
 
 
 TASK = register_task(

@@ -1,0 +1,117 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Executed paths and plans: cut, coloured, counted; bodies beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from run_files import drawn_lines, make_object_rollouts, make_rollouts, titles
+
+from torchrl_koap.reports import scenes
+from torchrl_koap.reports.mode_plots import mode_colors
+from torchrl_koap.reports.rollout_plots import choose_episodes, draw_plans, draw_rollouts, plan_deviation
+from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.tasks import get_task
+
+ROLLOUTS = make_rollouts()
+
+
+def run_of(task):
+    return RunFacts(Path("run"), None if task is None else get_task(task))
+
+
+def test_rollouts_are_cut_coloured_and_counted():
+    figure = draw_rollouts(ROLLOUTS, run_of("avoiding"))
+    axes, side = figure.axes
+    assert titles(figure)[0] == "2 of 4 rollouts succeed, out of time: 1, collision: 1"
+    lines = axes.collections[0]
+    np.testing.assert_allclose(lines.get_segments(), ROLLOUTS["position"][:2])
+    np.testing.assert_allclose(lines.get_colors()[:, :3], mode_colors(get_task("avoiding").modes)[:2])
+    late, hit = axes.lines[1:]  # the first line is the finish
+    assert len(late.get_xdata()) == 20 and len(hit.get_xdata()) == 10
+    np.testing.assert_allclose(axes.collections[-1].get_offsets()[0], ROLLOUTS["position"][3, 9])
+    counts = [text.get_text() for text in side.texts[:24]]
+    assert counts == ["1", "1"] + ["0"] * 22
+
+
+def test_a_list_of_modes_in_words():
+    side = draw_rollouts(make_object_rollouts("sorting"), run_of("sorting")).axes[2]
+    said = [text.get_text() for text in side.texts]
+    assert said[:4] == ["1", "red, red, blue, blue", "1", "red, blue, red, blue"] and said[-1] == "order of arrival"
+
+
+@pytest.mark.parametrize("task", ["aligning", "sorting", "stacking", None])
+def test_objects_get_a_panel(task):
+    rollouts = make_object_rollouts(task or "stacking")
+    bodies = scenes.bodies_of(run_of(task).task, rollouts["context"].shape[1])
+    figure = draw_rollouts(rollouts, run_of(task))
+    beside = figure.axes[1]
+    assert beside.get_title(loc="left").startswith("objects")
+    for index, body in enumerate(bodies):
+        wanted = [rollouts["object_position"][e, : 21 if e < 3 else 11, index] for e in range(4)]
+        found = [line for line in drawn_lines(beside) if len(line) in (20, 11) and np.allclose(line[0], wanted[0][0])]
+        assert bool(found) is not body.still
+        if found:
+            np.testing.assert_allclose(found[0], wanted[0])
+    entries = [text.get_text() for text in figure.axes[2].get_legend().get_texts()]
+    assert entries[:2] == ["out of time", "collision"] and entries[-2:] == ["end", "end of a failure"]
+    assert entries[2:-2] == list(dict.fromkeys(body.label for body in bodies))
+
+
+def test_plans_of_a_task_with_objects():
+    rollouts = make_object_rollouts("aligning")
+    lines = drawn_lines(draw_plans(rollouts, run_of("aligning"), episodes=[1, 3]).axes[0])
+    outline = scenes.outlines(rollouts["context"][1, 0], (0.05, 0.05))
+    assert any(line.shape == (5, 2) and np.allclose(line, outline) for line in lines)
+
+
+def test_plans_lie_over_their_path():
+    axes = draw_plans(ROLLOUTS, run_of("avoiding"), episodes=[1]).axes[0]
+    assert axes.get_title(loc="left") == "episode 1: left, left, gap 2\noff the path: median 0.0, 95 % within 0.0 mm"
+    lines = drawn_lines(axes)
+    assert len(lines) == 4 and all(len(line) == 4 for line in lines)
+    np.testing.assert_allclose(axes.collections[1].get_offsets(), ROLLOUTS["position"][1, [0, 4, 8, 12]])
+
+
+def test_plan_deviation_is_the_distance_to_the_polyline():
+    generator = np.random.default_rng(0)
+    path, plan = generator.normal(size=(7, 2)), generator.normal(size=(30, 2))
+    share = np.linspace(0, 1, 4001)[:, None]
+    fine = np.concatenate([a + share * (b - a) for a, b in zip(path[:-1], path[1:], strict=True)])
+    brute = np.linalg.norm(plan[:, None] - fine, axis=-1)
+    reached = brute.argmin(1) < len(fine) - 1
+    np.testing.assert_allclose(plan_deviation(path, [plan[:10], plan[10:]]), brute.min(1)[reached], atol=1e-3)
+    assert plan_deviation(path[:1], [plan]).size == 0
+
+
+@pytest.mark.parametrize(
+    ("mode", "outcome", "count", "wanted"),
+    [
+        ([3, 3, 5, 5], [1, 1, 1, 1], 3, [0, 2, 1]),
+        (range(24), [1] * 24, 4, [0, 8, 15, 23]),
+        ([-1] * 5, [2] * 5, 4, [0, 1, 2, 3]),
+        ([-1, 4], [0, 1], 6, [0, 1]),
+        ([], [], 6, []),
+    ],
+)
+def test_episodes_are_chosen_for_variety(mode, outcome, count, wanted):
+    assert choose_episodes(list(mode), outcome, count) == wanted
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mode": None}, "missing entry 'mode'"),
+        ({"position": np.zeros((4, 20, 3))}, r"'position' must have shape \[any, any, 2\], got \[4, 20, 3\]"),
+        ({"outcome": np.zeros(3)}, r"'outcome' must have shape \[4\], got \[3\]"),
+        ({"plan_step": np.zeros((4, 2))}, r"'plan_step' must have shape \[4, 5\]"),
+    ],
+)
+def test_bad_rollouts(change, message):
+    rollouts = {key: value for key, value in (ROLLOUTS | change).items() if value is not None}
+    with pytest.raises(ValueError, match=message):
+        draw_plans(rollouts, run_of("avoiding"))
+    with pytest.raises(ValueError, match="must be 0 to 3, got 4"):
+        draw_plans(ROLLOUTS, run_of("avoiding"), episodes=[4])

@@ -1,0 +1,122 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Picture of the demonstrations, and of which steps are labelled: from above, or column by column over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from torchrl_koap.reports.pictures import picture
+from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.reports.scenes import bodies_of, body_handles, draw_bodies, draw_scene, keep_inside
+from torchrl_koap.reports.style import BLUE, GREY, entry, set_title, tidy
+from torchrl_koap.tasks import Task
+
+_MOST_COLUMNS = 12  # panels of single state columns
+_HANDLES = (
+    Line2D([], [], color=BLUE, linewidth=1.7, label="with action label"),
+    Line2D([], [], color=GREY, linewidth=0.9, label="states only"),
+)
+
+
+def _caption(run: RunFacts) -> str:
+    objects = " Beside it the objects that were moved." if run.task is not None and run.task.bodies else ""
+    return f"Blue: transitions whose action the training may read. Grey: states only.{objects}"
+
+
+@picture(
+    "demonstrations.png",
+    source="demonstrations.safetensors",
+    title="Demonstrations and labels",
+    caption=_caption,
+    order=80,
+)
+def draw_demonstrations(demonstrations: Mapping[str, Any], run: RunFacts) -> Figure:
+    """Draws the demonstrations; transitions with an action label are emphasised, the others grey.
+
+    Args:
+        demonstrations (mapping): ``episode`` ``[N]``, ``labelled`` ``[N]``; ``state`` ``[N, d]`` for tasks without an
+            environment, which are drawn over time, ``position`` ``[N, 2]`` (m) for others; optionally ``objects``
+            ``[N, bodies, 2]`` (m), which get a panel of their own.
+        run (RunFacts): the run.
+
+    Raises:
+        ValueError: if an entry is missing or has a wrong shape.
+    """
+    episode = entry(demonstrations, "episode", [None])
+    labelled = entry(demonstrations, "labelled", [len(episode)]).astype(bool)
+    borders = np.flatnonzero(np.diff(episode) != 0) + 1
+    along = np.flatnonzero(labelled[:-1] & (episode[1:] == episode[:-1]))  # steps whose next state is of the same one
+    share = f"{labelled.mean():.1%}" if len(labelled) else "none"
+    number, touched = len(borders) + 1, len(np.unique(episode[labelled]))
+    head = f"{number} demonstrations; labels on {int(labelled.sum()):,} of {len(labelled):,} transitions ({share})"
+    if run.task is not None and run.offline:  # no environment says what lies in a plane
+        state = entry(demonstrations, "state", [len(episode), run.task.state_dim])
+        return _draw_over_time(state, borders, along, run.task, f"{head} in {touched} of them")
+    position = entry(demonstrations, "position", [len(episode), 2])
+    if "objects" in demonstrations:
+        figure = Figure(figsize=(10.9, 6.2), layout="constrained")
+        axes, beside = figure.subplots(1, 2)
+        objects = entry(demonstrations, "objects", [len(episode), None, 2])
+        _draw_objects(beside, np.split(objects, borders), run.task)
+    else:
+        figure = Figure(figsize=(5.9, 6.4), layout="constrained")
+        axes = figure.add_subplot()
+    draw_scene(axes, run.task)
+    _draw_lines(axes, position, borders, along, (0.7, 1.7))
+    keep_inside(axes, [position])
+    set_title(axes, f"{head}\nin {touched} of {number} demonstrations")
+    axes.legend(handles=_HANDLES, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2, frameon=False)
+    return figure
+
+
+def _draw_objects(axes: Axes, paths: list[np.ndarray], task: Task | None) -> None:
+    """The bodies that were moved, with a legend."""
+    draw_bodies(draw_scene(axes, task), paths, task, [True] * len(paths))
+    axes.label_outer()
+    handles = body_handles([body for body in bodies_of(task, paths[0].shape[1]) if not body.still], [True])
+    axes.legend(handles=handles, frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(1, 1))
+    set_title(axes, "objects: paths and where they end\n")
+
+
+def _draw_over_time(state: np.ndarray, borders: np.ndarray, along: np.ndarray, task: Task, head: str) -> Figure:
+    """A panel per state column."""
+    first = np.concatenate([[0], borders]).astype(int)
+    time = (np.arange(len(state)) - np.repeat(first, np.diff(np.append(first, len(state))))) / task.control_hz
+    columns = list(zip(task.state_names, task.state_units, strict=True))
+    drawn = columns[:_MOST_COLUMNS]
+    across = min(len(drawn), 4)
+    down = -(-len(drawn) // across)
+    figure = Figure(figsize=(max(2.9 * across, 5.6), 1.1 + 2.1 * down), layout="constrained")
+    panels = figure.subplots(down, across, squeeze=False)
+    for index, axes in enumerate(panels.flat):
+        if index >= len(drawn):
+            axes.set_axis_off()
+            continue
+        _draw_lines(axes, np.column_stack([time, state[:, index]]), borders, along, (0.6, 1.3))
+        axes.autoscale_view()
+        name, unit = columns[index]
+        set_title(axes, f"{name} ({unit})" if unit else name)
+        if index + across >= len(drawn):
+            axes.set_xlabel("time (s)")
+        tidy(axes)
+    rest = f"; {len(columns) - len(drawn)} further columns are not drawn" if len(drawn) < len(columns) else ""
+    figure.suptitle(head + rest, fontsize=9.5, x=0.01, ha="left")
+    figure.legend(handles=_HANDLES, fontsize=8.5, loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+def _draw_lines(
+    axes: Axes, points: np.ndarray, borders: np.ndarray, along: np.ndarray, widths: tuple[float, float]
+) -> None:
+    """Grey paths, and blue segments where steps are labelled."""
+    grey, blue = widths
+    axes.add_collection(LineCollection(np.split(points, borders), colors=GREY, linewidths=grey, alpha=0.8, zorder=2))
+    labelled = np.stack([points[along], points[along + 1]], 1)
+    axes.add_collection(LineCollection(labelled, colors=BLUE, linewidths=blue, capstyle="round", zorder=3))

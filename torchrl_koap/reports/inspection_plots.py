@@ -1,0 +1,295 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Pictures of what a controller has learnt: its spectrum, its latent space, and which part of the run fails."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, NullLocator
+from safetensors.numpy import load_file
+
+from torchrl_koap.evaluation.latent_verdict import (
+    MODELS,
+    ON_THE_CIRCLE,
+    OUTSIDE_THE_BUDGET,
+    error_unit,
+    unit_circle_sides,
+)
+from torchrl_koap.reports.pictures import NothingToDraw, picture
+from torchrl_koap.reports.run_facts import RunFacts
+from torchrl_koap.reports.style import (
+    BLUE,
+    FAINT,
+    INK,
+    MUTED,
+    ORANGE,
+    PALE,
+    PALE_BLUE,
+    WARNING,
+    entry,
+    legend_below,
+    set_title,
+    tidy,
+)
+from torchrl_koap.tasks import Task
+
+SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}
+EXPERIMENTS = {
+    "imagined": "planner alone\n(plans that come true)",
+    "followed": "controller alone\n(recorded states)",
+    "closed_loop": "both\n(closed loop)",
+}
+_TIMES = (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 20)
+_DIVERGED = 1e6  # in the unit shown; a prediction further off is left out of the picture
+_MODELS = {
+    "koopman": ("latent dynamics", BLUE),
+    "reconstruction": ("lifted and mapped back", PALE_BLUE),
+    "linear": ("linear model on raw states", ORANGE),
+    "copy_last": ("standing still", MUTED),
+}
+_EIGENVALUES = "eigenvalues.safetensors"
+
+
+@picture(
+    "eigenvalues.png",
+    source=_EIGENVALUES,
+    title="Koopman eigenvalues",
+    caption="Left: eigenvalues of the latent operator in the complex plane; orange ones lie outside the unit circle,"
+    " where predictions grow, pale ones on it within a thousandth. Right: how far each lies from the circle, on an axis"
+    " that is linear within a thousandth of it and logarithmic beyond, with the time in which such a part of the state"
+    " fades.",
+    order=110,
+)
+def draw_eigenvalues(data: Mapping[str, Any], run: RunFacts) -> Figure:
+    """Draws eigenvalues in the complex plane, and how far each lies from the unit circle.
+
+    Args:
+        data (mapping): ``real`` and ``imag`` parts ``[m]``.
+        run (RunFacts): the run; its control rate gives the time in which a part of the state fades.
+
+    Raises:
+        ValueError: if there is none, or one is not finite.
+    """
+    values = _spectrum(data)
+    figure = Figure(figsize=(9.4, 4.2), layout="constrained")
+    plane, rank = figure.subplots(1, 2, width_ratios=(1, 1.15))
+    _draw_plane(plane, values)
+    _draw_distances(rank, values, run.control_hz)
+    return figure
+
+
+@picture(
+    "latent.png",
+    source="inspect.json",
+    title="What the latent space holds",
+    caption="Left: eigenvalues of the operator. Middle: errors of predicted states, latent actions given; a test of the"
+    " models, not a forecast. Right, for analysis only: how much of the true actions a linear probe on labels"
+    " outside the budget, and the run's own decoder, explain on held-out demonstrations.",
+    order=60,
+)
+def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
+    """Draws eigenvalues, errors per horizon, and how much of the true actions lies in the latent ones.
+
+    Args:
+        result (mapping): ``inspect.json``, whose entry ``latent`` is of
+            :func:`~torchrl_koap.evaluation.latent_space.analyse_latent`.
+        run (RunFacts): the run; the first panel is left out where its eigenvalues are absent.
+
+    Raises:
+        NothingToDraw: if no latent space was looked into.
+    """
+    latent, eigenvalues = result.get("latent", {}), run.folder / _EIGENVALUES
+    if "multi_step" not in latent or run.task is None:
+        raise NothingToDraw("no latent space was looked into")
+    outside = latent[OUTSIDE_THE_BUDGET]
+    spectrum = "eigenvalues" in latent and eigenvalues.exists()
+    panels = ["spectrum"] * spectrum + ["errors"] + ["probe"] * ("note" not in outside)
+    figure = Figure(figsize=(4.6 * len(panels) + 0.8, 4.1), layout="constrained")
+    axes = dict(zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True))
+    if spectrum:
+        _draw_plane(axes["spectrum"], _spectrum(load_file(eigenvalues)))
+    _draw_errors(axes["errors"], latent["multi_step"], run.task)
+    if "probe" in axes:
+        _draw_probe(axes["probe"], outside, list(run.task.actions))
+        shared = outside.get("judged_trajectories_in_budget")
+        inside = bool(shared) and shared == outside.get("judged_trajectories")
+        which = "of the budget, which the decoder has seen" if inside else "outside the budget"
+        head = f"probe and decoder: for analysis only, reads {outside['labels_read']:,} labels, {which}"
+        figure.suptitle(head, fontsize=10, color=WARNING, x=0.99, ha="right")
+    return figure
+
+
+@picture(
+    "inspect.png",
+    source="inspect.json",
+    title="Which part fails",
+    caption="Success of the planner when its plans come true, of the controller on recorded states, and of both in"
+    " closed loop; distances of executed states to plans.",
+    order=70,
+)
+def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
+    """Draws success of planner, controller and both, and how far execution is from plans in each part of the state.
+
+    Args:
+        result (mapping): ``inspect.json``.
+        run (RunFacts): the run.
+
+    Raises:
+        NothingToDraw: if the experiments were not made.
+    """
+    if "closed_loop" not in result:
+        raise NothingToDraw("the experiments in the simulator were left out")
+    figure = Figure(figsize=(9.8, 4.1), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
+    made = {name: words for name, words in EXPERIMENTS.items() if name in result}
+    for index, name in enumerate(made):
+        value = result[name]
+        left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "closed_loop" else PALE_BLUE)
+        left.vlines(index, 100 * value["low"], 100 * value["high"], color=INK, linewidth=1.4)
+    numbers = [f"{words}\nn = {result[name]['episodes']}" for name, words in made.items()]
+    left.set_xticks(range(len(made)), numbers, fontsize=8)
+    left.set_ylim(0, 105)
+    left.set_ylabel("success (%)")
+    set_title(left, "Who reaches the goal (95 % intervals)")
+    tidy(left)
+    for key, color, label in (
+        ("plan_to_execution", ORANGE, "from the plan"),
+        ("recording_to_execution", MUTED, "from the recording, when that is the plan"),
+    ):
+        values = {name: errors[-1] for name, errors in result[key].items()}
+        offset = 0.18 if key == "plan_to_execution" else -0.18
+        rows = [index + offset for index in range(len(values))]
+        right.barh(rows, list(values.values()), height=0.34, color=color, label=label)
+    names = list(result["plan_to_execution"])
+    right.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
+    right.invert_yaxis()
+    right.set_xlabel("root mean square distance after the last step of a plan\n(m, rad, or on the unit circle)")
+    set_title(right, "How far execution is")
+    if names:
+        legend_below(right, 0.24)
+    tidy(right)
+    return figure
+
+
+def _spectrum(data: Mapping[str, Any]) -> np.ndarray:
+    """Complex eigenvalues of their parts."""
+    real = entry(data, "real", [None]).astype(float)
+    values = real + 1j * entry(data, "imag", [len(real)]).astype(float)
+    if not len(values) or not np.isfinite(values).all():
+        raise ValueError(f"eigenvalues must be finite and at least one, got {len(values)} with NaN or infinite ones")
+    return values
+
+
+def _draw_plane(axes: Axes, values: np.ndarray) -> None:
+    """Eigenvalues in the complex plane; an inset magnifies them where they crowd."""
+    angle = np.linspace(0, 2 * np.pi, 2000)
+    side = np.array(unit_circle_sides(np.abs(values)))
+    axes.fill(np.cos(angle), np.sin(angle), color=PALE, zorder=0)
+    axes.axhline(0, color=FAINT, linewidth=0.6, zorder=0.5)
+    axes.axvline(0, color=FAINT, linewidth=0.6, zorder=0.5)
+    reach = 1.1 * min(max(1.0, float(np.abs(values).max())), 4.0)  # the title counts those beyond
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), box_aspect=1, xlabel="real part", ylabel="imaginary part")
+    if reach < 2:
+        axes.set(xticks=(-1, -0.5, 0, 0.5, 1), yticks=(-1, -0.5, 0, 0.5, 1))
+    panels = [axes]
+    centre = np.array([values.real.min() + values.real.max(), values.imag.min() + values.imag.max()]) / 2
+    spread = max(np.ptp(values.real), np.ptp(values.imag), 0.002)
+    if spread < 0.4 and values.real.min() > 0.25:  # the empty half has room for a closer look
+        inset = axes.inset_axes((0.17, 0.54, 0.36, 0.36))
+        inset.set(xlim=centre[0] + 0.6 * spread * np.array([-1, 1]), ylim=centre[1] + 0.6 * spread * np.array([-1, 1]))
+        inset.tick_params(labelsize=6.5, color=FAINT, labelcolor=MUTED)
+        inset.locator_params(nbins=3)
+        axes.indicate_inset_zoom(inset, edgecolor=MUTED)
+        panels.append(inset)
+    for panel in panels:
+        panel.plot(np.cos(angle), np.sin(angle), color=MUTED, linewidth=1, zorder=1)
+        for name, color in SIDES.items():
+            here = values[side == name]
+            style = {"s": 20, "color": color, "alpha": 0.7, "linewidths": 0, "zorder": 2 + list(SIDES).index(name)}
+            panel.scatter(here.real, here.imag, **style)
+    counts = [f"{int((side == name).sum())} {name}" for name in SIDES]
+    radius = f"{len(values)} eigenvalues, radius {np.abs(values).max():.5g}"
+    set_title(axes, f"{radius}\n{', '.join(counts)} the unit circle")
+    tidy(axes)
+
+
+def _draw_distances(axes: Axes, values: np.ndarray, control_hz: float | None) -> None:
+    """Magnitudes minus 1 in order: linear within a thousandth of the circle, logarithmic beyond."""
+    size = np.sort(np.abs(values))[::-1]
+    side, ranks = np.array(unit_circle_sides(size)), np.arange(1, len(size) + 1)
+    axes.set_yscale("symlog", linthresh=ON_THE_CIRCLE, linscale=0.6)
+    axes.axhspan(-ON_THE_CIRCLE, ON_THE_CIRCLE, color=PALE, zorder=0)
+    axes.axhline(0, color=MUTED, linewidth=1, zorder=1)
+    for name, color in SIDES.items():
+        here = side == name
+        label = f"{name} the circle: {int(here.sum())}"
+        axes.scatter(ranks[here], size[here] - 1, s=22, color=color, alpha=0.8, linewidths=0, zorder=2, label=label)
+    low, high = min(size.min() - 1, -2 * ON_THE_CIRCLE), max(size.max() - 1, 2 * ON_THE_CIRCLE)
+    axes.set_ylim(1.6 * low, 1.6 * high)
+    bottom, top = axes.get_ylim()
+    near = max(-low, high) < 20 * ON_THE_CIRCLE  # within two per cent: decades alone would be one tick
+    steps = (1, 2, 5) if near else (1,)
+    ticks = [sign * step * 10.0**power for sign in (-1, 1) for step in steps for power in range(-3, 4)]
+    ticks = sorted(tick for tick in [*ticks, 0.0] if bottom <= tick <= top)
+    axes.set_yticks(ticks, [f"{tick:+g}" if tick else "0" for tick in ticks])
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("rank")
+    axes.set_ylabel("magnitude - 1")
+    set_title(axes, "distance from the unit circle\n(shaded: counted as on it)")
+    axes.legend(frameon=False, fontsize=8, loc="upper right")
+    tidy(axes)
+    if control_hz is not None:
+        places = {math.exp(-1 / (time * control_hz)) - 1: f"{time:g} s" for time in _TIMES}
+        places = {place: text for place, text in places.items() if bottom < place < -ON_THE_CIRCLE}
+        fades = axes.secondary_yaxis("right")
+        fades.set_yticks(list(places), list(places.values()))
+        fades.yaxis.set_minor_locator(NullLocator())
+        fades.tick_params(labelsize=8, color=FAINT, labelcolor=MUTED)
+        fades.set_ylabel("fades to 1/e within", size=9, color=INK)
+        fades.spines["right"].set_visible(False)
+
+
+def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
+    part = next(iter(errors["koopman"]))
+    shown, factor = error_unit(part, task)
+    steps = np.arange(1, errors["steps"] + 1)
+    for model in MODELS:
+        values = factor * np.asarray(errors[model][part], dtype=float)
+        label, color = _MODELS[model]
+        axes.plot(steps, np.where((values > 0) & (values < _DIVERGED), values, np.nan), ".-", color=color, label=label)
+    axes.set_yscale("log")
+    axes.margins(y=0.1)
+    axes.set_xlabel(f"control steps ahead, {1e3 / task.control_hz:.0f} ms each\n(latent actions given)")
+    axes.set_ylabel("root mean square distance" + (f" ({shown})" if shown else ""))
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
+    judged = f"on {errors['judged_trajectories']} demonstrations"
+    set_title(axes, f"Error of the predicted {part.replace('_', ' ')}\n{judged}")
+    legend_below(axes, 0.22)
+    tidy(axes)
+
+
+def _draw_probe(axes: Axes, outside: Mapping[str, Any], names: list[str]) -> None:
+    places = np.arange(len(names))
+    for offset, key, color, label in (
+        (-0.19, "probe_r2", PALE_BLUE, "linear probe, all labels of half"),
+        (0.19, "decoder_r2", BLUE, "the run's decoder"),
+    ):
+        values = np.asarray(outside[key], dtype=float)
+        axes.bar(places + offset, np.clip(values, 0, None), width=0.36, color=color, label=label)
+        for place, value in zip(places + offset, values, strict=True):
+            if np.isfinite(value):
+                style = {"ha": "center", "fontsize": 7, "color": INK, "rotation": 90 if len(names) > 4 else 0}
+                axes.annotate(f"{value:.3f}", (place, max(value, 0) + 0.01), **style)
+    axes.set_ylim(0, 1.12)
+    axes.set_xticks(places, names, fontsize=8, rotation=45 if len(names) > 4 else 0)
+    axes.set_yticks((0, 0.25, 0.5, 0.75, 1))
+    axes.set_ylabel("share of variance explained (R²)")
+    set_title(axes, "True actions from latent actions\non the same held-out demonstrations")
+    legend_below(axes, 0.22, columnspacing=1)
+    tidy(axes)

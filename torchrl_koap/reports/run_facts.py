@@ -1,0 +1,145 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What is known about a run: its task and the numbers in its files, read once for pictures, hints and page."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torchrl_koap.evaluation.statistics import expected_entropy
+from torchrl_koap.files import read_bytes
+from torchrl_koap.tasks import Modes, Task, task_of
+
+
+def number(value: Any) -> float | int | None:
+    """Returns the value if it is a finite number, else None.
+
+    Examples:
+        >>> from torchrl_koap.reports.run_facts import number
+        >>> number(0.5), number(True), number("0.5"), number(float("nan"))
+        (0.5, None, None, None)
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        return None
+    return value
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """Holds what is known about a run; files that are absent or damaged are empty.
+
+    Args:
+        folder (Path): the run directory.
+        task (Task, optional): its task; None if nobody here knows it.
+        summary (mapping): ``summary.json``.
+        evaluation (mapping): ``eval.json``.
+        inspection (mapping): ``inspect.json``.
+        config (mapping): ``config.json``.
+        damaged (tuple of str): what was wrong with which of them.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.reports.run_facts import RunFacts
+        >>> from torchrl_koap.tasks import get_task
+        >>> run = RunFacts(Path("runs/koap"), get_task("avoiding"), evaluation={"success_rate": 0.5, "episodes": 8})
+        >>> run.modes.number, run.successes
+        (24, 4)
+    """
+
+    folder: Path
+    task: Task | None = None
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    evaluation: Mapping[str, Any] = field(default_factory=dict)
+    inspection: Mapping[str, Any] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)
+    damaged: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, folder: str | Path) -> RunFacts:
+        """Reads the JSON files of a run directory, those that are there.
+
+        Args:
+            folder (str or Path): the run directory.
+
+        Raises:
+            FileNotFoundError: if there is no such directory.
+        """
+        folder, damaged = Path(folder), []
+        if not folder.is_dir():
+            raise FileNotFoundError(f"there is no run directory {str(folder)!r}")
+        files: dict[str, dict[str, Any]] = {}
+        names = {"config": "config", "summary": "summary", "evaluation": "eval", "inspection": "inspect"}
+        for key, name in names.items():
+            path = folder / f"{name}.json"
+            files[key], wrong = _read(path) if path.exists() else ({}, "")
+            damaged += [wrong] if wrong else []
+        try:
+            task = task_of(files["config"])
+        except (ValueError, KeyError, TypeError, AttributeError):  # a run of a task that nobody knows here
+            task = None
+        return cls(folder, task, damaged=tuple(damaged), **files)
+
+    @property
+    def offline(self) -> bool:
+        """Whether the task has no environment, so that recorded data say what the run is worth."""
+        return self.task is not None and self.task.env is None
+
+    @property
+    def control_hz(self) -> float | None:
+        """Control steps per second of the task, None if it is not known."""
+        return None if self.task is None else self.task.control_hz
+
+    @property
+    def modes(self) -> Modes:
+        """The ways to do the task; none where it is not known or was rolled out in another environment."""
+        return Modes() if self.task is None or self.evaluation.get("env") else self.task.modes
+
+    @property
+    def successes(self) -> int:
+        """Number of successful rollouts, 0 where there are none."""
+        rate, episodes = self.evaluated("success_rate"), self.evaluated("episodes")
+        return round(rate * episodes) if rate and episodes else 0
+
+    @property
+    def expected_entropy(self) -> float | None:
+        """Mode entropy that a uniform choice would have with as many successes; None where there is no choice."""
+        choice = self.modes.number > 1 and self.successes
+        return expected_entropy(self.successes, self.modes.number) if choice else None
+
+    @property
+    def labels(self) -> float | None:
+        """Labelled transitions, None if nobody counted."""
+        account = self.summary.get("labels")
+        return number(account.get("labelled_transitions")) if isinstance(account, Mapping) else None
+
+    @property
+    def action_errors(self) -> tuple[Mapping[str, Any], str]:
+        """Errors of the predicted actions, empty if there are none, and their unit."""
+        for name, errors in self.summary.items():
+            if name.startswith("action_error") and isinstance(errors, Mapping):
+                return errors, name.removeprefix("action_error").removeprefix("_")
+        return {}, ""
+
+    def evaluated(self, name: str) -> float | None:
+        """Returns a number of the evaluation, None if it is not there."""
+        return number(self.evaluation.get(name))
+
+    def experiment(self, name: str) -> float | None:
+        """Returns the success of an experiment of ``koap inspect``, None if it was not made."""
+        found = self.inspection.get(name)
+        return number(found.get("rate")) if isinstance(found, Mapping) else None
+
+
+def _read(path: Path) -> tuple[dict[str, Any], str]:
+    """Returns the content of a JSON file, empty if it is damaged, and what was wrong."""
+    try:
+        content = json.loads(read_bytes(path))
+    except (OSError, ValueError, RecursionError) as error:
+        return {}, f"{path} is damaged: {error}"
+    if not isinstance(content, dict):
+        return {}, f"{path} is damaged: wanted an object, got {type(content).__name__}"
+    return content, ""
