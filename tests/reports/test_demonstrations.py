@@ -11,7 +11,7 @@ from run_files import drawn_lines, make_demonstrations, titles
 
 from torchrl_koap.reports.demonstrations import draw_demonstrations
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks import Action, Task, get_task
 
 
 def run_of(task):
@@ -37,7 +37,14 @@ def test_demonstrations_with_objects():
 
 def test_columns_over_time_where_there_is_no_environment():
     names = tuple(f"q{index}" for index in range(14))
-    arm = Task("arm", {"joints": names}, {"a": "rad"}, "joints", control_hz=10.0, observation_units=("rad",) * 14)
+    arm = Task(
+        name="arm",
+        observation_parts={"joints": names},
+        observation_units=("rad",) * 14,
+        actions={"a": Action("rad")},
+        position="joints",
+        control_hz=10.0,
+    )
     data = make_demonstrations() | {"state": np.random.rand(40, 14)}
     figure = draw_demonstrations(data, RunFacts(Path("run"), arm))
     assert titles(figure) == [f"{name} (rad)" for name in names[:12]]

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from run_files import titles
 
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.training_plots import draw_actions, draw_losses, running_mean
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Action, Task, get_task
 
 NOTHING = RunFacts(Path("run"))
 
@@ -86,8 +85,8 @@ def test_actions_in_two_units():
 def test_actions_of_another_robot():
     """Seven joint torques: names and units as given, nothing speaks of x, y or mm."""
     true = np.random.rand(30, 7)
-    data, torques = {"predicted": true + 0.5, "true": true}, {f"torque {index}": "N m" for index in range(7)}
-    arm = replace(get_task("avoiding"), actions=torques, actuated=())
+    data, torques = {"predicted": true + 0.5, "true": true}, {f"torque {index}": Action("N m") for index in range(7)}
+    arm = Task(name="arm", observation_parts={"q": 7}, actions=torques, position="q")
     assert titles(draw_actions(data, RunFacts(Path("run"), arm)))[6:] == [
         "torque 6: RMSE 0.5 N m",
         "all: RMSE 0.5 N m, median 0.5",

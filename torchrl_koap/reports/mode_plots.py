@@ -17,11 +17,11 @@ from matplotlib.ticker import MaxNLocator
 from safetensors.numpy import load_file
 
 from torchrl_koap.evaluation.statistics import expected_entropy, mode_entropy
+from torchrl_koap.lookup import resolve
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import BLUE, FAINT, GREY, INK, MUTED, SUCCESS, entry, legend_beside, set_title, tidy
 from torchrl_koap.tasks import Modes
-from torchrl_koap.tasks.import_strings import resolve
 
 _LISTED = 10  # modes of a single choice: from here on names are short
 
