@@ -8,7 +8,7 @@ import itertools
 import pytest
 import torch
 
-from torchrl_koap.tasks import TASKS, Modes
+from torchrl_koap.tasks import TASKS
 
 
 @pytest.mark.parametrize("mode", range(24))
@@ -26,7 +26,6 @@ def test_mode_names_follow_the_flags(mode):
 def test_every_task_has_as_many_names_as_modes(task):
     modes, number = TASKS[task].modes, TASKS[task].num_modes
     assert len({modes.name_of(mode) for mode in range(number)}) == number and modes.name_of(number) == "no mode"
-    assert Modes().name_of(0) == "no mode"
 
 
 @pytest.mark.parametrize(("task", "boxes"), [("sorting", 4), ("sorting_2", 2), ("sorting_6", 6), ("po_sorting", 4)])
