@@ -31,7 +31,7 @@ from torchrl_koap.tasks.units import thousandths
 
 def _rollouts_caption(run: RunFacts) -> str:
     modes = "; a colour per mode, the table counts successes per mode" if run.modes.number > 1 else ""
-    cross = "a cross (collision) or " if run.task is not None and run.task.collides else ""
+    cross = "a cross (collision) or " if run.evaluation.get("collisions") else ""
     return (
         f"Path of the tool centre from above, to scale{modes}. Failures are black and end in {cross}a square (out of"
         f" time).{'' if run.task is None else run.task.scene.caption}"
