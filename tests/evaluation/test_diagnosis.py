@@ -25,11 +25,11 @@ from torchrl_koap.evaluation.diagnosis import (
     imagine,
     imagined_success,
     left_recordings,
-    rate,
     recorded_futures,
     tracking_errors,
 )
 from torchrl_koap.evaluation.inspection import verdict
+from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.reports.inspection_plots import draw_experiments
 from torchrl_koap.reports.run_facts import RunFacts
