@@ -198,7 +198,6 @@ def main() -> int:
     chance, ends, rows = random.Random(options.seed), time.monotonic() + 60 * options.minutes, []
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        os.environ["KOAP_CACHE"] = str(root / "cache")
         data, run = write_demonstrations(root / "data"), root / "run"
         assert call(("train", "--out", run, "--dataset", data, *TINY, "--quiet")) == 0
         wanted = [name for name in options.commands.split(",") if name]

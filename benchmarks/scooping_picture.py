@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from scooping_rows import scooping_cells
 from tables import read_rows
 
-from torchrl_koap.data.lerobot.images import read_image_episodes
+from torchrl_koap.data.formats.lerobot_frames import read_image_episodes
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, INK, MUTED, ORANGE, PALE_BLUE, set_title, tidy
 from torchrl_koap.tasks.scooping import FRAME_HZ

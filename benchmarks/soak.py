@@ -16,7 +16,6 @@ import contextlib
 import csv
 import ctypes
 import gc
-import os
 import resource
 import subprocess
 import sys
@@ -30,9 +29,10 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from raw_episodes import write_raw_episode  # noqa: E402
 from tiny_runs import TINY, demonstration, koap, write_demonstrations  # noqa: E402
 
-from torchrl_koap.data import D3ILExperienceReplay, RawEpisode, write_raw_episode
+from torchrl_koap.data import open_dataset
 from torchrl_koap.envs.registry import make_env_of
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.evaluation.rollouts import roll_out
@@ -137,16 +137,15 @@ def convert(files: int) -> dict[str, float]:
     """Writes raw files of 60 to 99 rows; memory that their conversion takes, and their check, which reads them all."""
     lengths = [60 + index % 40 for index in range(files)]
     with tempfile.TemporaryDirectory() as folder:
-        os.environ["KOAP_CACHE"] = f"{folder}/cache"
         written = Path(folder) / "data"
         for index, rows in enumerate(lengths):
             commanded, measured = demonstration(index % 8, rows)
             paths = {"des_c_pos": commanded, "c_pos": measured + 1e-7 * index}  # no episode is there twice
             paths = {name: np.pad(path, ((0, 0), (0, 1)), constant_values=0.12) for name, path in paths.items()}
-            write_raw_episode(written / f"env_{index:05d}_00.pkl", RawEpisode(robot=paths))
+            write_raw_episode(written / f"env_{index:05d}_00.pkl", paths)
         before, began = anonymous(), time.perf_counter()
         with watching_memory() as converting, progress_bar(None, "demonstrations", unit="episode", delay=0) as bar:
-            data = D3ILExperienceReplay("avoiding", written, progress=count_up_to(bar)).data
+            data, _ = open_dataset(written, progress=count_up_to(bar))
         seconds = time.perf_counter() - began
         row = {"files": files, "steps": len(data), "seconds": seconds, "data_mb": data.bytes() / 1e6}
         with watching_memory() as checking:

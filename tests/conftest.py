@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""One thread per test process, a cache of its own, and tiny demonstrations and runs shared by all tests."""
+"""One thread per test process, and tiny demonstrations and runs shared by all tests."""
 
 from __future__ import annotations
 
@@ -9,14 +9,6 @@ from tiny_runs import TINY, koap, write_demonstrations
 
 # two processes with two threads each on two cores wait for each other most of the time
 torch.set_num_threads(1)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def own_cache(tmp_path_factory):
-    """Converted demonstrations are never written to the home folder."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("KOAP_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 @pytest.fixture(scope="session")

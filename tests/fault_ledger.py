@@ -170,7 +170,7 @@ def make_template(root: Path) -> Path:
     run = ("--out", root / "run", "--dataset", data, *TINY, "--checkpoint-every", "10", "--quiet")
     assert koap("train", *run) == 0
     flat = load_demonstrations(str(data), get_task("avoiding"))
-    save_ted(flat, root / "ted" / "ted", task="avoiding")
+    save_ted(flat, root / "ted" / "ted", get_task("avoiding"))
     (root / "arrays").mkdir()
     for index in range(3):
         generator = np.random.default_rng(index)
@@ -185,7 +185,7 @@ def make_camera_template(root: Path) -> None:
     import numpy as np
     import torch
 
-    from torchrl_koap.data.lerobot.images import ImageEpisode, ImageEpisodeWriter
+    from torchrl_koap.data.formats.writers import LeRobotWriter
     from torchrl_koap.tasks import get_task
     from torchrl_koap.vision import FrozenImageEncoder, Projection, load_backbone, save_encoder
 
@@ -194,12 +194,12 @@ def make_camera_template(root: Path) -> None:
     torch.manual_seed(0)
     backbone = load_backbone("tiny_network:random_layer")
     about = {"state_names": "xyz", "action_names": task.action_names, "embodiment": "robot", "task": "scoop"}
-    writer = ImageEpisodeWriter(root / "frames", fps=10, **about)
+    writer = LeRobotWriter(root / "frames", fps=10, camera="observation.images.third_person", **about)
     generator = np.random.default_rng(0)
     for length in (4, 6):
         frames = generator.integers(0, 256, (length + 1, width, width, 3), dtype=np.uint8)
         action = generator.normal(size=(length, task.action_dim))
-        writer.add(ImageEpisode(frames, generator.normal(size=(length + 1, 3)), action, "robot"))
+        writer.add(generator.normal(size=(length + 1, 3)), action, frames=frames)
     writer.close()
     fitted = Projection.fit(torch.randn(200, 4 * 36), task.observation_dim - 3)
     encoder = FrozenImageEncoder(backbone, projection=fitted, size=width)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_koap.data import RawEpisode
 from torchrl_koap.envs.avoiding import FINISH_Y, OBSTACLES
 from torchrl_koap.envs.experts.avoiding import ROD_RADIUS
 
@@ -16,8 +15,8 @@ MOVING = 3.0  # mm per step
 LOOK_AHEAD = 8
 
 
-def statistics(episode: RawEpisode) -> dict[str, float]:
-    """Quantities of one demonstration, by name."""
+def statistics(episode: np.ndarray) -> dict[str, float]:
+    """Quantities of one demonstration ``[T, 4]``, by name."""
     command, measured = paths(episode)
     steps = np.diff(command, axis=0) * 1e3
     speed = np.linalg.norm(steps, axis=1)
@@ -61,9 +60,9 @@ def statistics(episode: RawEpisode) -> dict[str, float]:
     return values
 
 
-def paths(episode: RawEpisode) -> tuple[np.ndarray, np.ndarray]:
+def paths(episode: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Commanded and measured xy [T, 2] (m)."""
-    return episode.robot["des_c_pos"][:, :2], episode.robot["c_pos"][:, :2]
+    return episode[:, :2], episode[:, 2:]
 
 
 def clearance(measured: np.ndarray) -> float:
@@ -96,7 +95,7 @@ def autocorrelation(values: np.ndarray, lag: int) -> float:
     return float((centred[lag:] * centred[:-lag]).sum() / max((centred**2).sum(), 1e-12))
 
 
-def ridge_error(episodes: list[RawEpisode], strength: float = 1e-6) -> float:
+def ridge_error(episodes: list[np.ndarray], strength: float = 1e-6) -> float:
     """Error (mm, rms) of a linear guess of the command from measured positions before, now and ahead, per axis.
 
     Fitted on all demonstrations but one and tested on that one; a measure of how abrupt the commands are.

@@ -1,15 +1,18 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Locks between processes."""
+"""Locks between processes, saving that loses nothing, and errors that list every fault."""
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 import subprocess
 import sys
 import threading
 
 import pytest
 
-from torchrl_koap.files import LockedError, one_at_a_time
+from torchrl_koap.files import DataError, LockedError, one_at_a_time, replacing_file, replacing_folder
 
 HOLD = """
 import sys
@@ -49,3 +52,49 @@ def test_without_a_message_the_others_wait(tmp_path):
         order.append("first")
     thread.join(10)
     assert order == ["first", "second"]
+
+
+def test_a_file_that_cannot_be_written_leaves_the_earlier_one(tmp_path):
+    path = tmp_path / "new" / "a"
+    with replacing_file(path) as aside:
+        aside.write_text("old")
+    with pytest.raises(OSError, match="a could not be written: .*what was there before is kept"):
+        with replacing_file(path) as aside:
+            aside.write_text("half of it")
+            raise OSError(errno.ENOSPC, "No space left on device")
+    assert path.read_text() == "old" and list(path.parent.iterdir()) == [path]
+    (tmp_path / "plain").touch()
+    assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
+
+
+@pytest.mark.parametrize("moment", ["writing", "renaming"])
+def test_a_failed_folder_leaves_the_earlier_one(tmp_path, monkeypatch, moment):
+    with replacing_folder(tmp_path / "set") as aside:
+        (aside / "part").write_text("old")
+    real, calls = os.replace, []
+
+    def fail_second(source, target):
+        calls.append(source)
+        if len(calls) == 3:  # new to its place (refused: it is full), old aside, new to its place
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(source, target)
+
+    with pytest.raises(OSError, match="No space left"), replacing_folder(tmp_path / "set") as aside:
+        (aside / "part").write_text("new")
+        if moment == "writing":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        monkeypatch.setattr(os, "replace", fail_second)
+    assert (tmp_path / "set" / "part").read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["set"]
+    monkeypatch.undo()
+    with replacing_folder(tmp_path / "set") as aside:
+        (aside / "part").write_text("new")
+    assert (tmp_path / "set" / "part").read_text() == "new"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["set"]
+
+
+def test_faults_are_all_told():
+    assert str(DataError("a.csv", "it is empty")) == "a.csv cannot be used: it is empty"
+    error = DataError("demos", ["a.csv: it is empty", "b.csv: it is missing"])
+    assert str(error) == "demos cannot be used:\n  - a.csv: it is empty\n  - b.csv: it is missing"
+    assert error.source == "demos" and len(error.problems) == 2

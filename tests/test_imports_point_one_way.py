@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).parents[1] / "torchrl_koap"
 BASE = {"keys", "lookup", "files"}
 TRAINING = {*BASE, "tasks", "data", "modules", "objectives", "runs", "training"}
 MAY_IMPORT = {
-    "keys": set(),
+    "keys": {"files"},
     "lookup": set(),
     "files": set(),
     "tasks": {*BASE, "tasks"},

@@ -6,9 +6,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from raw_episodes import write_raw_episode
 
 from torchrl_koap.commands.cli import main
-from torchrl_koap.data import RawEpisode, write_raw_episode
 
 TINY = (
     *("--steps", "20", "--batch-size", "8", "--controller-batch-size", "8", "--threads", "1"),
@@ -46,5 +46,5 @@ def write_demonstrations(folder: Path, *, episodes: int = 8, rows: int = 30, cha
             commanded, measured = change(index, commanded, measured)
         height = np.full((len(commanded), 1), 0.12)
         paths = {"des_c_pos": np.hstack([commanded, height]), "c_pos": np.hstack([measured, height])}
-        write_raw_episode(Path(folder) / f"env_{index:03d}_00.pkl", RawEpisode(robot=paths))
+        write_raw_episode(Path(folder) / f"env_{index:03d}_00.pkl", paths)
     return Path(folder)

@@ -16,13 +16,33 @@ import stat
 import tempfile
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import filelock
 
 _NO_PLACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 LARGEST = 1 << 28  # bytes of a file that is read as a whole: hundreds of times what any of them has
+
+
+class DataError(ValueError):
+    """Data that cannot be used.
+
+    Args:
+        source (str or Path): what cannot be used: a file, a folder, or what the caller calls the whole.
+        problems (str or sequence of str): every fault that was found.
+
+    Examples:
+        >>> from torchrl_koap.files import DataError
+        >>> print(DataError("demos/ted", "about.json is missing"))
+        demos/ted cannot be used: about.json is missing
+    """
+
+    def __init__(self, source: str | Path, problems: str | Sequence[str]):
+        self.source, self.problems = str(source), [problems] if isinstance(problems, str) else list(problems)
+        several = len(self.problems) > 1
+        listed = "".join(f"\n  - {problem}" for problem in self.problems) if several else f" {''.join(self.problems)}"
+        super().__init__(f"{source} cannot be used:{listed}")
 
 
 def check_file(path: str | Path, *, largest: int = LARGEST) -> None:

@@ -30,6 +30,8 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 
+from torchrl_koap.files import DataError
+
 OBSERVATION = "observation"
 STATE = "state"
 ACTION = "action"
@@ -67,12 +69,11 @@ REQUIRED = (
 )
 
 
-class LayoutError(ValueError):
-    """A tensordict that does not follow the storage layout; ``problems`` lists every fault found."""
+class LayoutError(DataError):
+    """A tensordict that does not follow the storage layout."""
 
     def __init__(self, problems: list[str]):
-        self.problems = problems
-        super().__init__("the data do not follow the storage layout:\n  - " + "\n  - ".join(problems))
+        super().__init__("data that do not follow the storage layout", problems)
 
 
 def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDictBase:

@@ -58,7 +58,7 @@ for embodiment in ("robot", "hand"):
 sources = [Source(folder / embodiment) for embodiment in ("robot", "hand")]
 components = fit_projection(FrozenImageEncoder(backbone), sources, EMBEDDING_DIM)
 encoder = FrozenImageEncoder(backbone, projection=components)
-stored = load_ted(embed_demonstrations(folder / "data", sources, encoder, mixed=True) / "ted")
+stored, _ = load_ted(embed_demonstrations(folder / "data", sources, encoder, mixed=True) / "ted")
 
 robots = stored["episode"] < EACH
 seen = stored["observation"][robots, :EMBEDDING_DIM].double()

@@ -84,7 +84,7 @@ def test_a_fault_of_ours_keeps_its_traceback(monkeypatch):
 
 
 def test_options_that_can_mean_nothing():
-    from torchrl_koap.commands.demos import Demos
+    from torchrl_koap.commands.data_commands import Demos
 
     check_options(Demos(out="somewhere/new"))
     with pytest.raises(ValueError, match="--episodes must be at most"):

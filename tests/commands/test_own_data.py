@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 
@@ -11,11 +10,10 @@ import numpy as np
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap.data import load_ted, read_task, save_demonstrations
-from torchrl_koap.data.demonstrations import description_of
+from torchrl_koap.data import load_ted, save_demonstrations, stored_task
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
-from torchrl_koap.tasks import Action, get_task
+from torchrl_koap.tasks import Action
 
 TINY = ("--steps", 20, "--batch-size", 8, "--controller-batch-size", 8, "--channels", 8, 16)
 
@@ -48,7 +46,7 @@ def run(arrays, tmp_path_factory):
 
 
 def test_the_task_comes_with_the_data(run):
-    task = read_task(run.parent / "arm" / "ted")
+    task = stored_task(run.parent / "arm" / "ted")
     assert task.name == "arm" and task.robot == (0, 1) and task.actions == {"dq1": Action("rad"), "dq2": Action("rad")}
     config, summary = (json.loads((run / name).read_text()) for name in ("config.json", "summary.json"))
     assert config["task"] == "arm" and config["label_fraction"] == 1.0
@@ -88,7 +86,7 @@ def test_absolute_targets(arrays, tmp_path):
     command = ("convert", tmp_path / "arrays", "--out", tmp_path / "arm", "--name", "reach", "--robot", "q1", "q2")
     assert koap(*command, "--action-kind", "absolute") == 0
     assert koap("train", "--dataset", tmp_path / "arm", "--out", tmp_path / "run", "--method", "linear", *TINY) == 0
-    data = load_ted(tmp_path / "arm" / "ted")
+    data, _ = load_ted(tmp_path / "arm" / "ted")
     agent = Agent(load_policy(tmp_path / "run"))
     agent.reset()
     far = data["observation"][0].numpy() + np.array([5.0, 5.0, 5.0, 5.0])
@@ -99,24 +97,20 @@ def test_absolute_targets(arrays, tmp_path):
     assert np.abs(moved - near).min() > 2
 
 
-def test_a_data_set_that_is_written_again_keeps_what_it_says_of_its_columns(arrays, tmp_path):
-    options = ("--robot", "q1", "q2", "--command", "goal1", "goal2", "--action-units", "rad", "--state-units", "m")
-    assert koap("convert", arrays, "--out", tmp_path / "arm", *options, "--max-steps", 77) == 0
-    assert koap("convert", tmp_path / "arm", "--out", tmp_path / "again") == 0
-    assert koap("convert", tmp_path / "arm", "--out", tmp_path / "longer", "--max-steps", 99, "--robot", "q2") == 0
-    first, again, longer = (read_task(tmp_path / name / "ted") for name in ("arm", "again", "longer"))
-    assert dataclasses.replace(again, name="arm") == first
-    assert dataclasses.replace(longer, name="arm", robot=first.robot, max_steps=77).actions == first.actions
-    assert longer.max_steps == 99 and [longer.state_names[column] for column in longer.robot] == ["q2"]
-    one, other = (load_ted(tmp_path / name / "ted") for name in ("arm", "again"))
+def test_a_data_set_in_another_format(arrays, run, tmp_path, capsys):
+    assert koap("convert", run.parent / "arm", "--out", tmp_path / "plain", "--to", "npz") == 0
+    assert "labelled steps" in capsys.readouterr().out
+    assert koap("convert", tmp_path / "plain", "--out", tmp_path / "again", "--robot", "q1", "q2") == 0
+    one, other = (load_ted(folder / "ted")[0] for folder in (run.parent / "arm", tmp_path / "again"))
     assert (one["observation"] == other["observation"]).all() and (one["has_action"] == other["has_action"]).all()
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--control-hz", 5), "--control-hz was given, but .*arm is a data set of this library"),
-        (("--observations", "q1"), "--observations was given"),
+        ((), "arm is a data set of this library already: name another format with --to"),
+        (("--to", "npz", "--control-hz", 5), "control_hz: not an option for a data set of this library"),
+        (("--to", "npz", "--observations", "q1"), "observations: not an option"),
         (("--to", "npz", "--robot", "q1"), "--robot was given, but format 'npz' does not hold it"),
         (("--to", "npz", "--action-kind", "delta"), "--action-kind was given"),
     ],
@@ -124,11 +118,6 @@ def test_a_data_set_that_is_written_again_keeps_what_it_says_of_its_columns(arra
 def test_options_of_which_nothing_would_be_kept_are_refused(run, tmp_path, options, message, capsys):
     assert koap("convert", run.parent / "arm", "--out", tmp_path / "x", *options) == 1
     assert re.search(message, capsys.readouterr().err) and not (tmp_path / "x").exists()
-
-
-def test_a_task_that_hides_columns_is_not_described_as_one_that_shows_them():
-    with pytest.raises(ValueError, match="task 'po_sorting' hides red_1_tan_yaw"):
-        description_of(get_task("po_sorting"))
 
 
 def test_validation_says_how_many_labels_there_are(run, tmp_path, capsys):

@@ -1,32 +1,129 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The format of a folder, file or name decides who reads it."""
+"""One way in for every folder of demonstrations: right numbers, right task, noise of its own."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
+from raw_episodes import write_raw_episode
+from shared_data import HUMAN
+from tiny_runs import write_demonstrations
 
-from torchrl_koap.data import read_recordings
-
-
-def test_a_folder_of_tables(tmp_path):
-    np.savez(tmp_path / "a.npz", states=np.zeros((5, 2)), actions=np.ones((4, 1)))
-    assert read_recordings(tmp_path, control_hz=10).num_labels == 4
-    with pytest.raises(ValueError, match="observations: not an option for a folder of tables"):
-        read_recordings(tmp_path, control_hz=10, observations=["x"])
-
-
-def test_an_hdf5_file(tmp_path):
-    h5py = pytest.importorskip("h5py", reason="h5py is not installed (extra 'hdf5')")
-    with h5py.File(tmp_path / "a.hdf5", "w") as stream:
-        stream["data/demo_0/obs/q"] = np.zeros((5, 2))
-        stream["data/demo_0/actions"] = np.ones((5, 1))
-    assert read_recordings(tmp_path / "a.hdf5", control_hz=10).state_names == ("q_0", "q_1")
+from torchrl_koap.data import flatten_trajectories, load_ted, open_dataset, save_demonstrations, save_ted
+from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
+from torchrl_koap.files import DataError
+from torchrl_koap.keys import validate
+from torchrl_koap.tasks import get_task
 
 
-def test_nothing_to_read(tmp_path):
-    (tmp_path / "notes.txt").write_text("nothing")
-    with pytest.raises(ValueError, match="holds no recordings that can be read; there are readers for a folder of"):
-        read_recordings(tmp_path)
-    with pytest.raises(FileNotFoundError, match="none does not exist"):
-        read_recordings(tmp_path / "none")
+def write_sorting(folder, episodes=3):
+    rng = np.random.default_rng(0)
+    for number in range(episodes):
+        robot = {name: rng.normal(size=(5, *shape)) for name, shape in ROBOT_COLUMNS.items()}
+        boxes = {
+            f"{colour}-box{index}": {"pos": rng.normal(size=(5, 3)), "quat": rng.normal(size=(5, 4))}
+            for colour in ("red", "blue")
+            for index in (1, 2)
+        }
+        write_raw_episode(folder / f"env_{number:03d}_00.pkl", robot, boxes)
+    return folder
+
+
+def test_values_are_those_of_the_raw_episodes(tmp_path):
+    rng, lengths = np.random.default_rng(0), (5, 2, 9)
+    robots = [{name: rng.normal(size=(rows, 3)) for name in ("des_c_pos", "c_pos")} for rows in lengths]
+    for index, robot in enumerate(robots):
+        write_raw_episode(tmp_path / f"env_{index:03d}_00.pkl", robot)
+    data, task = open_dataset(tmp_path)
+    assert task.name == "avoiding" and validate(data).shape == (13,) and data["has_action"].all()
+    begin = 0
+    for index, (rows, robot) in enumerate(zip(lengths, robots, strict=True)):
+        frames = torch.from_numpy(np.concatenate([robot["des_c_pos"][:, :2], robot["c_pos"][:, :2]], 1))
+        part = data[begin : begin + rows - 1]
+        assert torch.equal(part["observation"], frames[:-1].float())
+        assert torch.equal(part["next", "observation"], frames[1:].float())
+        assert torch.equal(part["action"], (frames[1:, :2] - frames[:-1, :2]).float())
+        assert torch.equal(part["state"], frames[:-1, 2:].float())
+        assert part["episode"].tolist() == [index] * (rows - 1)
+        assert part["step_count"].tolist() == list(range(rows - 1))
+        assert part["next", "done"].squeeze(-1).tolist() == [False] * (rows - 2) + [True]
+        begin += rows - 1
+
+
+def test_demonstrations_of_another_task_are_used_where_that_is_meant(tmp_path):
+    sorting, partial = get_task("sorting"), get_task("po_sorting")
+    raw = write_sorting(tmp_path / "raw")
+    theirs, _ = open_dataset(raw, task=sorting)
+    save_ted(theirs.exclude("state"), tmp_path / "demos" / "ted", sorting)
+    save_ted(theirs, tmp_path / "with state", sorting)
+    wanted = theirs["observation"][:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]]  # no yaw
+    for folder in (raw, tmp_path / "demos", tmp_path / "demos" / "ted", tmp_path / "with state"):
+        data, task = open_dataset(folder, task=partial)
+        assert task is partial and torch.equal(data["action"], theirs["action"])
+        torch.testing.assert_close(data["state"], wanted, rtol=0, atol=6 * partial.noise)  # measured with noise
+        assert not torch.equal(data["state"], wanted)
+    assert open_dataset(tmp_path / "demos")[1] is sorting
+    with pytest.raises(DataError, match="holds demonstrations of 'sorting', wanted 'aligning'"):
+        open_dataset(tmp_path / "demos", task=get_task("aligning"))
+
+
+def test_demonstrations_of_po_sorting_are_as_noisy_as_its_rollouts(tmp_path):
+    frames = torch.linspace(0.1, 0.5, 200)[:, None].expand(200, 16).contiguous()
+    actions = torch.ones(199, 2)
+    partial, whole = get_task("po_sorting"), get_task("sorting")
+    save_ted(flatten_trajectories([frames] * 3, [actions] * 3), tmp_path / "ted", whole)
+    clean, noisy, again = (open_dataset(tmp_path, task=task)[0] for task in (whole, partial, partial))
+    assert torch.equal(noisy["observation"], again["observation"]) and torch.equal(noisy["action"], clean["action"])
+    change = noisy["observation"] - clean["observation"]
+    assert change[:, 2:4].std().item() == pytest.approx(partial.noise, rel=0.1) and partial.noise == 0.002
+    others = [column for column in range(16) if column not in (2, 3)]
+    assert not change[:, others].any()
+    inner = (noisy["step_count"] < 198).squeeze(-1).nonzero().squeeze(-1)
+    assert torch.equal(noisy["next", "observation"][inner], noisy["observation"][inner + 1])
+    assert noisy["state"].shape[-1] == 10  # no yaw, of planner or controller
+    stored, _ = load_ted(tmp_path / "ted")
+    assert torch.equal(stored["observation"], clean["observation"])
+
+
+def test_what_cannot_be_opened(tmp_path):
+    with pytest.raises(FileNotFoundError, match="dataset '.*nowhere' is no folder of"):
+        open_dataset(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match="no demonstrations"):
+        open_dataset(tmp_path)
+    folder = save_demonstrations(tmp_path / "arm", [np.zeros((9, 3))], control_hz=30, action_dim=2)
+    assert open_dataset(folder)[1].name == "arm"
+    arm = open_dataset(folder)[1]
+    write_demonstrations(tmp_path / "raw", episodes=1)
+    with pytest.raises(DataError, match="task 'arm' is none of D3IL's: `koap convert` it"):
+        open_dataset(tmp_path / "raw", task=arm)
+    (tmp_path / "lerobot" / "meta").mkdir(parents=True)
+    (tmp_path / "lerobot" / "meta" / "info.json").write_text("{}")
+    with pytest.raises(DataError, match="does not say what its columns mean: `koap convert` it first"):
+        open_dataset(tmp_path / "lerobot", task=get_task("avoiding"))
+    save_ted(flatten_trajectories([torch.zeros(5, 3)], [torch.zeros(4, 2)]), tmp_path / "narrow", arm)
+    about = (tmp_path / "narrow" / "about.json").read_text().replace('"task": "arm"', '"task": "avoiding"')
+    (tmp_path / "narrow" / "about.json").write_text(about)
+    with pytest.raises(DataError, match="3 observation and 2 action columns, task 'avoiding' has 4 and 2"):
+        open_dataset(tmp_path / "narrow", task=get_task("avoiding"))
+
+
+def test_raw_files_are_never_written(tmp_path):
+    folder = write_demonstrations(tmp_path / "raw", episodes=2)
+    before = {file.name: (file.read_bytes(), file.stat().st_mtime_ns) for file in folder.iterdir()}
+    calls = []
+    open_dataset(folder, progress=lambda *done: calls.append(done))
+    assert before == {file.name: (file.read_bytes(), file.stat().st_mtime_ns) for file in folder.iterdir()}
+    assert calls == [(1, 2)]
+
+
+@pytest.mark.skipif(not HUMAN.is_dir(), reason=f"the human demonstrations are not at {HUMAN}")
+def test_human_demonstrations():
+    data = validate(open_dataset(HUMAN)[0])
+    lengths = data["episode"].unique(return_counts=True)[1]
+    assert len(lengths) == 24 and lengths.min() >= 64 and lengths.max() <= 103
+    # commands are joystick steps: what is commanded next is the command plus the action
+    assert torch.allclose(data["observation"][:, :2] + data["action"], data["next", "observation"][:, :2], atol=1e-6)
+    same = data["episode"][1:] == data["episode"][:-1]
+    assert torch.equal(data["next", "observation"][:-1][same], data["observation"][1:][same])
+    assert data["action"].abs().max() < 0.03

@@ -18,10 +18,10 @@ from torchrl_koap.data import (
     WindowTable,
     WindowUnit,
     flatten_trajectories,
-    load_ted,
     make_window_buffer,
     save_ted,
 )
+from torchrl_koap.tasks import get_task
 
 GPU = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))
 
@@ -212,14 +212,10 @@ def test_short_trajectories_are_named():
 
 
 @pytest.mark.parametrize("device", ["cpu", GPU])
-@pytest.mark.parametrize("kind", ["tensor", "lazy", "memmap", "ted"])
+@pytest.mark.parametrize("kind", ["tensor", "lazy", "memmap"])
 def test_storages(kind, device, tmp_path):
     data = demonstrations().to(device)
-    if kind == "ted":
-        if device != "cpu":
-            pytest.skip("memory-mapped data are on the CPU")
-        storage = TensorStorage(load_ted(save_ted(data, tmp_path / "demos")))
-    elif kind == "tensor":
+    if kind == "tensor":
         storage = TensorStorage(data)
     elif kind == "lazy":
         storage = LazyTensorStorage(500, device=device)
@@ -270,8 +266,9 @@ def test_a_table_of_other_data_is_refused():
         buffer.sample(2)
 
 
-def test_from_a_data_set():
-    dataset = D3ILExperienceReplay.from_tensordict(demonstrations(), "avoiding", label_budget=LabelBudget(2))
+def test_from_a_data_set(tmp_path):
+    folder = save_ted(demonstrations(), tmp_path / "ted", get_task("avoiding"))
+    dataset = D3ILExperienceReplay("avoiding", folder, label_budget=LabelBudget(2))
     buffer = make_window_buffer(dataset, 16, 8, select=["state", "action"], labelled_share=0.5)
     batch = buffer.sample()
     assert set(batch.keys()) == {"state", "action"}

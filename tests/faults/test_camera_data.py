@@ -18,7 +18,7 @@ pytest.importorskip("pyarrow")
 
 EMBED = ("embed", *WORDS)
 OWN_WEIGHTS = (*EMBED, "--network", "{network}/weights.pth")
-INFO, FIRST = "meta/info.json", "data/chunk-000/episode_000000.parquet"
+INFO, FIRST = "meta/info.json", "data/chunk-000/file-000.parquet"
 WEIGHTS, PROJECTION = "weights.pth", "projection.safetensors"
 
 
@@ -164,7 +164,7 @@ def _write(place: Place, name: str, content: bytes) -> None:
 def _png(size: int, channels: int = 3) -> bytes:
     import numpy as np
 
-    from torchrl_koap.data.lerobot.images import encode_png
+    from torchrl_koap.data.formats.writers import encode_png
 
     return encode_png(np.zeros((size, size, channels), dtype=np.uint8))
 

@@ -15,13 +15,12 @@ import torchrl_koap
 PACKAGE = Path(torchrl_koap.__file__).parent
 ROOT = PACKAGE.parent
 UNPICKLER = PACKAGE / "data/d3il/unpickling.py"
-RAW = PACKAGE / "data/d3il/raw.py"  # writes what D3IL's own tools read
 FORBIDDEN = {
     r"\btorch\.load\((?![^)]*weights_only=True)": (),
     r"allow_pickle\s*=\s*True": (),
-    r"^\s*(import|from) (pickle|dill|cloudpickle|joblib|marshal|shelve)\b": (UNPICKLER, RAW),
+    r"^\s*(import|from) (pickle|dill|cloudpickle|joblib|marshal|shelve)\b": (UNPICKLER,),
     r"\bpickle\.loads?\(": (),
-    r"\bpickle\.dumps?\(": (RAW,),
+    r"\bpickle\.dumps?\(": (),
     r"\bos\.(system|popen|exec\w+|spawn\w+)\(": (),
     r"shell\s*=\s*True": (),
     r"^\s*(import|from) (urllib|http|requests|socket|ftplib|smtplib|telnetlib)\b": (),

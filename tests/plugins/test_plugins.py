@@ -19,7 +19,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.envs import make_env, mode_index_of
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts, evaluation_contexts
-from torchrl_koap.envs.experts.demonstrations import record_demonstrations, record_episodes, write_raw_episodes
+from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.envs.gym import register
 from torchrl_koap.evaluation.diagnosis import contexts_of
 from torchrl_koap.evaluation.scores import score, task_scores
@@ -73,13 +73,6 @@ def test_the_expert_records_both_modes(demonstrations):
     assert torch.equal(again["action"], data["action"])
 
 
-def test_recordings_that_no_pickle_of_d3il_can_hold_are_refused(tmp_path):
-    raw, _ = record_episodes("puck", episodes=1)
-    with pytest.raises(TypeError, match="recorded without D3IL's log"):
-        write_raw_episodes(tmp_path, raw)
-    assert not list(tmp_path.iterdir())
-
-
 def test_contexts_come_from_the_task():
     table = evaluation_contexts("puck")
     assert table.shape == (60, 1, 3) and np.array_equal(table, evaluation_contexts("puck"))
@@ -128,7 +121,7 @@ def test_a_robot_without_simulator():
     assert task.action_dim == 7 and len(task.delta_actions) == 7 and task.action_unit == "rad"
     assert task.tool_columns is None and task.tool_position is None and task.gripper is None
     assert task.state_dim == 9 and task.state_names[-2:] == ("cup_x", "cup_y") and task.num_modes == 1
-    for ask in (lambda: make_env(task), lambda: record_episodes("arm_data", episodes=1)):
+    for ask in (lambda: make_env(task), lambda: record_demonstrations("arm_data", episodes=1)):
         with pytest.raises(ValueError, match="task 'arm_data' has no (environment|scripted expert)"):
             ask()
     with pytest.raises(ValueError, match="task 'arm_data' has no goal"):

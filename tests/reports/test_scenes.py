@@ -9,6 +9,7 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from torchrl_koap.data.d3il.conversion import CONVERTERS
 from torchrl_koap.reports import scenes
 from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.tasks.avoiding import OBSTACLES
@@ -21,7 +22,7 @@ def models():
     return {
         name: registry.make_env(name).sims.model
         for name in TASKS
-        if (TASKS[name].env or "").startswith("torchrl_koap.") and TASKS[name].converter
+        if (TASKS[name].env or "").startswith("torchrl_koap.") and TASKS[name].source in CONVERTERS
     }
 
 
@@ -80,7 +81,7 @@ def test_regions_of_aligning_are_those_of_the_contexts():
         np.testing.assert_allclose(contexts[:, index, :2].max(0), high, atol=1e-3)
 
 
-@pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].objects and TASKS[task].converter])
+@pytest.mark.parametrize("task", [task for task in TASKS if TASKS[task].objects and TASKS[task].source in CONVERTERS])
 def test_bodies_have_the_sizes_and_colours_of_the_environment(task, models):
     model, bodies = models[task], scenes.bodies_of(TASKS[task], len(TASKS[task].objects))
     assert len(bodies) == len(TASKS[task].objects)

@@ -97,7 +97,7 @@ def test_a_curve_needs_data_where_it_has_no_environment(tmp_path, curve):
     try:
         with pytest.raises(ValueError, match="task 'bare_arm' has no environment to record demonstrations in"):
             run_curve(CurveConfig(out=tmp_path / "out", task="bare_arm"))
-        from torchrl_koap.commands.demos import Demos
+        from torchrl_koap.commands.data_commands import Demos
 
         with pytest.raises(ValueError, match="task 'bare_arm' has no environment: there is nothing to record"):
             Demos(out=tmp_path / "demos", task="bare_arm")()

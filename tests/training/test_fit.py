@@ -54,7 +54,7 @@ def test_the_weights_of_a_training_bit_for_bit(tmp_path):
     folder = save_demonstrations(tmp_path / "arm", **few_labels())
     options = {"controller_batch_size": 8, "validation_fraction": 0.0, **SMALL}
     train(TrainConfig(out=tmp_path / "run", dataset=str(folder), steps=30, controller_steps=20, seed=3, **options))
-    data, task = load_ted(folder / "ted"), make_demonstrations(name="arm", **few_labels())[1]
+    data, task = load_ted(folder / "ted")[0], make_demonstrations(name="arm", **few_labels())[1]
     before = torch.get_rng_state()
     planner = fit_planner(data, task, steps=30, seed=3, progress=False, **SMALL)
     controller = fit_controller(data, task, steps=20, seed=3, progress=False, controller_batch_size=8)

@@ -7,16 +7,12 @@ import json
 import shutil
 
 import pytest
-import torch
 from tiny_runs import TINY, koap
 
-from torchrl_koap.data import flatten_trajectories, load_ted, save_ted
 from torchrl_koap.evaluation import load_run
 from torchrl_koap.modules import SupervisedInverseDynamics, WindowVariationalInverseDynamics
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.tasks import get_task
-from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.resolved import resolve
 
@@ -65,21 +61,3 @@ def test_the_auto_encoder_reads_the_window_that_policies_hand_it():
 def test_coefficients_of_no_loss_are_refused(method, options, message):
     with pytest.raises(ValueError, match=message):
         resolve(TrainConfig(out="run", method=method, **options))
-
-
-def test_demonstrations_of_po_sorting_are_as_noisy_as_its_rollouts(tmp_path):
-    frames = torch.linspace(0.1, 0.5, 200)[:, None].expand(200, 16).contiguous()
-    actions = torch.ones(199, 2)
-    save_ted(flatten_trajectories([frames] * 3, [actions] * 3), tmp_path / "ted", task="sorting")
-    partial, whole = get_task("po_sorting"), get_task("sorting")
-    clean, noisy, again = (load_demonstrations(str(tmp_path), task) for task in (whole, partial, partial))
-    assert torch.equal(noisy["observation"], again["observation"]) and torch.equal(noisy["action"], clean["action"])
-    change = noisy["observation"] - clean["observation"]
-    assert change[:, 2:4].std().item() == pytest.approx(partial.noise, rel=0.1) and partial.noise == 0.002
-    others = [column for column in range(16) if column not in (2, 3)]
-    assert not change[:, others].any()
-    inner = (noisy["step_count"] < 198).squeeze(-1).nonzero().squeeze(-1)
-    assert torch.equal(noisy["next", "observation"][inner], noisy["observation"][inner + 1])
-    assert noisy["state"].shape[-1] == 10  # no yaw, of planner or controller
-    stored = load_ted(tmp_path / "ted")
-    assert torch.equal(stored["observation"], clean["observation"])

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap doctor`` and ``koap validate``: what this machine offers, and whether data are sound."""
+"""``koap doctor``: what this machine offers, and whether the files of a run are sound."""
 
 from __future__ import annotations
 
@@ -17,21 +17,12 @@ import torch
 import tyro
 
 from torchrl_koap.commands.command import Command
-from torchrl_koap.data.d3il.conversion import find_raw_files
-from torchrl_koap.data.doubts import find_doubts
-from torchrl_koap.data.lerobot.files import is_lerobot
 from torchrl_koap.evaluation import load_run
-from torchrl_koap.keys import validate
 from torchrl_koap.runs.device import has_bfloat16_units
-from torchrl_koap.runs.plugins import Plugins, load_plugins
-from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.tasks import Task
-from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 from torchrl_koap.training.digests import DIGESTS
 
-_NO_LABELS = "none: `koap train` needs a few"
 _LATER = (DIGESTS, "eval.json", "inspect.json", "suggestions.json")  # files that a run may have
 
 
@@ -52,59 +43,6 @@ class Doctor(Command):
             RunDirectoryError: with all problems of a run.
         """
         return machine_facts() if self.run is None else check_run(self.run)
-
-
-@dataclass(kw_only=True)
-class Validate(Command):
-    """Check a folder of demonstrations and report every problem found, and what is right in form but doubtful.
-
-    Attributes:
-        dataset: folder of D3IL raw pickles, a LeRobot data set, or a folder written by `koap demos`, `koap convert` or
-            save_demonstrations.
-        task: name of the task (default: that of the data set, if it says so; else "avoiding").
-        plugins: modules that register tasks; imported before anything else.
-    """
-
-    dataset: tyro.conf.Positional[str]
-    task: str | None = None
-    plugins: Plugins = ()
-
-    def __call__(self) -> dict[str, str]:
-        """Reads and checks demonstrations.
-
-        Raises:
-            LayoutError, RawFolderError: with all problems.
-        """
-        load_plugins(self.plugins)
-        task = find_task_of(self.dataset, self.task)
-        with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:
-            data = validate(load_demonstrations(self.dataset, task, progress=count_up_to(bar)))
-        units = task.observation_units or _position_units(task)
-        doubts = find_doubts(data, names=_files(self.dataset, task), units=units)
-        lengths = data["episode"].unique(return_counts=True)[1]
-        return {
-            "trajectories": str(len(lengths)),
-            "steps": str(len(data)),
-            "labelled steps": str(int(data["has_action"].sum())) if data["has_action"].any() else _NO_LABELS,
-            "shortest, longest": f"{int(lengths.min())}, {int(lengths.max())}",
-            "observation, action columns": f"{data['observation'].shape[-1]}, {data['action'].shape[-1]}",
-            **{f"doubt {number}": doubt for number, doubt in enumerate(doubts, 1)},
-            "verdict": f"no problem found, {len(doubts)} doubt(s)" if doubts else "no problem found",
-        }
-
-
-def _position_units(task: Task) -> list[str]:
-    """Metres for the columns that are positions for certain; the others have units of their own."""
-    position = task.observation[task.position]
-    inside = range(*position.indices(task.observation_dim))
-    return ["m" if task.env is not None and column in inside else "" for column in range(task.observation_dim)]
-
-
-def _files(dataset: str, task: Task) -> list[str]:
-    """Names of the files that trajectories are from, where each has its own."""
-    if dataset == "scripted" or (Path(dataset) / "ted").is_dir() or is_lerobot(dataset):
-        return []
-    return [str(file) for file in find_raw_files(task.name, dataset)[1]]
 
 
 def machine_facts() -> dict[str, str]:

@@ -48,7 +48,7 @@ class Embed(Command):
 
         Raises:
             WeightsError: if weights are missing or of another network.
-            ImageDataError: if a source is none, embodiments are mixed without saying so.
+            DataError: if a source is none, embodiments are mixed without saying so.
             ValueError: if the projection is damaged.
         """
         if self.episodes and len(self.episodes) != len(self.sources):

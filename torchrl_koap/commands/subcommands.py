@@ -8,10 +8,9 @@ from typing import Annotated
 import tyro
 
 from torchrl_koap.commands.bench import Bench
-from torchrl_koap.commands.convert import Convert
 from torchrl_koap.commands.curve import Curve
-from torchrl_koap.commands.demos import Demos
-from torchrl_koap.commands.doctor import Doctor, Validate
+from torchrl_koap.commands.data_commands import Convert, Demos, Validate
+from torchrl_koap.commands.doctor import Doctor
 from torchrl_koap.commands.embed import Embed
 from torchrl_koap.commands.eval import Eval
 from torchrl_koap.commands.export import Export

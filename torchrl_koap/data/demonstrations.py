@@ -14,9 +14,10 @@ import torch
 from numpy.typing import ArrayLike
 from tensordict import TensorDict
 
-from torchrl_koap.data.recordings import Recordings, RecordingsError, make_recordings
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories
+from torchrl_koap.files import DataError
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.action_rules import ActionKind
@@ -33,7 +34,7 @@ def save_demonstrations(
     Args:
         folder (str or Path): folder to create; a data set there is replaced in one step.
         states (sequence of array, or Recordings): frames of every trajectory ``[T_i, d]``, in the units that the robot
-            reports; or what a reader of :mod:`torchrl_koap.data.recordings` found.
+            reports; or what :func:`~torchrl_koap.data.read_recordings` found.
         actions (sequence of array or None, optional): actions ``[T_i, a]`` or ``[T_i - 1, a]`` of every trajectory, NaN
             where there is no label, or None for a trajectory without. Default: no labels.
         **description: everything :func:`make_demonstrations` takes besides.
@@ -42,7 +43,7 @@ def save_demonstrations(
         Path: the folder.
 
     Raises:
-        RecordingsError: with all faults of the arrays and of their description.
+        DataError: with all faults of the arrays and of their description.
         FileExistsError: if the folder holds something other than a data set.
 
     Examples:
@@ -61,7 +62,7 @@ def save_demonstrations(
     folder = Path(folder)
     name = description.pop("name", None) or re.sub(r"\W+", "_", folder.resolve().name).strip("_") or "robot"
     data, task = make_demonstrations(states, actions, name=name, **description)
-    return save_ted(data, folder / "ted", task=task).parent
+    return save_ted(data, folder / "ted", task).parent
 
 
 def make_demonstrations(
@@ -112,7 +113,7 @@ def make_demonstrations(
         :class:`~torchrl_koap.tasks.Task`.
 
     Raises:
-        RecordingsError: with all faults: those of :func:`~torchrl_koap.data.recordings.make_recordings`, columns that
+        DataError: with all faults: those of :func:`~torchrl_koap.data.make_recordings`, columns that
             do not exist or overlap, targets that do not fit, units of another number, an action that never changes.
         ValueError: for an unknown kind of action.
 
@@ -156,7 +157,7 @@ def make_demonstrations(
     own_units = _units(state_units, len(names), "state_units", problems)
     problems += _constant_actions(recordings)
     if problems:
-        raise RecordingsError(f"task {name!r}", problems)
+        raise DataError(f"task {name!r}", problems)
     data = flatten_trajectories(
         [torch.from_numpy(frames) for frames in recordings.states],
         [torch.from_numpy(steps) for steps in recordings.actions],
@@ -179,43 +180,6 @@ def make_demonstrations(
         robot=tuple(state_column[column] for column in own),
     )
     return data, task
-
-
-def description_of(task: Task) -> dict[str, Any]:
-    """The keyword arguments of :func:`make_demonstrations` that describe a task, for data that are written again.
-
-    Args:
-        task (Task): a task whose data are those of a robot: all observation columns, the command included.
-
-    Returns:
-        dict: ``control_hz``, ``robot``, ``command``, ``action_kind``, ``targets``, both units and ``max_steps``.
-
-    Raises:
-        ValueError: if the task hides parts: the data set of a robot cannot say that.
-
-    Examples:
-        >>> from torchrl_koap.data.demonstrations import description_of
-        >>> from torchrl_koap.tasks import get_task
-        >>> about = description_of(get_task("avoiding"))
-        >>> about["command"], about["action_units"]
-        (('desired_xy_0', 'desired_xy_1'), ('m', 'm'))
-    """
-    own, names = task.state_names, task.observation_names
-    if task.hidden:
-        raise ValueError(
-            f"task {task.name!r} hides {', '.join(task.hidden)}, which the data set of a robot cannot say; another"
-            " format (--to npz) holds all columns"
-        )
-    return {
-        "control_hz": task.control_hz,
-        "robot": tuple(own[column] for column in task.robot) or None,
-        "command": names[task.command_columns] if task.command_columns is not None else (),
-        "action_kind": "absolute" if task.targets else "delta",
-        "targets": tuple(own[column] for column in task.targets) or None,
-        "action_units": task.action_units,
-        "state_units": task.observation_units or "",
-        "max_steps": task.max_steps,
-    }
 
 
 _COMMAND = "command"

@@ -1,82 +1,124 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recordings from wherever they lie: the format of a folder, file or name decides who reads it."""
+"""From a folder of demonstrations to data and the task that they are used for: the one way in for every command."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
-from torchrl_koap.data.lerobot.any_robot import read_lerobot_recordings
-from torchrl_koap.data.lerobot.files import is_lerobot
-from torchrl_koap.data.recordings import Recordings, read_minari, read_robomimic, read_tables
-from torchrl_koap.data.recordings.minari import PREFIX
-from torchrl_koap.data.recordings.robomimic import is_hdf5
-from torchrl_koap.data.recordings.tables import is_table_folder
+import torch
+from tensordict import TensorDictBase
 
-FORMATS = (
-    "a folder of *.npz, *.csv or *.parquet files, a trajectory each",
-    "a LeRobot data set (meta/info.json)",
-    "an HDF5 file in robomimic's layout (*.hdf5)",
-    f"{PREFIX}NAME, a Minari data set on this machine",
-)
+from torchrl_koap.data.d3il.conversion import CONVERTERS, read_raw
+from torchrl_koap.data.ted import read_about, read_steps, stored_folder, stored_task
+from torchrl_koap.data.trajectories import flatten_trajectories, select_state
+from torchrl_koap.files import DataError
+from torchrl_koap.tasks import Task, get_task
+
+_OF_D3IL = "avoiding"  # what D3IL's pickles are of if nobody says so
 
 
-def read_recordings(
-    source: str | Path,
-    *,
-    control_hz: float | None = None,
-    observations: Sequence[str] = (),
-    action_columns: Sequence[str] = (),
-    action_dim: int | None = None,
-) -> Recordings:
-    """Reads recordings of any robot in any of the formats that there is a reader for.
+def open_dataset(
+    folder: str | Path, *, task: Task | None = None, progress: Callable[[int, int], None] | None = None
+) -> tuple[TensorDictBase, Task]:
+    """Reads demonstrations with all labels that there are, observed as their task observes.
 
     Args:
-        source (str or Path): a folder of tables, a LeRobot data set, an HDF5 file, or ``minari:NAME``.
+        folder (str or Path): what ``koap demos``, ``koap convert``, ``koap embed`` or
+            :func:`~torchrl_koap.data.save_demonstrations` wrote, or a folder of D3IL's raw pickles.
 
     Keyword Args:
-        control_hz (float, optional): frames per second. Default: as the source says.
-        observations (sequence of str): features of a LeRobot data set, or entries of an HDF5 file, that make up the
-            state. Default: all that are no images.
-        action_columns (sequence of str): columns of CSV and parquet tables that are actions, if they are not named
-            ``action...``.
-        action_dim (int, optional): number of action columns of tables without actions.
+        task (Task, optional): what the data are to be used for: their task, or one that takes its demonstrations, such
+            as ``po_sorting`` those of ``sorting``. Default: their own; of raw pickles ``avoiding``.
+        progress (callable, optional): called with the number of raw files that were read, and that of all.
 
     Returns:
-        Recordings: trajectories with the names and units that the format has.
+        tuple: flat data ``[N]`` in the storage layout with ``state``, the columns that a policy may see, measured with
+        the task's noise; and the task.
 
     Raises:
-        RecordingsError: with all faults, named (:mod:`torchrl_koap.data.recordings`).
-        FileNotFoundError: if there is no such source.
-        ValueError: if it is in none of the formats, or an option does not fit its format.
+        FileNotFoundError: if there is no such folder, or it holds no demonstrations.
+        DataError: if the data are damaged, or of another task.
+        ValueError: if nobody registered the task that the data name.
 
     Examples:
-        >>> from torchrl_koap.data import read_recordings
-        >>> read_recordings("/data/so100_pick")  # doctest: +SKIP
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from torchrl_koap.data import open_dataset, save_demonstrations
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     folder = save_demonstrations(root + "/arm", [np.random.rand(9, 3)], control_hz=30, action_dim=2)
+        ...     data, task = open_dataset(folder)
+        >>> data["state"].shape, task.name
+        (torch.Size([8, 3]), 'arm')
     """
-    text, path = str(source), Path(source)
-    chosen = list(observations) or None
-    if text.startswith(PREFIX):
-        _unfit("a Minari data set", observations=observations, action_columns=action_columns)
-        return read_minari(text.removeprefix(PREFIX), control_hz=control_hz)
-    if is_hdf5(path):
-        _unfit("an HDF5 file", action_columns=action_columns)
-        return read_robomimic(path, observations=chosen, control_hz=control_hz)
-    if is_lerobot(path):
-        _unfit("a LeRobot data set", action_columns=action_columns)
-        found = read_lerobot_recordings(path, features=chosen)
-        return found if control_hz is None else replace(found, control_hz=control_hz)
-    if path.is_dir() and is_table_folder(path):
-        _unfit("a folder of tables", observations=observations)
-        columns = list(action_columns) or None
-        return read_tables(path, control_hz=control_hz, action_columns=columns, action_dim=action_dim)
-    if not path.exists():
-        raise FileNotFoundError(f"{source} does not exist")
-    raise ValueError(f"{source} holds no recordings that can be read; there are readers for {'; '.join(FORMATS)}")
+    folder = Path(folder).expanduser()
+    stored = stored_folder(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"dataset {str(folder)!r} is no folder of {Path.cwd()}")
+    if stored is not None:
+        task = _fitting(stored, task)
+        data = read_steps(stored)
+    elif (folder / "meta" / "info.json").is_file():
+        raise DataError(folder, "a LeRobot data set does not say what its columns mean: `koap convert` it first")
+    else:
+        task = get_task(_OF_D3IL) if task is None else task
+        if task.source not in CONVERTERS:
+            raise DataError(
+                folder, f"it holds no data set, and task {task.name!r} is none of D3IL's: `koap convert` it"
+            )
+        data = flatten_trajectories(*read_raw(CONVERTERS[task.source], folder, progress=progress))
+    if data["observation"].shape[-1] != task.observation_dim or data["action"].shape[-1] != task.action_dim:
+        raise DataError(
+            folder,
+            f"it has {data['observation'].shape[-1]} observation and {data['action'].shape[-1]} action columns, task"
+            f" {task.name!r} has {task.observation_dim} and {task.action_dim}",
+        )
+    if task.noise:
+        data = with_noise(data, task.observation[task.position], task.noise)
+    return select_state(data, task.state_of), task
 
 
-def _unfit(what: str, **options: Sequence[str]) -> None:
-    given = [name for name, value in options.items() if value]
-    if given:
-        raise ValueError(f"{', '.join(given)}: not an option for {what}")
+def _fitting(stored: Path, task: Task | None) -> Task:
+    """The task that stored data are used for."""
+    name = read_about(stored)["task"]
+    if task is None:
+        return stored_task(stored)
+    if name not in (task.name, task.source):
+        raise DataError(stored, f"it holds demonstrations of {name!r}, wanted {task.source!r}")
+    return task
+
+
+def with_noise(data: TensorDictBase, columns: slice, sigma: float, *, seed: int = 0) -> TensorDictBase:
+    """Demonstrations as a noisy sensor would have recorded them: actions are untouched.
+
+    A frame has the same noise as the next observation of a step and as the observation of the step that follows it.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]``; not changed.
+        columns (slice): observation columns that are disturbed.
+        sigma (float): standard deviation of the noise, in the units of the columns.
+
+    Keyword Args:
+        seed (int): seed of the noise: every reader of the same data meets the same. Defaults to ``0``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import flatten_trajectories
+        >>> from torchrl_koap.data.sources import with_noise
+        >>> data = flatten_trajectories([torch.zeros(4, 3)] * 2, [torch.zeros(3, 1)] * 2)
+        >>> noisy = with_noise(data, slice(1, 3), 0.002)
+        >>> bool((noisy["next", "observation"][0] == noisy["observation"][1]).all())
+        True
+        >>> noisy["observation"].count_nonzero(dim=0).tolist()
+        [0, 6, 6]
+    """
+    generator = torch.Generator().manual_seed(seed)
+    now, following = data["observation"].clone(), data["next", "observation"].clone()
+    last = torch.ones(len(now), dtype=torch.bool)
+    last[:-1] = data["episode"][1:] != data["episode"][:-1]
+    shape = now[:, columns].shape
+    noise, ends = (sigma * torch.randn(shape, generator=generator, dtype=now.dtype) for _ in range(2))
+    after = torch.where(last[:, None], ends, noise.roll(-1, 0))
+    now[:, columns] += noise
+    following[:, columns] += after
+    return data.copy().set("observation", now).set("next", data["next"].copy().set("observation", following))

@@ -1,13 +1,13 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""A data set on disk: one memory-mapped TED tensordict and a description in JSON beside it.
+"""A data set on disk: TED data as safetensors, and a description in JSON beside them.
 
 ::
 
     folder/
-      about.json         task, number of trajectories and steps, lengths, statistics, checksums, and the caller's notes
-      steps/             the tensordict, one file per entry, in the storage layout of ``torchrl_koap.keys``
+      about.json           task, number of trajectories and steps, lengths, statistics, checksum, and the caller's notes
+      steps.safetensors    the entries in the storage layout of ``torchrl_koap.keys``, nested ones as ``next/done``
 
-The folder is written aside and renamed. When it is read, every file is compared with its checksum.
+The folder is written aside and renamed.
 """
 
 from __future__ import annotations
@@ -18,39 +18,28 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
 from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
 
 from torchrl_koap import keys
-from torchrl_koap.data.steps_on_disk import PART, join_on_disk
-from torchrl_koap.data.ted_guard import steps_problem
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.files import read_bytes, replacing_folder, sha256_of
-from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.registry import find_task, plain_task
+from torchrl_koap.files import DataError, read_bytes, replacing_folder, sha256_of
+from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.tasks.registry import plain_task
 
-FORMAT = 1
-_ABOUT = "about.json"
-_STEPS = "steps"
-
-
-class DamagedDataError(ValueError):
-    """A data set whose files are missing, changed, or do not belong together."""
+FORMAT = 2
+_ABOUT, _STEPS = "about.json", "steps.safetensors"
 
 
-def save_ted(
-    data: TensorDictBase, folder: str | Path, *, task: str | Task | None = None, notes: Mapping[str, Any] | None = None
-) -> Path:
+def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mapping[str, Any] | None = None) -> Path:
     """Writes flat TED data into a folder; an earlier data set there is replaced in one step.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout.
         folder (str or Path): folder to create or replace.
-        task (str or Task, optional): name of the task; or the task itself, which is kept with the data, so that they
-            can be used where nobody registered it.
+        task (Task): what the data are of. One that names no code is kept with them, any other one by its name.
         notes (mapping, optional): anything JSON can hold that should be kept with the data.
-
-    Returns:
-        Path: the folder.
 
     Raises:
         LayoutError: if the data do not follow the storage layout.
@@ -59,41 +48,61 @@ def save_ted(
 
     Examples:
         >>> import tempfile
-        >>> from pathlib import Path
         >>> import torch
         >>> from torchrl_koap.data import flatten_trajectories, load_ted, read_about, save_ted
-        >>> data = flatten_trajectories([torch.rand(4, 2), torch.rand(6, 2)], [torch.rand(3, 1), torch.rand(5, 1)])
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = save_ted(data, Path(folder) / "demos", notes={"seed": 0})
-        ...     load_ted(path).shape, read_about(path)["lengths"], read_about(path)["notes"]
-        (torch.Size([8]), [3, 5], {'seed': 0})
+        >>> from torchrl_koap.tasks import get_task
+        >>> data = flatten_trajectories([torch.rand(4, 4), torch.rand(6, 4)], [torch.rand(3, 2), torch.rand(5, 2)])
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     folder = save_ted(data, root + "/ted", get_task("avoiding"), notes={"seed": 0})
+        ...     load_ted(folder)[0].shape, load_ted(folder)[1].name, read_about(folder)["lengths"]
+        (torch.Size([8]), 'avoiding', [3, 5])
     """
     folder = Path(folder)
-    known = task if isinstance(task, Task) else find_task(task)
-    command = known.command_columns if known else None
-    keys.validate(data, command=command)
-    entries = data.items(True, True, is_leaf=is_leaf_nontensor)
-    strange = [key for key, value in entries if not isinstance(value, torch.Tensor)]
-    if strange:  # they would be written as pickles
+    keys.validate(data, command=task.command_columns)
+    entries = {_joined(key): value for key, value in data.items(True, True, is_leaf=is_leaf_nontensor)}
+    strange = [name for name, value in entries.items() if not isinstance(value, torch.Tensor)]
+    if strange:
         raise TypeError(f"only tensors can be saved, {strange} are none")
-    if folder.exists() and not (folder.is_dir() and ((folder / _ABOUT).is_file() or not any(folder.iterdir()))):
+    if folder.exists() and not (folder.is_dir() and (is_ted(folder) or not any(folder.iterdir()))):
         raise FileExistsError(f"{folder} exists and holds no data set; it is left as it is")
+    lengths = trajectory_lengths(data).tolist()
     about = {
         "format": FORMAT,
-        "task": task.name if isinstance(task, Task) else task,
-        "definition": task.to_json() if isinstance(task, Task) else None,
+        "task": task.name,
+        "definition": None if task.import_strings() else task.to_json(),
+        "trajectories": len(lengths),
+        "steps": len(data),
+        "lengths": lengths,
         "labelled_steps": int(data.get(keys.HAS_ACTION).sum()),
-        "trajectories": len(trajectory_lengths(data)),
-        "steps": data.shape[0],
-        "lengths": trajectory_lengths(data).tolist(),
-        "statistics": _statistics(data),
+        "statistics": {
+            name: _statistics(entries[name])
+            for name in (keys.OBSERVATION, keys.STATE, keys.ACTION)
+            if name in entries and entries[name].isfinite().all(-1).any()
+        },
         "notes": dict(notes or {}),
     }
     with replacing_folder(folder) as aside:
-        join_on_disk(data.split(PART), len(data), aside / _STEPS)
-        about["sha256"] = _checksums(aside)
+        save_file({name: value.detach().cpu().clone().contiguous() for name, value in entries.items()}, aside / _STEPS)
+        about["sha256"] = sha256_of(aside / _STEPS)
         (aside / _ABOUT).write_text(json.dumps(about, indent=1))
     return folder
+
+
+def is_ted(folder: str | Path) -> bool:
+    """Whether a folder holds a data set of this library."""
+    return (Path(folder) / _ABOUT).is_file()
+
+
+def stored_folder(folder: str | Path) -> Path | None:
+    """Where a folder holds a data set of this library: in ``ted`` inside it, or itself; None if nowhere.
+
+    Args:
+        folder (str or Path): the folder.
+    """
+    inside = Path(folder) / "ted"
+    if inside.is_dir():
+        return inside
+    return Path(folder) if is_ted(folder) else None
 
 
 def read_about(folder: str | Path) -> dict[str, Any]:
@@ -103,150 +112,99 @@ def read_about(folder: str | Path) -> dict[str, Any]:
         folder (str or Path): folder of the data set.
 
     Returns:
-        dict: ``task``, ``trajectories``, ``steps``, ``lengths``, ``labelled_steps``, ``statistics``, ``notes``,
-            ``definition`` (of a task that came along) and ``sha256`` of its files.
+        dict: ``task``, ``definition`` (None of a task that is only named), ``trajectories``, ``steps``, ``lengths``,
+        ``labelled_steps``, ``statistics``, ``notes`` and ``sha256``.
 
     Raises:
-        DamagedDataError: if the folder holds no data set, or one written by a newer version.
-
-    Examples:
-        >>> import tempfile
-        >>> import torch
-        >>> from torchrl_koap.data import flatten_trajectories, read_about, save_ted
-        >>> with tempfile.TemporaryDirectory() as root:
-        ...     folder = save_ted(flatten_trajectories([torch.rand(5, 4)], [torch.rand(4, 2)]), root + "/ted")
-        ...     read_about(folder)["lengths"], read_about(folder)["labelled_steps"]
-        ([4], 4)
+        DataError: if the folder holds no data set, or one in another format.
     """
     path = Path(folder) / _ABOUT
     try:
         about = json.loads(read_bytes(path))
     except FileNotFoundError:
-        raise DamagedDataError(f"{folder} holds no data set ({_ABOUT} is missing)") from None
+        raise DataError(folder, f"it holds no data set ({_ABOUT} is missing)") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise DamagedDataError(f"{path} cannot be read: {error}") from error
-    if not isinstance(about, dict) or about.get("format") != FORMAT or not isinstance(about.get("sha256"), dict):
-        raise DamagedDataError(f"{path} is no description of a data set in format {FORMAT}")
-    missing = [name for name in ("task", "trajectories", "steps", "lengths", "labelled_steps") if name not in about]
-    if missing:
-        raise DamagedDataError(f"{path} says nothing of {', '.join(missing)}")
+        raise DataError(path, str(error)) from error
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise DataError(path, f"it is no description of a data set in format {FORMAT}")
+    kinds = {"task": str, "sha256": str, "lengths": list, "trajectories": int, "steps": int, "labelled_steps": int}
+    wrong = [name for name, kind in kinds.items() if not isinstance(about.get(name), kind)]
+    if wrong:
+        raise DataError(path, f"it says nothing of {', '.join(wrong)}, or nothing that can be read")
     return about
 
 
-def read_task(folder: str | Path) -> Task | None:
-    """The task that a data set holds, None if it only names one.
+def load_ted(folder: str | Path) -> tuple[TensorDict, Task]:
+    """Reads a data set that :func:`save_ted` wrote, and the task that its data are of.
 
-    A task of a data set is plain facts. One that names code to import (an environment, rules) is refused: a folder that
-    somebody sent must not decide what is run.
+    A task that came with the data is plain facts. One that names code to import (an environment, rules) is refused: a
+    folder that somebody sent must not decide what is run.
+
+    Args:
+        folder (str or Path): the folder.
+
+    Returns:
+        tuple: flat data ``[N]``, and the task that the folder holds, or the registered one that it names.
+
+    Raises:
+        DataError: if files are missing, changed or damaged, or the task names code.
+        ValueError: if the task is only named, and nobody has registered it.
+    """
+    task = stored_task(folder)
+    return read_steps(folder), task
+
+
+def stored_task(folder: str | Path) -> Task:
+    """The task of a data set: the one that it holds, or the registered one that it names.
 
     Args:
         folder (str or Path): folder of the data set.
 
-    Returns:
-        Task or None: None if the data set only names its task.
-
     Raises:
-        DamagedDataError: if the folder holds no data set, or its task is damaged or names code.
-
-    Examples:
-        >>> import tempfile
-        >>> import numpy as np
-        >>> from torchrl_koap.data import read_task, save_demonstrations
-        >>> with tempfile.TemporaryDirectory() as root:
-        ...     folder = save_demonstrations(root + "/arm", [np.zeros((9, 2))], control_hz=30, action_dim=7)
-        ...     print(read_task(folder / "ted").action_dim)
-        7
+        DataError: if the folder holds no data set, or its task is damaged or names code.
+        ValueError: if nobody has registered the task that it names.
     """
-    definition = read_about(folder).get("definition")
-    if definition is None:
-        return None
+    about = read_about(folder)
+    if about.get("definition") is None:
+        return get_task(about["task"])
     try:
-        return plain_task(definition)
+        return plain_task(about["definition"])
     except ValueError as error:
-        raise DamagedDataError(f"{Path(folder) / _ABOUT}: {error}") from error
+        raise DataError(Path(folder) / _ABOUT, str(error)) from error
 
 
-def load_ted(folder: str | Path, *, task: str | None = None, memmap: bool = True) -> TensorDict:
-    """Opens a data set written by :func:`save_ted`.
+def read_steps(folder: str | Path) -> TensorDict:
+    """The data of a data set ``[N]``, whatever their task.
 
     Args:
-        folder (str or Path): the folder.
-        task (str, optional): the task the data must belong to.
-        memmap (bool): leave the entries on disk (writes into them change the files and are found out by the next
-            load), or copy them into memory.
-
-    Returns:
-        TensorDict: flat data ``[N]``.
+        folder (str or Path): folder of the data set.
 
     Raises:
-        DamagedDataError: if files are missing, changed, not those that were written, or lead out of the folder.
-        ValueError: if the data belong to another task.
-
-    Examples:
-        >>> import tempfile
-        >>> import torch
-        >>> from torchrl_koap.data import flatten_trajectories, load_ted, save_ted
-        >>> with tempfile.TemporaryDirectory() as root:
-        ...     folder = save_ted(flatten_trajectories([torch.rand(5, 4)], [torch.rand(4, 2)]), root + "/ted")
-        ...     load_ted(folder, memmap=False)["action"].shape
-        torch.Size([4, 2])
+        DataError: if files are missing, changed or damaged.
     """
-    folder = Path(folder)
-    about = read_about(folder)
-    if task is not None and about["task"] != task:
-        raise ValueError(f"{folder} holds demonstrations of {about['task']!r}, wanted {task!r}")
-    problem = steps_problem(folder / _STEPS)
-    if problem is not None:
-        raise DamagedDataError(problem)
-    found = _checksums(folder)
-    for name in sorted(found.keys() | about["sha256"].keys()):
-        if found.get(name) != about["sha256"].get(name):
-            fault = "was changed"
-            if name not in found or name not in about["sha256"]:
-                fault = "does not belong there" if name in found else "is missing"
-            raise DamagedDataError(f"{folder / name} {fault}")
+    about, path = read_about(folder), Path(folder) / _STEPS
     try:
-        data = TensorDict.load_memmap(folder / _STEPS, allow_pickle=False)
-    except Exception as error:  # a forged description passes the checksums and can be wrong in any way
-        raise DamagedDataError(f"{folder / _STEPS} cannot be read: {error}") from error
-    return data if memmap else data.clone()
+        changed = sha256_of(path) != about["sha256"]
+        entries = {} if changed else load_file(path)
+    except FileNotFoundError:
+        raise DataError(path, "it is missing") from None
+    except (OSError, SafetensorError, ValueError, KeyError) as error:
+        raise DataError(path, str(error)) from error
+    if changed:
+        raise DataError(path, "it was changed: its checksum is another one")
+    nested = {tuple(name.split("/")) if "/" in name else name: value for name, value in entries.items()}
+    try:
+        return TensorDict(nested, [about["steps"]])
+    except (RuntimeError, ValueError, KeyError, TypeError) as error:
+        raise DataError(path, f"its entries do not have {about['steps']} steps: {error}") from error
 
 
-def _checksums(folder: Path) -> dict[str, str]:
-    return {
-        path.relative_to(folder).as_posix(): sha256_of(path)
-        for path in sorted((folder / _STEPS).rglob("*"))
-        if path.is_file()
-    }
+def _joined(key: str | tuple[str, ...]) -> str:
+    return key if isinstance(key, str) else "/".join(key)
 
 
-def _statistics(data: TensorDictBase) -> dict[str, dict[str, list[float | None]]]:
-    """Column statistics of the observations and of the labelled actions, for people who look at the file."""
-    statistics = {}
-    for key in (keys.OBSERVATION, keys.STATE, keys.ACTION):
-        if key not in data.keys():
-            continue
-        parts = data.get(key).split(PART)
-        count, mean = 0, torch.zeros(data.get(key).shape[-1], dtype=torch.double)
-        lowest: list[torch.Tensor] = []
-        highest: list[torch.Tensor] = []
-        for values in map(_finite_rows, parts):
-            if len(values):
-                count += len(values)
-                mean = mean + (values - mean).sum(0) / count
-                lowest.append(values.amin(0))
-                highest.append(values.amax(0))
-        if count:
-            squares = torch.stack([(_finite_rows(values) - mean).square().sum(0) for values in parts]).sum(0)
-            statistics[key] = {
-                "mean": mean.tolist(),
-                "std": (squares / count).sqrt().tolist(),
-                "min": torch.stack(lowest).amin(0).tolist(),
-                "max": torch.stack(highest).amax(0).tolist(),
-            }
-    return statistics
-
-
-def _finite_rows(values: torch.Tensor) -> torch.Tensor:
-    values = values.double().cpu()
-    return values[values.isfinite().all(-1)]
+def _statistics(values: torch.Tensor) -> dict[str, list[float]]:
+    """Column statistics ``[N, d]`` of the rows that are known, for people who look at the file."""
+    values = values[values.isfinite().all(-1)].double().cpu()
+    found = {"mean": values.mean(0), "std": values.std(0, correction=0), "min": values.amin(0), "max": values.amax(0)}
+    return {name: value.tolist() for name, value in found.items()}

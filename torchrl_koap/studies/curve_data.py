@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import LabelBudget, flatten_trajectories, read_task, save_ted, subsample_trajectories
+from torchrl_koap.data import LabelBudget, flatten_trajectories, load_ted, save_ted, subsample_trajectories
 from torchrl_koap.data.label_budget import Unit
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory
@@ -68,14 +68,17 @@ def demonstrations_of(root: RunDirectory, options: CurveConfig, task: Task) -> s
             episodes = options.demonstrations or task.defaults.demonstrations
             with progress_bar(episodes, "demonstrations", unit="episode") as bar:
                 data, _ = record_demonstrations(task.name, episodes, 0, progress=count_up_to(bar))
-            save_ted(data, folder / "ted", task=task.source)
+            save_ted(data, folder / "ted", get_task(task.source))
     if options.data_share == 1:
         return str(folder)
     used = root.path / "demonstrations-used"
     if not (used / "ted").exists():
-        own = read_task(folder / "ted") if (folder / "ted").is_dir() else None
-        whole = load_demonstrations(str(folder), get_task(task.source)).exclude("state")
-        save_ted(thin(whole, options.data_share), used / "ted", task=own or task.source)
+        if (folder / "ted").is_dir():
+            whole, own = load_ted(folder / "ted")
+        else:
+            own = get_task(task.source)
+            whole = load_demonstrations(str(folder), own).exclude("state")
+        save_ted(thin(whole, options.data_share), used / "ted", own)
     return str(used)
 
 

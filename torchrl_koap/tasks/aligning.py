@@ -100,7 +100,6 @@ register_task(
         score="torchrl_koap.tasks.aligning:score",
         env="torchrl_koap.envs.aligning:AligningEnv",
         expert="torchrl_koap.envs.experts.aligning:AligningExpert",
-        converter="torchrl_koap.data.d3il.conversion:ALIGNING",
         scene=Scene(
             shapes=tuple(_frame(region) for region in REGIONS),
             bodies=(

@@ -111,7 +111,6 @@ register_task(
         score="torchrl_koap.tasks.avoiding:score",
         env="torchrl_koap.envs.avoiding:AvoidingEnv",
         expert="torchrl_koap.envs.experts.avoiding:AvoidingExpert",
-        converter="torchrl_koap.data.d3il.conversion:AVOIDING",
         scene=Scene(
             shapes=(*_cylinders(), Shape("line", (0.5, FINISH_Y), (0.5, 0.0), "finish", label="finish")),
             x=(0.215, 0.785),

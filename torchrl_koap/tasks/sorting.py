@@ -138,7 +138,6 @@ def _sorting(num_boxes: int) -> Task:
         env="torchrl_koap.envs.sorting:SortingEnv",
         env_options={"num_boxes": num_boxes},
         expert="torchrl_koap.envs.experts.sorting:SortingExpert",
-        converter=f"torchrl_koap.data.d3il.conversion:SORTING_{num_boxes}",
         scene=Scene(
             shapes=(platform, *_walls()),
             bodies=tuple(

@@ -90,7 +90,6 @@ _STACKING = register_task(
         env="torchrl_koap.envs.stacking:StackingEnv",
         env_options={"num_boxes": 3},
         expert="torchrl_koap.envs.experts.stacking:StackingExpert",
-        converter="torchrl_koap.data.d3il.conversion:STACKING",
         scene=Scene(
             shapes=(
                 Shape("circle", TARGET, (ZONE_RADIUS, ZONE_RADIUS), "zone", label="zone"),

@@ -154,7 +154,6 @@ class Task(Columns):
         env_options (dict): its further keyword arguments.
         expert (str, optional): import string of the scripted expert (:mod:`torchrl_koap.envs.experts.recording`).
         data (str): name of the task whose demonstrations are used, if another one.
-        converter (str, optional): import string of the :class:`~torchrl_koap.data.Converter` of D3IL's raw pickles.
         scene (Scene): the bodies that a context places, where they start, and how all looks from above.
         label_levels (tuple of float): shares of labelled windows of the label levels 1, 2, ...
         defaults (Defaults): settings that are the task's own.
@@ -191,7 +190,6 @@ class Task(Columns):
     env_options: Mapping[str, Any] = field(default_factory=dict)
     expert: str | None = None
     data: str = ""
-    converter: str | None = None
     scene: Scene = Scene()
     label_levels: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.25)
     defaults: Defaults = Defaults()
@@ -377,7 +375,7 @@ class Task(Columns):
 
     def import_strings(self) -> dict[str, str]:
         """Import strings by the field that has them: the code that using the task may run."""
-        named = {field: getattr(self, field) for field in ("env", "expert", "goal", "score", "converter")}
+        named = {field: getattr(self, field) for field in ("env", "expert", "goal", "score")}
         named |= {"tool_kinematics": self.tool_kinematics, "modes.index": self.modes.index}
         named |= {f"state.{part}": kind for part, kind in self.state.items() if ":" in kind}
         return {place: value for place, value in named.items() if value}

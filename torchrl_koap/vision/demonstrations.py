@@ -11,7 +11,8 @@ import numpy as np
 import torch
 
 from torchrl_koap.data import flatten_trajectories, save_ted
-from torchrl_koap.data.lerobot.images import ImageDataError, ImageEpisode, read_image_episodes
+from torchrl_koap.data.formats.lerobot_frames import ImageEpisode, read_image_episodes
+from torchrl_koap.files import DataError
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.vision.encoder import FrozenImageEncoder
 from torchrl_koap.vision.projection import Projection
@@ -85,7 +86,7 @@ def embed_demonstrations(
         Path: the folder.
 
     Raises:
-        ImageDataError: if embodiments are mixed without saying so, or a data set is unfinished.
+        DataError: if embodiments are mixed without saying so, or a data set is unfinished.
         ValueError: if the embedding has another size than the task's, or frames another size than the encoder's.
     """
     task = get_task(task) if isinstance(task, str) else task
@@ -93,9 +94,10 @@ def embed_demonstrations(
     read = [source.read() for source in sources]
     names = sorted({episode.embodiment for episodes in read for episode in episodes})
     if len(names) > 1 and not mixed:
-        raise ImageDataError(
+        raise DataError(
+            out,
             f"the sources mix the embodiments {' and '.join(names)}: pass mixed=True (koap embed --mixed) if that is"
-            " meant"
+            " meant",
         )
     for episode in (episode for episodes in read for episode in episodes):
         embedding = encoder.embed(torch.from_numpy(episode.frames)).float()
@@ -109,4 +111,4 @@ def embed_demonstrations(
         actions.append(torch.from_numpy(missing if episode.action is None else episode.action))
         embodiments.append(episode.embodiment)
     notes = {"embodiments": embodiments, "encoder": encoder.identity}
-    return save_ted(flatten_trajectories(states, actions), Path(out) / "ted", task=task.name, notes=notes).parent
+    return save_ted(flatten_trajectories(states, actions), Path(out) / "ted", task, notes).parent

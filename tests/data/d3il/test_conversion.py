@@ -5,27 +5,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from raw_episodes import write_raw_episode
 
-from torchrl_koap.data import (
-    D3ILExperienceReplay,
-    RawEpisode,
-    RawFolderError,
-    convert_raw_files,
-    find_raw_files,
-    save_ted,
-    write_raw_episode,
-)
-from torchrl_koap.data.d3il.conversion import get_converter
-from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
+from torchrl_koap.data import open_dataset
+from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files, read_raw
+from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS, RawEpisode
+from torchrl_koap.files import DataError
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, get_task
-from torchrl_koap.training.datasets import load_demonstrations
 
 ROOT3 = math.sqrt(3)
 
@@ -37,8 +31,7 @@ def turned(*degrees, sign=1.0):
     return sign * np.stack([np.cos(half), zeros, zeros, np.sin(half)], 1)
 
 
-D3IL = [name for name, task in TASKS.items() if task.converter is not None]
-RAW = [name for name in D3IL if not TASKS[name].data]
+D3IL = [name for name, task in TASKS.items() if task.source in CONVERTERS]
 
 
 def pose(positions, quat):
@@ -49,7 +42,7 @@ def made_up(task, rows=5, seed=0, extra=()):
     """Any episode of a task, with everything that is logged."""
     rng = np.random.default_rng(seed)
     robot = {key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()}
-    names = (*get_converter(task).objects, *extra)
+    names = (*CONVERTERS[get_task(task).source].objects, *extra)
     objects = {name: pose(rng.normal(size=(rows, 3)), turned(*rng.uniform(-80, 80, rows))) for name in names}
     return RawEpisode(robot=robot, objects=objects)
 
@@ -57,12 +50,13 @@ def made_up(task, rows=5, seed=0, extra=()):
 def write_folder(folder, task, episodes=3, **kwargs):
     files = [Path(folder) / f"env_{index:03d}_00.pkl" for index in range(episodes)]
     for index, file in enumerate(files):
-        write_raw_episode(file, made_up(task, rows=4 + index, seed=index, **kwargs))
+        episode = made_up(task, rows=4 + index, seed=index, **kwargs)
+        write_raw_episode(file, episode.robot, episode.objects)
     return files
 
 
 def convert(task, episode):
-    return get_converter(task).convert(episode)
+    return CONVERTERS[task].convert(episode)
 
 
 def same(array, wanted):
@@ -166,8 +160,8 @@ def test_boxes_turned_by_a_right_angle_give_finite_numbers(tmp_path):
     episode = made_up("sorting", rows=3)
     for name in episode.objects:
         episode.objects[name]["quat"] = turned(90, -90, 270)
-    write_raw_episode(tmp_path / "env_000_00.pkl", episode)
-    data = validate(D3ILExperienceReplay("sorting", tmp_path).data)
+    write_raw_episode(tmp_path / "env_000_00.pkl", episode.robot, episode.objects)
+    data = validate(open_dataset(tmp_path, task=get_task("sorting"))[0])
     assert data["observation"][:, 6].abs().min() > 1e15
     # cos 2 yaw, sin 2 yaw
     assert torch.allclose(data["state"][:, 4:6], torch.tensor([[-1.0, 0.0]]), atol=1e-6)
@@ -205,109 +199,82 @@ def test_stacking(target):
 def test_every_task_gets_its_columns(tmp_path, task):
     facts = get_task(task)
     write_folder(tmp_path / "raw", task)
-    dataset = D3ILExperienceReplay(task, tmp_path / "raw")
-    data = validate(dataset.data)
+    data = validate(open_dataset(tmp_path / "raw", task=facts)[0])
     assert data["observation"].shape == (12, facts.observation_dim) and data["action"].shape == (12, facts.action_dim)
     assert torch.equal(data["state"], facts.state_of(data["observation"]))
     # the command and the action give the next command
     command, size = facts.observation[facts.command], len(facts.delta_actions)
     reached = data["observation"][:, command][:, :size] + data["action"][:, :size]
     torch.testing.assert_close(reached, data["next", "observation"][:, command][:, :size], rtol=0, atol=1e-6)
-    seen = load_demonstrations(str(tmp_path / "raw"), facts)["state"]  # measured with noise, for a task that has some
-    torch.testing.assert_close(seen, data["state"], rtol=0, atol=6 * facts.noise)
-    assert torch.equal(seen, data["state"]) == (facts.noise == 0)
 
 
-@pytest.mark.parametrize(("task", "source"), [("po_sorting", "sorting"), ("stacking_1", "stacking")])
-def test_demonstrations_of_another_task_are_used_where_that_is_meant(tmp_path, task, source):
-    assert get_converter(source) is get_converter(task)
-    write_folder(tmp_path / "raw", source)
-    theirs = D3ILExperienceReplay(source, tmp_path / "raw").data
-    save_ted(theirs.exclude("state"), tmp_path / "demos" / "ted", task=source)
-    save_ted(theirs, tmp_path / "with state", task=source)
-    wanted = get_task(task).state_of(theirs["observation"])
-    for data in (
-        load_demonstrations(str(tmp_path / "raw"), get_task(task)),
-        load_demonstrations(str(tmp_path / "demos"), get_task(task)),
-        D3ILExperienceReplay.from_folder(tmp_path / "demos" / "ted", task=task).data,
-        D3ILExperienceReplay.from_folder(tmp_path / "with state", task=task).data,
-    ):
-        torch.testing.assert_close(data["state"], wanted, rtol=0, atol=6 * get_task(task).noise)
-        assert torch.equal(data["action"], theirs["action"])
-    with pytest.raises(ValueError, match=f"holds demonstrations of '{source}', wanted 'aligning'"):
-        D3ILExperienceReplay.from_folder(tmp_path / "demos" / "ted", task="aligning")
-    cached = D3ILExperienceReplay(task, tmp_path / "raw").data_path
-    assert torch.equal(D3ILExperienceReplay.from_folder(cached, task=task).data["state"], wanted)
-
-
-def test_po_sorting_sees_no_yaw(tmp_path):
-    write_folder(tmp_path, "sorting")
-    state = D3ILExperienceReplay("po_sorting", tmp_path).data["state"]
-    observation = D3ILExperienceReplay("sorting", tmp_path).data["observation"]
-    assert torch.equal(state, observation[:, [2, 3, 4, 5, 7, 8, 10, 11, 13, 14]])
-
-
-FOLDERS = {  # where D3IL keeps the files and its lists
-    "aligning": ("aligning/all_data/state", "aligning/{}_files.pkl"),
-    "sorting": ("sorting/4_boxes/state", "sorting/4_boxes_{}_files.pkl"),
-    "po_sorting": ("sorting/4_boxes/state", "sorting/4_boxes_{}_files.pkl"),
-    "sorting_2": ("sorting/2_boxes/state", "sorting/2_boxes_{}_files.pkl"),
-    "sorting_6": ("sorting/6_boxes/state", "sorting/6_boxes_{}_files.pkl"),
-    "stacking": ("stacking/all_data", "stacking/{}_files.pkl"),
-    "stacking_1": ("stacking/all_data", "stacking/{}_files.pkl"),
+FOLDERS = {  # where D3IL keeps the files
+    "avoiding": "avoiding/data",
+    "aligning": "aligning/all_data/state",
+    "sorting": "sorting/4_boxes/state",
+    "sorting_2": "sorting/2_boxes/state",
+    "sorting_6": "sorting/6_boxes/state",
+    "stacking": "stacking/all_data",
 }
 
 
 @pytest.mark.parametrize("task", FOLDERS)
-def test_the_folders_and_lists_of_d3il(tmp_path, task):
-    inside, lists = FOLDERS[task]
-    data = tmp_path / "environments/dataset/data"
-    files = write_folder(data / inside, task)
-    (data / lists.format("train")).write_bytes(pickle.dumps([files[2].name, files[0].name]))
-    (data / lists.format("eval")).write_bytes(pickle.dumps(np.array([files[1].name])))
-    (data / inside).parent.joinpath("9_boxes_train_files.pkl").write_bytes(pickle.dumps(["absent.pkl"]))  # of others
-    steps = {None: 12, "train": 8, "eval": 4, Path(lists.format("train")).name: 8}
-    folder = data / inside
-    for root in {tmp_path, data, *folder.parents[: len(Path(inside).parts)], folder}:
-        if root == data.parent:
-            continue
-        for split, count in steps.items():
-            assert find_raw_files(task, root, split_file=split)[0] == folder
-            assert len(D3ILExperienceReplay(task, root, split_file=split)) == count, (root, split)
+def test_the_folders_of_d3il(tmp_path, task):
+    folder = tmp_path / "environments/dataset/data" / FOLDERS[task]
+    files = write_folder(folder, task)
+    for other in ("train_files.pkl", "4_boxes_eval_files.pkl", "test_contexts.pkl"):  # lists are no demonstrations
+        (folder / other).write_bytes(pickle.dumps([files[0].name]))
+    for root in {tmp_path, *folder.parents[: len(Path(FOLDERS[task]).parts)], folder}:
+        assert find_raw_files(CONVERTERS[task], root) == files, root
 
 
-def test_lists_that_are_not_there(tmp_path):
-    write_folder(tmp_path / "stacking" / "all_data", "stacking")
-    with pytest.raises(FileNotFoundError, match=r"no split file at .*stacking/train_files\.pkl"):
-        find_raw_files("stacking", tmp_path, split_file="train")
+def test_absent_folders(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no folder .*nowhere"):
+        find_raw_files(CONVERTERS["avoiding"], tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match="no demonstrations .*avoiding/data"):
+        find_raw_files(CONVERTERS["avoiding"], tmp_path)
 
 
-def faults(task, files):
-    with pytest.raises(RawFolderError) as error:
-        convert_raw_files(get_converter(task), files, Path("folder"))
+def faults(task, folder):
+    with pytest.raises(DataError) as error:
+        read_raw(CONVERTERS[task], folder)
     return error.value.problems
 
 
-@pytest.mark.parametrize("wanted", RAW)
-@pytest.mark.parametrize("logged", RAW)
-def test_demonstrations_of_another_task_are_refused_by_name(tmp_path, wanted, logged):
-    files = write_folder(tmp_path, logged, episodes=1)
-    if wanted == logged:
-        assert convert_raw_files(get_converter(wanted), files, tmp_path).shape == (3,)
-        return
-    (problem,) = faults(wanted, files)
-    assert problem.startswith(f"{files[0]}: a demonstration of {logged!r}: it logs ")
-    assert problem.endswith(f", wanted {', '.join(get_converter(wanted).objects) or 'no objects'}")
+def test_demonstrations_of_another_task_are_refused(tmp_path):
+    (file,) = write_folder(tmp_path, "aligning", episodes=1)
+    assert faults("avoiding", tmp_path) == [f"{file}: of another task: it logs push-box, target-box, wanted no objects"]
+    assert faults("stacking", tmp_path) == [
+        f"{file}: missing key '{colour}-box'" for colour in ("red", "green", "blue")
+    ]
 
 
-def test_the_target_of_stacking_is_no_other_task(tmp_path):
-    files = write_folder(tmp_path, "stacking", extra=["target-box"])
-    assert convert_raw_files(get_converter("stacking_1"), files, tmp_path).shape == (12,)
-    (problem, *_) = faults("aligning", files)
-    assert "a demonstration of 'stacking': it logs red-box, green-box, blue-box, target-box" in problem
-    files = write_folder(tmp_path / "avoiding", "avoiding", extra=["target-box"], episodes=1)
-    (problem,) = faults("avoiding", files)
-    assert "env_000_00.pkl: of an unknown task: it logs target-box, wanted no objects" in problem
+def test_the_target_of_stacking_is_not_read(tmp_path):
+    write_folder(tmp_path, "stacking", extra=["target-box"])
+    frames, actions = read_raw(CONVERTERS["stacking"], tmp_path)
+    assert [part.shape for part in frames] == [(4, 31), (5, 31), (6, 31)] and actions[0].shape == (3, 8)
+
+
+def test_faults_of_all_files_come_together(tmp_path):
+    rng = np.random.default_rng(0)
+    for number, rows in ((0, 5), (5, 1)):
+        robot = {name: rng.normal(size=(rows, 3)) for name in ("des_c_pos", "c_pos")}
+        write_raw_episode(tmp_path / f"env_{number:03d}_00.pkl", robot)
+    (tmp_path / "env_003_00.pkl").write_bytes(pickle.dumps(os.system))
+    (tmp_path / "env_004_00.pkl").touch()
+    (tmp_path / "env_007_00.pkl").write_bytes(pickle.dumps({"robot": {"c_pos": np.full((4, 3), np.nan)}}))
+    calls = []
+    with pytest.raises(DataError) as error:
+        read_raw(CONVERTERS["avoiding"], tmp_path, progress=lambda *done: calls.append(done))
+    text = str(error.value)
+    for part in (
+        "003_00.pkl: asks for",
+        "004_00.pkl: the file is empty",
+        "005_00.pkl: too short",
+        "007_00.pkl: missing",
+    ):
+        assert part in text
+    assert len(error.value.problems) == 5 and "env_000" not in text and calls[-1] == (4, 5)
 
 
 @pytest.mark.parametrize(
@@ -331,7 +298,7 @@ def test_what_is_missing_or_broken_is_named(tmp_path, change, problems):
     change(content)
     file = tmp_path / "env_007_01.pkl"
     file.write_bytes(pickle.dumps(content))
-    found = faults("sorting", [file])
+    found = faults("sorting", tmp_path)
     assert len(found) == len(problems)
     for problem in problems:
         assert any(line.startswith(f"{file}: {problem}") for line in found), found

@@ -1,63 +1,41 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Raw episodes: what is written is read back; every fault is named; nothing is damaged by a failed save."""
+"""Raw episodes: what is there is read; every fault is named."""
 
 from __future__ import annotations
 
-import errno
 import os
 import pickle
 import re
-import stat
 
 import numpy as np
 import pytest
+from raw_episodes import write_raw_episode
 from shared_data import HUMAN
 
-from torchrl_koap.data import RawEpisode, RawEpisodeError, read_raw_episode, write_raw_episode
-from torchrl_koap.data.d3il import raw as raw_module
-from torchrl_koap.data.d3il.raw import OBJECT_COLUMNS, ROBOT_COLUMNS
-from torchrl_koap.files import replacing_folder
+from torchrl_koap.data.d3il.raw import OBJECT_COLUMNS, ROBOT_COLUMNS, read_raw_episode
+from torchrl_koap.files import DataError
 
 
-def episode(rows=6, seed=0, objects=()):
+def episode(rows=6, seed=0):
     rng = np.random.default_rng(seed)
-    return RawEpisode(
-        robot={key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()},
-        objects={name: {key: rng.normal(size=(rows, *s)) for key, s in OBJECT_COLUMNS.items()} for name in objects},
-        context=[(0.1, np.zeros(2))] if objects else None,
-    )
+    return {key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()}
 
 
 def problems(path, **kwargs):
-    with pytest.raises(RawEpisodeError) as error:
+    with pytest.raises(DataError) as error:
         read_raw_episode(path, **kwargs)
-    assert all(path.name in problem for problem in error.value.problems)
+    assert path.name in str(error.value)
     return error.value.problems
 
 
-@pytest.mark.parametrize("objects", [(), ("red-box", "target-box")])
-def test_round_trip(tmp_path, objects):
-    written = episode(objects=objects)
-    write_raw_episode(tmp_path / "new" / "env_000_00.pkl", written)
-    read = read_raw_episode(tmp_path / "new" / "env_000_00.pkl", robot=list(ROBOT_COLUMNS), objects=objects)
-    assert len(read) == 6
-    for key, value in written.robot.items():
+@pytest.mark.parametrize("names", [(), ("red-box", "target-box")])
+def test_what_is_there_is_read(tmp_path, names):
+    objects = {name: {key: np.ones((6, *shape)) for key, shape in OBJECT_COLUMNS.items()} for name in names}
+    path = write_raw_episode(tmp_path / "env_000_00.pkl", episode(), objects, context=[(0.1, np.zeros(2))])
+    read = read_raw_episode(path, robot=list(ROBOT_COLUMNS), objects=names)
+    for key, value in episode().items():
         np.testing.assert_array_equal(read.robot[key], value)
-    assert set(read.objects) == set(objects)
-    for name in objects:
-        np.testing.assert_array_equal(read.objects[name]["quat"], written.objects[name]["quat"])
-    # other tools use the ordinary unpickler
-    with open(tmp_path / "new" / "env_000_00.pkl", "rb") as file:
-        plain = pickle.load(file)
-    assert set(plain) == {"context", "robot", *objects}
-    plain["robot"]["c_pos"][0] = 0.0  # writable there
-    assert [entry.name for entry in (tmp_path / "new").iterdir()] == ["env_000_00.pkl"]
-
-
-def test_written_files_can_be_read_by_others(tmp_path):
-    write_raw_episode(tmp_path / "a.pkl", episode())
-    (tmp_path / "plain").touch()
-    assert stat.S_IMODE((tmp_path / "a.pkl").stat().st_mode) == stat.S_IMODE((tmp_path / "plain").stat().st_mode)
+    assert set(read.objects) == set(names)
 
 
 @pytest.mark.parametrize(
@@ -78,7 +56,7 @@ def test_written_files_can_be_read_by_others(tmp_path):
     ],
 )
 def test_faults_are_named(tmp_path, change, message):
-    content = {"context": None, "robot": dict(episode().robot)}
+    content = {"context": None, "robot": episode()}
     change(content["robot"])
     path = tmp_path / "env_004_01.pkl"
     path.write_bytes(pickle.dumps(content))
@@ -87,7 +65,7 @@ def test_faults_are_named(tmp_path, change, message):
 
 
 def test_all_faults_at_once(tmp_path):
-    content = {"robot": dict(episode().robot), "red-box": {"pos": np.zeros((6, 2))}}
+    content = {"robot": episode(), "red-box": {"pos": np.zeros((6, 2))}}
     del content["robot"]["c_pos"]
     content["robot"]["j_pos"] = np.full((6, 7), np.nan)
     path = tmp_path / "env.pkl"
@@ -119,65 +97,10 @@ def test_too_short_empty_damaged_hostile_absent(tmp_path):
         read_raw_episode(tmp_path / "absent.pkl")
 
 
-def test_broken_episodes_are_not_written(tmp_path):
-    broken = episode()
-    broken.robot["c_pos"][2] = np.nan
-    with pytest.raises(RawEpisodeError, match="robot/c_pos"):
-        write_raw_episode(tmp_path / "a.pkl", broken)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_full_disk_leaves_the_earlier_file(tmp_path, monkeypatch):
-    path = tmp_path / "a.pkl"
-    write_raw_episode(path, episode(seed=1))
-    before = path.read_bytes()
-
-    def full(content, file, protocol):
-        file.write(b"half of it")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(raw_module.pickle, "dump", full)
-    with pytest.raises(OSError, match="No space left"):
-        write_raw_episode(path, episode(seed=2))
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("moment", ["writing", "renaming"])
-def test_a_failed_folder_leaves_the_earlier_one(tmp_path, monkeypatch, moment):
-    with replacing_folder(tmp_path / "set") as aside:
-        (aside / "part").write_text("old")
-    real, calls = os.replace, []
-
-    def fail_second(source, target):
-        calls.append(source)
-        if len(calls) == 3:  # new to its place (refused: it is full), old aside, new to its place
-            raise OSError(errno.ENOSPC, "No space left on device")
-        real(source, target)
-
-    with pytest.raises(OSError, match="No space left"), replacing_folder(tmp_path / "set") as aside:
-        (aside / "part").write_text("new")
-        if moment == "writing":
-            raise OSError(errno.ENOSPC, "No space left on device")
-        monkeypatch.setattr(os, "replace", fail_second)
-    assert (tmp_path / "set" / "part").read_text() == "old"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["set"]
-    monkeypatch.undo()
-    with replacing_folder(tmp_path / "set") as aside:
-        (aside / "part").write_text("new")
-    assert (tmp_path / "set" / "part").read_text() == "new"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["set"]
-
-
 @pytest.mark.skipif(not HUMAN.is_dir(), reason=f"the human demonstrations are not at {HUMAN}")
-def test_human_demonstrations_survive_a_round_trip(tmp_path):
+def test_human_demonstrations():
     files = sorted(HUMAN.glob("env_*.pkl"))
     assert len(files) == 24
     for file in files[:3]:
         read = read_raw_episode(file, robot=list(ROBOT_COLUMNS))
-        assert 65 <= len(read) <= 104 and not read.objects and read.context is None
-        write_raw_episode(tmp_path / file.name, read)
-        again = read_raw_episode(tmp_path / file.name)
-        for key, value in read.robot.items():
-            np.testing.assert_array_equal(again.robot[key], value)
-            assert again.robot[key].dtype == value.dtype
+        assert 65 <= len(read.robot["c_pos"]) <= 104 and not read.objects

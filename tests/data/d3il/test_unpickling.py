@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from torchrl_koap.data.d3il.pickle_scan import DamagedPickleError, UnsafePickleError
-from torchrl_koap.data.d3il.unpickling import load_pickle, loads_pickle
+from torchrl_koap.data.d3il.unpickling import UnsafePickleError, load_pickle, loads_pickle
+from torchrl_koap.files import DataError
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 
@@ -115,7 +115,7 @@ def hostile():
         "class": (Plain(), "Plain"),
         "path": (pathlib.PurePosixPath("/x"), "pathlib"),
         "nested": ({"robot": {"c_pos": [np.zeros(2), (Call(os.system, "touch {}"),)]}}, f"{os.name}.system"),
-        "object array": (objects, f"{os.name}.system"),
+        "object array": (objects, f"{os.name}.system|O8"),
         "datetime": (np.array(["2020-01-01"], dtype="M8[D]"), "M8"),
         "record": (np.zeros(2, dtype=[("x", "f8")]), "V8"),
         "array subclass": (np.ma.masked_array([1.0], [True]), "numpy.ma"),
@@ -143,7 +143,7 @@ def test_hostile_files_are_refused_by_name_and_not_run(case, protocol, tmp_path)
     path.write_bytes(pickle.dumps(value, protocol))
     with pytest.raises(UnsafePickleError) as error:
         load_pickle(path)
-    assert name in str(error.value) and "demo_7.pkl" in str(error.value)
+    assert any(part in str(error.value) for part in name.split("|")) and "demo_7.pkl" in str(error.value)
     assert not target.exists()
 
 
@@ -170,11 +170,9 @@ def test_attribute_chains_are_refused():
         loads_pickle(content)
 
 
-def test_disguised_names_are_refused():
-    # the module name is the result of a computation, so no scan can know it
-    content = b"\x80\x04]\x8c\x06system\x93."
-    with pytest.raises(UnsafePickleError, match="disguised"):
-        loads_pickle(content)
+def test_a_name_that_is_no_text_is_refused():
+    with pytest.raises(DataError, match="STACK_GLOBAL requires str"):
+        loads_pickle(b"\x80\x04]\x8c\x06system\x93.")
 
 
 def test_remembered_names_are_resolved():
@@ -244,11 +242,11 @@ def array_with_shape(shape: bytes) -> bytes:
 
 def test_declared_sizes_never_allocate():
     np.testing.assert_array_equal(loads_pickle(array_with_shape(b"K\x01\x85")), [0.0])
-    with pytest.raises(DamagedPickleError, match="the file holds 8"):
+    with pytest.raises(DataError, match="the file holds 8"):
         loads_pickle(array_with_shape(b"\x8a\x05\x00\x00\x00\x00\x20\x85"))  # 2^37 elements
-    with pytest.raises(DamagedPickleError):
+    with pytest.raises(DataError):
         loads_pickle(array_with_shape(b"J\xff\xff\xff\xff\x85"))  # a negative size
-    with pytest.raises(DamagedPickleError):  # 2^60 bytes of text announced
+    with pytest.raises(DataError):  # 2^60 bytes of text announced
         loads_pickle(b"\x80\x04\x8e" + struct.pack("<Q", 2**60) + b"abc.")
     with pytest.raises(UnsafePickleError, match="memory"):
         loads_pickle(b"\x80\x02]r" + struct.pack("<I", 2**31) + b".")  # slot 2^31 of the memo
@@ -274,14 +272,14 @@ def test_exponential_and_cyclic_containers():
 def test_damaged_files(tmp_path):
     content = pickle.dumps({"robot": {"c_pos": np.arange(30.0).reshape(10, 3)}})
     for end in range(len(content)):
-        with pytest.raises((DamagedPickleError, UnsafePickleError)):
+        with pytest.raises(DataError):
             loads_pickle(content[:end])
     path = tmp_path / "empty.pkl"
     path.touch()
-    with pytest.raises(DamagedPickleError, match=r"empty\.pkl.*empty"):
+    with pytest.raises(DataError, match=r"empty\.pkl.*empty"):
         load_pickle(path)
     for other in (b"not a pickle", b"\x00" * 50, b"PK\x03\x04", content + b"more"):
-        with pytest.raises((DamagedPickleError, UnsafePickleError)):
+        with pytest.raises(DataError):
             loads_pickle(other)
     with pytest.raises(FileNotFoundError):
         load_pickle(tmp_path / "absent.pkl")
@@ -295,7 +293,7 @@ def test_random_damage_never_escapes(data):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     try:
         loads_pickle(bytes(content))
-    except (DamagedPickleError, UnsafePickleError):
+    except DataError:
         pass
 
 

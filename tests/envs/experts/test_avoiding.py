@@ -9,10 +9,10 @@ import torch
 from human_likeness import ridge_error, statistics
 from shared_data import HUMAN
 
-from torchrl_koap.data import read_raw_episode
+from torchrl_koap.data.d3il.conversion import CONVERTERS, read_raw
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.experts.avoiding import _HAND, _HAND_REST, FULL_PUSH, GAPS, AvoidingExpert, mode_gaps
-from torchrl_koap.envs.experts.demonstrations import record_episodes
+from torchrl_koap.envs.experts.demonstrations import iterate_takes
 
 
 def play(expert, count, steps=150):
@@ -106,9 +106,9 @@ def test_bad_input():
 
 @pytest.mark.skipif(not HUMAN.is_dir(), reason=f"the human demonstrations are not at {HUMAN}")
 def test_scripted_medians_lie_in_the_human_range():
-    human = [statistics(read_raw_episode(file)) for file in sorted(HUMAN.glob("env_*.pkl"))]
-    raw, _ = record_episodes("avoiding", 48, seed=1)
-    scripted = [statistics(episode) for episode in raw]
+    human = [statistics(frames.numpy()) for frames in read_raw(CONVERTERS["avoiding"], HUMAN)[0]]
+    played = [take.frames for take in iterate_takes("avoiding", 48, seed=1)]
+    scripted = [statistics(frames) for frames in played]
     outside = {}
     for name in human[0]:
         low, high = np.percentile([row[name] for row in human], [5, 95])
@@ -116,4 +116,4 @@ def test_scripted_medians_lie_in_the_human_range():
         if not low <= median <= high + 1e-9:
             outside[name] = (low, median, high)
     assert len(outside) <= 1, outside
-    assert ridge_error(raw[:24]) == pytest.approx(2.22, abs=0.4)  # 2.22 mm: the human ones
+    assert ridge_error(played[:24]) == pytest.approx(2.22, abs=0.4)  # 2.22 mm: the human ones

@@ -31,10 +31,9 @@ def contents(folder):
 def test_the_data_are_those_of_a_recording_in_memory(whole):
     folder, report = whole
     data, again = record_demonstrations("avoiding", COUNT, seed=3, num_threads=1)
-    assert (load_ted(folder / "ted") == data).all()
+    assert (load_ted(folder / "ted")[0] == data).all()
     assert (report.modes, report.rows, report.attempts) == (again.modes, again.rows, again.attempts)
-    assert sorted(path.name for path in folder.iterdir()) == ["raw", "ted"]
-    assert [path.name for path in sorted((folder / "raw").iterdir())][:2] == ["env_000_00.pkl", "env_001_00.pkl"]
+    assert [path.name for path in folder.iterdir()] == ["ted"]
     notes = read_about(folder / "ted")["notes"]
     assert notes["seed"] == 3 and notes["modes"] == report.modes and notes["attempts"] == report.attempts
 
@@ -66,7 +65,7 @@ def test_an_interrupted_recording_goes_on(whole, tmp_path, monkeypatch, batch_si
         interrupt_after(patch, 2)
         with pytest.raises(Stop):
             record_to_folder(folder, TASK, COUNT, seed=3, num_threads=1, batch_size=batch_size)
-    assert len(list((folder / "unfinished" / "raw").iterdir())) == 2 and not (folder / "ted").exists()
+    assert len(list((folder / "unfinished").glob("*.npz"))) == 2 and not (folder / "ted").exists()
     with open(folder / "unfinished" / "takes.jsonl", "a") as file:
         file.write('{"index": 2, "mo')  # the process died while it wrote
     asked, calls = interrupt_after(monkeypatch, 99), []
@@ -85,7 +84,7 @@ def test_an_interruption_at_the_very_end_is_made_good(whole, tmp_path, monkeypat
         patch.setattr(demonstration_folder, "save_ted", fail)
         with pytest.raises(Stop):
             record_to_folder(folder, TASK, COUNT, seed=3, num_threads=1)
-    assert (folder / "raw").exists() and not (folder / "ted").exists()
+    assert not (folder / "ted").exists()
     record_to_folder(folder, TASK, COUNT, seed=3, num_threads=1)
     assert contents(folder) == contents(whole[0])
 
@@ -117,10 +116,10 @@ def test_memory_holds_a_batch_of_episodes(tmp_path, monkeypatch):
 
     def watched(*arguments, **options):
         for take in play(*arguments, **options):
-            found.append(len(list((tmp_path / "unfinished" / "raw").iterdir())) if found or take.index else 0)
+            found.append(len(list((tmp_path / "unfinished").glob("*.npz"))) if found or take.index else 0)
             yield take
 
     monkeypatch.setattr(demonstration_folder, "iterate_takes", watched)
     record_to_folder(tmp_path, TASK, 3, num_threads=1, batch_size=1)
     assert found == [0, 1, 2]
-    assert load_ted(tmp_path / "ted")["action"].dtype == torch.float32
+    assert load_ted(tmp_path / "ted")[0]["action"].dtype == torch.float32

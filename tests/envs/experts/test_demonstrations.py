@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Recorded demonstrations: right modes, right rows, the same through TED and raw pickles, repeatable."""
+"""Recorded demonstrations: right modes, right rows, repeatable."""
 
 from __future__ import annotations
 
@@ -9,18 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_koap.data import D3ILExperienceReplay, read_raw_episode, trajectory_lengths
-from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
+from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.experts import demonstrations
 from torchrl_koap.envs.experts.avoiding import AvoidingExpert
 from torchrl_koap.envs.experts.demonstrations import (
     RecordingError,
     balanced_modes,
-    episodes_to_ted,
+    iterate_takes,
     record_demonstrations,
-    record_episodes,
-    write_raw_episodes,
 )
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS
@@ -31,16 +28,16 @@ EPISODES = 26
 @pytest.fixture(scope="module")
 def recording():
     calls = []
-    raw, report = record_episodes(
-        "avoiding", EPISODES, seed=5, progress=lambda done, total: calls.append((done, total))
+    data, report = record_demonstrations(
+        "avoiding", EPISODES, seed=5, progress=lambda done, total: calls.append((done, total)), dtype=torch.float64
     )
-    return raw, report, calls
+    return data, report, calls
 
 
 def test_report(recording):
-    raw, report, calls = recording
-    assert len(raw) == len(report.rows) == len(report.attempts) == EPISODES
-    assert report.rows == [len(episode) for episode in raw]
+    data, report, calls = recording
+    assert len(report.rows) == len(report.attempts) == EPISODES
+    assert trajectory_lengths(validate(data)).tolist() == [rows - 1 for rows in report.rows]
     assert np.bincount(report.modes, minlength=24).min() == 1 and len(set(report.modes[24:])) == 2
     assert sum(report.attempts) - EPISODES == report.failed_attempts == sum(report.failures.values())
     assert f"{EPISODES} demonstrations" in str(report)
@@ -48,20 +45,18 @@ def test_report(recording):
     assert done == sorted(done) and calls[-1] == (EPISODES, EPISODES)
 
 
-def test_rows_are_those_of_the_original_recorder(recording):
-    raw, _, _ = recording
-    for episode in raw:
-        robot = episode.robot
-        assert set(robot) == set(ROBOT_COLUMNS)
-        assert np.array_equal(robot["sim_step"], 2 + 35 * np.arange(len(episode)))
-        assert np.allclose(robot["time_stamp"], robot["sim_step"] * 1e-3)
-        assert np.allclose(robot["c_pos"][0], (0.524928, -0.279737, 0.122359), atol=1e-5)
-        assert np.ptp(robot["des_c_pos"][:, 2]) == 0
+def test_takes_are_the_rows_of_the_original_recorder(recording):
+    data = recording[0]
+    for take in iterate_takes("avoiding", EPISODES, seed=5, done=range(2, EPISODES)):
+        assert len(take.frames) == len(take.actions) + 1 == take.rows
+        assert np.allclose(take.frames[0, 2:], (0.524928, -0.279737), atol=1e-5)
+        np.testing.assert_array_equal(take.frames[:-1], data["observation"][data["episode"] == take.index])
 
 
 def test_demonstrations_are_successes_with_clearance(recording):
-    for episode in recording[0]:
-        path = episode.robot["c_pos"][:, :2]
+    data = recording[0]
+    for number in range(EPISODES):
+        path = data["next", "observation"][data["episode"] == number][:, 2:].numpy()
         assert path[-1, 1] > FINISH_Y
         for _, x, y, radius, _ in OBSTACLES:
             assert np.linalg.norm(path - (x, y), axis=1).min() > radius + ROD_RADIUS + 0.003
@@ -69,10 +64,10 @@ def test_demonstrations_are_successes_with_clearance(recording):
 
 def test_replayed_actions_give_the_same_episode(recording):
     """Recorded actions, sent to a fresh environment, reproduce the rows, outcome and mode."""
-    raw, report, _ = recording
-    data = episodes_to_ted(raw, "avoiding", dtype=torch.float64)
+    data, report, _ = recording
     for index in (0, 13, 25):
-        part, robot = data[data["episode"] == index], raw[index].robot
+        part = data[data["episode"] == index]
+        frames = torch.cat([part["observation"], part["next", "observation"][-1:]]).numpy()
         env = AvoidingEnv(1, dtype=torch.float64)
         step = env.reset()
         first = (
@@ -80,32 +75,13 @@ def test_replayed_actions_give_the_same_episode(recording):
         )  # the command of row 0 is a step from the start
         for row, action in enumerate(torch.cat([first, part["action"]])):
             step = env.step(step.set("action", action[None]))["next"]
-            assert np.allclose(env.raw_log()["j_pos"][0], robot["j_pos"][row], atol=1e-9, rtol=0)
-            frame = np.concatenate([robot["des_c_pos"][row, :2], robot["c_pos"][row, :2]])
+            assert np.allclose(env.raw_log()["c_pos"][0, :2], frames[row, 2:], atol=1e-9, rtol=0)
             seen = step["observation"][0].numpy()
-            assert np.allclose(seen[:2], frame[:2], atol=1e-12, rtol=0)
+            assert np.allclose(seen[:2], frames[row, :2], atol=1e-12, rtol=0)
             # the environment hands out the position of 1 ms before the recorder's
-            assert np.allclose(seen[2:], frame[2:], atol=1e-3, rtol=0)
+            assert np.allclose(seen[2:], frames[row, 2:], atol=1e-3, rtol=0)
         assert step["success"].item() and not step["collision"].item()
         assert mode_index(step["mode"]).item() == report.modes[index]
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_raw_files_read_back_equal_the_recorded_data(recording, tmp_path, monkeypatch, dtype):
-    raw, report, _ = recording
-    monkeypatch.setenv("KOAP_CACHE", str(tmp_path / "cache"))
-    files = write_raw_episodes(tmp_path / "raw", raw)
-    assert [file.name for file in files[:2]] == ["env_000_00.pkl", "env_001_00.pkl"]
-    data = validate(episodes_to_ted(raw, "avoiding", dtype=dtype))
-    read = D3ILExperienceReplay("avoiding", tmp_path / "raw", dtype=dtype).data.exclude("state")
-    assert set(read.keys(True, True)) == set(data.keys(True, True))
-    assert (read == data).all()
-    assert trajectory_lengths(data).tolist() == [rows - 1 for rows in report.rows]
-    again = read_raw_episode(files[3])
-    assert all(np.array_equal(again.robot[name], raw[3].robot[name]) for name in ROBOT_COLUMNS)
-    with pytest.raises(FileExistsError, match="left as they are"):
-        write_raw_episodes(tmp_path / "raw", raw[:1])
-    assert len(list((tmp_path / "raw").iterdir())) == EPISODES
 
 
 def test_same_seed_same_data_whatever_threads_and_progress():
@@ -186,10 +162,10 @@ def test_no_more_environments_than_the_batch_are_made(monkeypatch):
         return make(task, count, **options)
 
     monkeypatch.setattr(demonstrations, "make_env", make_env)
-    record_episodes("avoiding", 7, batch_size=4)
+    record_demonstrations("avoiding", 7, batch_size=4)
     assert made == [4]
 
 
 def test_a_batch_of_nothing():
     with pytest.raises(ValueError, match="batch_size must be an integer of at least 1, got 0"):
-        record_episodes("avoiding", 2, batch_size=0)
+        record_demonstrations("avoiding", 2, batch_size=0)

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.envs.experts import demonstrations
-from torchrl_koap.envs.experts.demonstrations import episodes_to_ted, record_episodes
+from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.envs.experts.disturbances import (
     KINDS,
     Disturbances,
@@ -92,11 +93,12 @@ def test_the_height_of_a_tool_drifts_up_and_down_and_nothing_else_does_at_once()
 
 
 def test_an_operator_brings_the_tool_back_to_its_height():
-    raw, report = record_episodes("aligning", 2, seed=2, num_threads=1, disturbance=1.0)
+    data, report = record_demonstrations("aligning", 2, seed=2, num_threads=1, disturbance=1.0, dtype=torch.float64)
     restored = []
-    for spells, episode in zip(report.spells, raw, strict=True):
+    for number, spells in enumerate(report.spells):
         drifts = [spell for spell in spells if spell[2] == "drift"]
-        command = episode.robot["des_c_pos"][:, 2]
+        own = data[data["episode"] == number]
+        command = torch.cat([own["observation"], own["next", "observation"][-1:]])[:, 2].numpy()
         for (begin, end, _), (later, _, _) in zip(drifts, [*drifts[1:], (len(command), 0, "")], strict=True):
             if begin > 60 and end + 15 < later:  # after the descent
                 assert np.ptp(command[begin - 1 : end + 1]) > 0.004
@@ -113,34 +115,35 @@ def test_grippers_are_left_alone():
 @pytest.mark.parametrize("share", [-0.1, 1.5, True, "all"])
 def test_a_share_that_is_none(share):
     with pytest.raises(ValueError, match="disturbance must be the share of the episodes that are disturbed, 0 to 1"):
-        record_episodes("avoiding", 2, disturbance=share)
+        record_demonstrations("avoiding", 2, disturbance=share)
 
 
 @pytest.fixture(scope="module")
 def disturbed():
-    return record_episodes("avoiding", 6, seed=2, num_threads=1, disturbance=0.5)
+    return record_demonstrations("avoiding", 6, seed=2, num_threads=1, disturbance=0.5)
 
 
 def test_the_recording_says_how_often(disturbed):
-    raw, report = disturbed
+    data, report = disturbed
     told = report.notes["disturbance"]
     assert told["share"] == 0.5 and told["disturbed_demonstrations"] == sum(report.disturbed) > 0
     assert told["attempts_under_disturbance"] == sum(
         attempts for attempts, chosen in zip(report.attempts, report.disturbed, strict=True) if chosen
     )
     assert sum(told["kept"].values()) == sum(map(len, report.spells)) > 0
-    for spells, chosen, episode in zip(report.spells, report.disturbed, raw, strict=True):
+    lengths = trajectory_lengths(data).tolist()
+    for spells, chosen, length in zip(report.spells, report.disturbed, lengths, strict=True):
         assert chosen or not spells
-        assert all(0 <= begin < end <= len(episode) - 1 for begin, end, _ in spells)
+        assert all(0 <= begin < end <= length for begin, end, _ in spells)
     assert "disturbed" in str(report)
 
 
 def test_undisturbed_episodes_are_those_of_a_recording_without(disturbed):
-    raw, report = disturbed
-    plain, without = record_episodes("avoiding", 6, seed=2, num_threads=1)
+    data, report = disturbed
+    plain, without = record_demonstrations("avoiding", 6, seed=2, num_threads=1)
     assert "disturbance" not in without.notes and "disturbed" not in str(without)
     for index, chosen in enumerate(report.disturbed):
-        same = np.array_equal(raw[index].robot["des_c_pos"], plain[index].robot["des_c_pos"])
+        same = np.array_equal(*(part["action"][part["episode"] == index] for part in (data, plain)))
         assert same == (not report.spells[index]) or chosen
 
 
@@ -154,18 +157,18 @@ def test_recorded_actions_are_those_that_were_executed(disturbed, monkeypatch):
             return done[-1][None]
 
     monkeypatch.setattr(demonstrations, "Disturbances", Watched)
-    raw, report = record_episodes("avoiding", 1, seed=1, num_threads=1, disturbance=1.0)
-    recorded = episodes_to_ted(raw, "avoiding", dtype=torch.float64)["action"].numpy()
+    data, report = record_demonstrations("avoiding", 1, seed=1, num_threads=1, disturbance=1.0, dtype=torch.float64)
+    recorded = data["action"].numpy()
     last = np.array(done[-len(recorded) - 1 :])[1:]  # the first action is the state that the log begins with
     assert report.attempts[0] >= 1 and np.allclose(recorded, last, atol=1e-12)
 
 
 def test_a_task_brings_its_share_of_disturbed_demonstrations_unless_another_is_asked_for():
     assert get_task("aligning").defaults.disturbance == 0.5 and get_task("avoiding").defaults.disturbance == 0
-    own, report = record_episodes("aligning", 2, seed=2, num_threads=1)
+    own, report = record_demonstrations("aligning", 2, seed=2, num_threads=1)
     assert report.notes["disturbance"]["share"] == 0.5 and report.disturbed == list(choose_disturbed(2, 0.5, 2))
-    assert "disturbance" not in record_episodes("avoiding", 1, num_threads=1)[1].notes
-    quiet, without = record_episodes("aligning", 2, seed=2, num_threads=1, disturbance=0.0)
+    assert "disturbance" not in record_demonstrations("avoiding", 1, num_threads=1)[1].notes
+    quiet, without = record_demonstrations("aligning", 2, seed=2, num_threads=1, disturbance=0.0)
     assert "disturbance" not in without.notes
-    same = [np.array_equal(a.robot["des_c_pos"], b.robot["des_c_pos"]) for a, b in zip(own, quiet, strict=True)]
+    same = [np.array_equal(*(d["action"][d["episode"] == number] for d in (own, quiet))) for number in range(2)]
     assert same == [not spells for spells in report.spells]

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_koap.commands.demos import Demos
-from torchrl_koap.data.lerobot.images import ImageDataError, read_image_episodes
+from torchrl_koap.commands.data_commands import Demos
+from torchrl_koap.data.formats.lerobot_frames import read_image_episodes
 from torchrl_koap.envs import ScoopingEnv
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.mujoco.rendering import Renderer
@@ -19,6 +19,7 @@ from torchrl_koap.envs.scooping.expert import ScoopingExpert, start_joints
 from torchrl_koap.envs.scooping.kinematics import SpoonKinematics, rotation_of
 from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations, settled_layouts
+from torchrl_koap.files import DataError
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.scooping import BOWL, PIECE_RADIUS, RIM_RADIUS, START_HEIGHT, STARTS, start_of
 
@@ -148,37 +149,24 @@ def test_no_graphics_is_one_clear_error(tmp_path, monkeypatch):
     assert not (tmp_path / "a").exists()
 
 
-def test_an_interrupted_recording_goes_on(tmp_path):
-    record = functools.partial(record_videos, embodiment="robot", episodes=2)
+def test_recordings_are_repeatable_and_an_unfinished_one_is_no_data_set(tmp_path):
+    record, seen = functools.partial(record_videos, embodiment="robot", episodes=2), []
 
     def interrupt(number, total):
         raise KeyboardInterrupt
 
     try:
-        record(tmp_path / "whole")
+        report = record(tmp_path / "whole", progress=lambda number, total: seen.append(number))
     except RuntimeError as error:
         pytest.skip(f"no OpenGL library: {error}")
+    assert seen == [1, 2] and report.episodes == 2 and report.attempts >= 2
     with pytest.raises(KeyboardInterrupt):
         record(tmp_path / "parts", progress=interrupt)
-    with pytest.raises(FileExistsError, match=r'holds an interrupted recording of .*"seed": 0.*, not of .*"seed": 1'):
-        record(tmp_path / "parts", seed=1)
-    account = tmp_path / "parts" / "unfinished.json"
-    whole = account.read_text()
-    account.write_text(whole[:-9])
-    with pytest.raises(ImageDataError, match="unfinished.json cannot be read"):
+    with pytest.raises(DataError, match="no finished data set"):
+        read_image_episodes(tmp_path / "parts")
+    with pytest.raises(FileExistsError, match="is not empty; choose another folder"):
         record(tmp_path / "parts")
-    account.write_text(whole)
-    seen = []
-    report = record(tmp_path / "parts", progress=lambda number, total: seen.append(number))
-    assert seen == [1, 2] and report.episodes == 2 and report.attempts >= 2
-    parts, whole = (read_image_episodes(tmp_path / name) for name in ("parts", "whole"))
-    for one, other in zip(parts, whole, strict=True):
+    record(tmp_path / "again")
+    for one, other in zip(*(read_image_episodes(tmp_path / name) for name in ("again", "whole")), strict=True):
         np.testing.assert_array_equal(one.frames, other.frames)
         np.testing.assert_array_equal(one.action, other.action)
-    files = [
-        sorted(path.relative_to(tmp_path / name) for path in (tmp_path / name).rglob("*"))
-        for name in ("parts", "whole")
-    ]
-    assert files[0] == files[1]
-    with pytest.raises(FileExistsError, match="holds a data set already"):
-        record(tmp_path / "parts")

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_koap.data.lerobot.images import read_image_episodes
+from torchrl_koap.data.formats.lerobot_frames import read_image_episodes
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.envs.scooping.expert import ScoopingExpert, start_joints

@@ -3,11 +3,11 @@
 
 A pickle is a program. Two gates stand before this one runs:
 
-1. The instructions are *scanned* without executing them. Every class or function a file asks for is compared with
-   the short list below, and every instruction that plain data never needs (extension codes, persistent ids, class
-   instances) is refused. The refusal names the file and what it asked for.
-2. The file is then loaded with *stand-ins* for numpy's constructors. They check types, shapes and byte counts and
-   build a view of the bytes in the file, so a declared shape can never allocate more than the file holds.
+1. The instructions are *scanned* without executing them: those that plain data never need (extension codes, persistent
+   ids, class instances) are refused.
+2. The file is loaded with *stand-ins* for numpy's constructors; every other class or function that it asks for is
+   refused by name. Stand-ins check types, shapes and byte counts and build a view of the bytes in the file, so a
+   declared shape can never allocate more than the file holds.
 """
 
 from __future__ import annotations
@@ -16,25 +16,32 @@ import functools
 import io
 import math
 import pickle
+import pickletools
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.d3il.pickle_scan import (
-    MOST_ODD_KEYS,
-    DamagedPickleError,
-    UnsafePickleError,
-    refusal,
-    scan,
-    spell,
-)
-from torchrl_koap.files import read_bytes
+from torchrl_koap.files import DataError, read_bytes
 
 _MAX_DEPTH = 64
 _ELEMENT_TYPES = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU][1-9]\d{0,5}")
 _PLAIN = (str, bytes, bool, int, float, type(None))
+_INSTRUCTIONS = frozenset(
+    "PROTO FRAME STOP MARK NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING"
+    " BINSTRING SHORT_BINSTRING UNICODE SHORT_BINUNICODE BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8"
+    " BYTEARRAY8 EMPTY_LIST APPEND APPENDS LIST EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_DICT DICT SETITEM SETITEMS"
+    " PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE BUILD".split()
+)
+
+
+class UnsafePickleError(DataError):
+    """A pickle that asks for something other than arrays and plain containers; nothing of it was run."""
+
+
+class _RefusedError(Exception):
+    """What a file asks for and does not get."""
 
 
 def load_pickle(path: str | Path) -> Any:
@@ -46,26 +53,15 @@ def load_pickle(path: str | Path) -> Any:
     Args:
         path (str or Path): the file.
 
-    Returns:
-        object: what the file holds: dicts, lists, strings, numbers and NumPy arrays.
-
     Raises:
         UnsafePickleError: if the file holds anything else. The message names the file and the class or function.
-        DamagedPickleError: if the file is empty, truncated or no pickle.
-        FileNotFoundError: if there is no such file.
-        OSError: if it is a pipe or device, or larger than 256 MB.
+        DataError: if the file is empty, truncated or no pickle.
+        OSError: if there is no such file, or it is a pipe or device, or larger than 256 MB.
 
     Examples:
         >>> import os, pickle, tempfile
         >>> import numpy as np
-        >>> from torchrl_koap.data import UnsafePickleError, load_pickle
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = os.path.join(folder, "episode.pkl")
-        ...     with open(path, "wb") as file:
-        ...         pickle.dump({"robot": {"c_pos": np.arange(6.0).reshape(2, 3)}}, file)
-        ...     load_pickle(path)["robot"]["c_pos"]
-        array([[0., 1., 2.],
-               [3., 4., 5.]])
+        >>> from torchrl_koap.data.d3il.unpickling import UnsafePickleError, load_pickle
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = os.path.join(folder, "hostile.pkl")
         ...     with open(path, "wb") as file:
@@ -76,7 +72,6 @@ def load_pickle(path: str | Path) -> Any:
         ...         "builtins.print" in str(error)
         True
     """
-    path = Path(path)
     return loads_pickle(read_bytes(path), name=str(path))
 
 
@@ -87,13 +82,6 @@ def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
         content (bytes): the pickle.
         name (str): what to call it in error messages.
 
-    Returns:
-        object: what the bytes hold: dicts, lists, strings, numbers and NumPy arrays.
-
-    Raises:
-        UnsafePickleError: see :func:`load_pickle`.
-        DamagedPickleError: see :func:`load_pickle`.
-
     Examples:
         >>> import pickle
         >>> from torchrl_koap.data.d3il.unpickling import loads_pickle
@@ -101,50 +89,74 @@ def loads_pickle(content: bytes, *, name: str = "<bytes>") -> Any:
         [1, 'two', None]
     """
     if not content:
-        raise DamagedPickleError(f"{name}: the file is empty")
-    scan(content, name, _STAND_INS)
+        raise DataError(name, "the file is empty")
     try:
-        loaded = _RestrictedUnpickler(content, name).load()
-        return _finish(loaded, name, depth=0, finished={}, open_containers=set())
-    except UnsafePickleError:
-        raise
+        _scan(content)
+        loaded = _RestrictedUnpickler(content).load()
+        return _finish(loaded, depth=0, finished={}, open_containers=set())
+    except _RefusedError as refused:
+        raise UnsafePickleError(name, str(refused)) from None
     except RecursionError:
-        raise UnsafePickleError(f"{name}: containers are nested too deeply") from None
+        raise UnsafePickleError(name, "containers are nested too deeply") from None
     # a damaged pickle program can fail in as many ways as a damaged Python program
     except Exception as error:
-        raise DamagedPickleError(f"{name}: not a complete pickle ({type(error).__name__}: {error})") from error
+        raise DataError(name, f"not a complete pickle ({str(error) or type(error).__name__})") from error
+
+
+def _asks_for(what: str) -> _RefusedError:
+    return _RefusedError(f"asks for {what}: refused, only numpy arrays and plain containers are read")
+
+
+def _scan(content: bytes) -> None:
+    """Refuses instructions that plain data do not need, and names that can be seen, without running anything."""
+    refused: dict[str, None] = {}  # in the order they are met
+    position, texts = 0, [""]
+    try:
+        for opcode, argument, position in pickletools.genops(content):
+            texts += [argument] if isinstance(argument, str) else []
+            if opcode.name in ("GLOBAL", "INST") and tuple(argument.split(" ", 1)) not in _STAND_INS:
+                refused[_spelled(*argument.split(" ", 1))] = None
+            elif opcode.name not in _INSTRUCTIONS:
+                refused[f"pickle instruction {opcode.name} (after {' '.join(texts[-2:])})"] = None
+            elif "PUT" in opcode.name and argument > position:  # the C unpickler allocates up to the largest slot
+                refused[f"memory slot {argument}"] = None
+    finally:
+        if refused:
+            raise _asks_for(", ".join(list(refused)[:6]))
+    if position + 1 != len(content):
+        raise ValueError(f"{len(content) - position - 1} bytes follow the end of the pickle")
+
+
+def _spelled(module: str, attribute: str = "") -> str:
+    return f"{module.replace('__builtin__', 'builtins')}.{attribute}"  # Python 2 called it __builtin__
 
 
 class _RestrictedUnpickler(pickle.Unpickler):
-    def __init__(self, content: bytes, name: str):
+    def __init__(self, content: bytes):
         super().__init__(io.BytesIO(content), encoding="latin1")  # numpy data pickled by Python 2 are latin1 text
-        self._name = name
 
     def find_class(self, module, attribute):
         if (module, attribute) not in _STAND_INS:
-            raise refusal(self._name, spell(module, attribute))
-        return _StandIn(f"{module}.{attribute}", _STAND_INS[module, attribute], self._name)
+            raise _asks_for(_spelled(module, attribute))
+        return _StandIn(f"{module}.{attribute}", _STAND_INS[module, attribute])
 
     def persistent_load(self, pid):
-        raise refusal(self._name, f"data outside the file (persistent id {pid!r})")
+        raise _asks_for(f"data outside the file (persistent id {pid!r})")
 
 
 class _StandIn:
     """Takes the place of a class or function; can be called, and cannot be changed by the file."""
 
-    __slots__ = ("_build", "_file", "name")
+    __slots__ = ("_build", "name")
 
-    def __init__(self, name, build, file):
-        self.name, self._build, self._file = name, build, file
+    def __init__(self, name, build):
+        self.name, self._build = name, build
 
     def __call__(self, *args):
-        try:
-            return self._build(*args)
-        except UnsafePickleError as error:
-            raise UnsafePickleError(f"{self._file}: {error}") from None
+        return self._build(*args)
 
     def __setstate__(self, state):
-        raise UnsafePickleError(f"{self._file}: tries to change {self.name}")
+        raise _RefusedError(f"tries to change {self.name}")
 
 
 class _ElementType:
@@ -154,13 +166,13 @@ class _ElementType:
 
     def __init__(self, code, align=False, copy=False):
         if not isinstance(code, str) or not _ELEMENT_TYPES.fullmatch(code):
-            raise UnsafePickleError(f"arrays of element type {code!r} are refused; only numbers and text are read")
+            raise _RefusedError(f"arrays of element type {code!r} are refused; only numbers and text are read")
         self.dtype = np.dtype(code)
 
     def __setstate__(self, state):
         byte_order, *structure = state[1:5]
         if any(part is not None for part in structure):
-            raise UnsafePickleError("structured element types are refused; only plain arrays are read")
+            raise _RefusedError("structured element types are refused; only plain arrays are read")
         if byte_order in ("<", ">"):
             self.dtype = self.dtype.newbyteorder(byte_order)
         elif byte_order not in ("|", "="):
@@ -178,7 +190,7 @@ class _Array:
     def __setstate__(self, state):
         _, shape, element_type, column_major, content = state
         if isinstance(content, list):
-            raise UnsafePickleError("arrays of objects are refused; only numbers and text are read")
+            raise _RefusedError("arrays of objects are refused; only numbers and text are read")
         self.value = _view(content, element_type, shape, "F" if column_major else "C")
 
 
@@ -186,7 +198,7 @@ def _view(content, element_type, shape, order) -> np.ndarray:
     if isinstance(content, str):
         content = content.encode("latin1")
     if not isinstance(element_type, _ElementType) or not isinstance(content, (bytes, bytearray)):
-        raise UnsafePickleError("an array is not made of bytes and a numpy element type")
+        raise _RefusedError("an array is not made of bytes and a numpy element type")
     if not isinstance(shape, tuple) or not all(type(size) is int and size >= 0 for size in shape):
         raise ValueError(f"array shape {shape!r}")
     needed = math.prod(shape) * element_type.dtype.itemsize
@@ -197,13 +209,9 @@ def _view(content, element_type, shape, order) -> np.ndarray:
     return array
 
 
-def _is(stand_in, attribute) -> bool:
-    return isinstance(stand_in, _StandIn) and stand_in.name.endswith(attribute)
-
-
 def _reconstruct(array_class, shape, code):
-    if not _is(array_class, "numpy.ndarray"):
-        raise UnsafePickleError("only plain numpy arrays are read, not subclasses of them")
+    if not isinstance(array_class, _StandIn) or not array_class.name.endswith("numpy.ndarray"):
+        raise _RefusedError("only plain numpy arrays are read, not subclasses of them")
     return _Array()
 
 
@@ -221,18 +229,12 @@ def _scalar(element_type, content):
 
 def _encode(text, encoding):
     if not isinstance(text, str) or encoding != "latin1":
-        raise UnsafePickleError(f"encoding {encoding!r} is refused")
+        raise _RefusedError(f"encoding {encoding!r} is refused")
     return text.encode("latin1")
 
 
-def _ordered_dict(*pairs):
-    if pairs and len(pairs[0]) > MOST_ODD_KEYS:
-        raise UnsafePickleError(f"a dictionary is made of {len(pairs[0]):,} pairs, more than {MOST_ODD_KEYS:,}")
-    return dict(*pairs)
-
-
 def _no_call(*_args):
-    raise UnsafePickleError("calls numpy.ndarray directly")
+    raise _RefusedError("calls numpy.ndarray directly")
 
 
 def _empty_bytes():
@@ -242,7 +244,7 @@ def _empty_bytes():
 _STAND_INS = {
     ("numpy", "ndarray"): _no_call,
     ("numpy", "dtype"): _ElementType,
-    ("collections", "OrderedDict"): _ordered_dict,
+    ("collections", "OrderedDict"): dict,
     ("_codecs", "encode"): _encode,
     ("builtins", "bytes"): _empty_bytes,
     ("__builtin__", "bytes"): _empty_bytes,
@@ -253,18 +255,18 @@ for _core in ("numpy.core", "numpy._core"):  # numpy 1.x and 2.x
     _STAND_INS[f"{_core}.numeric", "_frombuffer"] = _from_buffer
 
 
-def _finish(value, name: str, *, depth: int, finished: dict, open_containers: set) -> Any:
+def _finish(value, *, depth: int, finished: dict, open_containers: set) -> Any:
     """Puts the arrays in the place of their stand-ins and refuses what is left of the others."""
     if isinstance(value, _PLAIN) or isinstance(value, np.generic):
         return value
     if id(value) in finished:  # shared containers stay shared, and are visited once
         return finished[id(value)]
     if id(value) in open_containers:
-        raise UnsafePickleError(f"{name}: a container holds itself")
+        raise _RefusedError("a container holds itself")
     if depth > _MAX_DEPTH:
-        raise UnsafePickleError(f"{name}: containers are nested more than {_MAX_DEPTH} deep")
+        raise _RefusedError(f"containers are nested more than {_MAX_DEPTH} deep")
     open_containers.add(id(value))
-    finish = functools.partial(_finish, name=name, depth=depth + 1, finished=finished, open_containers=open_containers)
+    finish = functools.partial(_finish, depth=depth + 1, finished=finished, open_containers=open_containers)
     if isinstance(value, _Array) and value.value is not None:
         result = value.value
     elif isinstance(value, _ElementType):
@@ -272,7 +274,7 @@ def _finish(value, name: str, *, depth: int, finished: dict, open_containers: se
     elif type(value) is dict:
         for key, entry in value.items():
             if not isinstance(key, (*_PLAIN, np.generic, tuple)):
-                raise UnsafePickleError(f"{name}: a {type(key).__name__} is refused as a dictionary key")
+                raise _RefusedError(f"a {type(key).__name__} is refused as a dictionary key")
             value[key] = finish(entry)
         result = value
     elif type(value) is list:
@@ -283,8 +285,7 @@ def _finish(value, name: str, *, depth: int, finished: dict, open_containers: se
     elif type(value) is bytearray:
         result = bytes(value)
     else:
-        kind = value.name if isinstance(value, _StandIn) else type(value).__name__
-        raise refusal(name, f"{kind} as a value")
+        raise _asks_for(f"{value.name if isinstance(value, _StandIn) else type(value).__name__} as a value")
     open_containers.discard(id(value))
     finished[id(value)] = result
     return result

@@ -21,7 +21,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchrl_koap.data import RawEpisode
 from torchrl_koap.envs.experts.noise import ar1_noise
 from torchrl_koap.envs.experts.recording import RecordingRules
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS, ROW_Y
@@ -70,9 +69,9 @@ def mode_gaps(mode: int) -> tuple[int, int, int]:
     return mode // 12, mode % 12 // 4, mode % 4
 
 
-def clearance(episode: RawEpisode) -> float:
-    """Least distance of a recording between the rod, taken as upright, and any cylinder (m)."""
-    path = episode.robot["c_pos"][:, :2]
+def clearance(frames: np.ndarray) -> float:
+    """Least distance of a recording ``[T, 4]`` between the rod, taken as upright, and any cylinder (m)."""
+    path = frames[:, 2:]
     gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
     return min(gaps) - ROD_RADIUS
 

@@ -5,8 +5,7 @@
 
     folder/
       ted/          all demonstrations as one data set (see torchrl_koap.data.ted)
-      raw/          one file per demonstration in D3IL's own format, for tasks of D3IL
-      unfinished/   while recording: what was asked for, an account of every demonstration so far, and its file
+      unfinished/   while recording: what was asked for, a line on every demonstration so far, and its file
 
 Memory holds one batch of episodes, and at the end the data set itself in single precision.
 """
@@ -15,26 +14,22 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
 
-from torchrl_koap.data import RawEpisode, flatten_trajectories, read_raw_episode, save_ted, write_raw_episode
-from torchrl_koap.data.d3il.conversion import get_converter
+from torchrl_koap.data import flatten_trajectories, save_ted
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE, iterate_takes
 from torchrl_koap.envs.experts.disturbances import share_disturbed
-from torchrl_koap.envs.experts.recording import PlainEpisode
 from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.files import one_at_a_time, replacing_file
 from torchrl_koap.tasks import Task, get_task
 
-_REQUEST, _ACCOUNT = "request.json", "takes.jsonl"
+_REQUEST, _LOG = "request.json", "takes.jsonl"
 
 
 def record_to_folder(
@@ -51,7 +46,7 @@ def record_to_folder(
     """Records demonstrations into a folder; called again with the same arguments, it goes on where it was interrupted.
 
     Args:
-        folder (str or Path): where ``ted`` and ``raw`` shall lie.
+        folder (str or Path): where ``ted`` shall lie.
         task (Task): the task.
         episodes (int): number of demonstrations.
         seed (int): seed of modes and players.
@@ -77,7 +72,7 @@ def record_to_folder(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     report = record_to_folder(folder, get_task("avoiding"), 2)
         ...     sorted(path.name for path in Path(folder).iterdir()), len(report.rows)
-        (['raw', 'ted'], 2)
+        (['ted'], 2)
     """
     start, disturbance = time.perf_counter(), share_disturbed(task, disturbance)
     task = get_task(task.source)
@@ -94,9 +89,8 @@ def record_to_folder(
             progress(len(done), episodes)
         for take in iterating(progress, done=done):
             files.add(take)
-        account = files.account()
-        seconds = time.perf_counter() - start
-        report = RecordingReport.of(task, seed, [account[index] for index in range(episodes)], seconds, disturbance)
+        log, seconds = files.log(), time.perf_counter() - start
+        report = RecordingReport.of(task, seed, [log[index] for index in range(episodes)], seconds, disturbance)
         files.finish(report)
     shutil.rmtree(files.unfinished)
     return report
@@ -107,14 +101,12 @@ class _Files:
 
     def __init__(self, folder: Path, task: Task, episodes: int):
         self._folder, self._task, self._episodes = folder, task, episodes
-        self._raw = task.converter is not None
         self.unfinished = folder / "unfinished"
 
     def refuse_others(self, request: dict) -> None:
         begun = self.unfinished / _REQUEST
-        for name in ("ted", "raw"):
-            if (self._folder / name).exists() and not (name == "raw" and begun.exists()):
-                raise FileExistsError(f"{self._folder / name} exists already; choose another --out")
+        if (self._folder / "ted").exists():
+            raise FileExistsError(f"{self._folder / 'ted'} exists already; choose another --out")
         there = json.loads(begun.read_text()) if begun.exists() else request
         other = [
             f"{key} {there.get(key)!r}, not {value!r}" for key, value in request.items() if there.get(key) != value
@@ -127,59 +119,40 @@ class _Files:
 
     def begin(self, request: dict) -> set[int]:
         """Notes what is asked for; returns the numbers of the demonstrations that are there already."""
-        (self.unfinished / "raw").mkdir(parents=True, exist_ok=True)
+        self.unfinished.mkdir(parents=True, exist_ok=True)
         with replacing_file(self.unfinished / _REQUEST) as aside:
             aside.write_text(json.dumps(request))
-        account = self.account()
-        with replacing_file(self.unfinished / _ACCOUNT) as aside:  # without a half-written last line
-            aside.write_text("".join(json.dumps(take) + "\n" for take in account.values()))
-        return set(account)
+        log = self.log()
+        with replacing_file(self.unfinished / _LOG) as aside:  # without a half-written last line
+            aside.write_text("".join(json.dumps(take) + "\n" for take in log.values()))
+        return set(log)
 
     def add(self, take: Take) -> None:
-        path = self._file(self.unfinished / "raw", take.index)
-        if self._raw:
-            write_raw_episode(path, cast("RawEpisode", take.episode))
-        else:
-            plain = cast("PlainEpisode", take.episode)
-            with replacing_file(path) as aside, open(aside, "wb") as file:
-                np.savez(file, observation=plain.observation, action=plain.action)
-        line = {name: value for name, value in vars(take).items() if name != "episode"}
-        with open(self.unfinished / _ACCOUNT, "a") as file:
+        with replacing_file(self._file(take.index)) as aside, open(aside, "wb") as file:
+            np.savez(file, frames=take.frames, actions=take.actions)
+        line = {name: value for name, value in vars(take).items() if name not in ("frames", "actions")}
+        with open(self.unfinished / _LOG, "a") as file:
             file.write(json.dumps(line) + "\n")
 
-    def account(self) -> dict[int, dict]:
-        """The account of every demonstration whose file is there."""
-        path, account = self.unfinished / _ACCOUNT, {}
+    def log(self) -> dict[int, dict]:
+        """The line on every demonstration whose file is there."""
+        path, log = self.unfinished / _LOG, {}
         for line in path.read_text().splitlines() if path.exists() else ():
             try:
                 take = json.loads(line)
             except json.JSONDecodeError:  # the process ended while it wrote this line
                 continue
-            if self._find(take["index"]).exists():
-                account[take["index"]] = take
-        return account
+            if self._file(take["index"]).exists():
+                log[take["index"]] = take
+        return log
 
     def finish(self, report: RecordingReport) -> None:
-        frames, steps = zip(*(self._trajectory(index) for index in range(self._episodes)), strict=True)
-        data = flatten_trajectories(frames, steps)
-        del frames, steps
-        if self._raw and not (self._folder / "raw").exists():
-            os.replace(self.unfinished / "raw", self._folder / "raw")
-        save_ted(data, self._folder / "ted", task=self._task.name, notes=report.notes)
+        frames, actions = [], []
+        for index in range(self._episodes):
+            with np.load(self._file(index), allow_pickle=False) as held:
+                frames.append(torch.from_numpy(held["frames"]).float())
+                actions.append(torch.from_numpy(held["actions"]).float())
+        save_ted(flatten_trajectories(frames, actions), self._folder / "ted", self._task, report.notes)
 
-    def _file(self, folder: Path, index: int) -> Path:
-        digits = max(3, len(str(self._episodes - 1)))
-        return folder / (f"env_{index:0{digits}d}_00.pkl" if self._raw else f"{index:0{digits}d}.npz")
-
-    def _find(self, index: int) -> Path:
-        """The file of a demonstration; an interruption at the very end may have left it in its last place."""
-        last = self._file(self._folder / "raw", index)
-        return last if last.exists() else self._file(self.unfinished / "raw", index)
-
-    def _trajectory(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
-        if self._raw:
-            frames, steps = get_converter(self._task.name).convert(read_raw_episode(self._find(index)))
-        else:
-            with np.load(self._find(index), allow_pickle=False) as held:
-                frames, steps = held["observation"], held["action"]
-        return torch.from_numpy(frames).float(), torch.from_numpy(steps).float()
+    def _file(self, index: int) -> Path:
+        return self.unfinished / f"{index:0{max(3, len(str(self._episodes - 1)))}d}.npz"

@@ -12,17 +12,15 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.data import RawEpisode, flatten_trajectories, write_raw_episode
-from torchrl_koap.data.d3il.conversion import get_converter
+from torchrl_koap.data import flatten_trajectories
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.experts.disturbances import Disturbances, choose_disturbed, disturbed_columns, share_disturbed
-from torchrl_koap.envs.experts.recording import FAULTS, Episode, PlainEpisode, expert_of, play
+from torchrl_koap.envs.experts.recording import FAULTS, Attempt, expert_of, play
 from torchrl_koap.envs.experts.recording_report import RecordingReport, Take
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.tasks import Task, get_task
@@ -84,51 +82,14 @@ def record_demonstrations(
         >>> data["action"].shape[1], data["has_action"].all().item(), len(report.modes)
         (2, True, 3)
     """
-    raw, report = record_episodes(
-        task, episodes, seed, num_threads, progress, batch_size=batch_size, disturbance=disturbance
-    )
-    return episodes_to_ted(raw, task, dtype=dtype), report
-
-
-def record_episodes(
-    task: str = "avoiding",
-    episodes: int = 96,
-    seed: int = 0,
-    num_threads: int = 2,
-    progress: Callable[[int, int], None] | None = None,
-    *,
-    batch_size: int = BATCH_SIZE,
-    disturbance: float | None = None,
-) -> tuple[list[Episode], RecordingReport]:
-    """Records demonstrations with everything D3IL's recorder logs.
-
-    Args:
-        task (str): name of the task.
-        episodes (int): number of demonstrations.
-        seed (int): seed of modes and players. Same seed, same demonstrations, whatever the number of threads.
-        num_threads (int): threads that advance the physics.
-        progress (callable, optional): called with the number of demonstrations recorded and wanted.
-
-    Keyword Args:
-        batch_size (int): episodes played at once. The demonstrations do not depend on it.
-        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
-            the task.
-
-    Returns:
-        tuple: the episodes, for :func:`episodes_to_ted` and, of a task of D3IL, :func:`write_raw_episodes`, and the
-        report.
-
-    Raises:
-        ValueError: if the task is unknown or has no expert, or a number is out of range.
-        RecordingError: if an episode fails again and again.
-    """
     start, facts = time.perf_counter(), get_task(get_task(task).source)
     disturbance = share_disturbed(get_task(task), disturbance)
     takes = list(
         iterate_takes(facts, episodes, seed, num_threads, progress, batch_size=batch_size, disturbance=disturbance)
     )
     report = RecordingReport.of(facts, seed, takes, time.perf_counter() - start, disturbance)
-    return [take.episode for take in takes], report
+    frames = [torch.from_numpy(take.frames) for take in takes]
+    return flatten_trajectories(frames, [torch.from_numpy(take.actions) for take in takes], dtype=dtype), report
 
 
 def iterate_takes(
@@ -188,59 +149,6 @@ def iterate_takes(
     return _play_batches(task, episodes, seed, num_threads, progress, batch_size, disturbed, frozenset(done))
 
 
-def episodes_to_ted(raw: Sequence[Episode], task: str, *, dtype: torch.dtype = torch.float32) -> TensorDict:
-    """Converts recorded episodes to flat TED data, just as reading their raw files would.
-
-    Args:
-        raw (sequence of Episode): of ``T`` rows of a raw one become ``T - 1`` steps, of a plain one ``T``.
-        task (str): name of the task.
-        dtype (torch.dtype): floating type of the entries.
-    """
-    pairs = [
-        (episode.observation, episode.action)
-        if isinstance(episode, PlainEpisode)
-        else get_converter(task).convert(episode)
-        for episode in raw
-    ]
-    return flatten_trajectories(
-        [torch.from_numpy(frames) for frames, _ in pairs], [torch.from_numpy(steps) for _, steps in pairs], dtype=dtype
-    )
-
-
-def write_raw_episodes(folder: str | Path, raw: Sequence[RawEpisode]) -> list[Path]:
-    """Writes recorded episodes as D3IL raw pickles ``env_000_00.pkl``, ``env_001_00.pkl``, ...
-
-    Args:
-        folder (str or Path): a folder that is new or holds no pickles.
-        raw (sequence of RawEpisode): the episodes.
-
-    Returns:
-        list of Path: the files, in the order of the episodes.
-
-    Raises:
-        FileExistsError: if the folder holds pickles already; none is touched.
-        TypeError: if episodes were recorded without D3IL's log.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_koap.envs.experts.demonstrations import record_episodes, write_raw_episodes
-        >>> raw, report = record_episodes("avoiding", episodes=1)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     [file.name for file in write_raw_episodes(folder, raw)]
-        ['env_000_00.pkl']
-    """
-    if any(isinstance(episode, PlainEpisode) for episode in raw):
-        raise TypeError("episodes recorded without D3IL's log cannot be written as its pickles; save them as TED data")
-    folder = Path(folder)
-    if folder.is_dir() and any(folder.glob("*.pkl")):
-        raise FileExistsError(f"{folder} holds pickles already; they are left as they are")
-    digits = max(3, len(str(len(raw) - 1)))
-    files = [folder / f"env_{index:0{digits}d}_00.pkl" for index in range(len(raw))]
-    for file, episode in zip(files, raw, strict=True):
-        write_raw_episode(file, episode)
-    return files
-
-
 def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
     """Modes of a recording: each as often as any other, a remainder drawn without repetition.
 
@@ -298,7 +206,7 @@ def _play_batches(
             takes: dict[int, Take] = {}
             failures = {row: dict.fromkeys(FAULTS, 0) for row in batch}
             for attempt in range(MAX_ATTEMPTS):
-                rows, found = np.array([row for row in batch if row not in takes]), already + len(takes)
+                rows, kept = np.array([row for row in batch if row not in takes]), already + len(takes)
                 contexts = contexts_of(attempt - attempt % _PER_CONTEXT)
                 seeds = [(seed, int(row), attempt) for row in rows]
                 hand = Disturbances(task, seeds, disturbed[rows]) if disturbed[rows].any() else None
@@ -309,18 +217,24 @@ def _play_batches(
                     [modes[row] for row in rows],
                     None if contexts is None else contexts[np.resize(rows, size)],  # the rest of the batch idles
                     seeds,
-                    functools.partial(show, found),
+                    functools.partial(show, kept),
                     disturbances=hand,
                 )
-                for place, (row, (episode, fault)) in enumerate(zip(rows, results, strict=True)):
-                    if fault:
-                        failures[row][fault] += 1
-                        last = int(row), fault
+                for index, (row, found) in enumerate(zip(rows, results, strict=True)):
+                    if found.fault:
+                        failures[row][found.fault] += 1
+                        last = int(row), found.fault
                         continue
-                    spells = () if hand is None else _within(hand.spells[place], episode)
-                    reasons = {name: count for name, count in failures[row].items() if count}
                     takes[row] = Take(
-                        int(row), episode, modes[row], len(episode), attempt + 1, reasons, bool(disturbed[row]), spells
+                        int(row),
+                        found.frames,
+                        found.actions,
+                        modes[row],
+                        found.steps,
+                        attempt + 1,
+                        {name: count for name, count in failures[row].items() if count},
+                        bool(disturbed[row]),
+                        () if hand is None else _within(hand.spells[index], found),
                     )
                 if len(takes) == len(batch):
                     break
@@ -338,9 +252,9 @@ def _play_batches(
         env.close()
 
 
-def _within(spells: Sequence[tuple[int, int, str]], episode: Episode) -> tuple[tuple[int, int, str], ...]:
+def _within(spells: Sequence[tuple[int, int, str]], found: Attempt) -> tuple[tuple[int, int, str], ...]:
     """Disturbances in steps of the data: in D3IL's log the first row is the state after the first control step."""
-    shift = 0 if isinstance(episode, PlainEpisode) else 1
-    last = len(episode) - shift
+    last = len(found.actions)
+    shift = found.steps - last
     moved = [(max(begin - shift, 0), min(end - shift, last), kind) for begin, end, kind in spells]
     return tuple(spell for spell in moved if spell[0] < spell[1])

@@ -14,9 +14,8 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap import keys
-from torchrl_koap.envs.experts.demonstrations import episodes_to_ted
+from torchrl_koap.data import flatten_trajectories
 from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import PlainEpisode
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.tasks import Task, get_task
 
@@ -72,16 +71,17 @@ def record_random_play(
         if not value > 0:
             raise ValueError(f"{option} must be positive, got {value!r}")
     env = make_env(facts, trajectories, max_steps=steps + 1, dtype=torch.float64)
-    found: dict[int, PlainEpisode] = {}
+    found: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
     try:
         for attempt in range(MAX_ATTEMPTS):
             draws = [np.random.default_rng((seed, number, attempt)) for number in range(trajectories)]
             noise = np.stack([ar1_noise(draw, memory, push, (steps, facts.action_dim)) for draw in draws], 1)
-            for number, episode in enumerate(_play(env, noise, columns, low, high)):
-                if episode is not None:
-                    found.setdefault(number, episode)
+            for number, motion in enumerate(_play(env, noise, columns, low, high)):
+                if motion is not None:
+                    found.setdefault(number, motion)
             if len(found) == trajectories:
-                return episodes_to_ted([found[number] for number in range(trajectories)], facts.name, dtype=dtype)
+                frames, actions = zip(*(found[number] for number in range(trajectories)), strict=True)
+                return flatten_trajectories(frames, actions, dtype=dtype)
     finally:
         env.close()
     missing = [number for number in range(trajectories) if number not in found]
@@ -109,7 +109,9 @@ def _check_bounds(task: Task, bounds: Sequence[tuple[float, float]]) -> tuple[np
     return pairs[:, 0], pairs[:, 1]
 
 
-def _play(env, noise: np.ndarray, columns: slice, low: np.ndarray, high: np.ndarray) -> list[PlainEpisode | None]:
+def _play(
+    env, noise: np.ndarray, columns: slice, low: np.ndarray, high: np.ndarray
+) -> list[tuple[torch.Tensor, torch.Tensor] | None]:
     """One attempt: noise ``[steps, n, act]`` becomes a motion per environment, None where it ended early."""
     data = env.reset()
     frames, actions = [data[keys.OBSERVATION].numpy().copy()], []
@@ -123,4 +125,7 @@ def _play(env, noise: np.ndarray, columns: slice, low: np.ndarray, high: np.ndar
         frames.append(data[keys.OBSERVATION].numpy().copy())
         actions.append(action)
     motions = zip(np.stack(frames, 1), np.stack(actions, 1), ended, strict=True)
-    return [None if early else PlainEpisode(observation, action) for observation, action, early in motions]
+    return [
+        None if early else (torch.from_numpy(observation), torch.from_numpy(action))
+        for observation, action, early in motions
+    ]

@@ -9,14 +9,13 @@ What an expert (``Task.expert``) has to offer::
     finished          bool [n]: which episodes are over for the expert
     rules             RecordingRules, optional
 
-What an environment has to offer is told in :mod:`torchrl_koap.envs.registry`. One with ``raw_log()``, of a task with a
-converter, is recorded as D3IL does it (:class:`~torchrl_koap.data.RawEpisode`), any other one as what it observed and
-what was done (:class:`PlainEpisode`).
+What an environment has to offer is told in :mod:`torchrl_koap.envs.registry`. One of a task of D3IL with ``raw_log()``
+is recorded as D3IL's recorder does it: after the first substep of a control step, so that positions are 1 ms newer than
+those that were observed. Any other one is recorded as what it observed and what was done.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,9 +24,9 @@ import numpy as np
 import torch
 
 from torchrl_koap import keys
-from torchrl_koap.data import RawEpisode
-from torchrl_koap.data.d3il.conversion import get_converter
-from torchrl_koap.envs.contexts import yaw_quaternions
+from torchrl_koap.data.d3il.conversion import CONVERTERS, Converter
+from torchrl_koap.data.d3il.raw import RawEpisode
+from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.experts.disturbances import Disturbances
 from torchrl_koap.envs.registry import mode_index_of
 from torchrl_koap.lookup import resolve
@@ -37,28 +36,21 @@ FAULTS = ("collision", "unfinished", "mode", "close", "slow")
 
 
 @dataclass(frozen=True)
-class PlainEpisode:
-    """What an environment observed and what was done.
+class Attempt:
+    """What is kept of one attempt.
 
     Args:
-        observation (np.ndarray): ``[T + 1, obs]``.
-        action (np.ndarray): ``[T, act]``.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.recording import PlainEpisode
-        >>> len(PlainEpisode(observation=np.zeros((41, 4)), action=np.zeros((40, 2))))
-        40
+        frames (np.ndarray): float64 ``[T, obs]``.
+        actions (np.ndarray): float64 ``[T - 1, act]``.
+        steps (int): control steps that were played; one more than actions where D3IL's log was recorded, whose first
+            row is the state after the first of them.
+        fault (str): what went wrong, one of ``FAULTS``; empty if nothing did.
     """
 
-    observation: np.ndarray
-    action: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.action)
-
-
-Episode = RawEpisode | PlainEpisode
+    frames: np.ndarray
+    actions: np.ndarray
+    steps: int
+    fault: str = ""
 
 
 @dataclass(frozen=True)
@@ -66,9 +58,10 @@ class RecordingRules:
     """Which recordings of an expert are discarded, besides those without success or in another mode than asked for.
 
     Args:
-        most_rows (int, optional): longer recordings are discarded. Default: none is.
+        most_rows (int, optional): recordings of more control steps are discarded. Default: none is.
         touching (callable, optional): from the environment to where something forbidden is touched, bool ``[n]``.
-        clearance (callable, optional): from a recording to its least distance to what must not be touched (m).
+        clearance (callable, optional): from the frames ``[T, obs]`` of a recording to its least distance to what must
+            not be touched (m).
         least_clearance (float): nearer recordings are discarded (m).
 
     Examples:
@@ -79,7 +72,7 @@ class RecordingRules:
 
     most_rows: int | None = None
     touching: Callable[[Any], np.ndarray] | None = None
-    clearance: Callable[[Any], float] | None = None
+    clearance: Callable[[np.ndarray], float] | None = None
     least_clearance: float = 0.0
 
 
@@ -108,7 +101,7 @@ def play(
     *,
     rules: RecordingRules | None = None,
     disturbances: Disturbances | None = None,
-) -> list[tuple[Episode | None, str]]:
+) -> list[Attempt]:
     """Plays one attempt of the episodes ``rows``.
 
     Args:
@@ -125,13 +118,14 @@ def play(
         disturbances (Disturbances, optional): what changes the actions of the episodes that are played.
 
     Returns:
-        list: for each episode its recording and ``""``, or None and what went wrong, one of ``FAULTS``.
+        list of Attempt: one per episode that was played.
     """
     count, make = env.batch_size[0], expert_of(task)
     rules = rules or getattr(make, "rules", RecordingRules())
     placed = None if contexts is None else contexts[rows]
     expert = make(modes=modes, contexts=placed, seeds=seeds)
-    recorder = _RawRecorder(task) if task.converter is not None and hasattr(env, "raw_log") else _PlainRecorder()
+    converter = CONVERTERS.get(task.source) if isinstance(env, ManipulationEnv) else None
+    recorder = _PlainRecorder() if converter is None else _RawRecorder(converter)
     active = np.zeros(count, dtype=bool)
     active[rows] = True
     data = env.reset() if contexts is None else env.reset(contexts=contexts)
@@ -158,16 +152,16 @@ def play(
             break
     results = []
     for index, row in enumerate(rows):
-        episode = recorder.episode(row, lengths[row], None if placed is None else placed[index])
+        frames, actions = recorder.episode(row, lengths[row])
         faults = {
             "collision": touched[row],
             "unfinished": active[row] or not success[row],
             "mode": reached[row] != modes[index],
-            "close": rules.clearance is not None and rules.clearance(episode) < rules.least_clearance,
-            "slow": rules.most_rows is not None and len(episode) > rules.most_rows,
+            "close": rules.clearance is not None and rules.clearance(frames) < rules.least_clearance,
+            "slow": rules.most_rows is not None and lengths[row] > rules.most_rows,
         }
         fault = next((name for name in FAULTS if faults[name]), "")
-        results.append((None if fault else episode, fault))
+        results.append(Attempt(frames, actions, int(lengths[row]), fault))
     return results
 
 
@@ -183,36 +177,26 @@ class _PlainRecorder:
         self._frames.append(following.copy())
         self._actions.append(action)
 
-    def episode(self, row: int, length: int, context: np.ndarray | None) -> PlainEpisode:
+    def episode(self, row: int, length: int) -> tuple[np.ndarray, np.ndarray]:
         frames = np.stack([frame[row] for frame in self._frames[: length + 1]])
-        return PlainEpisode(frames, np.stack([action[row] for action in self._actions[:length]]))
+        return frames, np.stack([action[row] for action in self._actions[:length]])
 
 
 class _RawRecorder:
-    """Keeps what D3IL's recorder logs."""
+    """Keeps what D3IL's recorder logs, and converts it as its files are converted."""
 
-    def __init__(self, task: Task):
-        self._names = get_converter(task.name).objects
+    def __init__(self, converter: Converter):
+        self._converter = converter
         self._logs: list[tuple[dict, dict]] = []
 
     def add(self, env: Any, observation: np.ndarray, action: np.ndarray, following: np.ndarray) -> None:
         self._logs.append((env.raw_log(), env.raw_objects()))
 
-    def episode(self, row: int, length: int, context: np.ndarray | None) -> RawEpisode:
+    def episode(self, row: int, length: int) -> tuple[np.ndarray, np.ndarray]:
         logs = self._logs[:length]
-        robot = {name: np.stack([log[name][row] for log, _ in logs]) for name in logs[0][0]}
-        # simulated time, so that files are repeatable
-        robot["wall_clock"] = np.rint(robot["time_stamp"] * 1e9).astype(np.int64)
+        robot = {name: np.stack([log[name][row] for log, _ in logs]) for name in self._converter.robot}
         objects = {}
-        for name, own in zip(self._names, logs[0][1], strict=True):
+        for name, own in zip(self._converter.objects, logs[0][1], strict=True):
             poses = np.stack([poses[own][row] for _, poses in logs])
-            objects[name] = {"sim_step": robot["sim_step"], "pos": poses[:, :3], "quat": poses[:, 3:]}
-        return RawEpisode(robot=robot, objects=objects, context=None if context is None else _raw_context(context))
-
-
-def _raw_context(context: np.ndarray) -> list[list[np.ndarray]]:
-    """D3IL's way to write a context: position and yaw in deg, and a quaternion, for every object."""
-    return [
-        [np.array([x, y, math.degrees(yaw)]), quaternion]
-        for (x, y, yaw), quaternion in zip(context, yaw_quaternions(context[:, 2]), strict=True)
-    ]
+            objects[name] = {"pos": poses[:, :3], "quat": poses[:, 3:]}
+        return self._converter.convert(RawEpisode(robot=robot, objects=objects))

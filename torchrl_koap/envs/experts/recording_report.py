@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from torchrl_koap.envs.experts.disturbances import count_spells
-from torchrl_koap.envs.experts.recording import FAULTS, Episode
+from torchrl_koap.envs.experts.recording import FAULTS
 from torchrl_koap.tasks import Task
 
 
@@ -18,7 +20,8 @@ class Take:
 
     Args:
         index (int): number of the demonstration.
-        episode (Episode): the recording.
+        frames (np.ndarray): float64 ``[T, obs]``.
+        actions (np.ndarray): float64 ``[T - 1, act]``.
         mode (int): its mode.
         rows (int): its control steps.
         attempts (int): attempts it took, 1 if the first one was good.
@@ -34,7 +37,8 @@ class Take:
     """
 
     index: int
-    episode: Episode
+    frames: np.ndarray
+    actions: np.ndarray
     mode: int
     rows: int
     attempts: int

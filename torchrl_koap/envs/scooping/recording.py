@@ -3,20 +3,19 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from torchrl_koap.data.lerobot.images import LOCK, ImageEpisode, ImageEpisodeWriter
+from torchrl_koap.data.formats.lerobot_frames import ImageEpisode
+from torchrl_koap.data.formats.writers import LeRobotWriter
 from torchrl_koap.envs.contexts import draw_contexts
 from torchrl_koap.envs.mujoco.rendering import Renderer
 from torchrl_koap.envs.scooping.expert import HABITS, ScoopingExpert, start_joints
 from torchrl_koap.envs.scooping.kinematics import SpoonKinematics
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations
-from torchrl_koap.files import one_at_a_time
 from torchrl_koap.lookup import lookup
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, FRAME_HZ, IMAGE_SIZE, STARTS, start_of
@@ -149,7 +148,7 @@ def record_videos(
     *,
     task: Task | str = "scooping",
 ) -> VideoReport:
-    """Records demonstrations as a LeRobot data set with pictures; called again, it goes on where it was interrupted.
+    """Records demonstrations as a LeRobot data set with pictures.
 
     Args:
         folder (str or Path): folder to write.
@@ -162,43 +161,26 @@ def record_videos(
         task (Task or str): ``"scooping"`` or ``"scooping_moving_bowl"``.
 
     Raises:
-        FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.
-        LockedError: if another process records into the folder.
+        FileExistsError: if the folder is not empty.
         ValueError: for another embodiment, or a number out of range.
         RuntimeError: if there is no OpenGL library, pyarrow is missing, or the expert fails again and again.
     """
-    task, folder = get_task(task) if isinstance(task, str) else task, Path(folder)
+    task = get_task(task) if isinstance(task, str) else task
     _check(embodiment, episodes, seed)
-    with _alone_in(folder):
-        writer = ImageEpisodeWriter(
-            folder,
-            fps=FRAME_HZ,
-            state_names=("spoon_x", "spoon_y", "spoon_z", *task.observation_names[EMBEDDING_DIM + 3 :]),
-            action_names=task.action_names if embodiment == "robot" else (),
-            embodiment=embodiment,
-            task="take a piece out of the bowl with the spoon",
-            request={"task": task.name, "embodiment": embodiment, "episodes": episodes, "seed": seed},
-        )
-        done = len(writer.accounts)
-        if progress is not None and done:
-            progress(done, episodes)
-        for episode, played, scooped in play_episodes(embodiment, episodes, seed, task=task.name, first=done):
-            writer.add(episode, played=played, scooped=scooped)
-            if progress is not None:
-                progress(len(writer.accounts), episodes)
-        writer.close()
-    attempts = sum(each["played"] for each in writer.accounts)
-    again = sum(each["scooped"] > 1 for each in writer.accounts)
-    return VideoReport(embodiment, episodes, attempts, writer.num_frames, again)
-
-
-@contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """One process at a time in a folder, which is left as it was where nothing was written."""
-    with one_at_a_time(folder / LOCK, busy=f"another process records into {folder}"):
-        try:
-            yield
-        finally:
-            (folder / LOCK).unlink()
-            if not any(folder.iterdir()):
-                folder.rmdir()
+    writer = LeRobotWriter(
+        folder,
+        fps=FRAME_HZ,
+        state_names=("spoon_x", "spoon_y", "spoon_z", *task.observation_names[EMBEDDING_DIM + 3 :]),
+        action_names=task.action_names if embodiment == "robot" else (),
+        camera=f"observation.images.{CAMERA}",
+        embodiment=embodiment,
+        task="take a piece out of the bowl with the spoon",
+    )
+    attempts, frames, again = 0, 0, 0
+    for number, (episode, played, scooped) in enumerate(play_episodes(embodiment, episodes, seed, task=task.name), 1):
+        writer.add(episode.state, episode.action, frames=episode.frames)
+        attempts, frames, again = attempts + played, frames + len(episode.frames), again + int(scooped > 1)
+        if progress is not None:
+            progress(number, episodes)
+    writer.close()
+    return VideoReport(embodiment, episodes, attempts, frames, again)

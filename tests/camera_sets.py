@@ -1,0 +1,30 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Small LeRobot data sets that a camera saw."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_koap.data.formats.lerobot_frames import ImageEpisode
+from torchrl_koap.data.formats.writers import LeRobotWriter
+from torchrl_koap.tasks import get_task
+
+CAMERA = "observation.images.third_person"
+
+
+def episode(embodiment, length=6, seed=0):
+    generator = np.random.default_rng(seed)
+    frames = generator.integers(0, 256, (length + 1, 8, 8, 3), dtype=np.uint8)
+    action = generator.normal(size=(length, 7)) if embodiment == "robot" else None
+    return ImageEpisode(frames, generator.normal(size=(length + 1, 3)), action, embodiment)
+
+
+def write_camera_set(folder, embodiment, count=2, first=0):
+    actions = get_task("scooping").action_names if embodiment == "robot" else ()
+    writer = LeRobotWriter(
+        folder, fps=10, state_names="xyz", action_names=actions, camera=CAMERA, embodiment=embodiment, task="scoop"
+    )
+    for seed in range(first, first + count):
+        seen = episode(embodiment, 6 + seed, seed)
+        writer.add(seen.state, seen.action, frames=seen.frames)
+    return writer.close()

@@ -1,0 +1,82 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The format of a folder, file or name decides who reads it; what is written is read back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torchrl_koap.data import make_recordings, read_recordings, save_demonstrations, write_recordings
+from torchrl_koap.data.formats import FORMATS
+from torchrl_koap.files import DataError
+
+STATES, ACTIONS = ("x", "width", "y"), ("force", "turn")
+
+
+@pytest.fixture
+def recordings():
+    rng = np.random.default_rng(0)
+    states = [rng.normal(size=(length, 3)) for length in (5, 4, 7)]
+    actions = [rng.normal(size=(4, 2)), None, rng.normal(size=(6, 2))]
+    actions[2][3] = np.nan
+    return make_recordings(states, actions, state_names=STATES, action_names=ACTIONS, control_hz=20.0)
+
+
+def test_a_folder_of_tables(tmp_path):
+    np.savez(tmp_path / "a.npz", states=np.zeros((5, 2)), actions=np.ones((4, 1)))
+    assert read_recordings(tmp_path, control_hz=10).num_labels == 4
+    with pytest.raises(ValueError, match="observations: not an option for a folder of "):
+        read_recordings(tmp_path, control_hz=10, observations=["x"])
+
+
+def test_an_hdf5_file(tmp_path):
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed (extra 'hdf5')")
+    with h5py.File(tmp_path / "a.hdf5", "w") as stream:
+        stream["data/demo_0/obs/q"] = np.zeros((5, 2))
+        stream["data/demo_0/actions"] = np.ones((5, 1))
+    assert read_recordings(tmp_path / "a.hdf5", control_hz=10).state_names == ("q_0", "q_1")
+
+
+def test_nothing_to_read(tmp_path):
+    (tmp_path / "notes.txt").write_text("nothing")
+    with pytest.raises(ValueError, match="holds no recordings that can be read; there are readers for minari:NAME"):
+        read_recordings(tmp_path)
+    with pytest.raises(FileNotFoundError, match="none does not exist"):
+        read_recordings(tmp_path / "none")
+
+
+@pytest.mark.parametrize("kind", [name for name, form in FORMATS.items() if form.write is not None])
+def test_round_trip(kind, recordings, tmp_path):
+    if kind == "lerobot":
+        pytest.importorskip("pyarrow")
+    again = read_recordings(write_recordings(recordings, tmp_path / "demo", kind))
+    tolerance = 1e-6 if kind == "lerobot" else 0
+    assert len(again.states) == 3 and again.num_labels == 9 and again.control_hz == 20
+    for index in range(3):
+        np.testing.assert_allclose(again.states[index], recordings.states[index], rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(again.actions[index], recordings.actions[index], rtol=tolerance, atol=tolerance)
+    assert again.state_names == STATES and again.action_names == ACTIONS
+
+
+@pytest.mark.parametrize("below", ["", "ted"])
+def test_a_data_set_of_this_library(below, recordings, tmp_path):
+    save_demonstrations(tmp_path / "arm", recordings, robot=("x",))
+    again = read_recordings(tmp_path / "arm" / below)
+    assert (again.state_names, again.control_hz, again.num_labels) == (STATES, 20.0, 9)
+    np.testing.assert_allclose(again.states[2], recordings.states[2], rtol=1e-6)
+    np.testing.assert_allclose(again.actions[2], recordings.actions[2], rtol=1e-6)
+    with pytest.raises(ValueError, match="control_hz: not an option for a data set of this library"):
+        read_recordings(tmp_path / "arm", control_hz=3)
+
+
+def test_refusals_of_writing(recordings, tmp_path):
+    with pytest.raises(ValueError, match="unknown format 'lerobt'; did you mean 'lerobot'"):
+        write_recordings(recordings, tmp_path / "a", "lerobt")
+    with pytest.raises(ValueError, match="unknown format 'robomimic'"):
+        write_recordings(recordings, tmp_path / "a", "robomimic")
+    (tmp_path / "there").mkdir()
+    with pytest.raises(FileExistsError, match="there exists already"):
+        write_recordings(recordings, tmp_path / "there", "npz")
+    unknown = make_recordings([np.zeros((5, 1))], [np.zeros((4, 1))])
+    with pytest.raises(DataError, match="the rate is not known"):
+        write_recordings(unknown, tmp_path / "b", "lerobot")

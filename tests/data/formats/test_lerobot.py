@@ -1,0 +1,229 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""LeRobot data sets of robots that no task describes, with labels for a part of the rows or none."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+
+import numpy as np
+import pytest
+
+from torchrl_koap.data.formats.lerobot import is_lerobot, read_lerobot
+from torchrl_koap.files import DataError
+
+pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra lerobot)")
+pq = pytest.importorskip("pyarrow.parquet")
+
+JOINTS = [f"joint_{index}" for index in range(7)]
+FEATURES = {
+    "observation.state": {"dtype": "float32", "shape": [7], "names": {"motors": JOINTS}},
+    "observation.force": {"dtype": "float32", "shape": [1], "names": None},
+    "observation.images.front": {"dtype": "video", "shape": [48, 64, 3], "names": None},
+    "action": {"dtype": "float32", "shape": [7], "names": JOINTS},
+}
+
+
+def write(root, *, actions="all", features=None, rows=6, change=None, version="v3.0", lacking=()):
+    """Two episodes of a seven-joint arm; ``actions`` is "all", "none", "missing" or a list of rows without one.
+
+    In format 2.1 every episode has a file of its own; those ``lacking`` have no column of actions.
+    """
+    state = np.linspace(0, 1, 2 * rows * 7).reshape(-1, 7)
+    columns = {
+        "observation.state": pa.array(state.tolist(), pa.list_(pa.float32())),
+        "observation.force": pa.array(np.arange(2.0 * rows)),
+        "episode_index": pa.array(np.repeat([0, 1], rows)),
+        "frame_index": pa.array(np.tile(np.arange(rows), 2)),
+    }
+    if actions != "missing":
+        gaps = range(2 * rows) if actions == "none" else [] if actions == "all" else actions
+        steps = [None if row in gaps else [0.5] * 7 for row in range(2 * rows)]
+        columns["action"] = pa.array(steps, pa.list_(pa.float32()))
+    columns |= change or {}
+    (root / "data/chunk-000").mkdir(parents=True)
+    (root / "meta").mkdir()
+    table = pa.table(columns)
+    if version == "v3.0":
+        pq.write_table(table, root / "data/chunk-000/file-000.parquet")
+    for episode in range(2) if version == "v2.1" else ():
+        part = table.slice(episode * rows, rows)
+        part = part.drop_columns(["action"]) if episode in lacking else part
+        pq.write_table(part, root / f"data/chunk-000/episode_{episode:06d}.parquet")
+    info = {"codebase_version": version, "fps": 30, "total_episodes": 2, "features": features or FEATURES}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    return root
+
+
+def test_names_rate_and_images(tmp_path):
+    recordings = read_lerobot(write(tmp_path))
+    assert recordings.state_names == (*JOINTS, "force") and recordings.action_names == tuple(JOINTS)
+    assert recordings.control_hz == 30 and recordings.skipped == ("observation.images.front",)
+    assert [frames.shape for frames in recordings.states] == [(6, 8), (6, 8)] and recordings.num_labels == 10
+
+
+VERSIONS = pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+
+
+@VERSIONS
+def test_actions_for_a_part_of_the_rows(version, tmp_path):
+    recordings = read_lerobot(write(tmp_path, actions=[1, *range(6, 12)], version=version))
+    assert recordings.num_labels == 4
+    assert np.isnan(recordings.actions[0][1]).all() and np.isnan(recordings.actions[1]).all()
+
+
+@VERSIONS
+@pytest.mark.parametrize("actions", ["none", "missing"])
+def test_no_actions_at_all(actions, version, tmp_path):
+    recordings = read_lerobot(write(tmp_path, actions=actions, version=version))
+    assert recordings.num_labels == 0 and recordings.actions[0].shape == (5, 7)
+
+
+@VERSIONS
+def test_nan_rows_have_no_label(version, tmp_path):
+    steps = np.full((12, 7), 0.5)
+    steps[3] = np.nan
+    recordings = read_lerobot(write(tmp_path, change={"action": pa.array(steps.tolist())}, version=version))
+    assert recordings.num_labels == 9
+
+
+def test_an_episode_whose_file_has_no_actions(tmp_path):
+    recordings = read_lerobot(write(tmp_path, version="v2.1", lacking=[1]))
+    assert recordings.num_labels == 5 and np.isnan(recordings.actions[1]).all()
+
+
+@VERSIONS
+def test_pictures_inside_the_tables_are_listed_and_skipped(version, tmp_path):
+    features = FEATURES | {"observation.images.wrist": {"dtype": "image", "shape": [4, 4, 3], "names": None}}
+    pictures = pa.array([{"bytes": b"png", "path": None}] * 12)
+    root = write(tmp_path, features=features, change={"observation.images.wrist": pictures}, version=version)
+    recordings = read_lerobot(root)
+    assert recordings.skipped == ("observation.images.front", "observation.images.wrist")
+    assert recordings.state_names == (*JOINTS, "force")
+
+
+def test_chosen_features(tmp_path):
+    recordings = read_lerobot(write(tmp_path), observations=["observation.force"])
+    assert recordings.state_names == ("force",)
+
+
+def test_faults(tmp_path):
+    root = write(tmp_path)
+    with pytest.raises(DataError, match="'observation.images.front' is an image .video.: embed it first"):
+        read_lerobot(root, observations=["observation.images.front"])
+    with pytest.raises(DataError, match="has no feature 'observation.sate'; it has observation.state, "):
+        read_lerobot(root, observations=["observation.sate"])
+    with pytest.raises(FileNotFoundError, match="no LeRobot data set"):
+        read_lerobot(tmp_path / "none")
+
+
+def test_a_silent_description_of_missing_actions(tmp_path):
+    features = {name: feature for name, feature in FEATURES.items() if name != "action"}
+    with pytest.raises(DataError, match="info.json does not say how many columns an action has"):
+        read_lerobot(write(tmp_path, actions="missing", features=features))
+
+
+def edited(name, edit):
+    """A change of one column, given as a list of its rows."""
+
+    def change(table):
+        rows, position = table[name].to_pylist(), table.column_names.index(name)
+        return table.set_column(position, name, pa.array(edit(rows)))
+
+    return change
+
+
+def put(row, value):
+    return lambda rows: [*rows[:row], value(rows[row]) if callable(value) else value, *rows[row + 1 :]]
+
+
+FILES = [
+    (lambda t: t.drop_columns("observation.state"), "FILE: missing column 'observation.state'; the file has observ"),
+    (
+        edited("observation.state", put(3, lambda row: [np.nan, *row[1:]])),
+        "trajectory episode 1: states are not finite",
+    ),
+    (edited("observation.state", put(3, None)), "trajectory episode 1: states are not finite at frame 3"),
+    (
+        edited("action", put(2, lambda row: [np.inf, *row[1:]])),
+        "trajectory episode 1: the action of step 2 is infinite",
+    ),
+    (edited("action", put(5, lambda row: row[:1])), "FILE: column 'action' has rows of 1 and 7 numbers"),
+    (edited("action", lambda rows: ["up"] * len(rows)), "FILE: column 'action' must hold numbers or lists of numbers"),
+    (edited("action", lambda rows: [1.0] * len(rows)), "FILE: column 'action' holds numbers, that of another file"),
+    (lambda t: t.slice(0, 0), "1 episodes are missing: 1"),
+    (lambda t: t.slice(0, 4), "FILE: episode 1 has 4 rows, its description says 6"),
+    (
+        edited("frame_index", lambda rows: [row + 1 for row in rows]),
+        "FILE: column 'frame_index' of episode 1 must count 0, 1, 2, ...",
+    ),
+    (edited("observation.state", lambda rows: [row[:3] for row in rows]), "'observation.state' has rows of 3 and 7"),
+]
+
+
+@pytest.mark.parametrize(("change", "problem"), FILES)
+def test_faults_name_file_and_column(change, problem, tmp_path):
+    root = write(tmp_path, version="v2.1")
+    lines = [json.dumps({"episode_index": number, "length": 6}) for number in range(2)]
+    (root / "meta/episodes.jsonl").write_text("\n".join(lines))
+    file = root / "data/chunk-000/episode_000001.parquet"
+    pq.write_table(change(pq.read_table(file)), file)
+    with pytest.raises(DataError) as caught:
+        read_lerobot(root)
+    (found,) = caught.value.problems
+    assert problem.replace("FILE", str(file)) in found
+
+
+def test_faults_of_all_files_come_together(tmp_path):
+    root = write(tmp_path, version="v2.1")
+    first, second = sorted((root / "data").rglob("*.parquet"))
+    first.write_bytes(b"PAR1 no more")
+    pq.write_table(pq.read_table(second).drop_columns(["observation.force", "frame_index"]), second)
+    with pytest.raises(DataError) as caught:
+        read_lerobot(root)
+    assert [problem.split(":")[0] for problem in caught.value.problems] == [str(first), str(second), str(second)]
+    assert "cannot be read" in caught.value.problems[0]
+
+
+def test_missing_episodes_are_told(tmp_path):
+    root = write(tmp_path, version="v2.1")
+    (root / "data/chunk-000/episode_000000.parquet").unlink()
+    with pytest.raises(DataError, match="1 episodes are missing: 0"):
+        read_lerobot(root)
+    listed = pa.table({"episode_index": [1, 7], "length": [6, 6]})
+    (root / "meta/episodes/chunk-000").mkdir(parents=True)
+    pq.write_table(listed, root / "meta/episodes/chunk-000/file-000.parquet")
+    with pytest.raises(DataError, match="1 episodes are missing: 7"):
+        read_lerobot(root)
+
+
+def test_one_row_is_too_short(tmp_path):
+    with pytest.raises(DataError, match="trajectory episode 0: 1 frame; a transition needs two"):
+        read_lerobot(write(tmp_path, rows=1))
+
+
+def test_descriptions_that_are_none(tmp_path):
+    assert not is_lerobot(tmp_path)
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta/info.json").write_text(json.dumps({"features": FEATURES}))
+    with pytest.raises(FileNotFoundError, match=r"no \*\.parquet below"):
+        read_lerobot(tmp_path)
+    root = write(tmp_path / "set")
+    for text, message in (
+        ("{", "info.json cannot be used: it is no JSON"),
+        ("[1]", "must hold a dictionary, got list"),
+    ):
+        (root / "meta/info.json").write_text(text)
+        with pytest.raises(DataError, match=message):
+            read_lerobot(root)
+    root = write(tmp_path / "other")
+    (root / "meta/episodes.jsonl").write_text('{"episode_index": 0}')
+    with pytest.raises(DataError, match="list of its episodes cannot be read"):
+        read_lerobot(root)
+
+
+def test_without_pyarrow_the_extra_is_named(tmp_path, monkeypatch):
+    root, find_spec = write(tmp_path), importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pyarrow" else find_spec(name))
+    with pytest.raises(RuntimeError, match=r"pip install 'torchrl_koap\[lerobot\]'"):
+        read_lerobot(root)

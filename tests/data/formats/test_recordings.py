@@ -1,0 +1,79 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Arrays as recordings: what is a label, and one clear message per fault."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.data.formats.recordings import make_recordings
+from torchrl_koap.files import DataError
+
+FRAMES = np.arange(15.0).reshape(5, 3)
+
+
+def test_one_action_per_frame_or_per_transition():
+    steps = np.arange(10.0).reshape(5, 2)
+    recordings = make_recordings([FRAMES, FRAMES], [steps, steps[:4]])
+    assert all(np.array_equal(kept, steps[:4]) for kept in recordings.actions)
+    assert recordings.state_names == ("state_0", "state_1", "state_2")
+
+
+def test_what_has_no_label():
+    steps = np.ones((4, 2))
+    steps[1, 0] = np.nan  # half an action is none
+    recordings = make_recordings([FRAMES, FRAMES, FRAMES], [None, steps, np.full((5, 2), np.nan)])
+    assert recordings.num_labels == 3
+    assert np.isnan(recordings.actions[1][1]).all() and np.isnan(recordings.actions[0]).all()
+    assert recordings.actions[0].shape == (4, 2)
+
+
+def test_no_labels_at_all_needs_their_width():
+    assert make_recordings([FRAMES], action_dim=7).actions[0].shape == (4, 7)
+    assert make_recordings([FRAMES], action_names=["a", "b"]).actions[0].shape == (4, 2)
+    with pytest.raises(DataError, match="action_dim says how many columns"):
+        make_recordings([FRAMES])
+
+
+def test_tensors_are_arrays_too():
+    recordings = make_recordings([torch.from_numpy(FRAMES).float().requires_grad_()], [torch.ones(4, 1)])
+    assert recordings.states[0].dtype == np.float64 and recordings.num_labels == 4
+
+
+def with_nan(array):
+    array = array.copy()
+    array[2, 1] = np.nan
+    return array
+
+
+@pytest.mark.parametrize(
+    ("states", "actions", "options", "message"),
+    [
+        ([], None, {}, "there are no trajectories"),
+        ([FRAMES], [None, None], {}, "1 trajectories of states, 2 of actions"),
+        ([FRAMES, FRAMES[:, :2]], None, {"action_dim": 1}, "trajectory 1: states have 2 columns, those before have 3"),
+        ([FRAMES[:1]], [None], {"action_dim": 1}, "trajectory 0: 1 frame; a transition needs two"),
+        ([FRAMES.astype(int)], [np.ones((4, 1))], {}, "trajectory 0: states are int64; wanted floating-point numbers"),
+        ([FRAMES[0]], [np.ones((4, 1))], {}, r"trajectory 0: states must be \[T, d\], got \[3\]"),
+        ([with_nan(FRAMES)], [np.ones((4, 1))], {}, r"not finite at frame 2, columns \[1\]"),
+        ([FRAMES], [np.full((4, 1), np.inf)], {}, "the action of step 0 is infinite; NaN means that it is unknown"),
+        ([FRAMES], [np.ones((3, 1))], {}, r"3 actions for 5 frames; wanted one per frame \(5\) or one per"),
+        ([FRAMES], [np.ones(4)], {}, r"actions must be \[T, a\] or \[T - 1, a\], got \[4\]"),
+        ([FRAMES], [np.array([["x"]] * 4)], {}, "wanted numbers"),
+        ([FRAMES, FRAMES], [np.ones((4, 1)), np.ones((4, 2))], {}, "trajectory 1: actions have 2 columns"),
+        ([FRAMES], [np.ones((4, 1))], {"action_dim": 3}, "actions have 1 columns, action_dim says 3"),
+        ([FRAMES], [np.ones((4, 1))], {"state_names": ["a", "b"]}, "state_names names 2 columns, there are 3"),
+        ([FRAMES], [np.ones((4, 1))], {"state_names": ["a", "b", "a"]}, "state_names holds a more than once"),
+        ([FRAMES], [np.ones((4, 1))], {"control_hz": 0}, "control_hz must be a positive number"),
+    ],
+)
+def test_faults_are_named(states, actions, options, message):
+    with pytest.raises(DataError, match=message):
+        make_recordings(states, actions, **options)
+
+
+def test_all_faults_are_told_at_once():
+    with pytest.raises(DataError) as caught:
+        make_recordings([FRAMES[:1], FRAMES.astype(int)], [None, np.ones((9, 1))], sources=["left", "right"])
+    assert len(caught.value.problems) == 2 and "trajectory left" in str(caught.value)

@@ -1,0 +1,77 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""HDF5 files in robomimic's layout."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from torchrl_koap.data.formats.robomimic import read_robomimic
+from torchrl_koap.files import DataError
+
+h5py = pytest.importorskip("h5py", reason="h5py is not installed (extra 'hdf5')")
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "low_dim.hdf5"
+    with h5py.File(path, "w") as stream:
+        data = stream.create_group("data")
+        data.attrs["env_args"] = json.dumps({"env_name": "Lift", "env_kwargs": {"control_freq": 20}})
+        for index, length in ((10, 5), (2, 4)):
+            demo = data.create_group(f"demo_{index}")
+            demo["obs/eef"] = np.full((length, 3), float(index))
+            demo["obs/width"] = np.arange(float(length))
+            demo["obs/camera"] = np.zeros((length, 4, 4, 3), np.uint8)
+            if index == 2:
+                demo["actions"] = np.ones((length, 7))
+    return path
+
+
+def test_demonstrations_in_the_order_of_their_numbers(file):
+    recordings = read_robomimic(file)
+    assert recordings.sources == ("demo_2", "demo_10") and recordings.control_hz == 20
+    assert recordings.state_names == ("eef_0", "eef_1", "eef_2", "width")
+    assert recordings.skipped == ("camera",)
+    assert recordings.num_labels == 3 and np.isnan(recordings.actions[1]).all()
+    np.testing.assert_array_equal(recordings.states[0][:, 3], np.arange(4.0))
+
+
+def test_chosen_observations(file):
+    assert read_robomimic(file, observations=["width", "eef"]).state_names[0] == "width"
+
+
+def test_the_frame_behind_the_last_action(file):
+    with h5py.File(file, "a") as stream:
+        demo = stream["data/demo_2"]
+        demo["next_obs/eef"], demo["next_obs/width"] = np.full((4, 3), 7.0), np.arange(1.0, 5.0)
+    recordings = read_robomimic(file)
+    assert len(recordings.states[0]) == 5 and recordings.num_labels == 4
+    assert recordings.states[0][-1].tolist() == [7, 7, 7, 4]
+
+
+def test_faults(file, tmp_path):
+    with pytest.raises(DataError, match="data/demo_2/obs has no entry 'arm'; it has camera, eef, width"):
+        read_robomimic(file, observations=["arm"])
+    with pytest.raises(DataError, match=r"camera is \[4, 4, 4, 3\]: an image cannot be part of the state"):
+        read_robomimic(file, observations=["camera"])
+    with h5py.File(file, "a") as stream:
+        del stream["data/demo_10/obs"]
+        del stream["data"].attrs["env_args"]
+    with pytest.raises(DataError, match="data/demo_10 has no group 'obs'"):
+        read_robomimic(file)
+    (tmp_path / "text.hdf5").write_text("text")
+    with pytest.raises(DataError, match="no HDF5 file"):
+        read_robomimic(tmp_path / "text.hdf5")
+    with pytest.raises(FileNotFoundError):
+        read_robomimic(tmp_path / "none.hdf5")
+
+
+def test_a_rate_has_to_come_from_somewhere(file):
+    with h5py.File(file, "a") as stream:
+        del stream["data"].attrs["env_args"]
+    with pytest.raises(DataError, match="pass control_hz"):
+        read_robomimic(file)
+    assert read_robomimic(file, control_hz=10).control_hz == 10

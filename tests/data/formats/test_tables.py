@@ -1,0 +1,149 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Folders of NumPy archives, CSV and parquet files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torchrl_koap.data.formats.tables import read_tables
+from torchrl_koap.files import DataError
+
+FRAMES = np.linspace(0, 1, 12).reshape(6, 2)
+
+
+def write_csv(file, columns):
+    header, rows = ",".join(columns), zip(*columns.values(), strict=True)
+    file.write_text("\n".join([header, *(",".join("" if v is None else str(v) for v in row) for row in rows)]) + "\n")
+
+
+def columns_of(rows=6, **more):
+    time = [round(0.02 * row, 4) for row in range(rows)]
+    columns = {"timestamp": time, "x": FRAMES[:rows, 0].tolist(), "y": FRAMES[:rows, 1].tolist()}
+    return columns | more
+
+
+def test_archives(tmp_path):
+    np.savez(tmp_path / "a.npz", observation=FRAMES, action=np.ones((5, 3)), control_hz=25, state_names=["x", "y"])
+    np.savez(tmp_path / "b.npz", observation=FRAMES[:4])
+    recordings = read_tables(tmp_path)
+    assert recordings.control_hz == 25 and recordings.state_names == ("x", "y")
+    assert [len(frames) for frames in recordings.states] == [6, 4] and recordings.num_labels == 5
+    assert recordings.sources == ("a.npz", "b.npz")
+
+
+def test_csv_with_gaps_in_its_labels(tmp_path):
+    write_csv(tmp_path / "run.csv", columns_of(action_vx=[0.5, None, 0.25, 0.5, 1.0, 9.0]))
+    recordings = read_tables(tmp_path)
+    assert recordings.control_hz == pytest.approx(50)
+    assert recordings.state_names == ("x", "y") and recordings.action_names == ("action_vx",)
+    np.testing.assert_array_equal(recordings.actions[0][:, 0], [0.5, np.nan, 0.25, 0.5, 1.0])
+    np.testing.assert_allclose(recordings.states[0], FRAMES)
+
+
+def test_named_action_columns_and_episodes(tmp_path):
+    columns = columns_of(vx=[1.0] * 6, episode=[0, 0, 0, 1, 1, 1])
+    columns["timestamp"] = [0.0, 0.1, 0.2] * 2
+    write_csv(tmp_path / "run.csv", columns)
+    recordings = read_tables(tmp_path, action_columns=["vx"])
+    assert recordings.control_hz == pytest.approx(10) and recordings.sources == ("run.csv[0]", "run.csv[1]")
+    assert [steps.shape for steps in recordings.actions] == [(2, 1), (2, 1)]
+
+
+def test_archives_have_no_columns_to_name(tmp_path):
+    np.savez(tmp_path / "a.npz", states=np.zeros((5, 2)), actions=np.ones((4, 1)), control_hz=30.0)
+    with pytest.raises(ValueError, match=r"action_columns: not an option for NumPy archives \(a.npz\)"):
+        read_tables(tmp_path, action_columns=["action_0"])
+
+
+def test_parquet_is_read_as_csv_is(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")
+    parquet = pytest.importorskip("pyarrow.parquet")
+
+    actions = [[0.1, 0.2]] * 5 + [None]
+    table = pyarrow.table(columns_of(action=actions, frame_index=list(range(6))))
+    parquet.write_table(table, tmp_path / "run.parquet")
+    recordings = read_tables(tmp_path)
+    assert recordings.action_names == ("action_0", "action_1") and recordings.state_names == ("x", "y")
+    assert recordings.num_labels == 5
+    np.testing.assert_allclose(recordings.states[0], FRAMES)
+
+
+def test_what_is_not_read_is_named(tmp_path):
+    extra = {"obs": np.ones((6, 3)), "reward": np.zeros(5)}
+    np.savez(tmp_path / "a.npz", states=FRAMES, actions=np.ones((5, 1)), control_hz=30.0, **extra)
+    recordings = read_tables(tmp_path)
+    assert recordings.skipped == ("obs", "reward") and recordings.states[0].shape == FRAMES.shape
+
+
+def test_columns_of_text_are_named(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed (extra 'lerobot')")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    parquet.write_table(pyarrow.table(columns_of(action=[0.1] * 6, phase=["reach"] * 6)), tmp_path / "run.parquet")
+    recordings = read_tables(tmp_path)
+    assert recordings.skipped == ("phase",) and recordings.state_names == ("x", "y")
+
+
+def test_faults_of_all_files_are_named(tmp_path):
+    np.savez(tmp_path / "a.npz", pictures=FRAMES)
+    (tmp_path / "b.csv").write_text("x,y\n1,2\n3\n")
+    (tmp_path / "c.csv").write_text("x,y\n1,left\n3,4\n")
+    (tmp_path / "d.parquet").write_bytes(b"no parquet")
+    with pytest.raises(DataError) as caught:
+        read_tables(tmp_path)
+    text = str(caught.value)
+    assert "a.npz: has no states: wanted one of states" in text and "it holds pictures" in text
+    assert "b.csv: row 3 has 1 fields, the header has 2" in text
+    assert "c.csv: row 2, column 'y': 'left' is no number" in text
+    assert "d.parquet: cannot be read" in text
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"x": [0.0, 1.0]}, "no file has time stamps"),
+        ({"x": [0.0, 1.0, 2.0], "time": [0.0, 0.1, 0.5]}, "0.1 to 0.4 s apart; resample"),
+        ({"x": [0.0, 1.0], "time": [0.1, 0.0]}, "time stamps do not increase"),
+        ({"action": [0.0, 1.0], "time": [0.0, 0.1]}, "has no state columns, only action, time"),
+    ],
+)
+def test_tables_without_a_rate_or_states(columns, message, tmp_path):
+    write_csv(tmp_path / "run.csv", columns)
+    with pytest.raises(DataError, match=message):
+        read_tables(tmp_path)
+
+
+def test_a_rate_that_is_given_needs_no_time_stamps(tmp_path):
+    write_csv(tmp_path / "run.csv", {"x": [0.0, 1.0], "action": [0.0, 1.0]})
+    assert read_tables(tmp_path, control_hz=30).control_hz == 30
+    with pytest.raises(DataError, match="unknown action column 'akcion'; did you mean 'action'"):
+        read_tables(tmp_path, control_hz=30, action_columns=["akcion"])
+
+
+def test_other_columns_in_another_file(tmp_path):
+    write_csv(tmp_path / "a.csv", columns_of())
+    write_csv(tmp_path / "b.csv", {"timestamp": [0.0, 0.02], "y": [0.0, 1.0], "x": [0.0, 1.0]})
+    with pytest.raises(DataError, match="b.csv: state columns are y, x; those of a.csv are x, y"):
+        read_tables(tmp_path)
+
+
+def test_an_empty_folder(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no"):
+        read_tables(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK no archive", b"\x93NUMPY"])
+def test_damaged_archives_are_named(content, tmp_path):
+    (tmp_path / "a.npz").write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.npz: "):
+        read_tables(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [("time,x,y,x", "columns 2 and 4 are both named 'x'"), (",time,x,y", "column 1 has no name; is it the index")],
+)
+def test_columns_that_would_be_lost_are_refused(header, message, tmp_path):
+    (tmp_path / "a.csv").write_text(header + "\n0,0.1,1,2\n1,0.2,1,2\n")
+    with pytest.raises(DataError, match=message):
+        read_tables(tmp_path)

@@ -1,0 +1,50 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Demonstrations that are right in form and unlikely: each warning names its trajectory."""
+
+from __future__ import annotations
+
+import shutil
+
+import torch
+from tiny_runs import koap, write_demonstrations
+
+from torchrl_koap.data import flatten_trajectories
+from torchrl_koap.data.quality import find_warnings
+
+PATH = torch.arange(12.0).reshape(6, 2)
+ACTIONS = torch.ones(5, 1)
+
+
+def warnings(observations, actions, **options):
+    return find_warnings(flatten_trajectories(observations, actions), units=["m", "m"], **options)
+
+
+def test_sound_demonstrations_raise_none():
+    assert warnings([PATH, PATH + 1, PATH], [ACTIONS, ACTIONS, 2 * ACTIONS]) == []
+
+
+def test_each_warning_is_said_once_and_names_its_trajectory():
+    names = [f"{letter}.pkl" for letter in "abcdef"]
+    paths = [PATH, PATH, PATH * 0, PATH * 1e37, PATH + 1, PATH + 2]
+    actions = [ACTIONS, ACTIONS, ACTIONS, ACTIONS, 0 * ACTIONS, None]
+    assert warnings(paths, actions, names=names, columns=["x", "y"]) == [
+        "b.pkl repeats a.pkl: every step is the same",
+        "c.pkl: nothing moves in its 5 steps",
+        "d.pkl: x reaches 8e+37 m",
+        "e.pkl: all 5 labelled actions are zero",
+    ]
+
+
+def test_columns_without_a_unit_are_not_looked_at():
+    data = flatten_trajectories([PATH * 1e6, PATH], [ACTIONS, ACTIONS])
+    assert find_warnings(data) == [] and len(find_warnings(data, units=["", "rad"])) == 1
+
+
+def test_validate_names_the_files(tmp_path, capsys):
+    folder = write_demonstrations(tmp_path / "data")
+    assert koap("validate", folder) == 0
+    assert "no problem found\n" in capsys.readouterr().out
+    shutil.copy(folder / "env_000_00.pkl", folder / "env_900_00.pkl")
+    assert koap("validate", folder) == 0
+    said = capsys.readouterr().out
+    assert "env_900_00.pkl repeats" in said and "no problem found, 1 warning(s)" in said

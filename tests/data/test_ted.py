@@ -1,0 +1,144 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Data sets on disk: what is saved is loaded, with its task; damage and code are refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.data import (
+    LabelBudget,
+    flatten_trajectories,
+    load_ted,
+    make_demonstrations,
+    read_about,
+    save_ted,
+    select_state,
+)
+from torchrl_koap.files import DataError
+from torchrl_koap.keys import LayoutError
+from torchrl_koap.tasks import get_task
+
+AVOIDING = get_task("avoiding")
+
+
+def recorded(lengths=(4, 7), dtype=torch.float32):
+    generator = torch.Generator().manual_seed(1)
+    return flatten_trajectories(
+        [torch.randn(length + 1, 4, generator=generator) for length in lengths],
+        [torch.randn(length, 2, generator=generator) for length in lengths],
+        dtype=dtype,
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_saved_data_sets(tmp_path, dtype):
+    data = select_state(recorded(dtype=dtype), AVOIDING.state_of)
+    path = save_ted(data, tmp_path / "demos", AVOIDING, notes={"expert": "scripted"})
+    loaded, task = load_ted(path)
+    assert (loaded == data).all() and loaded["action"].dtype == dtype and task is AVOIDING
+    assert set(loaded.keys(True, True)) == set(data.keys(True, True))
+    about = read_about(path)
+    assert about["lengths"] == [4, 7] and about["notes"] == {"expert": "scripted"}
+    assert about["trajectories"] == 2 and about["steps"] == about["labelled_steps"] == 11
+    assert sorted(file.name for file in path.iterdir()) == ["about.json", "steps.safetensors"]
+    save_ted(data[:4], path, AVOIDING)  # replaces the earlier one
+    assert load_ted(path)[0].shape == (4,)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["demos"]
+
+
+def test_partially_labelled_data(tmp_path):
+    data, _ = LabelBudget(1).apply(recorded(), command=slice(0, 2))
+    path = save_ted(data, tmp_path / "demos", AVOIDING)
+    loaded, _ = load_ted(path)
+    assert torch.equal(loaded["action"].isnan(), data["action"].isnan())
+    assert torch.equal(loaded["observation"].nan_to_num(7), data["observation"].nan_to_num(7))
+    found, labelled = read_about(path)["statistics"]["action"], data["action"][data["has_action"].squeeze(-1)].double()
+    assert found["mean"] == pytest.approx(labelled.mean(0).tolist(), abs=1e-12)
+    assert found["std"] == pytest.approx(labelled.std(0, correction=0).tolist(), abs=1e-12)
+    assert found["min"] == labelled.amin(0).tolist() and found["max"] == labelled.amax(0).tolist()
+
+
+def test_a_task_of_plain_facts_comes_along(tmp_path):
+    data, task = make_demonstrations([np.zeros((9, 2))], control_hz=30, action_dim=7, name="doctest_bench_arm")
+    assert load_ted(save_ted(data, tmp_path / "ted", task))[1] == task
+
+
+def test_save_refuses(tmp_path):
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "thesis.txt").write_text("years")
+    with pytest.raises(FileExistsError, match="left as it is"):
+        save_ted(recorded(), tmp_path / "work", AVOIDING)
+    with pytest.raises(TypeError, match="only tensors can be saved, .'note'. are none"):
+        save_ted(recorded().set_non_tensor("note", "text"), tmp_path / "other", AVOIDING)
+    with pytest.raises(LayoutError):
+        save_ted(recorded().exclude("action"), tmp_path / "other", AVOIDING)
+    with pytest.raises(DataError, match="holds no data set"):
+        load_ted(tmp_path / "work")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["work"]
+
+
+def test_a_full_disk_leaves_the_earlier_data_set(tmp_path, monkeypatch):
+    from torchrl_koap.data import ted
+
+    path = save_ted(recorded(), tmp_path / "demos", AVOIDING)
+
+    def full(tensors, file):
+        file.write_bytes(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ted, "save_file", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_ted(recorded((3,)), path, AVOIDING)
+    assert len(load_ted(path)[0]) == 11 and list(tmp_path.iterdir()) == [path]
+
+
+def change(path, **entries):
+    about = json.loads((path / "about.json").read_text())
+    (path / "about.json").write_text(json.dumps(about | entries))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: (path / "about.json").write_text("{"), "about.json cannot be used"),
+        (lambda path: (path / "about.json").unlink(), "about.json is missing"),
+        (lambda path: (path / "steps.safetensors").unlink(), "steps.safetensors cannot be used: it is missing"),
+        (
+            lambda path: (path / "steps.safetensors").write_bytes(b"1"),
+            "steps.safetensors cannot be used: it was changed",
+        ),
+        (lambda path: change(path, format=1), "no description of a data set in format 2"),
+        (lambda path: change(path, steps=5), "its entries do not have 5 steps"),
+        (lambda path: change(path, lengths="many"), "says nothing of lengths"),
+        (lambda path: change(path, definition={"name": "x"}), "about.json cannot be used: the task is damaged"),
+        (lambda path: change(path, definition=AVOIDING.to_json()), "names code in env, expert, .*register it by"),
+    ],
+)
+def test_damage_is_named(damage, message, tmp_path):
+    path = save_ted(recorded(), tmp_path / "demos", AVOIDING)
+    damage(path)
+    with pytest.raises(DataError, match=message):
+        load_ted(path)
+
+
+def test_a_forged_checksum_does_not_let_anything_in(tmp_path):
+    from torchrl_koap.files import sha256_of
+
+    path = save_ted(recorded(), tmp_path / "demos", AVOIDING)
+    content = (path / "steps.safetensors").read_bytes()
+    for forged in (content[:-8], content[:8] + b"[" + content[9:], b"\xff" * 20):
+        (path / "steps.safetensors").write_bytes(forged)
+        change(path, sha256=sha256_of(path / "steps.safetensors"))
+        with pytest.raises(DataError, match="steps.safetensors cannot be used"):
+            load_ted(path)
+
+
+def test_a_task_that_nobody_registered(tmp_path):
+    path = save_ted(recorded(), tmp_path / "demos", AVOIDING)
+    change(path, task="avoidng")
+    with pytest.raises(ValueError, match="unknown task 'avoidng'; did you mean 'avoiding'"):
+        load_ted(path)

@@ -1,0 +1,229 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap demos``, ``koap convert`` and ``koap validate``: data are recorded, brought in, and looked at."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from torchrl_koap.commands.command import Command
+from torchrl_koap.data import open_dataset, read_about, read_recordings, save_demonstrations, write_recordings
+from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
+from torchrl_koap.data.quality import find_warnings
+from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
+from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE
+from torchrl_koap.envs.experts.recording import expert_of
+from torchrl_koap.envs.experts.recording_report import RecordingReport
+from torchrl_koap.envs.scooping.recording import VideoReport, record_videos
+from torchrl_koap.keys import validate
+from torchrl_koap.lookup import lookup
+from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.runs.progress import count_up_to, progress_bar
+from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.training.datasets import find_task_of
+
+_READING = ("control_hz", "observations", "action_columns", "action_dim")
+_DESCRIBING = ("name", "robot", "command", "action_kind", "targets", "action_units", "state_units", "max_steps")
+
+
+@dataclass(kw_only=True)
+class Demos(Command):
+    """Record scripted demonstrations.
+
+    Every demonstration is written as it comes (OUT/unfinished); the same command goes on with an interrupted recording.
+
+    Attributes:
+        out: folder to write, for `koap train --dataset`. Must not hold demonstrations yet.
+        task: name of the task.
+        episodes: number of demonstrations, spread evenly over the modes (default: that of the task).
+        seed: seed of the experts' variation.
+        threads: simulator threads.
+        batch_size: episodes played at once; the demonstrations do not depend on it.
+        disturbance: share of the demonstrations in which the expert is disturbed now and then (pushes, slips, late
+            turns, a height that drifts); those from which it recovers are kept, and OUT/ted/about.json says how often
+            it did (default: that of the task).
+        embodiment: of a task that is recorded by a camera, "robot" (with actions) or "hand" (frames alone); OUT is then
+            a LeRobot data set with pictures, for `koap embed`.
+        plugins: modules that register tasks; imported before anything else.
+    """
+
+    out: Path
+    task: str = "avoiding"
+    episodes: int | None = None
+    seed: int = 0
+    threads: int = 2
+    batch_size: int = BATCH_SIZE
+    disturbance: float | None = None
+    embodiment: str | None = None
+    plugins: Plugins = ()
+
+    def __call__(self) -> RecordingReport | VideoReport:
+        """Records and writes; returns what it took.
+
+        Raises:
+            FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.
+            ValueError: if the task has no environment or no scripted expert.
+            RecordingError: if the expert fails again and again.
+        """
+        load_plugins(self.plugins)
+        task = get_task(self.task)
+        if task.env is None or task.expert is None:
+            lacks = "environment" if task.env is None else "scripted expert"
+            raise ValueError(f"task {task.name!r} has no {lacks}: there is nothing to record demonstrations with")
+        episodes = task.defaults.demonstrations if self.episodes is None else self.episodes
+        embodiments = getattr(expert_of(task), "embodiments", ())
+        if self.embodiment is not None and not embodiments:
+            raise ValueError(f"--embodiment was given, but task {task.name!r} has one embodiment alone")
+        if embodiments:
+            return self._film(task, episodes, embodiments)
+        with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:  # refusals come without a bar
+            return record_to_folder(
+                self.out,
+                task,
+                episodes,
+                self.seed,
+                self.threads,
+                count_up_to(bar),
+                batch_size=self.batch_size,
+                disturbance=self.disturbance,
+            )
+
+    def _film(self, task: Task, episodes: int, embodiments: Sequence[str]) -> VideoReport:
+        """Records camera frames."""
+        if self.embodiment is None:
+            raise ValueError(f"say who demonstrates: --embodiment {' or '.join(embodiments)}")
+        lookup(embodiments, self.embodiment, "embodiment")
+        if self.disturbance:
+            raise ValueError("--disturbance was given, but demonstrations before a camera are not disturbed")
+        with progress_bar(episodes, "recording", unit="episode", delay=0.5) as bar:
+            return record_videos(self.out, self.embodiment, episodes, self.seed, count_up_to(bar), task=task)
+
+
+@dataclass(kw_only=True)
+class Convert(Command):
+    """Turn recordings of any robot, of which few or none have actions, into a data set that holds its whole task.
+
+    Attributes:
+        source: a folder of *.npz, *.csv or *.parquet files, a LeRobot data set, an HDF5 file in robomimic's layout,
+            minari:NAME, or (with --to) a data set of this library.
+        out: folder to write.
+        to: another format than this library's: "npz" or "lerobot" (3.0).
+        name: name of the task (default: that of the folder).
+        control_hz: frames per second (default: as the source says).
+        observations: features of a LeRobot data set or entries of an HDF5 file that make up the state (default: all
+            that are no images).
+        action_columns: columns of CSV or parquet tables that are actions, if they are not named action...
+        action_dim: number of action columns, where nothing has actions.
+        robot: state columns of the robot itself, which the controller reads (default: all that are no command).
+        command: neighbouring columns that repeat the last command; nothing that learns sees them.
+        action_kind: "delta" (velocities, efforts, changes) or "absolute" (targets of state columns) (default: delta).
+        targets: for absolute actions the state column that each is the target of (default: the robot's).
+        action_units: unit of each action column, or one for all.
+        state_units: unit of each state column, or one for all.
+        max_steps: steps after which an episode counts as failed (default: 1.5 times the longest demonstration).
+    """
+
+    source: tyro.conf.Positional[str]
+    out: Path
+    to: str | None = None
+    name: str | None = None
+    control_hz: float | None = None
+    observations: tuple[str, ...] = ()
+    action_columns: tuple[str, ...] = ()
+    action_dim: int | None = None
+    robot: tuple[str, ...] = ()
+    command: tuple[str, ...] = ()
+    action_kind: str | None = None
+    targets: tuple[str, ...] = ()
+    action_units: tuple[str, ...] = ()
+    state_units: tuple[str, ...] = ()
+    max_steps: int | None = None
+
+    def __call__(self) -> dict[str, Any]:
+        """Reads, checks and writes."""
+        if self.max_steps is not None and self.max_steps < 1:
+            raise ValueError(f"max_steps must be >= 1, got {self.max_steps}")
+        described = self._given(_DESCRIBING)
+        if self.to is not None and described:
+            raise ValueError(f"{_option(next(iter(described)))} was given, but format {self.to!r} does not hold it")
+        if self.to is None and stored_folder(self.source) is not None:
+            raise ValueError(f"{self.source} is a data set of this library already: name another format with --to")
+        if self.to is None and (self.out / "ted").exists():
+            raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
+        recordings = read_recordings(self.source, **self._given(_READING))
+        if self.to is not None:
+            said = {"written": str(write_recordings(recordings, self.out, self.to)), "format": self.to}
+            said |= {"trajectories": len(recordings.states), "labelled steps": recordings.num_labels}
+        else:
+            for name in ("action_units", "state_units"):
+                if len(described.get(name, ())) == 1:  # one for all
+                    described[name] = described[name][0]
+            folder = save_demonstrations(self.out, recordings, **described)
+            about = read_about(folder / "ted")
+            said = {"data set": str(folder)} | {name: about[name] for name in ("task", "trajectories", "steps")}
+            said["labelled steps"] = about["labelled_steps"]
+        said["states"], said["actions"] = ", ".join(recordings.state_names), ", ".join(recordings.action_names)
+        said["frames per second"] = recordings.control_hz
+        if self.to is None:
+            said["skipped"] = ", ".join(recordings.skipped) or "nothing"
+            said["next"] = f"koap train --dataset {shlex.quote(str(folder))} --out runs/{about['task']}"
+        return said
+
+    def _given(self, options: Sequence[str]) -> dict[str, Any]:
+        """Those of the options that were given."""
+        return {name: value for name, value in vars(self).items() if name in options and value not in (None, ())}
+
+
+@dataclass(kw_only=True)
+class Validate(Command):
+    """Check a folder of demonstrations and report every problem found, and what is right in form but unlikely.
+
+    Attributes:
+        dataset: folder written by `koap demos`, `koap convert` or save_demonstrations, or of D3IL's raw pickles.
+        task: name of the task (default: that of the data set, if it says so; else "avoiding").
+        plugins: modules that register tasks; imported before anything else.
+    """
+
+    dataset: tyro.conf.Positional[str]
+    task: str | None = None
+    plugins: Plugins = ()
+
+    def __call__(self) -> dict[str, str]:
+        """Reads and checks demonstrations.
+
+        Raises:
+            DataError: with all problems.
+        """
+        load_plugins(self.plugins)
+        task = find_task_of(self.dataset, self.task)
+        with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:
+            data = validate(open_dataset(self.dataset, task=task, progress=count_up_to(bar))[0])
+        files = [] if stored_folder(self.dataset) else find_raw_files(CONVERTERS[task.source], self.dataset)
+        warnings = find_warnings(data, names=list(map(str, files)), units=task.observation_units or _metres(task))
+        lengths = data["episode"].unique(return_counts=True)[1]
+        labels = int(data["has_action"].sum())
+        return {
+            "trajectories": str(len(lengths)),
+            "steps": str(len(data)),
+            "labelled steps": str(labels) if labels else "none: `koap train` needs a few",
+            "shortest, longest": f"{int(lengths.min())}, {int(lengths.max())}",
+            "observation, action columns": f"{data['observation'].shape[-1]}, {data['action'].shape[-1]}",
+            **{f"warning {number}": warning for number, warning in enumerate(warnings, 1)},
+            "result": f"no problem found, {len(warnings)} warning(s)" if warnings else "no problem found",
+        }
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _metres(task: Task) -> list[str]:
+    """Metres for the columns that are positions for certain; the others have units of their own."""
+    inside = range(*task.observation[task.position].indices(task.observation_dim))
+    return ["m" if task.env is not None and column in inside else "" for column in range(task.observation_dim)]

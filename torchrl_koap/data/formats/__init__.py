@@ -1,0 +1,142 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recordings of one's own robot, in the formats that :data:`FORMATS` lists."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torchrl_koap.data.formats import stored
+from torchrl_koap.data.formats.lerobot import is_lerobot, read_lerobot
+from torchrl_koap.data.formats.minari import PREFIX, read_minari
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.robomimic import is_hdf5, read_robomimic
+from torchrl_koap.data.formats.tables import is_table_folder, read_tables
+from torchrl_koap.data.formats.writers import write_lerobot, write_npz
+from torchrl_koap.lookup import lookup
+
+__all__ = ["FORMATS", "Format", "Recordings", "make_recordings", "read_recordings", "write_recordings"]
+
+
+@dataclass(frozen=True)
+class Format:
+    """How recordings in one format are recognised, read and written.
+
+    Args:
+        what (str): the format in words.
+        matches (callable): from a source to whether it is in this format.
+        read (callable): from a source, and some of the options, to :class:`Recordings`.
+        options (tuple of str): which options of :func:`read_recordings` it takes.
+        write (callable, optional): writes recordings into a new folder. Default: this format is not written.
+    """
+
+    what: str
+    matches: Callable[[str], bool]
+    read: Callable[..., Recordings]
+    options: tuple[str, ...] = ()
+    write: Callable[[Recordings, Path], None] | None = None
+
+
+FORMATS = {
+    "minari": Format(
+        f"{PREFIX}NAME, a Minari data set on this machine",
+        lambda source: source.startswith(PREFIX),
+        read_minari,
+        ("control_hz",),
+    ),
+    "ted": Format("a data set of this library", stored.is_stored, stored.read_stored),
+    "robomimic": Format(
+        "an HDF5 file in robomimic's layout (*.hdf5)",
+        is_hdf5,
+        read_robomimic,
+        ("control_hz", "observations", "action_dim"),
+    ),
+    "lerobot": Format(
+        "a LeRobot data set (meta/info.json)", is_lerobot, read_lerobot, ("control_hz", "observations"), write_lerobot
+    ),
+    "npz": Format(
+        "a folder of *.npz, *.csv or *.parquet files, a trajectory each",
+        is_table_folder,
+        read_tables,
+        ("control_hz", "action_columns", "action_dim"),
+        write_npz,
+    ),
+}
+
+
+def read_recordings(
+    source: str | Path,
+    *,
+    control_hz: float | None = None,
+    observations: Sequence[str] = (),
+    action_columns: Sequence[str] = (),
+    action_dim: int | None = None,
+) -> Recordings:
+    """Reads recordings of any robot; where they lie decides which of the :data:`FORMATS` they are in.
+
+    Args:
+        source (str or Path): a folder of tables, a LeRobot data set, an HDF5 file, ``minari:NAME``, or a data set of
+            this library.
+
+    Keyword Args:
+        control_hz (float, optional): frames per second. Default: as the source says.
+        observations (sequence of str): features of a LeRobot data set, or entries of an HDF5 file, that make up the
+            state. Default: all that are no images.
+        action_columns (sequence of str): columns of CSV and parquet tables that are actions, if they are not named
+            ``action...``.
+        action_dim (int, optional): number of action columns where nothing has actions.
+
+    Raises:
+        DataError: with all faults of the recordings.
+        FileNotFoundError: if there is no such source.
+        ValueError: if it is in none of the formats, or an option does not fit its format.
+
+    Examples:
+        >>> from torchrl_koap.data import read_recordings
+        >>> read_recordings("/data/so100_pick")  # doctest: +SKIP
+    """
+    asked: dict[str, Any] = {"control_hz": control_hz, "observations": list(observations)}
+    asked |= {"action_columns": list(action_columns), "action_dim": action_dim}
+    given = {name: value for name, value in asked.items() if value not in (None, [])}
+    for form in FORMATS.values():
+        if form.matches(str(source)):
+            unfit = [name for name in given if name not in form.options]
+            if unfit:
+                raise ValueError(f"{', '.join(unfit)}: not an option for {form.what}")
+            return form.read(str(source), **given)
+    if not Path(source).exists():
+        raise FileNotFoundError(f"{source} does not exist")
+    known = "; ".join(form.what for form in FORMATS.values())
+    raise ValueError(f"{source} holds no recordings that can be read; there are readers for {known}")
+
+
+def write_recordings(recordings: Recordings, out: str | Path, name: str) -> Path:
+    """Writes recordings into a new folder.
+
+    Args:
+        recordings (Recordings): what to write.
+        out (str or Path): the folder; it must not exist yet.
+        name (str): a format that is written, ``"npz"`` or ``"lerobot"``.
+
+    Raises:
+        ValueError: for a format that is not written; the message suggests the nearest.
+        FileExistsError: if there is something of that name.
+        DataError: if the format needs a rate, and none is known.
+        RuntimeError: if the format's package is not installed; the message names the extra.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from torchrl_koap.data import make_recordings, read_recordings, write_recordings
+        >>> recordings = make_recordings([np.zeros((5, 3))], [np.ones((5, 2))], control_hz=30.0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     read_recordings(write_recordings(recordings, f"{folder}/arm", "npz")).control_hz
+        30.0
+    """
+    write = lookup({key: form.write for key, form in FORMATS.items() if form.write is not None}, name, "format")
+    if Path(out).exists():
+        raise FileExistsError(f"{out} exists already; choose another --out")
+    write(recordings, Path(out))
+    return Path(out)

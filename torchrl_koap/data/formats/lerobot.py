@@ -1,0 +1,301 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""LeRobot data sets (formats 2.x and 3.0) of any robot, with pyarrow alone.
+
+::
+
+    meta/info.json                     features with their names, fps, totals
+    meta/episodes.jsonl                number of rows of every episode                  (2.x)
+    meta/episodes/**/*.parquet         the same                                         (3.0)
+    data/**/*.parquet                  one row per frame: observation.state, action, episode_index, frame_index
+
+How the rows are spread over files (one per episode, many episodes per file) does not matter here: they are put together
+by ``episode_index`` and ``frame_index``.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.files import DataError, check_file, read_bytes
+
+PREFIX, STATE, ACTION = "observation.", "observation.state", "action"
+EPISODE, FRAME = "episode_index", "frame_index"
+IMAGES = ("image", "video")
+_INFO = "meta/info.json"
+_LARGEST = 1 << 40  # bytes of a file of rows
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of all episodes, one after the other.
+
+    Args:
+        columns (dict): of each column what it holds: float64 ``[N, d]`` of numbers, NaN where a row is empty; lists of
+            ``N`` cells of pictures. ``action`` is missing where no file has it.
+        numbers (list of int): of every episode its ``episode_index``.
+        spans (list of slice): of every episode its rows.
+    """
+
+    columns: dict[str, Any]
+    numbers: list[int]
+    spans: list[slice]
+
+
+def is_lerobot(folder: str | Path) -> bool:
+    """Whether a folder is a LeRobot data set."""
+    return (Path(folder) / _INFO).is_file()
+
+
+def read_lerobot(
+    root: str | Path, *, observations: Sequence[str] | None = None, control_hz: float | None = None
+) -> Recordings:
+    """Reads states and actions of all episodes; rows without actions have no label.
+
+    Args:
+        root (str or Path): folder of a data set in format 2.x or 3.0.
+
+    Keyword Args:
+        observations (sequence of str, optional): features that make up the state, in that order. Default: every feature
+            named ``observation...`` that holds numbers; images are skipped and listed.
+        control_hz (float, optional): frames per second. Default: ``fps`` of the data set.
+
+    Raises:
+        DataError: with all problems: features that do not exist, or an image is asked for; files that are unreadable,
+            columns that are missing, states that are not finite, rows or episodes that are missing.
+        FileNotFoundError: if the folder is no LeRobot data set.
+        RuntimeError: if pyarrow is not installed (extra ``lerobot``).
+
+    Examples:
+        >>> from torchrl_koap.data.formats.lerobot import read_lerobot
+        >>> read_lerobot("/data/so100_pick", observations=["observation.state"])  # doctest: +SKIP
+    """
+    info = read_info(root)
+    known = info["features"]
+    observed = [name for name in known if name.startswith(PREFIX)]
+    images = [name for name in observed if _is_image(known[name])]
+    chosen = [name for name in observed if name not in images] if observations is None else list(observations)
+    problems = [
+        f"feature {name!r} is an image ({known[name].get('dtype')}): embed it first, it cannot be part of the state"
+        for name in chosen
+        if name in images
+    ]
+    problems += [
+        f"info.json has no feature {name!r}; it has {', '.join(observed) or 'no observations'}"
+        for name in chosen
+        if name not in known
+    ]
+    if not chosen:
+        problems.append(f"no feature {PREFIX}* holds numbers; there are {', '.join(observed) or 'none'}")
+    if problems:
+        raise DataError(root, problems)
+    rows = read_rows(root, chosen)
+    names = [label for name in chosen for label in _names(known[name], name, rows.columns[name].shape[1])]
+    states = np.concatenate([rows.columns[name] for name in chosen], 1)
+    actions, width = rows.columns.get(ACTION), _announced(info)
+    if actions is None and not width:
+        raise DataError(root, "no file has actions, and info.json does not say how many columns an action has")
+    return make_recordings(
+        [states[span] for span in rows.spans],
+        None if actions is None else [actions[span] for span in rows.spans],
+        action_dim=width if actions is None else None,
+        state_names=names if len(set(names)) == len(names) else None,
+        action_names=_names(known.get(ACTION) or {}, ACTION, width if actions is None else actions.shape[1]),
+        sources=[f"episode {number}" for number in rows.numbers],
+        control_hz=control_hz or _rate(info),
+        skipped=images,
+        source=str(root),
+    )
+
+
+def read_info(root: str | Path) -> dict[str, Any]:
+    """Reads the description of a data set.
+
+    Raises:
+        FileNotFoundError: if the folder is no LeRobot data set.
+        DataError: if the description is no JSON dictionary, or its features are none.
+    """
+    file = Path(root).expanduser() / _INFO
+    if not file.is_file():
+        raise FileNotFoundError(f"no LeRobot data set in {root}: it has no {_INFO}")
+    try:
+        info = json.loads(read_bytes(file))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(file, f"it is no JSON: {error}") from error
+    if not isinstance(info, dict):
+        raise DataError(file, f"it must hold a dictionary, got {type(info).__name__}")
+    features = info.get("features") or {}
+    if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
+        raise DataError(file, "its features must be dictionaries by name")
+    return info | {"features": features}
+
+
+def read_rows(root: str | Path, features: Sequence[str], *, pictures: Sequence[str] = ()) -> Rows:
+    """Reads columns of all episodes, and their actions if there are any.
+
+    Args:
+        root (str or Path): folder of the data set.
+        features (sequence of str): columns of numbers.
+
+    Keyword Args:
+        pictures (sequence of str): columns of pictures.
+
+    Raises:
+        DataError: with the problems of all files and episodes.
+        FileNotFoundError: if there are no files.
+        RuntimeError: if pyarrow is not installed (extra ``lerobot``).
+    """
+    root = Path(root).expanduser()
+    table = _read_table(root, (*features, EPISODE, FRAME), pictures)
+    files, problems = table["__filename"].to_pylist(), []
+    columns: dict[str, Any] = {name: table[name].to_pylist() for name in pictures}
+    for name in table.column_names:
+        if name not in (*pictures, "__filename"):
+            try:
+                columns[name] = _numbers(table, name, _announced(read_info(root)) if name == ACTION else 0)
+            except ValueError as error:
+                problems.append(str(error))
+    if problems:
+        raise DataError(root, problems)
+    episode, frame = (columns.pop(name)[:, 0] for name in (EPISODE, FRAME))
+    numbers, starts = np.unique(episode, return_index=True)
+    ends, expected = [*starts[1:], len(episode)], _expected_lengths(root)
+    missing = sorted(expected.keys() - {*numbers.tolist()})
+    problems = [f"{len(missing)} episodes are missing: {', '.join(map(str, missing[:10]))}"] if missing else []
+    spans = [slice(int(start), int(end)) for start, end in zip(starts, ends, strict=True)]
+    for number, span in zip(numbers.astype(int).tolist(), spans, strict=True):
+        length, wanted = span.stop - span.start, expected.get(number)
+        if wanted not in (None, length):
+            problems.append(f"{files[span.start]}: episode {number} has {length} rows, its description says {wanted}")
+        elif not np.array_equal(frame[span], np.arange(length)):
+            problems.append(f"{files[span.start]}: column {FRAME!r} of episode {number} must count 0, 1, 2, ...")
+    if problems:
+        raise DataError(root, problems)
+    return Rows(columns, numbers.astype(int).tolist(), spans)
+
+
+def import_pyarrow():
+    """The package pyarrow, or an error that names the extra."""
+    if importlib.util.find_spec("pyarrow") is None:
+        raise RuntimeError("LeRobot data sets need an extra: pip install 'torchrl_koap[lerobot]'")
+    import pyarrow
+    import pyarrow.compute
+    import pyarrow.dataset
+    import pyarrow.parquet
+
+    return pyarrow
+
+
+def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
+    """The rows of all files, sorted: the columns that are asked for, the actions, and ``__filename``."""
+    pyarrow = import_pyarrow()
+    files, problems, kinds = sorted((root / "data").rglob("*.parquet")), [], {}
+    if not files:
+        raise FileNotFoundError(f"no *.parquet below {root / 'data'}")
+    for file in files:
+        try:
+            check_file(file, largest=_LARGEST)
+            schema = pyarrow.parquet.read_schema(file)
+        except (pyarrow.ArrowException, OSError) as error:
+            problems.append(f"{file}: cannot be read: {str(error).splitlines()[0]}")
+            continue
+        missing = [name for name in (*needed, *pictures) if name not in schema.names]
+        problems += [f"{file}: missing column {name!r}; the file has {', '.join(schema.names)}" for name in missing]
+        for name in schema.names:
+            if name in pictures:
+                kinds.setdefault(name, schema.field(name).type)
+            elif name in needed or name == ACTION:
+                kind = _double(pyarrow, schema.field(name).type)
+                kinds.setdefault(name, kind)
+                if kind is None:
+                    got = schema.field(name).type
+                    problems.append(f"{file}: column {name!r} must hold numbers or lists of numbers, got {got}")
+                elif kind != kinds[name]:
+                    problems.append(f"{file}: column {name!r} holds numbers, that of another file lists of them")
+    if problems:
+        raise DataError(root, problems)
+    try:
+        data = pyarrow.dataset.dataset(files, schema=pyarrow.schema(list(kinds.items())), format="parquet")
+        table = data.to_table(columns=[*kinds, "__filename"])
+    except (pyarrow.ArrowException, OSError) as error:
+        raise DataError(root, f"it cannot be read: {str(error).splitlines()[0]}") from error
+    return table.sort_by([(EPISODE, "ascending"), (FRAME, "ascending")])
+
+
+def _double(pyarrow, kind):
+    """The type that a column of numbers is read as, None of anything else."""
+    types = pyarrow.types
+    nested = types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
+    inner = kind.value_type if nested else kind
+    if not (types.is_floating(inner) or types.is_integer(inner)):
+        return None
+    return pyarrow.list_(pyarrow.float64()) if nested else pyarrow.float64()
+
+
+def _numbers(table, name: str, announced: int) -> np.ndarray:
+    """A column as float64 ``[rows, width]``; rows that are empty, ``announced`` wide if all are, are NaN."""
+    pyarrow, column = import_pyarrow(), table[name].combine_chunks()
+    if not pyarrow.types.is_list(column.type):
+        return column.to_numpy(zero_copy_only=False).reshape(-1, 1)
+    there = column.is_valid().to_numpy(zero_copy_only=False)
+    sizes = pyarrow.compute.list_value_length(column).drop_null().to_numpy()
+    widths = np.unique(sizes)
+    if len(widths) > 1 or 0 in widths:
+        file = table["__filename"][int(np.flatnonzero(there)[(sizes != sizes[0]).argmax()])]
+        counts = " and ".join(map(str, widths))
+        raise ValueError(f"{file}: column {name!r} has rows of {counts} numbers, wanted the same number in all")
+    values = np.full((len(column), int(widths[0]) if len(widths) else max(announced, 1)), np.nan)
+    if len(widths):
+        values[there] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, values.shape[1])
+    return values
+
+
+def _expected_lengths(root: Path) -> dict[int, int | None]:
+    """Rows of every episode as the description has it, None where it only says that there is such an episode."""
+    listed, tables = root / "meta/episodes.jsonl", sorted((root / "meta/episodes").rglob("*.parquet"))
+    try:
+        if listed.is_file():
+            entries = [json.loads(line) for line in read_bytes(listed).splitlines() if line.strip()]
+        elif tables:
+            read = import_pyarrow().parquet.read_table
+            entries = [row for file in tables for row in read(file, columns=[EPISODE, "length"]).to_pylist()]
+        else:
+            return dict.fromkeys(range(int(read_info(root).get("total_episodes") or 0)))
+        return {int(entry[EPISODE]): int(entry["length"]) for entry in entries}
+    except Exception as error:  # a damaged list can be wrong in any way
+        raise DataError(root, f"the list of its episodes cannot be read: {error!r}") from error
+
+
+def _announced(info: Mapping[str, Any]) -> int:
+    """Number of action columns that ``info.json`` announces, 0 if it is silent."""
+    shape = (info["features"].get(ACTION) or {}).get("shape") or [0]
+    return int(shape[0]) if isinstance(shape, list) and isinstance(shape[0], int) else 0
+
+
+def _names(feature: Mapping[str, Any], name: str, width: int) -> list[str]:
+    """Names of a feature's columns: a list (in a list), ``{"motors": [...]}``, ``{"pan": 0, ...}``, or made up."""
+    given, short = feature.get("names"), name.removeprefix(PREFIX)
+    if isinstance(given, Mapping):
+        listed = next(iter(given.values()), None)
+        given = listed if isinstance(listed, list) else sorted(given, key=given.get)
+    if isinstance(given, list) and len(given) == 1 and isinstance(given[0], list):
+        given = given[0]
+    if isinstance(given, list) and len(given) == width and all(isinstance(label, str) for label in given):
+        return given
+    return [short] if width == 1 else [f"{short}_{index}" for index in range(width)]
+
+
+def _is_image(feature: Mapping[str, Any]) -> bool:
+    return feature.get("dtype") in IMAGES or len(feature.get("shape") or [1]) > 1
+
+
+def _rate(info: Mapping[str, Any]) -> float | None:
+    fps = info.get("fps")
+    return float(fps) if isinstance(fps, (int, float)) and fps > 0 else None

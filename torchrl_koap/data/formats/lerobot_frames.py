@@ -1,0 +1,156 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Camera frames of a LeRobot data set: PNG in its parquet files, or videos (extra ``video``)."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_koap.data.formats.lerobot import ACTION, IMAGES, STATE, Rows, is_lerobot, read_info, read_rows
+from torchrl_koap.files import DataError
+
+EMBODIMENT = "embodiment"  # an entry of info.json that LeRobot itself has nothing like
+
+
+@dataclass(frozen=True)
+class ImageEpisode:
+    """What a camera saw in one demonstration.
+
+    Args:
+        frames (np.ndarray): uint8 ``[T + 1, H, W, 3]``.
+        state (np.ndarray): what else is known ``[T + 1, d]``.
+        action (np.ndarray, optional): ``[T, act]``; None for an embodiment without.
+        embodiment (str): who demonstrates.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data.formats.lerobot_frames import ImageEpisode
+        >>> len(ImageEpisode(np.zeros((5, 8, 8, 3), np.uint8), np.zeros((5, 3)), None, "hand"))
+        4
+    """
+
+    frames: np.ndarray
+    state: np.ndarray
+    action: np.ndarray | None
+    embodiment: str
+
+    def __len__(self) -> int:
+        return len(self.frames) - 1
+
+
+def read_image_episodes(
+    folder: str | Path, *, camera: str | None = None, episodes: int | None = None, embodiment: str | None = None
+) -> list[ImageEpisode]:
+    """Reads episodes with their frames.
+
+    Args:
+        folder (str or Path): a LeRobot data set with a camera, such as ``koap demos --embodiment`` writes.
+
+    Keyword Args:
+        camera (str, optional): feature of the frames. Default: the only camera.
+        episodes (int, optional): only so many, from the first. Default: all.
+        embodiment (str, optional): refuse demonstrations of another one.
+
+    Raises:
+        DataError: if the folder holds no finished data set, no such camera, too few episodes, or those of another
+            embodiment; or if an episode is damaged.
+        RuntimeError: if pyarrow, or what decodes videos, is not installed.
+    """
+    if not is_lerobot(folder):
+        raise DataError(folder, "it holds no finished data set (meta/info.json is missing); `koap demos` makes one")
+    info = read_info(folder)
+    own, total = info.get(EMBODIMENT, "unknown"), info.get("total_episodes")
+    if type(total) is not int or total < 1:
+        raise DataError(Path(folder) / "meta/info.json", f"total_episodes must be a whole number >= 1, got {total!r}")
+    if embodiment not in (None, own):
+        raise DataError(folder, f"it holds demonstrations of embodiment {own!r}, wanted {embodiment!r}")
+    if episodes is not None and not 1 <= episodes <= total:
+        raise DataError(folder, f"it holds {total} episodes, asked for {episodes}")
+    camera = _camera(folder, info, camera)
+    video = info["features"][camera].get("dtype") == "video"
+    rows = read_rows(folder, [STATE], pictures=() if video else (camera,))
+    found = []
+    for number, span in list(zip(rows.numbers, rows.spans, strict=True))[:episodes]:
+        state, action = (rows.columns[name][span] if name in rows.columns else None for name in (STATE, ACTION))
+        try:
+            if span.stop - span.start < 2:
+                raise ValueError("1 row: an episode has two frames at least")
+            if not np.isfinite(state).all():
+                raise ValueError(f"column {STATE!r} is empty, NaN or infinite in some rows")
+            if video:
+                frames = _from_video(Path(folder), info, camera, number, span, rows)
+            else:
+                frames = _from_cells(rows.columns[camera][span], camera)
+        except (ValueError, OSError) as error:
+            raise DataError(folder, f"episode {number}: {error}") from error
+        label = None if action is None else action[:-1].astype(np.float32)
+        found.append(ImageEpisode(frames, state.astype(np.float32), label, own))
+    return found
+
+
+def _camera(folder: str | Path, info: dict[str, Any], wanted: str | None) -> str:
+    cameras = [name for name, feature in info["features"].items() if feature.get("dtype") in IMAGES]
+    if wanted is None and len(cameras) == 1 or wanted in cameras:
+        return wanted or cameras[0]
+    there = ", ".join(cameras) or "none"
+    asked = "no camera: there is nothing to embed" if not cameras else "several cameras: choose one"
+    raise DataError(folder, f"it has {asked if wanted is None else f'no camera {wanted!r}'} (cameras: {there})")
+
+
+def _from_cells(cells: list, camera: str) -> np.ndarray:
+    """Frames uint8 ``[T, H, W, 3]`` of pictures in parquet."""
+    from PIL import Image
+
+    frames = []
+    for row, cell in enumerate(cells):
+        content = cell.get("bytes") if isinstance(cell, dict) else None
+        if not isinstance(content, bytes):
+            raise ValueError(f"column {camera!r} has no picture in row {row}")
+        try:
+            frames.append(np.asarray(Image.open(io.BytesIO(content))))
+        except Exception as error:  # what a damaged picture makes of a decoder
+            raise ValueError(f"column {camera!r} has a damaged picture in row {row}: {error}") from None
+    shapes = sorted({frame.shape for frame in frames})
+    if len(shapes) > 1 or len(shapes[0]) != 3 or shapes[0][-1] != 3:
+        raise ValueError(f"column {camera!r} has pictures of shapes {shapes}: wanted one [H, W, 3]")
+    return np.stack(frames)
+
+
+def _from_video(folder: Path, info: dict, camera: str, number: int, span: slice, rows: Rows) -> np.ndarray:
+    """Frames uint8 ``[T, H, W, 3]`` of a video, of which an episode may be a part (format 3.0)."""
+    if importlib.util.find_spec("imageio") is None:
+        raise RuntimeError("videos are read with an extra: pip install 'torchrl_koap[video]'")
+    import imageio.v3
+
+    size, first = int(info.get("chunks_size") or 1000), 0
+    names = {"video_key": camera, "episode_index": number, "episode_chunk": number // size}
+    places = _places(folder, camera)
+    if places:
+        file, start = places[number]
+        names |= {"chunk_index": file[0], "file_index": file[1]}
+        first = round(start * float(info["fps"]))
+    path, length = folder / str(info.get("video_path")).format(**names), span.stop - span.start
+    frames = list(islice(imageio.v3.imiter(path), first, first + length))
+    if len(frames) < length:
+        raise ValueError(f"{path} has {first + len(frames)} frames, {first + length} are needed")
+    return np.stack(frames)[..., :3]
+
+
+def _places(folder: Path, camera: str) -> dict[int, tuple[tuple[int, int], float]]:
+    """Format 3.0: of every episode chunk and number of its video, and where in it (s) it begins."""
+    import pyarrow.parquet
+
+    found = {}
+    key = f"videos/{camera}"
+    columns = ["episode_index", f"{key}/chunk_index", f"{key}/file_index", f"{key}/from_timestamp"]
+    for file in sorted((folder / "meta/episodes").rglob("*.parquet")):
+        for row in pyarrow.parquet.read_table(file, columns=columns).to_pylist():
+            number, chunk, place, start = (row[name] for name in columns)
+            found[number] = (chunk, place), start
+    return found

@@ -1,0 +1,98 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recordings from a Minari data set on this machine."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.files import DataError
+
+PREFIX = "minari:"
+
+
+def read_minari(source: str, *, control_hz: float | None = None) -> Recordings:
+    """Reads a Minari data set that was downloaded or created before; nothing is fetched.
+
+    Args:
+        source (str): ``minari:`` and the id of the data set, such as ``"minari:D4RL/door/human-v2"``. Dictionary
+            observations are laid side by side in the order of their names; images are skipped.
+
+    Keyword Args:
+        control_hz (float, optional): control steps per second. Default: ``render_fps`` of the data set's environment.
+
+    Raises:
+        DataError: if the data set holds no usable observations, actions are no vectors of numbers, or no rate is
+            known.
+        FileNotFoundError: if there is no such data set on this machine.
+        RuntimeError: if Minari is not installed (extra ``minari``).
+
+    Examples:
+        >>> from torchrl_koap.data.formats.minari import read_minari
+        >>> read_minari("minari:D4RL/door/human-v2", control_hz=50)  # doctest: +SKIP
+    """
+    if importlib.util.find_spec("minari") is None:
+        raise RuntimeError("Minari data sets are read with an extra: pip install 'torchrl_koap[minari]'")
+    import minari
+
+    name, local = source.removeprefix(PREFIX), minari.list_local_datasets()
+    if name not in local:
+        known = ", ".join(sorted(local)) or "none"
+        raise FileNotFoundError(
+            f"Minari data set {name!r} is not on this machine (here: {known}); `minari download` it"
+        )
+    dataset = minari.load_dataset(name, download=False)
+    states, actions, names, skipped, problems = [], [], None, [], []
+    for episode in dataset.iterate_episodes():
+        tables, images = _tables(episode.observations)
+        skipped += images
+        if not tables:
+            problems.append(f"episode {episode.id}: observations hold no numbers but images")
+            continue
+        names = _labels(tables)
+        states.append(np.concatenate([table.astype(np.float64) for table in tables.values()], 1))
+        steps = np.asarray(episode.actions)
+        actions.append(steps[:, None] if steps.ndim == 1 and steps.dtype.kind == "f" else steps)
+    if control_hz is None:
+        control_hz = _rate(dataset)
+        if control_hz is None:
+            problems.append("its environment says nothing of render_fps: pass control_hz")
+    if problems:
+        raise DataError(source, problems)
+    return make_recordings(states, actions, state_names=names, control_hz=control_hz, skipped=skipped, source=source)
+
+
+def _tables(observations: Any, name: str = "") -> tuple[dict[str, np.ndarray], list[str]]:
+    """Entries ``[T, d]`` by name, and the names of those that are images."""
+    if isinstance(observations, Mapping):
+        tables: dict[str, np.ndarray] = {}
+        images: list[str] = []
+        for key in sorted(observations):
+            inner, left = _tables(observations[key], f"{name}_{key}" if name else str(key))
+            tables |= inner
+            images += left
+        return tables, images
+    array = np.asarray(observations)
+    if array.ndim > 2 or array.dtype.kind not in "fiu":
+        return {}, [name or "observation"]
+    return {name or "state": array.reshape(len(array), -1)}, []
+
+
+def _labels(tables: Mapping[str, np.ndarray]) -> list[str]:
+    return [
+        key if table.shape[1] == 1 else f"{key}_{index}"
+        for key, table in tables.items()
+        for index in range(table.shape[1])
+    ]
+
+
+def _rate(dataset: Any) -> float | None:
+    try:
+        rate = dataset.recover_environment().metadata.get("render_fps")
+    except Exception:  # an environment that is not installed can fail in any way, and only its rate is wanted
+        return None
+    return float(rate) if rate else None

@@ -1,0 +1,150 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recordings from one HDF5 file in robomimic's layout.
+
+::
+
+    data                     attribute env_args (JSON; env_kwargs/control_freq is the rate)
+    data/demo_0/obs/<name>   [T, d] or [T] numbers, side by side the state; images [T, H, W, C] are skipped
+    data/demo_0/actions      [T, a]; may be missing
+    data/demo_0/next_obs     optional; its last row is the frame behind the last action
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.files import DataError
+
+_MOST_AXES = 2  # entries with more are images
+
+
+def is_hdf5(path: str | Path) -> bool:
+    """Whether a path is an HDF5 file, by its name."""
+    return Path(path).suffix in (".hdf5", ".h5") and Path(path).is_file()
+
+
+def read_robomimic(
+    file: str | Path,
+    *,
+    observations: Sequence[str] | None = None,
+    control_hz: float | None = None,
+    action_dim: int | None = None,
+) -> Recordings:
+    """Reads trajectories from an HDF5 file in robomimic's layout.
+
+    Args:
+        file (str or Path): the file.
+
+    Keyword Args:
+        observations (sequence of str, optional): entries of ``obs`` that make up the state, in that order. Default: all
+            that are no images, by name.
+        control_hz (float, optional): frames per second. Default: ``control_freq`` of the file's ``env_args``.
+        action_dim (int, optional): number of action columns, where no trajectory has actions.
+
+    Raises:
+        DataError: with all faults: a trajectory without ``obs``, entries that are missing or of other widths, no
+            rate.
+        FileNotFoundError: if there is no such file.
+        RuntimeError: if h5py is not installed (extra ``hdf5``).
+
+    Examples:
+        >>> from torchrl_koap.data.formats.robomimic import read_robomimic
+        >>> read_robomimic("low_dim.hdf5", observations=["robot0_eef_pos", "object"])  # doctest: +SKIP
+    """
+    if importlib.util.find_spec("h5py") is None:
+        raise RuntimeError("HDF5 files are read with an extra: pip install 'torchrl_koap[hdf5]'")
+    import h5py
+
+    file = Path(file)
+    if not file.is_file():
+        raise FileNotFoundError(f"{file} is no file")
+    try:
+        stream = h5py.File(file, "r")
+    except OSError as error:
+        raise DataError(file, [f"no HDF5 file: {str(error).splitlines()[0]}"]) from error
+    with stream:
+        if "data" not in stream or not isinstance(stream["data"], h5py.Group):
+            raise DataError(file, [f"no group 'data'; the file holds {', '.join(stream) or 'nothing'}"])
+        demos = sorted(stream["data"], key=_number)
+        problems = [f"data/{name} has no group 'obs'" for name in demos if "obs" not in stream[f"data/{name}"]]
+        if problems or not demos:
+            raise DataError(file, problems or ["'data' holds no trajectories"])
+        first = stream[f"data/{demos[0]}/obs"]
+        usable = [name for name in sorted(first) if _is_table(first[name])]
+        skipped = [name for name in sorted(first) if name not in usable]
+        chosen = usable if observations is None else list(observations)
+        for name in demos:
+            group = stream[f"data/{name}/obs"]
+            problems += [
+                f"data/{name}/obs has no entry {entry!r}; it has {', '.join(sorted(group))}"
+                for entry in chosen
+                if entry not in group
+            ]
+            problems += [
+                f"data/{name}/obs/{entry} is {list(group[entry].shape)}: an image cannot be part of the state"
+                for entry in chosen
+                if entry in group and not _is_table(group[entry])
+            ]
+        if not chosen:
+            problems.append(f"no entry of obs is a table of numbers; there are {', '.join(skipped)}")
+        if control_hz is None:
+            control_hz = _control_frequency(stream["data"].attrs.get("env_args"))
+            if control_hz is None:
+                problems.append("env_args holds no control_freq: pass control_hz")
+        if problems:
+            raise DataError(file, problems)
+        states, actions = [], []
+        for name in demos:
+            group = stream[f"data/{name}"]
+            frames, steps = _frames(group["obs"], chosen), np.asarray(group["actions"]) if "actions" in group else None
+            if "next_obs" in group and all(entry in group["next_obs"] for entry in chosen):
+                frames = np.concatenate([frames, _frames(group["next_obs"], chosen)[-1:]])
+            states.append(frames)
+            actions.append(steps)
+        names = [label for entry in chosen for label in _labels(entry, first[entry].shape)]
+    return make_recordings(
+        states,
+        actions,
+        action_dim=action_dim,
+        state_names=names,
+        sources=demos,
+        control_hz=control_hz,
+        skipped=[name for name in skipped if name not in chosen],
+        source=str(file),
+    )
+
+
+def _number(name: str) -> tuple[int, str]:
+    digits = re.search(r"\d+$", name)
+    return (int(digits[0]) if digits else -1, name)
+
+
+def _is_table(entry: Any) -> bool:
+    import h5py
+
+    return isinstance(entry, h5py.Dataset) and 1 <= entry.ndim <= _MOST_AXES and entry.dtype.kind in "fiu"
+
+
+def _labels(name: str, shape: Sequence[int]) -> list[str]:
+    return [name] if len(shape) == 1 or shape[1] == 1 else [f"{name}_{index}" for index in range(shape[1])]
+
+
+def _frames(group: Any, names: Sequence[str]) -> np.ndarray:
+    parts = [np.asarray(group[name], dtype=np.float64) for name in names]
+    return np.concatenate([part.reshape(len(part), -1) for part in parts], 1)
+
+
+def _control_frequency(text: Any) -> float | None:
+    try:
+        value = json.loads(text)["env_kwargs"]["control_freq"]
+    except (TypeError, ValueError, KeyError):
+        return None
+    return float(value) if isinstance(value, (int, float)) and value > 0 else None

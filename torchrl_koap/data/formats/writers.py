@@ -1,0 +1,196 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recordings as NumPy archives, or as a LeRobot data set (format 3.0) with or without camera frames."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torchrl_koap.data.formats.lerobot import ACTION, EPISODE, FRAME, STATE, import_pyarrow
+from torchrl_koap.data.formats.lerobot_frames import EMBODIMENT
+from torchrl_koap.data.formats.recordings import Recordings
+from torchrl_koap.files import DataError, replacing_file
+
+_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_CHUNK = 1000  # files in a folder
+
+
+def write_npz(recordings: Recordings, out: Path) -> None:
+    """Writes a folder of ``*.npz`` files, one per trajectory.
+
+    Args:
+        recordings (Recordings): what to write.
+        out (Path): folder to create.
+    """
+    out.mkdir(parents=True)
+    digits = len(str(len(recordings.states)))
+    about: dict[str, Any] = {"state_names": recordings.state_names, "action_names": recordings.action_names}
+    if recordings.control_hz is not None:
+        about["control_hz"] = recordings.control_hz
+    for index, (states, actions) in enumerate(zip(recordings.states, recordings.actions, strict=True)):
+        labelled = {} if np.isnan(actions).all() else {"actions": actions}
+        np.savez(out / f"trajectory_{index:0{digits}}.npz", states=states, **labelled, **about)
+
+
+def write_lerobot(recordings: Recordings, out: Path) -> None:
+    """Writes a LeRobot data set; float64 becomes float32.
+
+    Args:
+        recordings (Recordings): what to write.
+        out (Path): folder to create.
+
+    Raises:
+        DataError: if the rate is not known.
+        RuntimeError: if pyarrow is not installed (extra ``lerobot``).
+    """
+    if recordings.control_hz is None:
+        raise DataError(out, "the rate is not known: pass control_hz")
+    names = {"state_names": recordings.state_names, "action_names": recordings.action_names}
+    writer = LeRobotWriter(out, fps=recordings.control_hz, **names)
+    for states, actions in zip(recordings.states, recordings.actions, strict=True):
+        writer.add(states, actions)
+    writer.close()
+
+
+class LeRobotWriter:
+    """A LeRobot data set that is written episode by episode; :meth:`close` finishes it.
+
+    Args:
+        folder (str or Path): folder to create.
+        fps (float): frames per second.
+        state_names (sequence of str): columns of ``observation.state``.
+        action_names (sequence of str): columns of ``action``; empty where nothing has any.
+        camera (str, optional): feature of the camera frames.
+        embodiment (str, optional): who demonstrates.
+        task (str): what is done, in words.
+
+    Raises:
+        FileExistsError: if the folder holds anything.
+        RuntimeError: if pyarrow is not installed (extra ``lerobot``).
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from torchrl_koap.data.formats.lerobot_frames import read_image_episodes
+        >>> from torchrl_koap.data.formats.writers import LeRobotWriter
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     writer = LeRobotWriter(folder, fps=10, state_names=["x"], camera="observation.images.front")
+        ...     writer.add(np.zeros((4, 1)), frames=np.zeros((4, 8, 8, 3), np.uint8))
+        ...     read_image_episodes(writer.close())[0].frames.shape
+        (4, 8, 8, 3)
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        *,
+        fps: float,
+        state_names: Sequence[str],
+        action_names: Sequence[str] = (),
+        camera: str | None = None,
+        embodiment: str | None = None,
+        task: str = "task",
+    ):
+        self._pyarrow, self._folder = import_pyarrow(), Path(folder)
+        if self._folder.exists() and any(self._folder.iterdir()):
+            raise FileExistsError(f"{self._folder} is not empty; choose another folder")
+        self._fps, self._camera, self._embodiment, self._task = float(fps), camera, embodiment, task
+        self._names = {STATE: list(state_names)} | ({ACTION: list(action_names)} if action_names else {})
+        self._shape: list[int] = []
+        self._lengths: list[int] = []
+
+    def add(self, states: np.ndarray, actions: np.ndarray | None = None, *, frames: np.ndarray | None = None) -> None:
+        """Writes an episode. LeRobot has an action per row: behind the last frame the one before is repeated.
+
+        Args:
+            states (np.ndarray): ``[T + 1, d]``.
+            actions (np.ndarray, optional): ``[T, a]``.
+
+        Keyword Args:
+            frames (np.ndarray, optional): uint8 ``[T + 1, H, W, 3]``, where there is a camera.
+        """
+        number, numbers = len(self._lengths), np.arange(len(states))
+        columns: dict[str, Any] = {STATE: states}
+        if ACTION in self._names and actions is not None:
+            columns[ACTION] = np.concatenate([actions, actions[-1:]])
+        columns = {name: self._vectors(values) for name, values in columns.items()}
+        if self._camera is not None and frames is not None:
+            self._shape = list(frames.shape[1:])
+            kind = self._pyarrow.struct([("bytes", self._pyarrow.binary()), ("path", self._pyarrow.string())])
+            cells = [{"bytes": encode_png(frame), "path": None} for frame in frames]
+            columns[self._camera] = self._pyarrow.array(cells, type=kind)
+        columns |= {
+            "timestamp": (numbers / self._fps).astype(np.float32),
+            FRAME: numbers,
+            EPISODE: np.full(len(states), number),
+            "index": sum(self._lengths) + numbers,
+            "task_index": np.zeros(len(states), dtype=np.int64),
+        }
+        self._write(_DATA.format(**self._place(number)), columns)
+        self._lengths.append(len(states))
+
+    def close(self) -> Path:
+        """Writes the description, which makes the data set a finished one; returns the folder."""
+        lengths, places = np.array(self._lengths), [self._place(number) for number in range(len(self._lengths))]
+        ends = lengths.cumsum()
+        listed = {
+            EPISODE: np.arange(len(lengths)),
+            "tasks": [[self._task]] * len(lengths),
+            "length": lengths,
+            **{f"data/{name}": np.array([place[name] for place in places]) for name in ("chunk_index", "file_index")},
+            "dataset_from_index": ends - lengths,
+            "dataset_to_index": ends,
+        }
+        self._write("meta/episodes/chunk-000/file-000.parquet", listed)
+        self._write("meta/tasks.parquet", {"task_index": np.zeros(1, dtype=np.int64), "task": [self._task]})
+        single = {"shape": [1], "names": None}
+        features: dict[str, Any] = {
+            name: {"dtype": "float32", "shape": [len(columns)], "names": columns}
+            for name, columns in self._names.items()
+        }
+        if self._camera is not None:
+            features[self._camera] = {"dtype": "image", "shape": self._shape, "names": ["height", "width", "channel"]}
+        features |= {name: {"dtype": "int64", **single} for name in (EPISODE, FRAME, "index", "task_index")}
+        info = {
+            "codebase_version": "v3.0",
+            "robot_type": self._embodiment,
+            "fps": int(self._fps) if self._fps.is_integer() else self._fps,
+            "total_episodes": len(lengths),
+            "total_frames": int(lengths.sum()),
+            "total_tasks": 1,
+            "chunks_size": _CHUNK,
+            "splits": {"train": f"0:{len(lengths)}"},
+            "data_path": _DATA,
+            "video_path": None,
+            "features": features | {"timestamp": {"dtype": "float32", **single}},
+        }
+        if self._embodiment is not None:
+            info[EMBODIMENT] = self._embodiment
+        with replacing_file(self._folder / "meta" / "info.json") as aside:
+            aside.write_text(json.dumps(info, indent=2) + "\n")
+        return self._folder
+
+    def _place(self, number: int) -> dict[str, int]:
+        return {"chunk_index": number // _CHUNK, "file_index": number % _CHUNK}
+
+    def _vectors(self, values: np.ndarray) -> Any:
+        flat = self._pyarrow.array(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
+        return self._pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
+
+    def _write(self, place: str, columns: dict[str, Any]) -> None:
+        with replacing_file(self._folder / place) as aside:
+            self._pyarrow.parquet.write_table(self._pyarrow.table(columns), aside)
+
+
+def encode_png(frame: np.ndarray) -> bytes:
+    """A picture uint8 ``[H, W, 3]`` as PNG."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(frame).save(buffer, format="PNG", compress_level=3)
+    return buffer.getvalue()
