@@ -72,12 +72,12 @@ def test_the_hand_ends_where_the_decision_wants():
 def test_it_stops_for_a_cylinder_ahead():
     """Shown that it stands right before the first cylinder, the player never decides to go on forwards."""
     expert = AvoidingExpert([0] * 8, range(8))
-    expert._pause[:] = 0
-    expert._misjudgement[:] = expert._tremor[:] = 0.0
+    expert._habits.pause[:] = 0
+    expert._habits.misjudgement[:] = expert._habits.tremor[:] = 0.0
     expert.act(np.tile([0.5, -0.16, 0.5, -0.16], (8, 1)))
     assert (expert._decisions[:, 0, 1] == 0).all() and expert._blocked.all()
     expert = AvoidingExpert([0] * 8, range(8))
-    expert._pause[:] = 0
+    expert._habits.pause[:] = 0
     expert.act(np.tile([0.42, -0.2, 0.42, -0.2], (8, 1)))
     assert (expert._decisions[:, 0, 1] > 0.005).all()
 

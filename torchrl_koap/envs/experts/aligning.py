@@ -261,7 +261,7 @@ class _Player:
         hold += 0.008 * np.array([math.cos(angle), math.sin(angle)])
         along = float(hold[0] * ahead[0] + hold[1] * ahead[1])
         step = min(speed, along + 0.02) * ahead + 0.35 * (hold - along * ahead)
-        self._judge(rod, length)
+        self._assess(rod, length)
         return np.append(self.command[:2] + step, self.height), 0.010
 
     def _felt_contact(self, rod: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -278,7 +278,7 @@ class _Player:
             anchor += 0.5 * slip
         return contact, anchor
 
-    def _judge(self, rod: np.ndarray, length: float) -> None:
+    def _assess(self, rod: np.ndarray, length: float) -> None:
         """Ends a push that has done what it could: its way is over, the tray rests, or the way grows again."""
         self.progress = 0.9 * self.progress + 0.1 * float(np.abs(self.pose - self.last_pose).sum())
         self.last_pose, self.shortest, self.started = self.pose, min(self.shortest, length), True

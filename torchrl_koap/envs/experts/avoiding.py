@@ -18,6 +18,7 @@ others in the batch, and nothing touches a global generator.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -107,41 +108,16 @@ class AvoidingExpert:
         least_clearance=0.003,
     )
 
-    # habits and slips, set from _draw
-    _attention: np.ndarray
-    _caution: np.ndarray
-    _cruise: np.ndarray
-    _creep: np.ndarray
-    _ease: np.ndarray
-    _gap_x: np.ndarray
-    _gate: np.ndarray
-    _grip: np.ndarray
-    _haste: np.ndarray
-    _head_start: np.ndarray
-    _last_forward: np.ndarray
-    _last_side: np.ndarray
-    _linger: np.ndarray
-    _margin: np.ndarray
-    _misjudgement: np.ndarray
-    _open: np.ndarray
-    _patience: np.ndarray
-    _pause: np.ndarray
-    _release: np.ndarray
-    _side_pause: np.ndarray
-    _tolerance: np.ndarray
-    _tremor: np.ndarray
-
     def __init__(self, modes: Sequence[int], seeds: Sequence, contexts: None = None):
         modes, seeds = list(modes), list(seeds)
         if not modes or len(modes) != len(seeds):
             raise ValueError(f"as many seeds as modes are needed, at least one, got {len(modes)} and {len(seeds)}")
         drawn = [_draw(mode, np.random.default_rng(seed)) for mode, seed in zip(modes, seeds, strict=True)]
-        for name in drawn[0]:
-            setattr(self, f"_{name}", np.stack([habits[name] for habits in drawn]))
+        self._habits = SimpleNamespace(**{name: np.stack([each[name] for each in drawn]) for name in drawn[0]})
         count = len(modes)
         self._time = 0
         self._row = np.zeros(count, dtype=np.int64)  # the row whose gap is aimed at; 3 behind the last one
-        self._forward = self._cruise[:, 0].copy()  # forwards push that is held
+        self._forward = self._habits.cruise[:, 0].copy()  # forwards push that is held
         self._blocked = np.zeros(count, dtype=bool)  # a cylinder was straight ahead
         self._side = np.zeros(count)  # sideways push that is held, m per step
         self._crossed = np.full(count, -1)  # time at which the finish line was seen crossed
@@ -152,7 +128,7 @@ class AvoidingExpert:
     @property
     def finished(self) -> np.ndarray:
         """Which players have let go after the finish line and would stop recording, bool [n]."""
-        return (self._crossed >= 0) & (self._time >= self._crossed + self._linger)
+        return (self._crossed >= 0) & (self._time >= self._crossed + self._habits.linger)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Decides the next control step of every episode.
@@ -173,9 +149,9 @@ class AvoidingExpert:
         decision = self._decide(seen, observation[:, 3])
         self._decisions = np.concatenate([decision[:, None], self._decisions[:, :-1]], axis=1)
         if self._time == 0:  # some had begun to push before the recording started
-            begun = np.arange(len(_HAND)) <= self._head_start[:, None]
+            begun = np.arange(len(_HAND)) <= self._habits.head_start[:, None]
             self._decisions = np.where(begun[..., None], decision[:, None], 0.0)
-        push = np.einsum("nkd,k->nd", self._decisions, _HAND) + self._tremor[:, self._time % _HORIZON]
+        push = np.einsum("nkd,k->nd", self._decisions, _HAND) + self._habits.tremor[:, self._time % _HORIZON]
         self._time += 1
         return push
 
@@ -190,62 +166,66 @@ class AvoidingExpert:
         pushed_since = commanded - self._commanded[:, _GLANCE + _ROBOT_LAG]
         surprise = self._measured[:, _GLANCE] + pushed_since - commanded
         to_come = np.einsum("nkd,k->nd", self._decisions, _HAND_REST)
-        slip = self._misjudgement[:, self._time % _HORIZON]
-        return commanded + to_come + self._attention[:, None] * surprise + slip
+        slip = self._habits.misjudgement[:, self._time % _HORIZON]
+        return commanded + to_come + self._habits.attention[:, None] * surprise + slip
 
     def _decide(self, seen: np.ndarray, height: np.ndarray) -> np.ndarray:
         count = np.arange(len(seen))
-        passed = np.array([*ROW_Y, np.inf])[self._row] + self._release[count, self._row]
+        passed = np.array([*ROW_Y, np.inf])[self._row] + self._habits.release[count, self._row]
         self._row += ((seen[:, 1] > passed) | self._may_go_on(seen[:, 0])) & (self._row < 3)
         newly = (height > FINISH_Y) & (self._crossed < 0)
         self._crossed[newly] = self._time
 
-        way = self._gap_x[count, self._row] - seen[:, 0]
-        gate = np.array([*ROW_Y, FINISH_Y])[self._row] - self._gate[count, self._row]
+        way = self._habits.gap_x[count, self._row] - seen[:, 0]
+        gate = np.array([*ROW_Y, FINISH_Y])[self._row] - self._habits.gate[count, self._row]
         room = np.maximum(gate - seen[:, 1], 0.0)
-        cruise = self._cruise[:, self._time % _HORIZON]
+        cruise = self._habits.cruise[:, self._time % _HORIZON]
         self._push_sideways(way, room / cruise, count)
 
         steps_sideways = np.abs(way) / FULL_PUSH
-        off = np.abs(way) > 2 * self._tolerance[count, self._row]
-        late = off & (steps_sideways > room / cruise + self._patience) & (self._row < 3)
+        off = np.abs(way) > 2 * self._habits.tolerance[count, self._row]
+        late = off & (steps_sideways > room / cruise + self._habits.patience) & (self._row < 3)
         forward = np.where(late, room / np.maximum(steps_sideways, 1e-9), cruise)
-        forward = np.where(forward < LEAST_PUSH * self._creep, 0.0, forward)
-        self._forward += self._ease * (forward - self._forward)
+        forward = np.where(forward < LEAST_PUSH * self._habits.creep, 0.0, forward)
+        self._forward += self._habits.ease * (forward - self._forward)
         forward = np.where(self._forward < 0.3 * LEAST_PUSH, 0.0, self._forward)
-        decision = np.stack([self._side * self._grip[:, self._time % _HORIZON], forward], axis=1)
+        decision = np.stack([self._side * self._habits.grip[:, self._time % _HORIZON], forward], axis=1)
         decision[:, 0] = np.clip(decision[:, 0], -FULL_PUSH, FULL_PUSH)
         decision = self._avoid(seen, decision, cruise)
         behind = (self._crossed >= 0)[:, None]
-        decision = np.where(behind, np.stack([self._last_side, self._last_forward * cruise], axis=1), decision)
-        return np.where((self._time < self._pause)[:, None], 0.0, decision)
+        decision = np.where(
+            behind, np.stack([self._habits.last_side, self._habits.last_forward * cruise], axis=1), decision
+        )
+        return np.where((self._time < self._habits.pause)[:, None], 0.0, decision)
 
     def _may_go_on(self, x: np.ndarray) -> np.ndarray:
         """Whether the gap is reached with a push that may go on: it is the open side, and the next gap lies there."""
         count = np.arange(len(x))
-        following = self._gap_x[count, np.minimum(self._row + 1, 3)] - x
+        following = self._habits.gap_x[count, np.minimum(self._row + 1, 3)] - x
         direction = np.sign(self._side)
-        reached = (self._gap_x[count, self._row] - x) * direction < 0
-        open_side = self._open[count, self._row] == direction
+        reached = (self._habits.gap_x[count, self._row] - x) * direction < 0
+        open_side = self._habits.open[count, self._row] == direction
         return reached & open_side & (direction != 0) & (following * direction > 0.02) & (self._row < 2)
 
     def _push_sideways(self, way: np.ndarray, steps: np.ndarray, count: np.ndarray) -> None:
         """Begins, hardens and ends the sideways push, given the way to the gap and the steps left until its row."""
         holding = self._side != 0
-        there = way * np.sign(self._side) < self._tolerance[count, self._row] * 0.3
+        there = way * np.sign(self._side) < self._habits.tolerance[count, self._row] * 0.3
         self._side[holding & there] = 0.0
-        begin = (self._side == 0) & (np.abs(way) > np.where(self._blocked, 0.003, self._tolerance[count, self._row]))
+        begin = (self._side == 0) & (
+            np.abs(way) > np.where(self._blocked, 0.003, self._habits.tolerance[count, self._row])
+        )
         needed = np.abs(way) / np.maximum(steps, 1.0)
-        push = np.clip(needed * self._haste[count, self._row], LEAST_PUSH * 1.06, FULL_PUSH)
+        push = np.clip(needed * self._habits.haste[count, self._row], LEAST_PUSH * 1.06, FULL_PUSH)
         push = np.where(push > 0.92 * FULL_PUSH, FULL_PUSH, push)
         harder = holding & ~there & (needed > 1.35 * np.abs(self._side))
         change = begin | harder
         self._side[change] = (np.sign(way) * push)[change]
-        self._side[self._time < self._side_pause] = 0.0
+        self._side[self._time < self._habits.side_pause] = 0.0
 
     def _avoid(self, seen: np.ndarray, decision: np.ndarray, cruise: np.ndarray) -> np.ndarray:
         """Takes back the part of a decision that would run into a cylinder within the next steps."""
-        margin = self._margin + self._caution * np.abs(decision[:, 0]) / FULL_PUSH
+        margin = self._habits.margin + self._habits.caution * np.abs(decision[:, 0]) / FULL_PUSH
         self._blocked[:] = False
         ahead = np.arange(1, 5)[None, :, None] * decision[:, None] + seen[:, None]  # [n, 4, 2]
         decision = decision.copy()
@@ -260,7 +240,7 @@ class AvoidingExpert:
             self._blocked |= near & in_front
             cramped = near & in_front & (self._side == 0)  # aims too near to the cylinder: more room on the next try
             rows = self._row[cramped]
-            self._gap_x[cramped, rows] += 0.0015 * np.sign(self._gap_x[cramped, rows] - x)
+            self._habits.gap_x[cramped, rows] += 0.0015 * np.sign(self._habits.gap_x[cramped, rows] - x)
         return decision
 
 

@@ -17,6 +17,7 @@ seed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -68,12 +69,6 @@ class SortingExpert:
 
     rules = RecordingRules(most_rows=699)
 
-    # set from _draw
-    _taste: np.ndarray
-    _aim: np.ndarray
-    _pause: np.ndarray
-    _tempo: np.ndarray
-
     def __init__(self, modes: Sequence[int], contexts, seeds: Sequence):
         modes, seeds, contexts = list(modes), list(seeds), np.asarray(contexts)
         num_boxes = contexts.shape[1] if contexts.ndim == 3 else 0
@@ -85,8 +80,7 @@ class SortingExpert:
         self._colours = box_colours(num_boxes)
         self._orders = np.array([mode_colours(mode, num_boxes) for mode in modes])
         drawn = [_draw(np.random.default_rng(seed), num_boxes) for seed in seeds]
-        for name in drawn[0]:
-            setattr(self, f"_{name}", np.stack([habits[name] for habits in drawn]))
+        self._habits = SimpleNamespace(**{name: np.stack([each[name] for each in drawn]) for name in drawn[0]})
         count = len(modes)
         self._time = 0
         self._arrived = np.zeros((count, num_boxes), dtype=bool)
@@ -130,7 +124,7 @@ class SortingExpert:
         decision = np.zeros_like(rod)
         for row in np.flatnonzero(self._rest == 0):
             decision[row] = self._play(row, observation[row], boxes[row])
-        tempo = self._tempo[:, self._time % _HORIZON] * (self._time >= self._pause)
+        tempo = self._habits.tempo[:, self._time % _HORIZON] * (self._time >= self._habits.pause)
         self._wish += 0.4 * (decision * tempo[:, None] - self._wish)
         self._time += 1
         stretch = observation[:, 2:4] - observation[:, :2]
@@ -155,7 +149,7 @@ class SortingExpert:
             self._target[row] = self._choose_box(row, places, yaws, present, ahead)
             self._pushing[row], self._direction[row] = False, np.nan
         target = int(self._target[row])
-        lane = BIN_X[self._colours[target]] + self._aim[row, target]
+        lane = BIN_X[self._colours[target]] + self._habits.aim[row, target]
         mind = bool(self._pushing[row]), float(self._direction[row])
         x, y, *mind = decide(places, yaws, present, target, lane, rod, ahead, *mind)
         self._pushing[row], self._direction[row] = mind
@@ -170,7 +164,7 @@ class SortingExpert:
         for target in candidates:
             lane = BIN_X[self._colours[target]]
             costs.append(pushing_cost(places, yaws, present, target, lane, rod))
-        return int(candidates[np.argmin(np.array(costs) + self._taste[row, candidates])])
+        return int(candidates[np.argmin(np.array(costs) + self._habits.taste[row, candidates])])
 
 
 def _draw(generator: np.random.Generator, num_boxes: int) -> dict[str, np.ndarray]:

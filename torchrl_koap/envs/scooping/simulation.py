@@ -155,13 +155,13 @@ class ScoopingSimulations:
         for tick in range(1, TICKS + 1):
             data.ctrl[:] = begin + (target - begin) * tick / TICKS
             mujoco.mj_step(self.model, data, SUBSTEPS)
-            self._judge(row, data)
+            self._assess(row, data)
         mujoco.mj_kinematics(self.model, data)  # the spoon where the joints are now
         self.commands[row] = target
         if abs(data.time - due) > TIMESTEP:  # MuJoCo resets a state that blows up
             raise RuntimeError(f"the simulation of environment {row} became unstable")
 
-    def _judge(self, row: int, data: mujoco.MjData) -> None:
+    def _assess(self, row: int, data: mujoco.MjData) -> None:
         x, y, height = data.site_xpos[self._site]
         bowl = data.mocap_pos[0]
         over = math.hypot(x - bowl[0], y - bowl[1]) < RIM_RADIUS
