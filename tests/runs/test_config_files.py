@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from torchrl_koap.studies import CurveConfig
 from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.config_files import CONTROLLER, PLANNER, check_config, check_types
+from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.studies import CurveConfig
 from torchrl_koap.training.provenance import to_json
 from torchrl_koap.training.resolved import resolve
-from torchrl_koap.runs.run_directory import RunDirectoryError
-from torchrl_koap.runs.config_files import CONTROLLER, PLANNER, check_config, check_types
 
 
 @pytest.mark.parametrize(

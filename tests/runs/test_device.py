@@ -6,8 +6,8 @@ import warnings
 import pytest
 import torch
 
-from torchrl_koap.studies.paper_tables import SMALL_PLANNER, WIDE_PLANNER
 from torchrl_koap.runs.device import has_bfloat16_units, set_up_torch, training_dtype
+from torchrl_koap.studies.paper_tables import SMALL_PLANNER, WIDE_PLANNER
 
 
 @pytest.fixture(params=["amx_bf16", "avx512_bf16", None])

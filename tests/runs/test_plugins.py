@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 from tiny_runs import TINY
 
-from torchrl_koap.studies.table import read_cells
-from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.training.method import Method, Phase
-from torchrl_koap.training.methods import METHODS, register_method
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_tensors
+from torchrl_koap.studies.table import read_cells
+from torchrl_koap.training.method import Method, Phase
+from torchrl_koap.training.methods import METHODS, register_method
 
 PLUGINS = Path(__file__).parents[1] / "plugins"
 PLUGIN = ("--plugin", "nearest_neighbour")

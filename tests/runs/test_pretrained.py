@@ -11,12 +11,11 @@ from publish_pretrained import publish
 from tiny_runs import TINY, koap, write_demonstrations
 
 from torchrl_koap.evaluation.trained_run import load_run
-from torchrl_koap.studies.paper_tables import PRESETS, BenchConfig, _curves
 from torchrl_koap.runs import pretrained
-from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.runs.pretrained import copy_run
+from torchrl_koap.runs.pretrained import copy_run, find_run
 from torchrl_koap.runs.run_directory import RunDirectoryError
-from torchrl_koap.runs.pretrained import find_run
+from torchrl_koap.runs.weights import load_tensors
+from torchrl_koap.studies.paper_tables import PRESETS, BenchConfig, _curves
 
 
 @pytest.fixture(scope="module")

@@ -180,5 +180,7 @@ def log_scores(logger: Any, scores: Mapping[str, Any]) -> None:
         logger: what :func:`open_logger` yielded.
         scores (mapping): name to value.
     """
-    numbers = {name: value for name, value in scores.items() if isinstance(value, (int, float)) and math.isfinite(value)}
+    numbers = {
+        name: value for name, value in scores.items() if isinstance(value, (int, float)) and math.isfinite(value)
+    }
     logger.log_metrics({f"eval/{name}": float(value) for name, value in numbers.items()}, step=0)
