@@ -37,7 +37,7 @@ counts, seeds = (1, 2, 5), (0, 1, 2)
 
 
 def budget(count, seed):
-    return LabelBudget(count, seed=seed).apply(demonstrations, command=task.command_columns)[0]
+    return LabelBudget(count=count, seed=seed).apply(demonstrations, command=task.command_columns)[0]
 
 
 # %%

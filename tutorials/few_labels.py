@@ -47,7 +47,7 @@ torch.manual_seed(0)
 task = get_task("avoiding")
 demonstrations, _ = record_demonstrations("avoiding", episodes=48)
 demonstrations = select_state(demonstrations, task.state_columns)
-data, report = LabelBudget(2, unit="trajectory").apply(demonstrations, command=task.command_columns)
+data, report = LabelBudget(count=2, unit="trajectory").apply(demonstrations, command=task.command_columns)
 print(f"labels: {report.labelled_transitions} of {report.total_transitions} transitions, 2 of 48 demonstrations")
 
 # %%

@@ -34,7 +34,7 @@ every = demonstrations["episode"].unique().tolist()
 
 
 def labelled(episodes):
-    return LabelBudget.of_episodes(episodes).apply(demonstrations, command=task.command_columns)[0]
+    return LabelBudget(episodes=episodes).apply(demonstrations, command=task.command_columns)[0]
 
 
 def fit(episodes):

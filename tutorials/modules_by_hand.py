@@ -43,7 +43,7 @@ from torchrl_koap.training import fit_planner
 torch.manual_seed(0)
 task = get_task("avoiding")
 demonstrations = select_state(record_demonstrations("avoiding", episodes=24)[0], task.state_columns)
-data, report = LabelBudget(2).apply(demonstrations, command=task.command_columns)
+data, report = LabelBudget(count=2).apply(demonstrations, command=task.command_columns)
 model = KoopmanInverseDynamics(
     LatentActionMLP(2, 16, hidden_dims=(32, 32), num_past=1, look_ahead=(2, 3), relative=True, linear_skip=True),
     LinearActionDecoder(16, 2),

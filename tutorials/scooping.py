@@ -75,7 +75,7 @@ print(f"{len(components.mean)} features, {EMBEDDING_DIM} components: the spoon's
 # embeddings of all videos and at the joint targets of the five: ridge on raw frames, KOAP, and KOAP whose features
 # stay random (no training, the same decoder), which is the control.
 
-data, labels = LabelBudget.of_episodes(range(LABELLED)).apply(stored)
+data, labels = LabelBudget(episodes=range(LABELLED)).apply(stored)
 print(f"labels: {labels.labelled_transitions} of {labels.total_transitions} steps")
 planner = torchrl_koap.fit_planner(data, task, steps=1000, progress=False)
 controllers = {

@@ -172,7 +172,7 @@ def hidden_commands_changed(folder, source, budget, *, inside=False):
 def test_nothing_outside_the_label_budget_reaches_planner_or_controller(
     amount, unit, options, demonstrations, tmp_path
 ):
-    budget = LabelBudget(amount, unit=unit, seed=0, window=16, history=2)
+    budget = LabelBudget(count=amount, unit=unit)
     folders = {
         "clean": demonstrations,
         "outside": hidden_commands_changed(tmp_path / "data_outside", demonstrations, budget),

@@ -27,6 +27,10 @@ def demonstrations(lengths=(20, 33, 16, 40), seed=0):
     return flatten_trajectories(frames, [torch.diff(f[:, :2], dim=0) for f in frames], dtype=torch.float64)
 
 
+def budget_of(amount, **options):
+    return LabelBudget(**{"count" if isinstance(amount, int) else "fraction": amount}, **options)
+
+
 def same_bits(left, right):
     assert left.dtype == right.dtype and left.shape == right.shape
     assert left.numpy().tobytes() == right.numpy().tobytes()
@@ -45,9 +49,9 @@ def test_the_account_is_right(lengths, unit, amount, seed):
     expected = amount if isinstance(amount, int) else math.floor(amount * totals[unit] + 0.5)
     if not 1 <= expected <= totals[unit]:
         with pytest.raises(ValueError, match=f"{totals[unit]}"):
-            LabelBudget(amount, unit, seed).apply(data)
+            budget_of(amount, unit=unit, seed=seed).apply(data)
         return
-    labelled, report = LabelBudget(amount, unit, seed).apply(data)
+    labelled, report = budget_of(amount, unit=unit, seed=seed).apply(data)
     validate(labelled)
     kept = labelled["has_action"].squeeze(-1)
     assert report.selected_units == expected and report.total_units == totals[unit]
@@ -72,17 +76,15 @@ def test_the_account_is_right(lengths, unit, amount, seed):
 
 def test_one_window_is_fourteen_labels():
     data = demonstrations()
-    labelled, report = LabelBudget(1, "window").apply(data)
+    labelled, report = LabelBudget(count=1, unit="window").apply(data)
     rows = labelled["has_action"].squeeze(-1).nonzero().squeeze(-1)
     assert len(rows) == 14 == report.labelled_transitions
     assert rows.tolist() == list(range(int(rows[0]), int(rows[0]) + 14))
     assert len(data["episode"][int(rows[0]) - 1 : int(rows[-1]) + 2].unique()) == 1  # frames 0 and 15 are there too
-    wide, _ = LabelBudget(1, "window", window=10, history=3).apply(data)
-    assert int(wide["has_action"].sum()) == 7
 
 
 def test_all_windows_leave_out_the_ends():
-    labelled, report = LabelBudget(1.0, "window").apply(demonstrations((20, 16)))
+    labelled, report = LabelBudget(fraction=1.0, unit="window").apply(demonstrations((20, 16)))
     inner = [False] + [True] * 18 + [False] + [False] + [True] * 14 + [False]
     assert labelled["has_action"].squeeze(-1).tolist() == inner
     assert report.selected_units == 6
@@ -92,7 +94,7 @@ def test_all_windows_leave_out_the_ends():
 def test_the_input_is_untouched(unit):
     data = demonstrations()
     before = data.clone()
-    labelled, _ = LabelBudget(2, unit).apply(data, command=COMMAND)
+    labelled, _ = LabelBudget(count=2, unit=unit).apply(data, command=COMMAND)
     labelled.apply_(lambda value: value.zero_())
     assert (data == before).all()
 
@@ -107,18 +109,21 @@ def test_the_seed_alone_decides(unit):
         before = torch.get_num_threads()
         torch.set_num_threads(threads)
         state = torch.get_rng_state()
-        draws.append(LabelBudget(2, unit, seed).apply(data)[0]["has_action"])
+        draws.append(LabelBudget(count=2, unit=unit, seed=seed).apply(data)[0]["has_action"])
         assert torch.equal(torch.get_rng_state(), state)
         torch.set_num_threads(before)
     assert torch.equal(draws[0], draws[1])
-    seeds = {tuple(LabelBudget(2, unit, seed).apply(data)[0]["has_action"].flatten().tolist()) for seed in range(8)}
+    seeds = {
+        tuple(LabelBudget(count=2, unit=unit, seed=seed).apply(data)[0]["has_action"].flatten().tolist())
+        for seed in range(8)
+    }
     assert len(seeds) > 2
 
 
 @pytest.mark.parametrize("unit", UNITS)
 def test_larger_budgets_contain_smaller_ones(unit):
     data = demonstrations()
-    kept = [LabelBudget(count, unit, seed=4).apply(data)[0]["has_action"] for count in (1, 2, 4)]
+    kept = [LabelBudget(count=count, unit=unit, seed=4).apply(data)[0]["has_action"] for count in (1, 2, 4)]
     for small, large in zip(kept[:-1], kept[1:], strict=True):
         assert (large | ~small).all() and large.sum() > small.sum()
 
@@ -128,39 +133,43 @@ def test_larger_budgets_contain_smaller_ones(unit):
     [(0.02, 96, 2), (0.005, 100, 1), (0.145, 100, 15), (0.01, 96, 1), (1.0, 7, 7), (1, 7, 1), (0.5, 3, 2), (0.3, 5, 2)],
 )
 def test_rounding_is_half_up_in_decimals(amount, total, expected):
-    assert LabelBudget(amount).apply(demonstrations((2,) * total))[1].selected_units == expected
+    assert budget_of(amount).apply(demonstrations((2,) * total))[1].selected_units == expected
 
 
 @pytest.mark.parametrize("total", [3, 7, 30, 96])
 def test_selecting_nothing_names_a_fraction_that_works(total):
     data = demonstrations((3,) * total)
     with pytest.raises(ValueError, match=f"none of the {total} trajectories") as error:
-        LabelBudget(0.49 / total).apply(data)
+        LabelBudget(fraction=0.49 / total).apply(data)
     least = float(str(error.value).split()[-1])
-    assert LabelBudget(least).apply(data)[1].selected_units == 1
+    assert LabelBudget(fraction=least).apply(data)[1].selected_units == 1
     assert least <= 0.5 / total * 1.001
 
 
-@pytest.mark.parametrize("amount", [0, 0.0, -1, -0.5, 1.5, math.nan, math.inf, True, None, "0.1"])
+@pytest.mark.parametrize(
+    "amount",
+    [{"count": count} for count in (0, -1, True, 2.0, "3")]
+    + [{"fraction": fraction} for fraction in (0, -0.5, 1.5, math.nan, math.inf, True, "0.1")],
+)
 def test_wrong_amounts(amount):
-    with pytest.raises(ValueError, match="fraction|count"):
-        LabelBudget(amount)
+    with pytest.raises(ValueError, match=r"label fraction must be in \(0, 1\]|count .* whole number of at least 1"):
+        LabelBudget(**amount)
 
 
 def test_wrong_options():
     with pytest.raises(ValueError, match="unknown unit 'windows'"):
-        LabelBudget(1, "windows")
-    with pytest.raises(ValueError, match="history"):
-        LabelBudget(1, "window", window=2)
+        LabelBudget(count=1, unit="windows")
+    with pytest.raises(ValueError, match="a fraction, a count or episodes, got fraction and count"):
+        LabelBudget(fraction=0.1, count=1)
     with pytest.raises(ValueError, match="9 labelled trajectories asked for, there are 4"):
-        LabelBudget(9).apply(demonstrations())
+        LabelBudget(count=9).apply(demonstrations())
     with pytest.raises(ValueError, match="longest: 12"):
-        LabelBudget(1, "window").apply(demonstrations((12, 3)))
+        LabelBudget(count=1, unit="window").apply(demonstrations((12, 3)))
 
 
 def test_commands_hide_with_the_actions():
     data = demonstrations()
-    labelled, _ = LabelBudget(2, "trajectory", seed=1).apply(data, command=COMMAND)
+    labelled, _ = LabelBudget(count=2, unit="trajectory", seed=1).apply(data, command=COMMAND)
     kept = labelled["has_action"].squeeze(-1)
     for key in ("observation", ("next", "observation")):
         assert labelled[key][~kept][:, COMMAND].isnan().all()
@@ -168,12 +177,12 @@ def test_commands_hide_with_the_actions():
         same_bits(labelled[key][:, 2:].contiguous(), data[key][:, 2:].contiguous())
     validate(labelled, command=COMMAND)
     # with single labels no trajectory is complete, and no command may be seen: their differences are sums of actions
-    labelled, _ = LabelBudget(0.5, "transition").apply(data, command=COMMAND)
+    labelled, _ = LabelBudget(fraction=0.5, unit="transition").apply(data, command=COMMAND)
     assert labelled["observation"][:, COMMAND].isnan().all()
     assert labelled["next", "observation"][:, COMMAND].isnan().all()
-    again, report = LabelBudget(1).apply(LabelBudget(2).apply(data, command=COMMAND)[0], command=COMMAND)
+    again, report = LabelBudget(count=1).apply(LabelBudget(count=2).apply(data, command=COMMAND)[0], command=COMMAND)
     assert report.selected_units == 1 and again["has_action"].any()  # data that lack labels are spent as well
-    full, _ = LabelBudget(1.0).apply(data, command=COMMAND)
+    full, _ = LabelBudget(fraction=1.0).apply(data, command=COMMAND)
     assert (full == data).all()
     assert (hide_commands(data, COMMAND) == data).all()
 
@@ -183,7 +192,7 @@ def test_commands_hide_with_the_actions():
 def test_nothing_outside_the_budget_leaks(unit, amount):
     """Poison all actions and commands outside the budget: everything downstream is the same, bit for bit."""
     clean = demonstrations()
-    budget = LabelBudget(amount, unit, seed=2)
+    budget = budget_of(amount, unit=unit, seed=2)
     kept = budget.apply(clean)[0]["has_action"].squeeze(-1)
     poisoned = clean.clone()
     poisoned["action"][~kept] = 1e6
@@ -224,17 +233,19 @@ def test_select_state():
 def test_given_episodes_are_labelled_and_no_others():
     data = flatten_trajectories([torch.rand(6, 4)] * 5, [torch.rand(5, 2)] * 5)
     data["episode"] = data["episode"] * 10  # numbers, not positions
-    labelled, report = LabelBudget.of_episodes([40, 10]).apply(data)
+    labelled, report = LabelBudget(episodes=[40, 10]).apply(data)
     shown = labelled["has_action"].squeeze(-1)
     assert labelled["episode"][shown].unique().tolist() == [10, 40] and int(shown.sum()) == 10
     assert report.selected_units == 2 and report.trajectories_touched == 2
     with pytest.raises(ValueError, match=r"no episodes \[3\] to label; the data have 0 to 40"):
-        LabelBudget.of_episodes([10, 3]).apply(data)
+        LabelBudget(episodes=[10, 3]).apply(data)
     for wrong in ([], [1, 1]):
         with pytest.raises(ValueError, match="one or more different numbers"):
-            LabelBudget.of_episodes(wrong)
-    with pytest.raises(ValueError, match="without an amount or a unit"):
-        LabelBudget(3, episodes=(1, 2))
+            LabelBudget(episodes=wrong)
+    with pytest.raises(ValueError, match="got count and episodes"):
+        LabelBudget(count=3, episodes=(1, 2))
+    with pytest.raises(ValueError, match="episodes to label are trajectories, got unit 'window'"):
+        LabelBudget(episodes=(1, 2), unit="window")
 
 
 def partly(lengths, shown, seed=0):
@@ -247,9 +258,9 @@ def partly(lengths, shown, seed=0):
 @pytest.mark.parametrize("unit", UNITS)
 def test_a_smaller_budget_of_the_same_draw_is_what_it_would_have_been(unit):
     data = demonstrations((20, 33, 16, 40, 25, 18))
-    some, _ = LabelBudget(4, unit, seed=3).apply(data)
-    again, report = LabelBudget(2, unit, seed=3).apply(some)
-    direct, plain = LabelBudget(2, unit, seed=3).apply(data)
+    some, _ = LabelBudget(count=4, unit=unit, seed=3).apply(data)
+    again, report = LabelBudget(count=2, unit=unit, seed=3).apply(some)
+    direct, plain = LabelBudget(count=2, unit=unit, seed=3).apply(data)
     if unit != "window":  # overlapping windows share labels: others can have some, too
         assert report.selected_units == 2 and report.available_units == 4
         assert torch.equal(again["has_action"], direct["has_action"])
@@ -261,39 +272,39 @@ def test_a_smaller_budget_of_the_same_draw_is_what_it_would_have_been(unit):
 
 def test_missing_labels_are_the_budget():
     data = partly((20, 33, 16, 40), shown=(1, 3))
-    everything, report = LabelBudget(1.0).apply(data)
+    everything, report = LabelBudget(fraction=1.0).apply(data)
     assert torch.equal(everything["has_action"], data["has_action"])
     assert str(report).endswith("2 of 4 trajectories touched; the data came with 73 labels, on 2 trajectories")
-    assert {int(LabelBudget(1, seed=s).apply(data)[0]["has_action"].sum()) for s in range(8)} == {33, 40}
-    assert LabelBudget(0.25).apply(data)[1].selected_units == 1  # of all four
-    assert LabelBudget(5, "transition").apply(data)[1].labelled_transitions == 5
-    windows, report = LabelBudget(1.0, "window").apply(data)
+    assert {int(LabelBudget(count=1, seed=s).apply(data)[0]["has_action"].sum()) for s in range(8)} == {33, 40}
+    assert LabelBudget(fraction=0.25).apply(data)[1].selected_units == 1  # of all four
+    assert LabelBudget(count=5, unit="transition").apply(data)[1].labelled_transitions == 5
+    windows, report = LabelBudget(fraction=1.0, unit="window").apply(data)
     assert report.available_units == report.selected_units == 18 + 25 and report.labelled_transitions == 31 + 38
-    episodes, _ = LabelBudget.of_episodes([3]).apply(data)
+    episodes, _ = LabelBudget(episodes=[3]).apply(data)
     assert int(episodes["has_action"].sum()) == 40
     holes = data.clone()
     holes["has_action"][25], holes["action"][25] = False, math.nan
-    assert LabelBudget(2).apply(holes)[1].labelled_transitions == 72
+    assert LabelBudget(count=2).apply(holes)[1].labelled_transitions == 72
 
 
 def test_a_budget_above_what_there_is_is_named():
     data = partly((20, 33, 16, 40), shown=(1, 3))
     with pytest.raises(ValueError, match="3 labelled trajectories asked for, only 2 of 4 have a label"):
-        LabelBudget(3).apply(data)
+        LabelBudget(count=3).apply(data)
     with pytest.raises(ValueError, match=r"fraction of 0.75 is 3 of 4 trajectories, but only 2 have a label \(0.5\)"):
-        LabelBudget(0.75).apply(data)
+        LabelBudget(fraction=0.75).apply(data)
     with pytest.raises(ValueError, match=r"episodes \[2\] are to be labelled, but the data hold no action of them"):
-        LabelBudget.of_episodes([2, 3]).apply(data)
+        LabelBudget(episodes=[2, 3]).apply(data)
     with pytest.raises(ValueError, match="none of the 109 steps has an action: there are no labels to spend"):
-        LabelBudget(1).apply(partly((20, 33, 16, 40), shown=()))
+        LabelBudget(count=1).apply(partly((20, 33, 16, 40), shown=()))
     with pytest.raises(ValueError, match="no entry 'action', and thus no labels"):
-        LabelBudget(1).apply(data.exclude("has_action", "action"))
+        LabelBudget(count=1).apply(data.exclude("has_action", "action"))
 
 
 def test_labels_that_are_no_numbers_are_named():
     data = demonstrations()
     data["action"][7] = math.nan
     with pytest.raises(ValueError, match="'action' is not finite in 1 labelled steps, first at step 7"):
-        LabelBudget(1).apply(data)
-    found, report = LabelBudget(1.0).apply(data.exclude("has_action"))  # without the column NaN means no label
+        LabelBudget(count=1).apply(data)
+    found, report = LabelBudget(fraction=1.0).apply(data.exclude("has_action"))  # without the column NaN means no label
     assert report.available_transitions == 108 and not found["has_action"][7]

@@ -39,7 +39,7 @@ def make_data(labelled=1, act=2, dtype=torch.float32):
     ]
     actions = [torch.randn(n, act) for n in LENGTHS]
     data = select_state(flatten_trajectories(frames, actions, dtype=dtype), (0, 1))
-    return LabelBudget(labelled, seed=2).apply(data)[0] if labelled else data
+    return LabelBudget(count=labelled, seed=2).apply(data)[0] if labelled else data
 
 
 def expected_window(data, row, window, now):
@@ -108,7 +108,7 @@ def test_a_known_law_is_recovered():
     states = [torch.randn(31, 2).cumsum(0) for _ in range(12)]
     truth = flatten_trajectories([x[:-1] for x in states], [x[2:] - x[:-2] for x in states])
     truth = select_state(truth, (0, 1))
-    data, _ = LabelBudget(4, seed=1).apply(truth)
+    data, _ = LabelBudget(count=4, seed=1).apply(truth)
     controller = LinearInverseDynamics(2, 2, look_ahead=2)
     windows = torch.stack(list(data["state"].split(29)))
     actions = torch.stack(list(data["action"].split(29)))

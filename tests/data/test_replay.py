@@ -32,7 +32,7 @@ def test_unknown_tasks(demonstrations):
 
 
 def test_label_budget_at_loading(demonstrations):
-    dataset = D3ILExperienceReplay("avoiding", demonstrations, label_budget=LabelBudget(1, seed=3))
+    dataset = D3ILExperienceReplay("avoiding", demonstrations, label_budget=LabelBudget(count=1, seed=3))
     hidden = ~dataset.data["has_action"].squeeze(-1)
     assert dataset.label_report.trajectories_touched == 1
     assert dataset.data["action"][hidden].isnan().all()

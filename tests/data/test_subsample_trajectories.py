@@ -17,7 +17,7 @@ def make_data(labelled=2, seed=0):
     states = [torch.full((length + 1, 2), float(index)) for index, length in enumerate(LENGTHS)]
     actions = [torch.full((length, 1), float(index)) for index, length in enumerate(LENGTHS)]
     data = flatten_trajectories(states, actions)
-    return data if labelled is None else LabelBudget(labelled, seed=seed).apply(data)[0]
+    return data if labelled is None else LabelBudget(count=labelled, seed=seed).apply(data)[0]
 
 
 def kept_of(data):

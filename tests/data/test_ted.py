@@ -51,7 +51,7 @@ def test_saved_data_sets(tmp_path, dtype):
 
 
 def test_partially_labelled_data(tmp_path):
-    data, _ = LabelBudget(1).apply(recorded(), command=slice(0, 2))
+    data, _ = LabelBudget(count=1).apply(recorded(), command=slice(0, 2))
     path = save_ted(data, tmp_path / "demos", AVOIDING)
     loaded, _ = load_ted(path)
     assert torch.equal(loaded["action"].isnan(), data["action"].isnan())

@@ -144,7 +144,7 @@ def test_spectrum_by_hand():
 
 def test_steps_are_inferred_once_each_whatever_the_labels():
     data, controller = blown(), knowing()
-    hidden, _ = LabelBudget(1, seed=2).apply(data)
+    hidden, _ = LabelBudget(count=1, seed=2).apply(data)
     steps = infer_steps(controller, hidden)
     lengths = [12, 15, 11, 20]
     usable = torch.cat([torch.arange(length) < length - 2 for length in lengths])

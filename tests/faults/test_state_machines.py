@@ -145,7 +145,7 @@ class Budgets(RuleBasedStateMachine):
         unit=st.sampled_from(["trajectory", "window", "transition"]), share=st.floats(0.05, 1.0), seed=st.integers(0, 5)
     )
     def spent(self, unit, share, seed):
-        budget = LabelBudget(share, unit=unit, seed=seed, window=8, history=1)
+        budget = LabelBudget(fraction=share, unit=unit, seed=seed)
         before = self.data.clone()
         try:
             data, report = budget.apply(self.data)

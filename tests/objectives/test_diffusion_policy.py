@@ -166,7 +166,7 @@ def test_training_recovers_a_linear_law_from_few_labels():
     states = [torch.rand(2) * 2 - 1 for _ in range(60)]
     states = [torch.stack([torch.linalg.matrix_power(turn, t) @ start for t in range(31)]) for start in states]
     data = flatten_trajectories(states, [frames[:-1] @ law.T for frames in states])
-    data, _ = LabelBudget(10, seed=1).apply(select_state(data, (0, 1)))
+    data, _ = LabelBudget(count=10, seed=1).apply(select_state(data, (0, 1)))
     policy = DiffusionPolicy(
         MLPDenoiser(2, 4, horizon=4, width=64, depth=1, frequencies=0),
         state_dim=2,

@@ -55,7 +55,7 @@ def hidden_steps(data, labelled):
 @pytest.mark.parametrize("num_past", [0, 1, 4, 7])
 def test_the_same_hidden_steps_for_every_controller(num_past, amount, unit):
     data = counting()
-    labelled, report = LabelBudget(amount, unit=unit, seed=2).apply(data)
+    labelled, report = LabelBudget(count=amount, unit=unit, seed=2).apply(data)
     assert report.trajectories_touched < 5
     controller = Copy(num_past)
     predicted, true = hidden_action_errors(controller, data, labelled)
@@ -67,7 +67,7 @@ def test_the_same_hidden_steps_for_every_controller(num_past, amount, unit):
 
 def test_actions_of_the_budget_are_not_even_looked_at():
     data = counting()
-    labelled, _ = LabelBudget(2).apply(data)
+    labelled, _ = LabelBudget(count=2).apply(data)
     poisoned = data.clone()
     touched = torch.isin(data["episode"], labelled["episode"][labelled["has_action"].squeeze(-1)])
     poisoned["action"][touched] = torch.nan
@@ -82,7 +82,7 @@ def test_the_first_frame_is_repeated_where_there_is_no_history():
             return tensordict.set("action", state[..., :1, :].expand_as(state))
 
     data = counting()
-    labelled, _ = LabelBudget(1).apply(data)
+    labelled, _ = LabelBudget(count=1).apply(data)
     predicted, true = hidden_action_errors(First(4), data, labelled)
     steps = data["step_count"][true[:, 0].long() - 1]
     assert torch.equal(true - predicted, steps.clamp_max(4)[:, None].expand(-1, 2).float())
@@ -102,7 +102,7 @@ def test_a_linear_world_is_predicted_by_the_ridge_and_written_down(tmp_path):
         frames.append(torch.cat([torch.full((length + 1, 2), 9.0), state[: length + 1]], 1))
         actions.append(action[:length])
     data = select_state(flatten_trajectories(frames, actions), (2, 3))
-    labelled, report = LabelBudget(1).apply(data)
+    labelled, report = LabelBudget(count=1).apply(data)
     torch.manual_seed(0)
     controller = build_controller({"method": "koap", "preset": "paper"}, 2, 2, labelled)
     run = RunDirectory(tmp_path)
@@ -121,7 +121,7 @@ def test_tool_and_objects_of_demonstrations_are_kept_for_pictures(tmp_path):
     task = get_task("stacking")
     frames = torch.arange(40 * task.observation_dim).float().reshape(40, -1)
     data = select_state(flatten_trajectories([frames[:20], frames[20:]], [torch.zeros(19, 8)] * 2), task.state_of)
-    labelled, _ = LabelBudget(1.0).apply(data)
+    labelled, _ = LabelBudget(fraction=1.0).apply(data)
     write_analysis(RunDirectory(tmp_path), task, data, labelled, Copy(1), (0, 1))
     shown, _ = load_tensors(tmp_path / "demonstrations.safetensors")
     assert torch.equal(shown["position"], data["observation"][:, 28:30])
@@ -130,7 +130,7 @@ def test_tool_and_objects_of_demonstrations_are_kept_for_pictures(tmp_path):
 
 def test_with_a_label_in_every_trajectory_there_is_nothing_to_measure(tmp_path):
     data = counting()
-    labelled, _ = LabelBudget(1.0).apply(data)
+    labelled, _ = LabelBudget(fraction=1.0).apply(data)
     result = write_analysis(RunDirectory(tmp_path), get_task("avoiding"), data, labelled, Copy(1), (0, 1))
     assert set(result) == {"note"}
     assert not (tmp_path / "actions.safetensors").exists()

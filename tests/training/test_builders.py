@@ -102,7 +102,7 @@ def test_unknown_and_unfit_planner_options_are_explained():
     [(preset, name) for name, method in METHODS.items() if method.has_planner for preset in method.presets],
 )
 def test_every_controller_acts_and_takes_over_weights(method, preset, data):
-    labelled, _ = LabelBudget(2).apply(data)
+    labelled, _ = LabelBudget(count=2).apply(data)
     tracking = {"states": [0, 1], "commands": [0, 1], "actions": [0, 1]}
     posture = {"state_dim": 3, "commands": [0, 1], "actions": [0, 1]}
     options = {"method": method, "preset": preset, "revised": True, "tracking": tracking, "posture": posture}
@@ -119,7 +119,7 @@ def test_every_controller_acts_and_takes_over_weights(method, preset, data):
 
 
 def test_statistics_are_those_of_all_states_and_of_the_labelled_actions(data):
-    labelled, _ = LabelBudget(2).apply(data)
+    labelled, _ = LabelBudget(count=2).apply(data)
     shown = data["action"][labelled["has_action"].squeeze(-1)]
     default = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
     torch.testing.assert_close(default.action_normalizer.scale, shown.square().mean(0).sqrt())

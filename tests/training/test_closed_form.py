@@ -27,11 +27,17 @@ def numbered(lengths=LENGTHS):
 
 @pytest.mark.parametrize(("method", "preset"), CONTROLLERS)
 @pytest.mark.parametrize(
-    ("amount", "unit"), [(2, "trajectory"), (3, "window"), (0.3, "transition"), (1.0, "trajectory")]
+    "budget",
+    [
+        LabelBudget(count=2),
+        LabelBudget(count=3, unit="window"),
+        LabelBudget(fraction=0.3, unit="transition"),
+        LabelBudget(),
+    ],
 )
-def test_every_label_with_full_look_ahead_is_used_exactly_once(monkeypatch, method, preset, amount, unit):
+def test_every_label_with_full_look_ahead_is_used_exactly_once(monkeypatch, method, preset, budget):
     data = numbered()
-    labelled, _ = LabelBudget(amount, unit=unit).apply(data)
+    labelled, _ = budget.apply(data)
     torch.manual_seed(0)
     controller = build_controller({"method": method, "preset": preset}, 2, 2, labelled)
     seen = []
@@ -58,7 +64,7 @@ def test_few_trajectories_take_the_default_penalty_many_choose():
     data = numbered()
     reports = []
     for count in (1, 2, 3, 5):
-        labelled, _ = LabelBudget(count).apply(data)
+        labelled, _ = LabelBudget(count=count).apply(data)
         torch.manual_seed(0)
         controller = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
         reports.append(fit_closed_form(controller, labelled))
@@ -94,7 +100,7 @@ def test_no_penalty_is_below_that_of_the_errors_of_plans(monkeypatch, method):
 @pytest.mark.parametrize(("preset", "through_zero"), [("default", True), ("paper", False)])
 def test_no_motion_decodes_to_no_action_only_where_zero_is_zero(preset, through_zero):
     """With actions normalised by their root mean square, a bias would be an action out of nothing."""
-    labelled, _ = LabelBudget(5).apply(numbered())
+    labelled, _ = LabelBudget(count=5).apply(numbered())
     torch.manual_seed(0)
     controller = build_controller({"method": "koap", "preset": preset}, 2, 2, labelled)
     fit_closed_form(controller, labelled)
@@ -104,7 +110,7 @@ def test_no_motion_decodes_to_no_action_only_where_zero_is_zero(preset, through_
 
 def test_labels_that_see_no_look_ahead_are_an_error():
     data = numbered((20,))
-    labelled, _ = LabelBudget(1, unit="transition", seed=1).apply(data)
+    labelled, _ = LabelBudget(count=1, unit="transition", seed=1).apply(data)
     labelled["has_action"] = torch.zeros_like(labelled["has_action"])
     labelled["has_action"][-1] = True
     labelled["action"] = torch.where(labelled["has_action"], data["action"], torch.nan)
@@ -114,7 +120,7 @@ def test_labels_that_see_no_look_ahead_are_an_error():
 
 
 def test_keys_of_the_controller_and_no_normalizer_of_actions():
-    labelled, _ = LabelBudget(2).apply(numbered())
+    labelled, _ = LabelBudget(count=2).apply(numbered())
     fits = []
     for keys in ({}, {"state": "frames", "action": ("robot", "u")}):
         torch.manual_seed(0)

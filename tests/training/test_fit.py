@@ -79,7 +79,7 @@ def test_labels_marked_missing_or_found():
     unmarked = data.exclude("has_action")
     assert same_weights(fit_controller(unmarked, task, method="linear", progress=False), expected)
     full, _ = make_demonstrations(**few_labels(6))
-    budgeted, _ = LabelBudget.of_episodes([0, 1]).apply(full)
+    budgeted, _ = LabelBudget(episodes=[0, 1]).apply(full)
     assert same_weights(fit_controller(budgeted, task, method="linear", progress=False), expected)
     with_state = select_state(data, task.state_of)
     assert same_weights(fit_controller(with_state, task, method="linear", progress=False), expected)

@@ -19,7 +19,7 @@ def data():
     generator = torch.Generator().manual_seed(0)
     states = [torch.randn(41, 3, generator=generator).cumsum(0) for _ in range(4)]
     data = flatten_trajectories(states, [state.diff(dim=0)[:, :2] for state in states])
-    return LabelBudget(2).apply(select_state(data, (0, 1, 2)))[0]
+    return LabelBudget(count=2).apply(select_state(data, (0, 1, 2)))[0]
 
 
 def make(name, data):

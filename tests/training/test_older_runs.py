@@ -40,7 +40,7 @@ def older_run(trained_run, tmp_path):
 def test_it_is_loaded_and_evaluated(older_run):
     loaded = load_run(older_run)
     assert (loaded.task.name, loaded.method.name, loaded.columns) == ("avoiding", "koap", (0, 1))
-    assert loaded.budget.amount == 2
+    assert loaded.budget.count == 2
     assert koap("eval", older_run, "--episodes", 1, "--threads", 1, "--no-report") == 0
     assert json.loads((older_run / "eval.json").read_text())["episodes"] == 1
 

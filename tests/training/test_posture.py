@@ -38,7 +38,7 @@ def posture() -> CommandPosture:
 
 def test_commands_are_found_from_windows():
     data = recordings()
-    labelled = LabelBudget(0.1, unit="window", window=8, history=2).apply(data, command=slice(0, 2))[0]
+    labelled = LabelBudget(fraction=0.1, unit="window").apply(data, command=slice(0, 2))[0]
     assert labelled["observation"][:, :2].isnan().all()
     module = posture()
     found = fit_posture(module, with_label_commands(labelled, data, slice(0, 2)), updates=600)
@@ -48,14 +48,14 @@ def test_commands_are_found_from_windows():
 
 
 def test_trajectories_that_are_labelled_throughout_need_nothing_added():
-    labelled = LabelBudget(2).apply(recordings(), command=slice(0, 2))[0]
+    labelled = LabelBudget(count=2).apply(recordings(), command=slice(0, 2))[0]
     found = fit_posture(posture(), labelled, updates=20)
     assert found["labels_used"] == int(labelled["has_action"].sum()) and found["commands_told"] == 0
 
 
 def test_steps_without_label_are_not_read():
     data = recordings()
-    budget = LabelBudget(0.1, unit="window", window=8, history=2)
+    budget = LabelBudget(fraction=0.1, unit="window")
     weights = []
     for other in (data, data.clone()):
         free = ~budget.apply(data)[0]["has_action"].reshape(-1)
@@ -78,7 +78,7 @@ def test_commands_that_nobody_hid_count_at_labelled_steps_alone():
 
 
 def test_without_a_known_command_it_says_so():
-    labelled = LabelBudget(0.1, unit="window", window=8, history=2).apply(recordings(), command=slice(0, 2))[0]
+    labelled = LabelBudget(fraction=0.1, unit="window").apply(recordings(), command=slice(0, 2))[0]
     with pytest.raises(ValueError, match="labelled steps whose command is known"):
         fit_posture(posture(), labelled)
 

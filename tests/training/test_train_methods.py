@@ -72,7 +72,7 @@ CASES = [(method, unit, {}) for method in METHODS for unit in ("trajectory", "wi
 def test_no_weight_of_any_method_depends_on_a_hidden_label(
     method, unit, options, demonstrations, planner, tmp_path, monkeypatch
 ):
-    budget = LabelBudget(2, unit=unit, seed=0, window=16, history=2)
+    budget = LabelBudget(count=2, unit=unit)
     real = load_demonstrations(str(demonstrations), TASK)
     outside = poisoned(real, budget, told=METHODS[method].keeps_posture)
     variants = {"clean": real, "outside": outside, "inside": poisoned(real, budget, inside=True)}
@@ -90,7 +90,7 @@ def test_no_weight_of_any_method_depends_on_a_hidden_label(
 
 
 def test_no_weight_of_a_planner_depends_on_any_label(demonstrations, planner, tmp_path, monkeypatch):
-    budget = LabelBudget(2)
+    budget = LabelBudget(count=2)
     data = poisoned(poisoned(load_demonstrations(str(demonstrations), TASK), budget), budget, inside=True)
     monkeypatch.setattr("torchrl_koap.training.run.load_demonstrations", lambda *a, **o: data.clone())
     options = {"method": "linear", "label_count": 2, "analysis": False}

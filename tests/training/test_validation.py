@@ -19,7 +19,7 @@ def flat(count):
 
 def test_trajectories_without_labels_are_taken_first():
     for seed in range(5):
-        data, _ = LabelBudget(6, seed=seed).apply(flat(10))
+        data, _ = LabelBudget(count=6, seed=seed).apply(flat(10))
         labelled = set(data["episode"][data["has_action"].squeeze(-1)].tolist())
         chosen = choose_validation(data, 0.4, seed=seed)
         assert len(chosen) == 4 and not labelled & set(chosen)

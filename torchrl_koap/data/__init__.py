@@ -10,11 +10,10 @@ from torchrl_koap.data.augmentation import (
 from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstrations
 from torchrl_koap.data.formats import Recordings, make_recordings, read_recordings, write_recordings
 from torchrl_koap.data.gripper_recovery import GripperRecovery
-from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands
+from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands, subsample_trajectories
 from torchrl_koap.data.neighbor_recovery import NeighborRecovery
 from torchrl_koap.data.replay import D3ILExperienceReplay
 from torchrl_koap.data.sources import open_dataset
-from torchrl_koap.data.subsampling import subsample_trajectories
 from torchrl_koap.data.ted import load_ted, read_about, save_ted, stored_task
 from torchrl_koap.data.trajectories import (
     controller_view,
@@ -23,10 +22,8 @@ from torchrl_koap.data.trajectories import (
     select_state,
     trajectory_lengths,
 )
-from torchrl_koap.data.window_buffer import cut_windows, make_window_buffer
 from torchrl_koap.data.window_sampler import WindowSampler, WindowUnit
-from torchrl_koap.data.window_sampler_without_replacement import WindowSamplerWithoutReplacement
-from torchrl_koap.data.window_table import WindowTable
+from torchrl_koap.data.windows import WindowTable, cut_windows, make_window_buffer
 from torchrl_koap.files import DataError
 
 __all__ = [
@@ -41,7 +38,6 @@ __all__ = [
     "Recordings",
     "RecoveryAugmentation",
     "WindowSampler",
-    "WindowSamplerWithoutReplacement",
     "WindowTable",
     "WindowUnit",
     "controller_view",

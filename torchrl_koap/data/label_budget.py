@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Which steps keep their action label, and an exact account of how many that were.
+"""Which steps keep their action label, an exact account of how many that were, and which trajectories are used.
 
 Everything outside the budget is poisoned rather than dropped: the action becomes NaN, so whoever reads it by mistake
 finds out at once. The observation of some tasks repeats the last command, whose differences *are* the actions; those
@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import numbers
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from decimal import ROUND_CEILING, ROUND_HALF_UP, Context, Decimal
 from typing import Any, Literal, get_args
@@ -23,6 +23,7 @@ from tensordict import TensorDictBase
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import mark_labels, trajectory_lengths
 from torchrl_koap.lookup import lookup
+from torchrl_koap.tasks import HISTORY, WINDOW
 
 Unit = Literal["trajectory", "window", "transition"]
 
@@ -47,7 +48,7 @@ class LabelReport:
     Examples:
         >>> import torch
         >>> from torchrl_koap.data import LabelBudget, flatten_trajectories
-        >>> _, report = LabelBudget(1).apply(flatten_trajectories([torch.rand(6, 2)] * 4, [torch.rand(5, 1)] * 4))
+        >>> _, report = LabelBudget(count=1).apply(flatten_trajectories([torch.rand(6, 2)] * 4, [torch.rand(5, 1)] * 4))
         >>> report.labelled_transitions, report.total_transitions, report.trajectories_touched
         (5, 20, 1)
     """
@@ -80,7 +81,7 @@ class LabelReport:
         ) + (had if self.available_transitions < self.total_transitions else "")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LabelBudget:
     """Keeps the labels of a few trajectories, windows or single transitions, and hides all others.
 
@@ -91,74 +92,55 @@ class LabelBudget:
     for ``1.0``, which draws every unit that has a label.
 
     * ``"trajectory"``: whole demonstrations. The honest default: a robot records whole demonstrations.
-    * ``"window"``: the unit of the first public code. Windows are drawn without replacement from all windows of all
-      trajectories, and of each the inner frames ``history - 1 .. window - 2`` keep their label (14 of 16). A window
-      costs 14 labels where windows overlap less, and the windows of a small share touch most trajectories: read the
-      report.
+    * ``"window"``: the unit of the first public code. Windows of 16 steps are drawn without replacement from all
+      windows of all trajectories, and of each the 14 inner frames keep their label. A window costs 14 labels where
+      windows overlap less, and the windows of a small share touch most trajectories: read the report.
     * ``"transition"``: single steps.
 
     Args:
-        amount (float or int): a fraction in (0, 1], rounded half up to whole units, or a count >= 1. ``1.0`` is
-            everything, ``1`` is one unit.
+        fraction (float, optional): share of the units in (0, 1], rounded half up to whole ones.
+        count (int, optional): number of units instead.
+        episodes (iterable of int, optional): these trajectories instead of a draw, such as those that ``koap suggest``
+            names. Default where none of the three is given: every label that there is.
         unit (str): ``"trajectory"``, ``"window"`` or ``"transition"``.
         seed (int): seed of the draw.
-        window (int): frames of a window.
-        history (int): frames of a window up to and including "now".
-        episodes (tuple of int): these trajectories instead of a draw, see :meth:`of_episodes`.
 
     Raises:
-        ValueError: if an argument is out of range.
+        ValueError: if an argument is out of range, or several of the first three are given.
 
     Examples:
         >>> import torch
         >>> from torchrl_koap.data import LabelBudget, flatten_trajectories
         >>> data = flatten_trajectories([torch.rand(31, 4)] * 10, [torch.rand(30, 2)] * 10)
-        >>> labelled, report = LabelBudget(0.2).apply(data)
+        >>> labelled, report = LabelBudget(fraction=0.2).apply(data)
         >>> print(report)
         2 of 10 trajectories drawn: 60 of 300 transitions labelled (20.00%), 2 of 10 trajectories touched
         >>> int(labelled["has_action"].sum()), int(labelled["action"].isnan().all(-1).sum())
         (60, 240)
     """
 
-    amount: float | int
+    fraction: float | None = None
+    count: int | None = None
+    episodes: Iterable[int] | None = None
     unit: Unit = "trajectory"
     seed: int = 0
-    window: int = 16
-    history: int = 2
-    episodes: tuple[int, ...] = ()
-
-    @classmethod
-    def of_episodes(cls, episodes: Sequence[int]) -> LabelBudget:
-        """The labels of given trajectories, such as those that ``koap suggest`` names.
-
-        Raises:
-            ValueError: if there are none, or one occurs twice.
-
-        Examples:
-            >>> from torchrl_koap.data import LabelBudget
-            >>> LabelBudget.of_episodes([57, 79]).amount
-            2
-        """
-        chosen = tuple(int(episode) for episode in episodes)
-        if not chosen or len(set(chosen)) < len(chosen):
-            raise ValueError(f"episodes to label must be one or more different numbers, got {list(chosen)}")
-        return cls(len(chosen), episodes=chosen)
 
     def __post_init__(self):
-        if self.episodes and (self.unit != "trajectory" or self.amount != len(self.episodes)):
-            raise ValueError("episodes are given with LabelBudget.of_episodes(), without an amount or a unit")
+        given = [name for name in ("fraction", "count", "episodes") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"labels are a fraction, a count or episodes, got {' and '.join(given)}")
         lookup(get_args(Unit), self.unit, "unit")
-        amount = self.amount
-        real, counted = (isinstance(amount, kind) for kind in (numbers.Real, numbers.Integral))
-        if isinstance(amount, bool) or not real:
-            raise ValueError(f"amount must be a fraction in (0, 1] or a count >= 1, got {amount!r}")
-        if counted:
-            if amount < 1:
-                raise ValueError(f"a count of labelled units must be at least 1, got {amount}")
-        elif not 0 < amount <= 1:
-            raise ValueError(f"a fraction must be in (0, 1], got {amount}; counts are integers")
-        if not 1 <= self.history < self.window:
-            raise ValueError(f"wanted 1 <= history < window, got history {self.history} and window {self.window}")
+        if self.fraction is not None and not (_is(self.fraction, numbers.Real) and 0 < self.fraction <= 1):
+            raise ValueError(f"a label fraction must be in (0, 1], got {self.fraction!r}")
+        if self.count is not None and not (_is(self.count, numbers.Integral) and self.count >= 1):
+            raise ValueError(f"a count of labelled units must be a whole number of at least 1, got {self.count!r}")
+        if self.episodes is not None:
+            chosen = tuple(int(episode) for episode in self.episodes)
+            if not chosen or len(set(chosen)) < len(chosen):
+                raise ValueError(f"episodes to label must be one or more different numbers, got {list(chosen)}")
+            if self.unit != "trajectory":
+                raise ValueError(f"episodes to label are trajectories, got unit {self.unit!r}")
+            object.__setattr__(self, "episodes", chosen)
 
     def apply(self, data: TensorDictBase, *, command: slice | None = None) -> tuple[TensorDictBase, LabelReport]:
         """Hides all labels outside the budget.
@@ -189,23 +171,21 @@ class LabelBudget:
         elif self.unit == "transition":
             units, labels = np.arange(lengths.sum()), range(1)
         else:
-            counts = np.maximum(lengths - self.window + 1, 0)
+            counts = np.maximum(lengths - WINDOW + 1, 0)
             if not counts.any():
-                raise ValueError(
-                    f"no trajectory is as long as a window of {self.window} steps (longest: {lengths.max()})"
-                )
+                raise ValueError(f"no trajectory is as long as a window of {WINDOW} steps (longest: {lengths.max()})")
             units = np.concatenate([start + np.arange(count) for start, count in zip(starts, counts, strict=True)])
-            labels = range(self.history - 1, self.window - 1)
+            labels = range(HISTORY - 1, WINDOW - 1)
 
         if labels is None:
             usable = np.logical_or.reduceat(available, starts)
         else:
             usable = available[units[:, None] + np.asarray(labels)].any(1)
-        number = self._number_of(len(units), int(usable.sum()))
-        order = np.random.default_rng(self.seed).permutation(len(units))
-        chosen = order[usable[order]][:number]
-        if self.episodes:
-            chosen = _positions(data.get(keys.EPISODE).cpu().numpy()[starts], usable, self.episodes)
+        if self.episodes is None:
+            order = np.random.default_rng(self.seed).permutation(len(units))
+            chosen = order[usable[order]][: self._number_of(len(units), int(usable.sum()))]
+        else:
+            chosen = _positions(data.get(keys.EPISODE).cpu().numpy()[starts], usable, tuple(self.episodes))
         kept = np.zeros(lengths.sum(), dtype=bool)
         if labels is None:
             for index in chosen:
@@ -223,8 +203,8 @@ class LabelBudget:
         touched = np.add.reduceat(kept, starts, dtype=np.int64) > 0
         report = LabelReport(
             unit=self.unit,
-            requested=self.amount,
-            selected_units=number,
+            requested=next((asked for asked in (self.fraction, self.count) if asked is not None), len(chosen)),
+            selected_units=len(chosen),
             total_units=len(units),
             labelled_transitions=int(kept.sum()),
             total_transitions=len(kept),
@@ -239,31 +219,34 @@ class LabelBudget:
     def _number_of(self, total: int, usable: int) -> int:
         """Units to draw, of ``total`` of which ``usable`` have a label."""
         plural = _plural(self.unit)
-        amount, counted = self.amount, isinstance(self.amount, numbers.Integral)
-        if counted:
-            if amount > usable:
+        if self.count is not None:
+            if self.count > usable:
                 have = f"there are {total}" if usable == total else f"only {usable} of {total} have a label"
-                raise ValueError(f"{amount} labelled {plural} asked for, {have}")
-            return int(amount)
-        if amount == 1:
+                raise ValueError(f"{self.count} labelled {plural} asked for, {have}")
+            return int(self.count)
+        if self.fraction is None or self.fraction == 1:
             return usable
         # in decimals, so that 0.145 of 100 is 14.5 and not 14.499999999999998
-        number = int((Decimal(repr(float(amount))) * total).to_integral_value(ROUND_HALF_UP))
+        number = int((Decimal(repr(float(self.fraction))) * total).to_integral_value(ROUND_HALF_UP))
         if number == 0:
             least = Context(prec=4, rounding=ROUND_CEILING).divide(Decimal("0.5"), Decimal(total))
             raise ValueError(
-                f"a label fraction of {amount} selects none of the {total} {plural};"
+                f"a label fraction of {self.fraction} selects none of the {total} {plural};"
                 f" the smallest fraction that selects one is {least}"
             )
         if number > usable:
             raise ValueError(
-                f"a label fraction of {amount} is {number} of {total} {plural}, but only {usable} have a label"
+                f"a label fraction of {self.fraction} is {number} of {total} {plural}, but only {usable} have a label"
                 f" ({usable / total:.4g}); 1.0 keeps every label there is"
             )
         return number
 
 
-def _positions(present: np.ndarray, usable: np.ndarray, wanted: Sequence[int]) -> np.ndarray:
+def _is(value: object, kind: type) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
+def _positions(present: np.ndarray, usable: np.ndarray, wanted: tuple[int, ...]) -> np.ndarray:
     """Where the trajectories of some numbers lie."""
     absent = sorted(set(wanted) - set(present.tolist()))
     if absent:
@@ -293,7 +276,7 @@ def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
         >>> import torch
         >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, hide_commands
         >>> data = flatten_trajectories([torch.ones(2, 4), torch.ones(2, 4)], [torch.ones(1, 2), torch.ones(1, 2)])
-        >>> hide_commands(LabelBudget(1).apply(data)[0], slice(0, 2))["observation"].isnan().sum(-1).sort().values
+        >>> hide_commands(LabelBudget(count=1).apply(data)[0], slice(0, 2))["observation"].isnan().sum(-1).sort().values
         tensor([0, 2])
     """
     lengths = trajectory_lengths(data)
@@ -305,6 +288,52 @@ def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
         value[:, command] = torch.where(rows.unsqueeze(-1), math.nan, value[:, command])
         result.set(key, value)
     return result
+
+
+def subsample_trajectories(data: TensorDictBase, fraction: float, *, seed: int = 0) -> TensorDictBase:
+    """Drops whole trajectories without a label until a share of all trajectories is left.
+
+    Trajectories with a label always stay. Of one seed, a smaller share is part of every larger one.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` after the label budget was applied; not changed.
+        fraction (float): share of the trajectories to keep, in ``(0, 1]``.
+
+    Keyword Args:
+        seed (int): seed of the choice.
+
+    Returns:
+        TensorDictBase: flat data in the order of ``data``; ``data`` itself if nothing is dropped.
+
+    Raises:
+        ValueError: if the share is out of range, or smaller than that of the trajectories with labels.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, subsample_trajectories
+        >>> data = flatten_trajectories([torch.zeros(5, 2)] * 10, [torch.zeros(4, 1)] * 10)
+        >>> data, _ = LabelBudget(count=2).apply(data)
+        >>> kept = subsample_trajectories(data, 0.5)
+        >>> len(kept["episode"].unique()), int(kept["has_action"].sum())
+        (5, 8)
+    """
+    if not 0 < fraction <= 1:
+        raise ValueError(f"observation fraction must be in (0, 1], got {fraction}")
+    lengths = trajectory_lengths(data)
+    number = math.floor(fraction * len(lengths) + 0.5)
+    labelled = torch.stack([part.any() for part in data.get(keys.HAS_ACTION).split(lengths.tolist())]).cpu()
+    if number < max(int(labelled.sum()), 1):
+        raise ValueError(
+            f"an observation fraction of {fraction} keeps {number} of {len(lengths)} trajectories,"
+            f" but {int(labelled.sum())} have labels"
+        )
+    if number == len(lengths):
+        return data
+    order = torch.randperm(len(lengths), generator=torch.Generator().manual_seed(seed))
+    order = torch.cat([order[labelled[order]], order[~labelled[order]]])
+    kept = torch.zeros(len(lengths), dtype=torch.bool)
+    kept[order[:number]] = True
+    return data[kept.to(lengths.device).repeat_interleave(lengths)]
 
 
 def _plural(unit: str) -> str:

@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_koap.data.augmentation import extrapolate_ends
-from torchrl_koap.data.window_table import WindowTable
+from torchrl_koap.data.windows import WindowTable
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 
 RELABELLED = "relabelled"
@@ -58,7 +58,7 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
         >>> from torchrl_koap.modules import LinearInverseDynamics
         >>> from torchrl_koap.data.pseudo_labels import relabel
         >>> data = flatten_trajectories([torch.rand(21, 2)] * 4, [torch.rand(20, 3)] * 4)
-        >>> data, _ = LabelBudget(1).apply(select_state(data, (0, 1)))
+        >>> data, _ = LabelBudget(count=1).apply(select_state(data, (0, 1)))
         >>> relabelled = relabel(LinearInverseDynamics(2, 3), data, window=10)
         >>> int(relabelled["has_action"].sum()), int(relabelled["relabelled"].sum())
         (80, 60)
@@ -93,18 +93,16 @@ def _predict(controller: nn.Module, data: TensorDictBase, hidden: Tensor, window
     now = controller.num_past
     continued = extrapolate_ends(data, window - 1 - now)
     # one window per step of the data, in their order: those that have the step at frame `now`
-    table = WindowTable.build(continued, window, history=now + 1, pad_before=now)
-    starts, first = table.starts[hidden, None], table.first[hidden, None]
-    offsets = torch.arange(window, device=starts.device)
+    frames, _ = WindowTable.build(continued, window, history=now + 1, pad_before=now).frames(hidden)
     example = next(itertools.chain(controller.parameters(), controller.buffers()), continued.get(STATE))
     was_training = controller.training
     controller.eval()  # dropout would make labels of noise
     try:
         actions = []
-        for start, low in zip(starts.split(batch_size), first.split(batch_size), strict=True):
-            states = continued.get(STATE)[(start + offsets).clamp_min(low)].to(example)  # [B, T, d]
+        for part in frames.split(batch_size):
+            states = continued.get(STATE)[part].to(example)  # [B, T, d]
             windows = TensorDict({controller.in_keys[0]: states}, batch_size=states.shape[:-1])
-            actions.append(controller(windows).get(controller.out_keys[-1])[:, now].to(starts.device))
+            actions.append(controller(windows).get(controller.out_keys[-1])[:, now].to(frames.device))
     finally:
         controller.train(was_training)
     return torch.cat(actions)

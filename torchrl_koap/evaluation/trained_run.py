@@ -24,7 +24,7 @@ from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import CheckpointError, load_weights
-from torchrl_koap.tasks import HISTORY, REPLAN_INTERVAL, WINDOW, Task, task_of
+from torchrl_koap.tasks import REPLAN_INTERVAL, Task, task_of
 from torchrl_koap.training.builders import method_named
 from torchrl_koap.training.digests import check_digests
 from torchrl_koap.training.method import Method
@@ -46,7 +46,7 @@ class TrainedRun:
     Examples:
         >>> from torchrl_koap.evaluation.trained_run import load_run
         >>> trained = load_run("runs/koap")  # doctest: +SKIP
-        >>> trained.method.name, trained.budget.amount  # doctest: +SKIP
+        >>> trained.method.name, trained.budget.count  # doctest: +SKIP
         ('koap', 0.02)
     """
 
@@ -68,10 +68,10 @@ class TrainedRun:
         """The label budget it was trained with."""
         episodes = self.config.get("label_episodes")
         if episodes is not None:
-            return LabelBudget.of_episodes(episodes)
+            return LabelBudget(episodes=episodes)
         names = ("label_count", "label_fraction", "label_unit", "seed")
         count, fraction, unit, seed = (self.directory.read_entry("config.json", name) for name in names)
-        return LabelBudget(fraction if count is None else count, unit=unit, seed=seed, window=WINDOW, history=HISTORY)
+        return LabelBudget(fraction=fraction if count is None else None, count=count, unit=unit, seed=seed)
 
 
 def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:

@@ -16,7 +16,7 @@ from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.studies.cells import Cell
 from torchrl_koap.studies.curve_folder import dataset_of
-from torchrl_koap.tasks import HISTORY, WINDOW, Task, get_task
+from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import load_demonstrations
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def first_look(root: RunDirectory, options: CurveConfig, task: Task) -> TensorDi
     if (root.path / "demonstrations" / "ted").exists():
         return thin(load_demonstrations(str(root.path / "demonstrations"), task), options.data_share)
     if options.units != "trajectory":
-        LabelBudget(1, unit=cast("Unit", options.units))  # knows the units
+        LabelBudget(count=1, unit=cast("Unit", options.units))  # knows the units
         return None
     number = options.demonstrations or task.defaults.demonstrations
     return thin(flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number), options.data_share)
@@ -128,5 +128,5 @@ def check_budgets(cells: Sequence[Cell], options: CurveConfig, data: TensorDictB
     for fraction, share, seed in dict.fromkeys((cell.fraction, cell.observations, cell.seed) for cell in cells):
         amount = fraction / options.data_share
         unit = cast("Unit", options.units)  # another one is refused there
-        budget = LabelBudget(amount, unit=unit, seed=seed, window=WINDOW, history=HISTORY)
+        budget = LabelBudget(fraction=amount, unit=unit, seed=seed)
         subsample_trajectories(budget.apply(data)[0], share)

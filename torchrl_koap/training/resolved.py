@@ -17,7 +17,7 @@ from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import PRECISIONS
 from torchrl_koap.runs.progress import check_logger
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.tasks import HISTORY, HORIZON, WINDOW, Task
+from torchrl_koap.tasks import HISTORY, HORIZON, Task
 from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.diffusion_builders import SIZES
 from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
@@ -47,7 +47,7 @@ class ResolvedConfig:
         >>> from pathlib import Path
         >>> from torchrl_koap.training import TrainConfig, resolve
         >>> resolved = resolve(TrainConfig(out=Path("runs/koap"), label_fraction=0.05))
-        >>> resolved.task.name, resolved.method.name, resolved.budget.amount, resolved.options.steps
+        >>> resolved.task.name, resolved.method.name, resolved.budget.fraction, resolved.options.steps
         ('avoiding', 'koap', 0.05, 5000)
     """
 
@@ -220,11 +220,12 @@ def _budget(options: TrainConfig) -> LabelBudget:
     if options.label_episodes is not None:
         if options.label_count is not None or options.label_unit != "trajectory":
             raise ValueError("label_episodes are trajectories of their own choice: no label_count or label_unit")
-        return LabelBudget.of_episodes(options.label_episodes)
-    amount = options.label_fraction if options.label_count is None else options.label_count
-    amount = LABEL_FRACTION if amount is None else amount
+        return LabelBudget(episodes=options.label_episodes)
     unit = cast("Unit", options.label_unit)  # another one is refused there
-    return LabelBudget(amount, unit=unit, seed=options.seed, window=WINDOW, history=HISTORY)
+    if options.label_count is not None:
+        return LabelBudget(count=options.label_count, unit=unit, seed=options.seed)
+    fraction = LABEL_FRACTION if options.label_fraction is None else options.label_fraction
+    return LabelBudget(fraction=fraction, unit=unit, seed=options.seed)
 
 
 def _planner_entry(options: TrainConfig, task: Task, method: Method) -> dict[str, Any]:

@@ -1,0 +1,232 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Windows of consecutive steps: where they may start, which frames they have, all of them at once or a replay buffer.
+
+With ``pad_before`` and ``pad_after`` windows may reach over the ends of their trajectory by that many frames, whose
+place is taken by the first or last step::
+
+    steps of the trajectory                0 1 2 3 4
+    window 3, no padding                   0 1 2 ... 2 3 4
+    window 3, pad_before 1, pad_after 1    0 0 1 ... 3 4 4
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorDictReplayBuffer, TensorStorage
+
+from torchrl_koap import keys
+from torchrl_koap.data.window_sampler import WindowSampler, WindowUnit
+
+
+@dataclass(frozen=True)
+class WindowTable:
+    """All windows of a data set.
+
+    Args:
+        starts (Tensor): int64 ``[M]``, storage index of frame 0; outside the trajectory where frames are padded.
+        first (Tensor): int64 ``[M]``, index of the first step of the window's trajectory.
+        last (Tensor): int64 ``[M]``, index of its last step.
+        labelled (Tensor): bool ``[M]``, whether an inner frame, ``history - 1 .. window - 2``, has an action label and
+            neither that frame nor the one after it is padded.
+        window (int): frames per window.
+        num_steps (int): number of steps of the data set.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import WindowTable, flatten_trajectories
+        >>> table = WindowTable.build(flatten_trajectories([torch.rand(6, 2)] * 2, [torch.rand(5, 1)] * 2), 4)
+        >>> table.starts.tolist(), table.last.tolist(), table.num_steps
+        ([0, 1, 5, 6], [4, 4, 9, 9], 10)
+        >>> table.frames(torch.tensor([1]))[0]
+        tensor([[1, 2, 3, 4]])
+    """
+
+    starts: Tensor
+    first: Tensor
+    last: Tensor
+    labelled: Tensor
+    window: int
+    num_steps: int
+
+    @classmethod
+    def build(
+        cls, data: TensorDictBase, window: int, *, history: int = 2, pad_before: int = 0, pad_after: int = 0
+    ) -> WindowTable:
+        """Tabulates the windows of flat data.
+
+        Args:
+            data (TensorDictBase): flat data ``[N]`` with ``episode``; ``step_count`` and ``has_action`` are used if
+                they are there.
+            window (int): frames per window.
+            history (int): frames up to and including "now", ``1 .. window - 1``; tells which frames' labels count.
+            pad_before (int): frames by which a window may begin before its trajectory (the first frame is repeated).
+            pad_after (int): frames by which a window may end after its trajectory (the last frame is repeated).
+
+        Raises:
+            KeyError: if there is no ``episode``.
+            ValueError: if an argument is out of range, or a trajectory is too short.
+        """
+        if not 1 <= history < window:
+            raise ValueError(f"wanted 1 <= history < window, got history {history} and window {window}")
+        for name, value in (("pad_before", pad_before), ("pad_after", pad_after)):
+            if not 0 <= value < window:
+                raise ValueError(f"{name} must be in 0..{window - 1} frames (less than the window), got {value}")
+        episode = data.get(keys.EPISODE, None)
+        if episode is None:
+            raise KeyError(f"windows need the entry {keys.EPISODE!r}; the data have {sorted(map(str, data.keys()))}")
+        device, steps = episode.device, len(episode)
+        new = torch.ones(steps, dtype=torch.bool, device=device)
+        new[1:] = episode[1:] != episode[:-1]
+        count = data.get(keys.STEP_COUNT, None)
+        if count is not None:  # where steps were left out, those of one trajectory are not consecutive
+            new[1:] |= count[1:] != count[:-1] + 1
+        first = new.nonzero().squeeze(-1)
+        lengths = torch.diff(first, append=torch.tensor([steps], device=device))
+        windows = (lengths + pad_before + pad_after - window + 1).clamp_min(0)
+        _check_lengths(episode[first], lengths, windows, window - pad_before - pad_after)
+
+        trajectory = torch.arange(len(first), device=device).repeat_interleave(windows)
+        number = torch.arange(len(trajectory), device=device) - (windows.cumsum(0) - windows)[trajectory]
+        starts = first[trajectory] - pad_before + number
+        first, last = first[trajectory], (first + lengths - 1)[trajectory]
+        labelled = torch.zeros_like(starts, dtype=torch.bool)
+        has_action = data.get(keys.HAS_ACTION, None)
+        if has_action is not None:
+            before = torch.zeros(steps + 1, dtype=torch.int64, device=device)
+            before[1:] = has_action.reshape(-1).cumsum(0)
+            low = torch.maximum(starts + history - 1, first)
+            high = torch.minimum(starts + window - 2, last - 1)
+            labelled = before[(high + 1).clamp_min(0)] > before[low.clamp_max(steps)]
+        return cls(starts, first, last, labelled, window, steps)
+
+    def frames(self, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Gives the storage index of every frame of windows, padded at the ends of their trajectories.
+
+        Args:
+            rows (Tensor, optional): numbers of windows ``[M]``, or bool. Default: all of them.
+
+        Returns:
+            tuple: int64 ``[M, T]``, and bool ``[M, T]``, which of them repeat the first or last step. A transition is
+            recorded, rather than made up, where neither its frame nor the next one is padded.
+        """
+        starts, first, last = (value if rows is None else value[rows] for value in (self.starts, self.first, self.last))
+        wanted = starts.unsqueeze(-1) + torch.arange(self.window, device=starts.device)
+        inside = wanted.clamp(first.unsqueeze(-1), last.unsqueeze(-1))
+        return inside, inside != wanted
+
+
+def cut_windows(
+    data: TensorDictBase, window: int, *, select: Sequence[NestedKey] | None = None, pad_before: int = 0
+) -> TensorDictBase:
+    """Cuts all windows of flat data at once.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` with ``episode``.
+        window (int): frames per window.
+        select (sequence of keys, optional): the entries to return. Default: all.
+        pad_before (int): frames by which a window may begin before its trajectory; they repeat its first frame.
+
+    Returns:
+        TensorDictBase: ``[M, window]`` in the order of the data, with ``padded`` ``[M, window, 1]``.
+
+    Raises:
+        ValueError: if a trajectory is too short for a window.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import cut_windows
+        >>> data = TensorDict({"state": torch.arange(4.0)[:, None], "episode": torch.zeros(4, dtype=torch.int64)}, [4])
+        >>> cut_windows(data, 3, pad_before=1)["state"].squeeze(-1).tolist()
+        [[0.0, 0.0, 1.0], [0.0, 1.0, 2.0], [1.0, 2.0, 3.0]]
+    """
+    frames, padded = WindowTable.build(data, window, pad_before=pad_before).frames()
+    windows = (data if select is None else data.select(*select))[frames]
+    return windows.set("padded", padded.unsqueeze(-1))
+
+
+def make_window_buffer(
+    data: TensorDictBase | ReplayBuffer,
+    window: int,
+    batch_size: int,
+    *,
+    select: Sequence[NestedKey] | None = None,
+    labelled_share: float | None = None,
+    pad_before: int = 0,
+    pad_after: int = 0,
+    transform: Callable[[TensorDictBase], TensorDictBase] | None = None,
+) -> ReplayBuffer:
+    """Makes a replay buffer of windows over flat data.
+
+    Args:
+        data (TensorDictBase or ReplayBuffer): flat data ``[N]``, in memory or on a GPU, or a buffer over such data, for
+            example a :class:`D3ILExperienceReplay`. Not copied.
+        window (int): frames per window.
+        batch_size (int): windows per batch.
+        select (sequence of keys, optional): the entries to return; the fewer the faster. Default: all.
+        labelled_share (float, optional): see :class:`WindowSampler`.
+        pad_before (int): see :meth:`WindowTable.build`.
+        pad_after (int): likewise.
+        transform (callable, optional): what every batch undergoes, such as an augmentation.
+
+    Returns:
+        ReplayBuffer: samples are tensordicts ``[batch_size, window]``. With padding, a
+        :class:`~torchrl.data.TensorDictReplayBuffer` whose samples also hold ``padded`` and ``index``.
+
+    Raises:
+        KeyError: if a selected entry does not exist.
+        ValueError: if an option is out of range, a trajectory is too short for a window, or labelled windows are asked
+            for and there are none.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer
+        >>> data = flatten_trajectories([torch.rand(61, 4)] * 10, [torch.rand(60, 2)] * 10)
+        >>> data, _ = LabelBudget(count=2).apply(data)
+        >>> entries = ["observation", "action", "has_action"]
+        >>> buffer = make_window_buffer(data, 16, 8, select=entries, labelled_share=0.25)
+        >>> batch = buffer.sample()
+        >>> batch.shape, int(batch["has_action"].any(1).sum())
+        (torch.Size([8, 16]), 2)
+    """
+    if isinstance(data, ReplayBuffer):
+        data = data.storage.get(slice(None))
+    if data.batch_dims != 1:
+        raise ValueError(f"windows are cut from flat data [N], got batch size {list(data.batch_size)}")
+    table = WindowTable.build(data, window, pad_before=pad_before, pad_after=pad_after)
+    if select is not None:
+        absent = [key for key in select if data.get(key, None) is None]
+        if absent:
+            raise KeyError(f"the data have no entries {absent}")
+        data = data.select(*select)
+    sampler = WindowSampler(table.labelled, labelled_share=labelled_share)
+    sampler.number_labelled(batch_size)  # a share that is no window at all is refused here
+    padded = bool(pad_before or pad_after)
+    return (TensorDictReplayBuffer if padded else ReplayBuffer)(
+        storage=TensorStorage(data),
+        sampler=sampler,
+        sample_unit=WindowUnit(table.frames, padded=padded),
+        writer=ImmutableDatasetWriter(),
+        batch_size=batch_size,
+        transform=transform,
+    )
+
+
+def _check_lengths(episodes: Tensor, lengths: Tensor, windows: Tensor, least: int) -> None:
+    short = windows == 0
+    if not short.any():
+        return
+    listed = ", ".join(
+        f"{episode} ({length} steps)"
+        for episode, length in zip(episodes[short].tolist()[:10], lengths[short].tolist()[:10], strict=True)
+    )
+    number = int(short.sum())
+    more = ", ..." if number > 10 else ""
+    raise ValueError(
+        f"{number} of {len(lengths)} trajectories are shorter than a window ({least} steps): {listed}{more}"
+    )
