@@ -32,6 +32,7 @@ from torchrl.envs import EnvBase
 from torchrl_koap import EvalConfig, Task, TrainConfig, evaluate, register_task, train
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
+from torchrl_koap.envs.experts.recording import Expert
 from torchrl_koap.reports.scenes import draw_scene
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import Action, Body, Defaults, Modes, Scene, Shape
@@ -157,7 +158,7 @@ class PushEnv(EnvBase):
 # It is told a mode per episode, and says what to do and when it is done. What it fails at is discarded and counted.
 
 
-class PushExpert:
+class PushExpert(Expert):
     def __init__(self, modes, contexts, seeds):
         wide = [np.random.default_rng(seed).uniform(0.05, 0.09) for seed in seeds]
         self.gates = np.array([(POST[0] + (2 * m - 1) * w, POST[1] + 0.02) for m, w in zip(modes, wide, strict=True)])

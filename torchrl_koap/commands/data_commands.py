@@ -77,7 +77,7 @@ class Demos(Command):
             lacks = "environment" if task.env is None else "scripted expert"
             raise ValueError(f"task {task.name!r} has no {lacks}: there is nothing to record demonstrations with")
         episodes = task.defaults.demonstrations if self.episodes is None else self.episodes
-        embodiments = getattr(expert_of(task), "embodiments", ())
+        embodiments = expert_of(task).embodiments
         if self.embodiment is not None and not embodiments:
             raise ValueError(f"--embodiment was given, but task {task.name!r} has one embodiment alone")
         if embodiments:

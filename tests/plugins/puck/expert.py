@@ -6,12 +6,13 @@ from __future__ import annotations
 import numpy as np
 
 from puck.task import GATE_Y, GOAL, GOAL_RADIUS, POST, PUCK_RADIUS, ROBOT_RADIUS
+from torchrl_koap.envs.experts.recording import Expert
 
 SPEED = 0.008  # m per control step
 REACH = PUCK_RADIUS + ROBOT_RADIUS
 
 
-class PuckExpert:
+class PuckExpert(Expert):
     """Players of a batch of episodes.
 
     Args:

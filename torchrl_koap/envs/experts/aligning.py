@@ -28,7 +28,7 @@ import numpy as np
 from torchrl_koap.envs.contexts import check_contexts
 from torchrl_koap.envs.experts.noise import ar1_noise
 from torchrl_koap.envs.experts.push_planning import LENGTH, PLAN_SIZE, arrive, improve, motion, search, two_pushes
-from torchrl_koap.envs.experts.recording import RecordingRules
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.aligning import DISTANCE_TOLERANCE, ROTATION_TOLERANCE
 
@@ -66,7 +66,7 @@ def _contacts() -> tuple[np.ndarray, np.ndarray]:
 CONTACTS = _contacts()
 
 
-class AligningExpert:
+class AligningExpert(Expert):
     """Scripted expert of Aligning for a batch of episodes: pushes trays into their target poses, each in its mode.
 
     Args:

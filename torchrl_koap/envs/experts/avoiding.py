@@ -23,7 +23,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import RecordingRules
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROD_RADIUS, ROW_Y
 
 FULL_PUSH = 0.0124  # m per control step at full deflection
@@ -77,7 +77,7 @@ def clearance(frames: np.ndarray) -> float:
     return min(gaps) - ROD_RADIUS
 
 
-class AvoidingExpert:
+class AvoidingExpert(Expert):
     """Scripted expert of Avoiding for a batch of episodes, one mode and one seed each.
 
     Args:

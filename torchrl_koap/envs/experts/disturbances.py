@@ -211,7 +211,7 @@ class _Hand:
             if self._time == self._start:
                 self._held = self._last.copy()
                 self.spells.append((self._start, self._end, self._kind))
-            done = getattr(self, f"_{self._kind}")(wanted)
+            done = {"impulse": self._impulse, "slip": self._slip, "late_turn": self._late_turn}[self._kind](wanted)
         self._last = wanted
         self._time += 1
         if self._time >= self._end:

@@ -1,14 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """One attempt of a scripted expert at a batch of episodes, and what is kept of it.
 
-What an expert (``Task.expert``) has to offer::
-
-    __init__          (modes=, contexts=, seeds=) a mode, a context [bodies, 3] and a seed per episode, contexts=None in
-                      a task without bodies
-    act(observation)  float64 [n, obs] to the next actions [n, act], once per control step
-    finished          bool [n]: which episodes are over for the expert
-    rules             RecordingRules, optional
-
 What an environment has to offer is told in :mod:`torchrl_koap.envs.registry`. One of a task of D3IL with ``raw_log()``
 is recorded as D3IL's recorder does it: after the first substep of a control step, so that positions are 1 ms newer than
 those that were observed. Any other one is recorded as what it observed and what was done.
@@ -16,6 +8,7 @@ those that were observed. Any other one is recorded as what it observed and what
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -76,7 +69,28 @@ class RecordingRules:
     least_clearance: float = 0.0
 
 
-def expert_of(task: Task) -> type:
+class Expert(abc.ABC):
+    """Plays a batch of ``n`` episodes of a task; a subclass is named by ``Task.expert``.
+
+    Args:
+        modes (sequence of int): mode of each episode.
+        contexts (np.ndarray, optional): context ``[n, bodies, 3]``; None in a task without bodies.
+        seeds (sequence): seed of each episode.
+    """
+
+    rules = RecordingRules()
+    embodiments: tuple[str, ...] = ()  # of demonstrations before a camera
+    finished: np.ndarray  # which episodes are over for the expert, bool [n]
+
+    @abc.abstractmethod
+    def __init__(self, modes: Sequence[int], contexts: np.ndarray | None, seeds: Sequence): ...
+
+    @abc.abstractmethod
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Actions ``[n, act]`` under observations, float64 ``[n, obs]``; called once per control step."""
+
+
+def expert_of(task: Task) -> type[Expert]:
     """The task's scripted expert.
 
     Args:
@@ -121,7 +135,7 @@ def play(
         list of Attempt: one per episode that was played.
     """
     count, make = env.batch_size[0], expert_of(task)
-    rules = rules or getattr(make, "rules", RecordingRules())
+    rules = rules or make.rules
     placed = None if contexts is None else contexts[rows]
     expert = make(modes=modes, contexts=placed, seeds=seeds)
     converter = CONVERTERS.get(task.source) if isinstance(env, ManipulationEnv) else None

@@ -22,7 +22,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import RecordingRules
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules
 from torchrl_koap.envs.experts.sorting_decision import decide, pushing_cost
 from torchrl_koap.envs.sorting import box_colours, mode_colours
 from torchrl_koap.tasks.sorting import BIN_HALF, BIN_X
@@ -38,7 +38,7 @@ _LEAK = 0.18
 _LATENCY = 2.0  # control steps from what is seen to when an action begins to show
 
 
-class SortingExpert:
+class SortingExpert(Expert):
     """Scripted expert of Sorting for a batch of episodes, one mode and one seed each.
 
     Args:

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchrl_koap.envs.experts.noise import ar1_noise
-from torchrl_koap.envs.experts.recording import RecordingRules
+from torchrl_koap.envs.experts.recording import Expert, RecordingRules
 from torchrl_koap.envs.mujoco.inverse_kinematics import follow_pose, tcp_pose
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.stacking import BOXES, TARGET
@@ -45,7 +45,7 @@ _HORIZON = 1500  # control steps for which the wobble of the hand is drawn
 _REACH, _GRASP, _CARRY, _RELEASE, _RETREAT = range(5)
 
 
-class StackingExpert:
+class StackingExpert(Expert):
     """Scripted expert of Stacking for a batch of episodes, one order and one seed each.
 
     Args:

@@ -56,6 +56,7 @@ class ScoopingSimulations:
         self.commands = np.zeros((num_sims, self.model.nu))
         self.rim = np.zeros(num_sims, dtype=bool)
         self.held = np.zeros(num_sims, dtype=np.int64)
+        self._episode = {"commands": self.commands, "rim": self.rim, "held": self.held}
         self._site = self.model.site("spoon").id
         self._pieces = 7 * NUM_PIECES  # numbers that make up the pieces' poses
         self._executor: ThreadPoolExecutor | None = None
@@ -174,7 +175,7 @@ class ScoopingSimulations:
         """Everything that decides the future of one simulation."""
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
         mujoco.mj_getState(self.model, self.data[row], physics, _PHYSICS)
-        return {"physics": physics} | {name: np.copy(getattr(self, name)[row]) for name in ("commands", "rim", "held")}
+        return {"physics": physics} | {name: array[row].copy() for name, array in self._episode.items()}
 
     def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
         """Restores what :meth:`get_state` returned."""
@@ -183,8 +184,8 @@ class ScoopingSimulations:
         mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
         mujoco.mj_forward(self.model, data)
         mujoco.mj_setState(self.model, data, state["physics"], _PHYSICS)
-        for name in ("commands", "rim", "held"):
-            getattr(self, name)[row] = state[name]
+        for name, array in self._episode.items():
+            array[row] = state[name]
 
     def close(self) -> None:
         """Ends the threads; they start again when needed."""
