@@ -13,7 +13,7 @@ from tiny_runs import TINY, koap
 from torch import nn
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
-from torchrl_koap.evaluation.inspection import verdict
+from torchrl_koap.evaluation.findings import describe_inspection
 from torchrl_koap.evaluation.latent_space import (
     OUTSIDE_THE_BUDGET,
     analyse_latent,
@@ -193,11 +193,11 @@ def test_the_decoder_of_the_run_is_judged_beside_the_probe():
     labelled = data["episode"] == 1
     result = analyse_latent(controller, data, labelled, PARTS)[OUTSIDE_THE_BUDGET]
     assert result["probe_r2"] == pytest.approx([1, 1], abs=1e-6) and result["decoder_r2"] == pytest.approx([1, 1])
-    assert (result["labels_read"], result["steps_judged"]) == (4 * 18, 2 * 18)
-    assert result["judged_trajectories_in_budget"] == 0
+    assert (result["labels_read"], result["held_out_steps"]) == (4 * 18, 2 * 18)
+    assert result["held_out_in_budget"] == 0
     nn.init.zeros_(controller.action_decoder.linear.weight)
     worse = analyse_latent(controller, data, data["episode"] >= 0, PARTS)[OUTSIDE_THE_BUDGET]
-    assert max(worse["decoder_r2"]) < 0.1 and worse["judged_trajectories_in_budget"] == 2
+    assert max(worse["decoder_r2"]) < 0.1 and worse["held_out_in_budget"] == 2
 
 
 def test_what_blew_up_is_drawn_all_the_same(tmp_path):
@@ -212,15 +212,17 @@ def test_what_blew_up_is_drawn_all_the_same(tmp_path):
     assert not math.isfinite(koopman.get_ydata()[-1]) and math.isfinite(linear.get_ydata()[-1])
 
 
-def test_verdict_without_experiments_says_whose_labels_were_read():
+def test_findings_without_experiments_says_whose_labels_were_read():
     controller, data = knowing(), blown((20, 20, 20, 20))
     latent = analyse_latent(controller, data, data["episode"] == 0, {"measured_xy": [0, 1]})
-    text = verdict({"latent": latent}, get_task("avoiding"))
+    text = describe_inspection({"latent": latent}, get_task("avoiding"))
     assert text.startswith("10 steps ahead the latent dynamics miss the measured xy by")
     assert "Outside the budget, for analysis only" in text and "100.0%" in text
     assert "have labels in the budget" not in text
     latent = analyse_latent(controller, data, data["episode"] >= 1, {"measured_xy": [0, 1]})
-    assert verdict({"latent": latent}, get_task("avoiding")).endswith("(1 of these 2 have labels in the budget)")
+    assert describe_inspection({"latent": latent}, get_task("avoiding")).endswith(
+        "(1 of these 2 have labels in the budget)"
+    )
 
 
 @pytest.fixture
@@ -230,15 +232,17 @@ def run(trained_run, tmp_path):
 
 
 def test_inspect_the_latent_space_alone(run, capsys):
-    (run / "inspect.json").write_text(json.dumps({"followed": {"rate": 0.5}, "verdict": "old", "latent": "old"}))
+    (run / "inspect.json").write_text(
+        json.dumps({"controller_alone": {"rate": 0.5}, "findings": "old", "latent": "old"})
+    )
     assert koap("inspect", run, "--latent-only", "--latent-steps", "3", "--threads", "1") == 0
     written = json.loads((run / "inspect.json").read_text())
-    assert written["followed"] == {"rate": 0.5}  # an earlier experiment is kept
+    assert written["controller_alone"] == {"rate": 0.5}  # an earlier experiment is kept
     latent = written["latent"]
     assert list(latent["multi_step"]["koopman"]) == ["measured_xy"] and latent["multi_step"]["steps"] == 3
     assert len(latent[OUTSIDE_THE_BUDGET]["probe_r2"]) == 2
-    assert latent[OUTSIDE_THE_BUDGET]["judged_trajectories_in_budget"] == 0  # 2 of 8 are labelled
-    assert "for analysis only" in written["verdict"] and (run / "plots" / "latent.png").exists()
+    assert latent[OUTSIDE_THE_BUDGET]["held_out_in_budget"] == 0  # 2 of 8 are labelled
+    assert "for analysis only" in written["findings"] and (run / "plots" / "latent.png").exists()
     assert not (run / "plots" / "inspect.png").exists()
     assert koap("inspect", run, "--latent-only", "--latent-steps", "0") == 1
     assert "latent_steps must be >= 1, got 0" in capsys.readouterr().err
@@ -249,7 +253,7 @@ def test_a_method_without_latent_actions_gets_a_note(demonstrations, tmp_path):
     assert koap("inspect", tmp_path / "run", "--latent-only", "--threads", "1") == 0
     written = json.loads((tmp_path / "run" / "inspect.json").read_text())
     assert written["latent"] == {"note": "method 'linear' has no latent actions to look into"}
-    assert written["verdict"] == written["latent"]["note"]
+    assert written["findings"] == written["latent"]["note"]
     assert not (tmp_path / "run" / "plots" / "latent.png").exists()
 
 

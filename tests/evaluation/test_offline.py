@@ -13,8 +13,8 @@ from offline_runs import save_arm, train_arm
 
 from torchrl_koap.commands.cli import main
 from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, evaluate, inspect, suggest
-from torchrl_koap.evaluation.label_errors import summarise_errors
-from torchrl_koap.evaluation.offline import find_faults
+from torchrl_koap.evaluation.action_errors import summarise_errors
+from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.tasks import Action, Task
@@ -72,9 +72,9 @@ def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):
 
 
 def test_latent_space_and_suggestions(run):
-    verdict = inspect(run, InspectConfig(latent_only=True, threads=1)).result["verdict"]
-    assert "mrad" in verdict and " mm" not in verdict
-    assert "On labels of the budget, which the run's decoder was fitted on: a linear probe" in verdict
+    found = inspect(run, InspectConfig(latent_only=True, threads=1)).result["findings"]
+    assert "mrad" in found and " mm" not in found
+    assert "On labels of the budget, which the run's decoder was fitted on: a linear probe" in found
     assert {row["episode"] for row in suggest(run, SuggestConfig(count=7)).suggestions} == set(range(3, 10))
     with pytest.raises(ValueError, match="task 'arm' has no environment to make experiments in: --latent-only"):
         inspect(run)
@@ -165,7 +165,7 @@ def test_a_controller_worse_than_the_mean_is_a_fault():
     found = summarise_errors(models, true, torch.tensor([4, 5]), task)
     assert found["relative"] == pytest.approx(math.sqrt((0.25 + 4) / 2))
     assert [row["episode"] for row in found["trajectory"]] == [4, 5]
-    faults = find_faults({"note": ""}, {"left_out": found, "outside_budget": {"note": ""}})
+    faults = offline_faults({"note": ""}, {"left_out": found, "outside_budget": {"note": ""}})
     assert faults == [
         "action b is worse than always giving its mean (labelled trajectories left out): 2e+03 against 1e+03 mrad"
     ]

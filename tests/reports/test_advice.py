@@ -15,7 +15,7 @@ from torchrl_koap.tasks import get_task
 def inspected(imagined, followed, closed):
     return {
         name: {"rate": rate}
-        for name, rate in (("imagined", imagined), ("followed", followed), ("closed_loop", closed))
+        for name, rate in (("planner_alone", imagined), ("controller_alone", followed), ("both", closed))
         if rate is not None
     }
 

@@ -12,8 +12,8 @@ import torch
 from run_files import titles
 from safetensors.numpy import save_file
 
+from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET
 from torchrl_koap.evaluation.latent_space import spectrum
-from torchrl_koap.evaluation.latent_verdict import MODELS, OUTSIDE_THE_BUDGET
 from torchrl_koap.reports.inspection_plots import EXPERIMENTS, draw_eigenvalues, draw_experiments, draw_latent
 from torchrl_koap.reports.pictures import NothingToDraw
 from torchrl_koap.reports.run_facts import RunFacts
@@ -57,13 +57,13 @@ def test_bad_eigenvalues(real):
 @pytest.mark.parametrize(
     ("outside", "panels", "said"),
     [
-        ({"labels_read": 50, "judged_trajectories": 4}, 2, "reads 50 labels, outside the budget"),
-        ({"labels_read": 50, "judged_trajectories": 4, "judged_trajectories_in_budget": 4}, 2, "the decoder has seen"),
+        ({"labels_read": 50, "held_out_trajectories": 4}, 2, "reads 50 labels, outside the budget"),
+        ({"labels_read": 50, "held_out_trajectories": 4, "held_out_in_budget": 4}, 2, "the decoder has seen"),
         ({"note": "no label lies outside the budget"}, 1, ""),
     ],
 )
 def test_latent_space(outside, panels, said, tmp_path):
-    errors = {name: {"measured_xy": [0.001, 0.002]} for name in MODELS} | {"steps": 2, "judged_trajectories": 3}
+    errors = {name: {"measured_xy": [0.001, 0.002]} for name in MODELS} | {"steps": 2, "held_out_trajectories": 3}
     outside = outside if "note" in outside else {"probe_r2": [0.9, 0.8], "decoder_r2": [0.7, 0.6]} | outside
     result = {"latent": {"multi_step": errors, OUTSIDE_THE_BUDGET: outside, "eigenvalues": {}}}
     figure = draw_latent(result, RunFacts(tmp_path, get_task("avoiding")))

@@ -111,7 +111,7 @@ def test_they_are_inspected_exported_and_timed_by_name(policies, tmp_path, capfd
     assert koap("demos", "--out", tmp_path / "demos", "--episodes", "4", "--threads", "1", "--quiet") == 0
     looked = ("--latent-only", "--threads", "1", "--dataset", tmp_path / "demos")
     assert koap("inspect", "pretrained:avoiding", "--out", out, *looked) == 0
-    assert "verdict" in json.loads((out / "inspect.json").read_text())
+    assert "findings" in json.loads((out / "inspect.json").read_text())
     assert koap("export", "pretrained:avoiding", "--out", exported, "--no-latency") == 0
     assert len(list(exported.iterdir())) == 3
     assert koap("latency", "pretrained:avoiding", "--steps", "2") == 0

@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Which part of a policy fails: planner, controller, or the data.
 
-Three success rates tell them apart. The planner *imagines* episodes on its own: every plan's executed part becomes the
-next history, nothing is simulated. The controller follows the *recorded* states of demonstrations in their own
+Three success rates tell them apart. The planner alone continues its own plans: the executed part of each becomes the
+next history, nothing is simulated. The controller alone follows the recorded states of demonstrations in their own
 contexts, as if the planner were perfect. Both together are the closed loop. Beside them: how far the executed states
 leave the plans, and how far they leave the demonstrations.
 """
@@ -28,7 +28,7 @@ RECORDED = "recorded"  # steps whose next state the recording that is followed h
 
 
 @torch.no_grad()
-def imagine(planner: StatePlanner, start: Tensor, *, interval: int, max_steps: int, seed: int = 0) -> Tensor:
+def planner_rollout(planner: StatePlanner, start: Tensor, *, interval: int, max_steps: int, seed: int = 0) -> Tensor:
     """Lets a planner continue its own plans.
 
     Args:
@@ -37,7 +37,7 @@ def imagine(planner: StatePlanner, start: Tensor, *, interval: int, max_steps: i
 
     Keyword Args:
         interval (int): planned states that are taken over before the next plan.
-        max_steps (int): states to imagine.
+        max_steps (int): states to planner_rollout.
         seed (int): seed of the planner's noise.
 
     Returns:
@@ -238,7 +238,7 @@ def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase, *
     }
 
 
-def imagined_success(task: Task, imagined: Tensor) -> list[bool]:
+def reaches_goal(task: Task, imagined: Tensor) -> list[bool]:
     """Which imagined episodes reach the goal at any time.
 
     Args:

@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import cut_windows, trajectory_lengths
-from torchrl_koap.evaluation.latent_verdict import (
+from torchrl_koap.evaluation.findings import (
     MODELS,
     ON_THE_CIRCLE,
     OUTSIDE_THE_BUDGET,
@@ -293,7 +293,7 @@ def analyse_latent(
     horizon = min(horizon, max(1, int(trajectory_lengths(data).min()) - reach))
     held_out = int(len(data[EPISODE].unique()) - len(fit_on))
     errors = prediction_errors(controller, data, fit_on, parts, horizon=horizon)
-    sizes = {"steps": horizon, "fitted_trajectories": len(fit_on), "judged_trajectories": held_out}
+    sizes = {"steps": horizon, "fitted_trajectories": len(fit_on), "held_out_trajectories": held_out}
     result["multi_step"] = sizes | errors
     steps = infer_steps(controller, data)
     known = steps[HAS_ACTION]
@@ -311,9 +311,9 @@ def analyse_latent(
         own = explained(controller.decode(latent[~fit]), action[~fit])
     result[OUTSIDE_THE_BUDGET] = {
         "labels_read": len(steps),
-        "steps_judged": int((~fit).sum()),
-        "judged_trajectories": len(steps[EPISODE][~fit].unique()),
-        "judged_trajectories_in_budget": int((~torch.isin(budget, fit_on)).sum()),
+        "held_out_steps": int((~fit).sum()),
+        "held_out_trajectories": len(steps[EPISODE][~fit].unique()),
+        "held_out_in_budget": int((~torch.isin(budget, fit_on)).sum()),
         "probe_r2": probe(latent, action, steps[EPISODE], fit),
         "decoder_r2": own,
     }

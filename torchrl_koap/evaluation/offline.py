@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import controller_view
-from torchrl_koap.evaluation.chunk_errors import errors_of_chunks
-from torchrl_koap.evaluation.label_errors import errors_left_out, errors_outside_budget
+from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chunks, errors_outside_budget
+from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.evaluation.training_data import hide_labels_again, load_training_data
 from torchrl_koap.tasks.units import thousandths
@@ -33,8 +33,7 @@ def evaluate_offline(
     Plans are scored on the validation trajectories, which the planner has not seen
     (:func:`~torchrl_koap.evaluation.plan_errors.plan_errors`). Actions are decoded from recorded states and compared
     with labels outside the budget, if there are any, and with those inside it, a trajectory left out at a time
-    (:mod:`~torchrl_koap.evaluation.label_errors`). A policy of its own is asked for chunks of actions in the situations
-    outside the budget instead (:mod:`~torchrl_koap.evaluation.chunk_errors`).
+    (:mod:`~torchrl_koap.evaluation.action_errors`). A policy of its own samples chunks of actions outside the budget.
 
     Args:
         trained (TrainedRun): the run.
@@ -63,7 +62,7 @@ def evaluate_offline(
         "relative_plan_error": plan.get("relative"),
         "relative_action_error": None if split is None else action[split]["relative"],
         "action_errors_on": split,
-        "faults": find_faults(plan, action),
+        "faults": offline_faults(plan, action),
         "plan_errors": plan,
         "action_errors": action,
         "trajectory": _per_trajectory(plan, action),
@@ -110,42 +109,6 @@ def _per_trajectory(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[
             {"judged": f"actions, {split.replace('_', ' ')}", **row} for row in action[split].get("trajectory", ())
         ]
     return rows
-
-
-def find_faults(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[str]:
-    """What is wrong with a run by its offline figures, a sentence each: worse than what needs no learning at all.
-
-    Args:
-        plan (mapping): of :func:`~torchrl_koap.evaluation.plan_errors.plan_errors`, or a note.
-        action (mapping): by split, of :func:`~torchrl_koap.evaluation.label_errors.summarise_errors`, or a note.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.offline import find_faults
-        >>> row = {"name": "dq1", "unit": "rad", "controller": 0.004, "mean_action": 0.003}
-        >>> find_faults({"note": ""}, {"left_out": {"column": [row]}, "outside_budget": {"note": ""}})
-        ['action dq1 is worse than always giving its mean (labelled trajectories left out): 4 against 3 mrad']
-    """
-    faults = []
-    for row in plan.get("unit", ()):
-        own = row["planner"]["energy_score"]["overall"]
-        for name in ("standing_still", "constant_velocity"):
-            other = row[name]["energy_score"]["overall"]
-            if own > other > 0:
-                against = _against(own, other, row["unit"])
-                what = f"columns in {row['unit']}" if row["unit"] else "columns without a unit"
-                faults.append(f"plans are worse than {name.replace('_', ' ')} ({what}): {against}")
-    where = {"outside_budget": "labels outside the budget", "left_out": "labelled trajectories left out"}
-    for split in SPLITS:
-        for row in action.get(split, {}).get("column", ()):
-            if row["controller"] > row["mean_action"]:
-                against = _against(row["controller"], row["mean_action"], row["unit"])
-                faults.append(f"action {row['name']} is worse than always giving its mean ({where[split]}): {against}")
-    return faults
-
-
-def _against(own: float, other: float, unit: str) -> str:
-    shown, factor = thousandths(unit)
-    return f"{own * factor:.3g} against {other * factor:.3g} {shown}".rstrip()
 
 
 def describe_offline(result: Mapping[str, Any]) -> str:

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 
 from torchrl_koap.evaluation.config import EvalConfig, check_options
+from torchrl_koap.evaluation.environments import choose_contexts, environment_of
 from torchrl_koap.evaluation.offline import evaluate_offline
-from torchrl_koap.evaluation.places import choose_contexts, place_of
 from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_policy, load_run
@@ -69,28 +69,28 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         raise ValueError(f"dataset is for judging without an environment; task {task.name!r} is rolled out in one")
     policy, execution = load_policy(trained, config), execution_of(trained, config)
     seeds = list(range(config.seed, config.seed + config.episodes))
-    place = place_of(task, config)
+    where = environment_of(task, config)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
         episodes = roll_out(
             policy,
-            place.make_env,
+            where.make_env,
             seeds,
-            max_steps=place.max_steps,
+            max_steps=where.max_steps,
             batch_size=config.batch_size,
-            contexts=place.contexts,
+            contexts=where.contexts,
             progress=count_up_to(bar),
         )
     unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
     result = score(
         episodes,
         seeds,
-        num_modes=place.num_modes,
-        mode_index=place.mode_index,
-        contexts=place.numbers,
+        num_modes=where.num_modes,
+        mode_index=where.mode_index,
+        contexts=where.numbers,
         unsolved=unsolved,
     )
     if config.env is None:
-        result = task_scores(task, result, episodes, place.numbers)
+        result = task_scores(task, result, episodes, where.numbers)
     rows = result.pop("episode")
     timed = policy if config.controller == "learned" else load_policy(trained, replace(config, controller="learned"))
     result |= measure_latency(timed, task.observation_dim)
@@ -106,13 +106,13 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     rollouts = rollouts_to_tensors(
         [episode.cpu() for episode in episodes],
         position=task.observation[task.position],
-        mode_index=place.mode_index,
+        mode_index=where.mode_index,
         interval=execution["replan_interval"],
         objects=[task.observation[body.position] for body in task.bodies] if config.env is None else (),
         plans_position=task.plans_position,
     )
-    if place.contexts is not None:  # in full precision: a film of the same episode starts from it
-        rollouts["context"] = torch.from_numpy(place.contexts)
+    if where.contexts is not None:  # in full precision: a film of the same episode starts from it
+        rollouts["context"] = torch.from_numpy(where.contexts)
     save_tensors(directory.path / "rollouts.safetensors", rollouts, {"task": task.name})
     directory.write_json("eval.json", result)
     return result

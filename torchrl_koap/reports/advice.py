@@ -59,7 +59,7 @@ def advice(run: RunFacts) -> list[Advice]:
 def which_part(run: RunFacts) -> Advice | None:
     """The closed loop fails and nobody has looked where."""
     success = run.evaluated("success_rate")
-    if success is None or success >= GOOD or run.experiment("closed_loop") is not None or _is_policy(run):
+    if success is None or success >= GOOD or run.experiment("both") is not None or _is_policy(run):
         return None
     finding = f"success is {_percent(success)}; whether planner or controller fails is not known"
     return Advice(finding, "let each of them work alone", "koap inspect {run}")
@@ -67,24 +67,24 @@ def which_part(run: RunFacts) -> Advice | None:
 
 def planner_fails(run: RunFacts) -> Advice | None:
     """The planner does not reach the goal even when its plans come true."""
-    imagined = run.experiment("imagined")
-    if imagined is None or imagined >= GOOD:
+    planner = run.experiment("planner_alone")
+    if planner is None or planner >= GOOD:
         return None
     return Advice(
-        f"plans that come true reach the goal in {_percent(imagined)} only: the planner is what fails, not the labels",
+        f"plans that come true reach the goal in {_percent(planner)} only: the planner is what fails, not the labels",
         "more updates (--steps), more demonstrations, or a wide MLP (--denoiser mlp); more labels will not help",
     )
 
 
 def plans_are_not_followed(run: RunFacts) -> Advice | None:
-    """Imagined high, closed loop low: what lies between a plan and its execution."""
-    imagined, followed, closed = (run.experiment(name) for name in ("imagined", "followed", "closed_loop"))
-    if imagined is None or closed is None or imagined < GOOD or imagined - closed < APART:
+    """Planner alone high, closed loop low: what lies between a plan and its execution."""
+    planner, controller, both = (run.experiment(name) for name in ("planner_alone", "controller_alone", "both"))
+    if planner is None or both is None or planner < GOOD or planner - both < APART:
         return None
-    seen = f"plans alone reach the goal in {_percent(imagined)}, the closed loop in {_percent(closed)}"
-    if followed is not None and followed < GOOD:
+    seen = f"plans alone reach the goal in {_percent(planner)}, the closed loop in {_percent(both)}"
+    if controller is not None and controller < GOOD:
         return Advice(
-            f"{seen}, recorded futures are followed in {_percent(followed)}: the controller is what fails",
+            f"{seen}, recorded futures are followed in {_percent(controller)}: the controller is what fails",
             "more labels, those that teach the decoder most first",
             "koap suggest {run} --count 5",
         )
@@ -137,7 +137,7 @@ def control_is_as_good(run: RunFacts) -> Advice | None:
 def few_labels(run: RunFacts) -> Advice | None:
     """Little is labelled, and it does not succeed yet."""
     labels, success = run.labels, run.evaluated("success_rate")
-    planner = run.experiment("imagined")
+    planner = run.experiment("planner_alone")
     if labels is None or labels >= FEW_LABELS or success is None or success >= GOOD:
         return None
     if planner is not None and planner < GOOD:  # more labels would not help

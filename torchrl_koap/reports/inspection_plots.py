@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 from safetensors.numpy import load_file
 
-from torchrl_koap.evaluation.latent_verdict import (
+from torchrl_koap.evaluation.findings import (
     MODELS,
     ON_THE_CIRCLE,
     OUTSIDE_THE_BUDGET,
@@ -40,9 +40,9 @@ from torchrl_koap.tasks import Task
 
 SIDES = {"inside": BLUE, "on": PALE_BLUE, "outside": ORANGE}
 EXPERIMENTS = {
-    "imagined": "planner alone\n(plans that come true)",
-    "followed": "controller alone\n(recorded states)",
-    "closed_loop": "both\n(closed loop)",
+    "planner_alone": "planner alone\n(plans that come true)",
+    "controller_alone": "controller alone\n(recorded states)",
+    "both": "both\n(closed loop)",
 }
 _TIMES = (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 20)
 _DIVERGED = 1e6  # in the unit shown; a prediction further off is left out of the picture
@@ -116,8 +116,8 @@ def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
     _draw_errors(axes["errors"], latent["multi_step"], run.task)
     if "probe" in axes:
         _draw_probe(axes["probe"], outside, list(run.task.actions))
-        shared = outside.get("judged_trajectories_in_budget")
-        inside = bool(shared) and shared == outside.get("judged_trajectories")
+        shared = outside.get("held_out_in_budget")
+        inside = bool(shared) and shared == outside.get("held_out_trajectories")
         which = "of the budget, which the decoder has seen" if inside else "outside the budget"
         head = f"probe and decoder: for analysis only, reads {outside['labels_read']:,} labels, {which}"
         figure.suptitle(head, fontsize=10, color=WARNING, x=0.99, ha="right")
@@ -142,14 +142,14 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     Raises:
         NothingToDraw: if the experiments were not made.
     """
-    if "closed_loop" not in result:
+    if "both" not in result:
         raise NothingToDraw("the experiments in the simulator were left out")
     figure = Figure(figsize=(9.8, 4.1), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.3))
     made = {name: words for name, words in EXPERIMENTS.items() if name in result}
     for index, name in enumerate(made):
         value = result[name]
-        left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "closed_loop" else PALE_BLUE)
+        left.bar(index, 100 * value["rate"], width=0.6, color=BLUE if name == "both" else PALE_BLUE)
         left.vlines(index, 100 * value["low"], 100 * value["high"], color=INK, linewidth=1.4)
     numbers = [f"{words}\nn = {result[name]['episodes']}" for name, words in made.items()]
     left.set_xticks(range(len(made)), numbers, fontsize=8)
@@ -268,7 +268,7 @@ def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
     axes.set_ylabel("root mean square distance" + (f" ({shown})" if shown else ""))
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
-    judged = f"on {errors['judged_trajectories']} demonstrations"
+    judged = f"on {errors['held_out_trajectories']} demonstrations"
     set_title(axes, f"Error of the predicted {part.replace('_', ' ')}\n{judged}")
     legend_below(axes, 0.22)
     tidy(axes)

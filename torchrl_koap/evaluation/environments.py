@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Where a run is rolled out: environment, contexts, modes."""
+"""Environments, contexts and modes of the rollouts of an evaluation."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def choose_contexts(
 
 
 @dataclass(frozen=True)
-class Place:
+class EvaluationEnv:
     """Where a run is rolled out.
 
     Args:
@@ -66,10 +66,10 @@ class Place:
 
     Examples:
         >>> from torchrl_koap.evaluation import EvalConfig
-        >>> from torchrl_koap.evaluation.places import place_of
+        >>> from torchrl_koap.evaluation.environments import environment_of
         >>> from torchrl_koap.tasks import get_task
-        >>> place = place_of(get_task("avoiding"), EvalConfig(episodes=2))
-        >>> place.max_steps, place.num_modes, place.numbers
+        >>> where = environment_of(get_task("avoiding"), EvalConfig(episodes=2))
+        >>> where.max_steps, where.num_modes, where.numbers
         (250, 24, None)
     """
 
@@ -81,7 +81,7 @@ class Place:
     contexts: np.ndarray | None = None
 
 
-def place_of(task: Task, config: EvalConfig) -> Place:
+def environment_of(task: Task, config: EvalConfig) -> EvaluationEnv:
     """The task's own environment, or the one of Gymnasium that was asked for.
 
     Args:
@@ -96,7 +96,7 @@ def place_of(task: Task, config: EvalConfig) -> Place:
         from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
 
         make_env = make_env_of(task, num_threads=config.threads)
-        return Place(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
+        return EvaluationEnv(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
     for name, unfit in {
         "contexts_file": config.contexts_file is not None,
         "rollouts_per_context": config.rollouts_per_context != 1,
@@ -108,7 +108,7 @@ def place_of(task: Task, config: EvalConfig) -> Place:
     make_env = partial(GymnasiumBatch, config.env, task, success_key=config.success_key)
     probe = make_env(1)
     probe.close()
-    return Place(make_env, probe.max_steps, _only_mode, 1)
+    return EvaluationEnv(make_env, probe.max_steps, _only_mode, 1)
 
 
 def _only_mode(mode: torch.Tensor) -> torch.Tensor:

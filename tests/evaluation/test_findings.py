@@ -1,0 +1,74 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What is said about a run follows from its numbers."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from torchrl_koap.evaluation.findings import EXPERIMENTS, describe_inspection, latent_faults, unit_circle_sides
+from torchrl_koap.tasks import get_task
+
+
+def errors(koopman, back, linear, still):
+    values = {"koopman": koopman, "reconstruction": back, "linear": linear, "copy_last": still}
+    return {"steps": 2} | {name: {"xy": [0.0, value]} for name, value in values.items()}
+
+
+@pytest.mark.parametrize(
+    ("measured", "said"),
+    [
+        (errors(2.0, 0.01, 0.04, 9.0), ["50 times worse than a linear model"]),
+        (errors(2.0, 1.0, 0.04, 9.0), ["50 times worse than a linear model", "alone loses 25 times what"]),
+        (errors(3.0, 0.01, 2.0, 1.0), ["3 times worse than standing still"]),
+        (errors(1.9, 0.01, 1.0, 9.0), []),
+        (errors(0.5, 5.0, 1.0, 9.0), []),  # a poor decoder is no fault where the prediction is good
+        (errors(math.nan, 0.1, 0.1, 0.1), ["diverge"]),
+        (errors(math.inf, 0.1, 0.1, 0.1), ["diverge"]),
+        (errors(0.1, 0.05, 0.0, 9.0), ["infinitely worse", "infinitely"]),
+    ],
+)
+def test_faults(measured, said):
+    found = latent_faults(measured)
+    assert len(found) == len(said)
+    for clause, words in zip(found, said, strict=True):
+        assert words in clause
+
+
+def test_sides_of_the_circle():
+    assert unit_circle_sides([1.0011, 1.0009, 0.9991, 0.9989]) == ["outside", "on", "on", "inside"]
+    assert unit_circle_sides([1.05], tolerance=0.1) == ["on"]
+
+
+@pytest.mark.parametrize(
+    ("rates", "words"),
+    [
+        ((0.5, 1.0, 1.0), "nothing to find"),
+        ((0.5, 1.0, 0.4), "the planner alone reaches the goal in 50%"),
+        ((1.0, 0.3, 0.4), "the controller follows recorded states to the goal in 30%"),
+        ((1.0, 1.0, 0.4), "planner and controller work alone, not together"),
+    ],
+)
+def test_findings(rates, words):
+    result = {name: {"rate": value} for name, value in zip(EXPERIMENTS, rates, strict=True)}
+    assert describe_inspection(result | {"distance_to_demonstrations": {}}, get_task("avoiding")).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("left", "words"),
+    [(1, "planner and controller work alone"), (2, "the controller leaves 2 of 10 recorded tool paths by more than")],
+)
+def test_a_blind_push_is_not_held_against_the_controller(left, words):
+    rates = {"planner_alone": 1.0, "controller_alone": 0.0, "both": 0.4}
+    result = {name: {"rate": value} for name, value in rates.items()}
+    result |= {"distance_to_demonstrations": {}, "recordings_left": {"count": left, "episodes": 10}}
+    assert describe_inspection(result, get_task("sorting")).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("followed", "words"), [(0.3, "the controller follows recorded states"), (1.0, "the controller works alone")]
+)
+def test_findings_without_a_goal(followed, words):
+    result = {"controller_alone": {"rate": followed}, "both": {"rate": 0.4}, "distance_to_demonstrations": {}}
+    assert describe_inspection(result, get_task("scooping")).startswith(words)

@@ -1,0 +1,209 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What the numbers of a run mean: every threshold and sentence of ``koap inspect`` and of offline evaluations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from torchrl_koap.tasks import Task
+from torchrl_koap.tasks.units import thousandths
+
+EXPERIMENTS = ("planner_alone", "controller_alone", "both")  # of ``koap inspect``, in the simulator
+MODELS = ("koopman", "reconstruction", "linear", "copy_last")  # whose multi-step errors are compared
+OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"  # entry of figures that read labels of no budget
+ON_THE_CIRCLE = 1e-3  # eigenvalues whose magnitude is nearer to 1 lie on the unit circle, in texts and pictures alike
+NEAR = 0.015  # m; recorded tool paths followed within this are followed well
+GOOD = 0.9  # a success rate of a part that is not at fault
+_WORSE = 2.0  # from here on a latent model's error is no longer that of a comparable model
+
+
+def unit_circle_sides(magnitudes: Sequence[float], *, tolerance: float = ON_THE_CIRCLE) -> list[str]:
+    """Tells whether eigenvalues of these magnitudes lie ``"inside"``, ``"on"`` or ``"outside"`` the unit circle.
+
+    Args:
+        magnitudes (sequence of float): magnitudes ``[m]``.
+
+    Keyword Args:
+        tolerance (float): distance to the circle below which an eigenvalue lies on it.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.findings import unit_circle_sides
+        >>> unit_circle_sides([0.9, 0.9995, 1.2])
+        ['inside', 'on', 'outside']
+    """
+    return ["outside" if size > 1 + tolerance else "inside" if size < 1 - tolerance else "on" for size in magnitudes]
+
+
+def error_unit(part: str, task: Task) -> tuple[str, float]:
+    """Returns the unit in which errors of a part of the state are shown, and the factor to it.
+
+    Args:
+        part (str): the part. Where the task says no units, positions are in m and joints in rad.
+        task (Task): the task. A part whose columns have several units is shown without any.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.findings import error_unit
+        >>> from torchrl_koap.tasks import get_task
+        >>> error_unit("measured_xy", get_task("avoiding")), error_unit("measured_joints", get_task("avoiding"))
+        (('mm', 1000.0), ('mrad', 1000.0))
+    """
+    if not task.observation_units:
+        return ("", 1.0) if task.env is None else thousandths("rad" if "joints" in part else "m")
+    units = set(task.observation_units[task.observation[part]])
+    return thousandths(units.pop()) if len(units) == 1 else ("", 1.0)
+
+
+def describe_inspection(result: Mapping[str, Any], task: Task) -> str:
+    """Says what an inspection found: a sentence on the experiments, if there are any, and one on the latent space.
+
+    Args:
+        result (mapping): of :func:`~torchrl_koap.evaluation.inspection.inspect`.
+        task (Task): the task.
+    """
+    sentences = [describe_experiments(result)] if "both" in result else []
+    latent = result.get("latent", {})
+    if "multi_step" in latent:
+        sentences.append(_describe_latent(latent, task))
+    elif not sentences:
+        sentences.append(latent["note"])
+    return ". ".join(sentences)
+
+
+def describe_experiments(result: Mapping[str, Any]) -> str:
+    """Says which part fails by the three experiments.
+
+    Where things are pushed or grasped, recorded tool paths do not answer to where the objects went: there the
+    controller is rated by how near the tool stays to them. A planner whose task has no goal is not rated.
+
+    Args:
+        result (mapping): of :func:`~torchrl_koap.evaluation.inspection.inspect`.
+    """
+    planner, controller, both = (result[name]["rate"] if name in result else None for name in EXPERIMENTS)
+    if both >= GOOD:
+        return "nothing to find: the closed loop succeeds"
+    parts = []
+    if planner is not None and planner < GOOD:
+        parts.append(f"the planner alone reaches the goal in {planner:.0%} of the episodes only")
+    if "recordings_left" in result:
+        left, count = (result["recordings_left"][name] for name in ("count", "episodes"))
+        if left > (1 - GOOD) * count:
+            paths = f"{left} of {count} recorded tool paths"
+            parts.append(f"the controller leaves {paths} by more than {1e3 * NEAR:.0f} mm")
+    elif controller < GOOD:
+        parts.append(f"the controller follows recorded states to the goal in {controller:.0%} only")
+    distance = result["distance_to_demonstrations"]
+    if distance and distance["visited_95"] > 2 * distance["demonstrated_95"]:
+        parts.append("executed states lie far from every demonstration")
+    if parts:
+        return "; ".join(parts)
+    if planner is None:
+        return "the controller works alone: the planner, or plans that start from executed states, are what is left"
+    return "planner and controller work alone, not together: plans that start from executed states are worse"
+
+
+def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
+    """Says what is wrong with the latent dynamics as a model of the motion; an empty list if nothing is.
+
+    The errors of the last predicted step are compared, by the first part of the state. A latent model is faulted for an
+    error above twice that of a linear model on raw states (fitted on the same inputs), for one above standing still,
+    and for losing more by mapping states back than the linear model errs in all.
+
+    Args:
+        multi_step (mapping): by model of :data:`MODELS` and part of the state the errors after 1, 2, ... steps, as of
+            :func:`~torchrl_koap.evaluation.latent_space.prediction_errors`.
+
+    Returns:
+        list of str: a clause per fault, the worst first.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.findings import latent_faults
+        >>> errors = {"koopman": 2.0, "reconstruction": 0.5, "linear": 0.04, "copy_last": 9.0}
+        >>> latent_faults({name: {"xy": [value]} for name, value in errors.items()})[0]
+        'the latent dynamics predict 50 times worse than a linear model on raw states'
+    """
+    part = next(iter(multi_step["koopman"]))
+    koopman, back, linear, still = (float(multi_step[model][part][-1]) for model in MODELS)
+    faults = []
+    if not koopman < float("inf"):
+        return ["the latent dynamics diverge: their prediction is not finite"]
+    if koopman > still:
+        faults.append(f"the latent dynamics predict {_times(koopman, still)} worse than standing still")
+    if koopman > _WORSE * linear:
+        faults.append(f"the latent dynamics predict {_times(koopman, linear)} worse than a linear model on raw states")
+    if faults and back > _WORSE * linear:
+        faults.append(f"mapping lifted states back alone loses {_times(back, linear)} what that linear model does")
+    return faults
+
+
+def offline_faults(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[str]:
+    """Says what is worse than what needs no learning at all, by the figures of an offline evaluation.
+
+    Args:
+        plan (mapping): of :func:`~torchrl_koap.evaluation.plan_errors.plan_errors`, or a note.
+        action (mapping): by split, of :func:`~torchrl_koap.evaluation.action_errors.summarise_errors`, or a note.
+
+    Returns:
+        list of str: a sentence per fault.
+
+    Examples:
+        >>> from torchrl_koap.evaluation.findings import offline_faults
+        >>> row = {"name": "dq1", "unit": "rad", "controller": 0.004, "mean_action": 0.003}
+        >>> offline_faults({"note": ""}, {"left_out": {"column": [row]}, "outside_budget": {"note": ""}})
+        ['action dq1 is worse than always giving its mean (labelled trajectories left out): 4 against 3 mrad']
+    """
+    faults = []
+    for row in plan.get("unit", ()):
+        own = row["planner"]["energy_score"]["overall"]
+        for name in ("standing_still", "constant_velocity"):
+            other = row[name]["energy_score"]["overall"]
+            if own > other > 0:
+                what = f"columns in {row['unit']}" if row["unit"] else "columns without a unit"
+                against = _against(own, other, row["unit"])
+                faults.append(f"plans are worse than {name.replace('_', ' ')} ({what}): {against}")
+    where = {"outside_budget": "labels outside the budget", "left_out": "labelled trajectories left out"}
+    for split, words in where.items():
+        for row in action.get(split, {}).get("column", ()):
+            if row["controller"] > row["mean_action"]:
+                against = _against(row["controller"], row["mean_action"], row["unit"])
+                faults.append(f"action {row['name']} is worse than always giving its mean ({words}): {against}")
+    return faults
+
+
+def _describe_latent(latent: Mapping[str, Any], task: Task) -> str:
+    errors = latent["multi_step"]
+    part = next(iter(errors["koopman"]))
+    shown, factor = error_unit(part, task)
+    ahead = {model: f"{factor * errors[model][part][-1]:.3g} {shown}".rstrip() for model in MODELS}
+    faults = latent_faults(errors)
+    said = f"A fault to look into: {'; '.join(faults)}. " if faults else ""
+    return said + (
+        f"{errors['steps']} steps ahead the latent dynamics miss the {part.replace('_', ' ')} by {ahead['koopman']}"
+        f" ({ahead['reconstruction']} of mapping back alone), a linear model on raw states by {ahead['linear']},"
+        f" standing still by {ahead['copy_last']}. {_describe_probe(latent[OUTSIDE_THE_BUDGET])}"
+    )
+
+
+def _describe_probe(outside: Mapping[str, Any]) -> str:
+    if "note" in outside:
+        return outside["note"].capitalize()
+    shared, held_out = (outside.get(name, 0) for name in ("held_out_in_budget", "held_out_trajectories"))
+    probe, own = (min(outside[name]) for name in ("probe_r2", "decoder_r2"))
+    head, reservation = "Outside the budget, for analysis only", ""
+    if shared and shared == held_out:
+        head = "On labels of the budget, which the run's decoder was fitted on"
+    elif shared:
+        reservation = f" ({shared} of these {held_out} have labels in the budget)"
+    return (
+        f"{head}: a linear probe on all labels explains {probe:.1%} of the hardest action dimension on"
+        f" held-out trajectories, the run's own decoder {own:.1%}{reservation}"
+    )
+
+
+def _against(own: float, other: float, unit: str) -> str:
+    shown, factor = thousandths(unit)
+    return f"{own * factor:.3g} against {other * factor:.3g} {shown}".rstrip()
+
+
+def _times(large: float, small: float) -> str:
+    return f"{large / small:.3g} times" if small > 0 else "infinitely"
