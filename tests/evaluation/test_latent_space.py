@@ -13,9 +13,8 @@ from tiny_runs import TINY, koap
 from torch import nn
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
-from torchrl_koap.evaluation.findings import describe_inspection
+from torchrl_koap.evaluation.findings import OUTSIDE_THE_BUDGET, describe_inspection
 from torchrl_koap.evaluation.latent_space import (
-    OUTSIDE_THE_BUDGET,
     analyse_latent,
     explained,
     infer_steps,
@@ -168,7 +167,7 @@ def test_a_probe_finds_what_lies_linearly_in_the_latent_and_nothing_else():
     # what holds in one half and is the other way round in the other explains -3: 1 - (2 a)^2 / a^2
     sign = torch.where(groups < 20, 1.0, -1.0)[:, None]
     assert probe(latent, sign * (linear - 4), groups, groups < 20) == pytest.approx([-3, -3], abs=0.02)
-    with pytest.raises(ValueError, match="judged on others, got 1200 of 1200"):
+    with pytest.raises(ValueError, match="tested on others, got 1200 of 1200"):
         probe(latent, linear, groups, groups < 40)
 
 

@@ -15,6 +15,7 @@ OUTSIDE_THE_BUDGET = "outside_the_budget_for_analysis_only"  # entry of figures 
 ON_THE_CIRCLE = 1e-3  # eigenvalues whose magnitude is nearer to 1 lie on the unit circle, in texts and pictures alike
 NEAR = 0.015  # m; recorded tool paths followed within this are followed well
 GOOD = 0.9  # a success rate of a part that is not at fault
+_LEFT = 0.1  # share of recorded paths that a controller may leave
 _WORSE = 2.0  # from here on a latent model's error is no longer that of a comparable model
 
 
@@ -87,7 +88,7 @@ def describe_experiments(result: Mapping[str, Any]) -> str:
         parts.append(f"the planner alone reaches the goal in {planner:.0%} of the episodes only")
     if "recordings_left" in result:
         left, count = (result["recordings_left"][name] for name in ("count", "episodes"))
-        if left > (1 - GOOD) * count:
+        if left > _LEFT * count:
             paths = f"{left} of {count} recorded tool paths"
             parts.append(f"the controller leaves {paths} by more than {1e3 * NEAR:.0f} mm")
     elif controller < GOOD:

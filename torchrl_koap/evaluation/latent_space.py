@@ -15,42 +15,22 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import cut_windows, trajectory_lengths
-from torchrl_koap.evaluation.findings import (
-    MODELS,
-    ON_THE_CIRCLE,
-    OUTSIDE_THE_BUDGET,
-    error_unit,
-    judge_latent_model,
-    unit_circle_sides,
-)
+from torchrl_koap.evaluation.findings import MODELS, ON_THE_CIRCLE, OUTSIDE_THE_BUDGET, unit_circle_sides
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics, LinearActionDecoder
 
-__all__ = [
-    "MODELS",
-    "OUTSIDE_THE_BUDGET",
-    "analyse_latent",
-    "error_unit",
-    "explained",
-    "infer_steps",
-    "judge_latent_model",
-    "prediction_errors",
-    "probe",
-    "spectrum",
-    "split_trajectories",
-]
 _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
 
 
 def spectrum(eigenvalues: Tensor, *, tolerance: float = ON_THE_CIRCLE, slowest: int = 5) -> dict[str, Any]:
-    r"""Where the eigenvalues of an operator lie, and in how many steps its slowest parts fade to 1/e.
+    r"""Tells where the eigenvalues of an operator lie, and in how many steps its slowest parts fade to 1/e.
 
     Args:
         eigenvalues (Tensor): complex ``[m]``.
 
     Keyword Args:
-        tolerance (float): distance to the unit circle below which an eigenvalue lies on it. Defaults to ``1e-3``.
-        slowest (int): decay times :math:`-1 / \ln |\lambda|` to list, of those inside. Defaults to ``5``.
+        tolerance (float): distance to the unit circle below which an eigenvalue lies on it.
+        slowest (int): decay times :math:`-1 / \ln |\lambda|` to list, of those inside.
 
     Examples:
         >>> import math
@@ -71,7 +51,7 @@ def spectrum(eigenvalues: Tensor, *, tolerance: float = ON_THE_CIRCLE, slowest: 
 
 @torch.no_grad()
 def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> TensorDict:
-    """Latent actions of all steps that see their whole look-ahead, each once: those a decoder is fitted on.
+    """Infers the latent actions of all steps that see their whole look-ahead, each once: those a decoder is fitted on.
 
     Args:
         controller (KoopmanInverseDynamics): the model, in evaluation mode.
@@ -91,7 +71,7 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
 
 
 def split_trajectories(episode: Tensor, labelled: Tensor, *, seed: int = 0) -> Tensor:
-    """Half of the trajectories to fit on, drawn at random, those with a label in the budget first.
+    """Draws half of the trajectories to fit on, drawn at random, those with a label in the budget first.
 
     The other half is then new to a decoder fitted within the budget too, as far as the budget leaves so many.
 
@@ -125,7 +105,7 @@ def prediction_errors(
     *,
     horizon: int = 10,
 ) -> dict[str, dict[str, list[float]]]:
-    r"""How far predicted states are from recorded ones, ``1 .. horizon`` steps ahead, for three models.
+    r"""Measures how far predicted states are from recorded ones, ``1 .. horizon`` steps ahead, for three models.
 
     * ``koopman``: :math:`z_{t+1} = K z_t + B u_t` from :math:`z_t = g_\theta(x_t)`, mapped back by :math:`g_\psi`;
     * ``linear``: :math:`x_{t+1} = A x_t + C v_t + c` by least squares, with ``v_t`` the frames that ``u_t`` is made of:
@@ -135,7 +115,7 @@ def prediction_errors(
     Beside them ``reconstruction``: :math:`g_\psi(g_\theta(x_{t+h}))`, what the first one cannot do better than.
 
     Both ``u`` and ``v`` read recorded states around and *ahead* of every step (``x_{t+k}``), so this tests the models;
-    it is no forecast. The linear model is fitted on the trajectories ``fit_on``, and all three are judged on the
+    it is no forecast. The linear model is fitted on the trajectories ``fit_on``, and all three are tested on the
     others. The Koopman model was trained on the states of all of them (that takes no label). Where ``v_t`` holds
     ``x_{t+2}``, as by default, the linear model interpolates and owes little to what it predicted before.
 
@@ -146,7 +126,7 @@ def prediction_errors(
         parts (mapping): columns of the state by name.
 
     Keyword Args:
-        horizon (int): steps to predict. Defaults to ``10``.
+        horizon (int): steps to predict.
 
     Returns:
         dict: by model and part the root mean square distance after ``1 .. horizon`` steps, in raw units.
@@ -214,7 +194,7 @@ def _roll_linear(controller: KoopmanInverseDynamics, weight: Tensor, states: Ten
 
 
 def explained(predicted: Tensor, true: Tensor) -> list[float]:
-    """Share ``R^2`` of the variance of every column that predictions explain.
+    """Returns the share ``R^2`` of the variance of every column that predictions explain.
 
     Args:
         predicted (Tensor): predictions ``[N, a]``.
@@ -236,7 +216,7 @@ def explained(predicted: Tensor, true: Tensor) -> list[float]:
 
 
 def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[float]:
-    """``R^2`` of a linear map from latent to true actions, fitted on some steps and judged on the others.
+    """Returns the ``R^2`` of a linear map from latent to true actions, fitted on some steps, tested on the others.
 
     Args:
         latent (Tensor): latent actions ``[N, m]``.
@@ -248,10 +228,10 @@ def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[f
         list of float: per action dimension.
 
     Raises:
-        ValueError: if nothing is left to fit on or to judge on.
+        ValueError: if nothing is left to fit or to test on.
     """
     if fit.all() or not fit.any():
-        raise ValueError(f"a probe is fitted on some steps and judged on others, got {int(fit.sum())} of {len(fit)}")
+        raise ValueError(f"a probe is fitted on some steps and tested on others, got {int(fit.sum())} of {len(fit)}")
     decoder = LinearActionDecoder(latent.shape[-1], action.shape[-1]).to(latent)
     decoder.fit_ridge(latent, action, fit, groups=groups)
     with torch.no_grad():
@@ -267,7 +247,7 @@ def analyse_latent(
     horizon: int = 10,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Everything this file measures.
+    """Measures spectrum, multi-step errors and what a linear probe explains.
 
     Args:
         controller (KoopmanInverseDynamics): the model, in evaluation mode, on the device of the data.
@@ -276,7 +256,7 @@ def analyse_latent(
         parts (mapping): columns of the state by name.
 
     Keyword Args:
-        horizon (int): steps to predict; fewer where trajectories are shorter. Defaults to ``10``.
+        horizon (int): steps to predict; fewer where trajectories are shorter.
         seed (int): seed of the half of the trajectories that is fitted on.
 
     Returns:
