@@ -65,6 +65,17 @@ def test_absolute_actions_are_targets_of_columns():
     assert task.targets == (1, 0)
 
 
+def test_every_action_may_be_of_its_own_kind():
+    kinds = ("delta", "absolute")
+    _, task = make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds)
+    assert [action.kind for action in task.actions.values()] == list(kinds)
+    assert task.delta_actions == (0,) and task.targets == ()
+    with pytest.raises(DataError, match="targets are for action_kind='absolute'"):
+        make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=kinds, targets=[0, 1])
+    with pytest.raises(DataError, match="action_kind names 3 columns, there are 2"):
+        make_demonstrations(STATES, ACTIONS, control_hz=20, action_kind=("delta",) * 3)
+
+
 def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
     """What it is shown, and what the policy adds again, are inverse to each other."""
     targets = [STATES[0][:-1, :2] + ACTIONS[0], None, None]

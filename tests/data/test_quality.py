@@ -48,3 +48,14 @@ def test_validate_names_the_files(tmp_path, capsys):
     assert koap("validate", folder) == 0
     said = capsys.readouterr().out
     assert "env_900_00.pkl repeats" in said and "no problem found, 1 warning(s)" in said
+
+
+def test_columns_that_say_nothing_are_named():
+    states = [torch.cat([path, path[:, :1], torch.full((6, 1), 3.0)], -1) for path in (PATH, PATH + 1)]
+    data = flatten_trajectories(states, [ACTIONS, ACTIONS])
+    data["state"] = data["observation"]
+    assert find_warnings(data) == []
+    assert find_warnings(data, seen=["x", "y", "again", "shelf"]) == [
+        "columns 'x' and 'again' are the same in every step",
+        "column 'shelf' is 3 in all 10 steps: it says nothing",
+    ]

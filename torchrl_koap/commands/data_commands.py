@@ -205,7 +205,10 @@ class Validate(Command):
         with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:
             data = validate(open_dataset(self.dataset, task=task, progress=count_up_to(bar))[0])
         files = [] if stored_folder(self.dataset) else find_raw_files(CONVERTERS[task.source], self.dataset)
-        warnings = find_warnings(data, names=list(map(str, files)), units=task.observation_units or _metres(task))
+        units, seen = task.observation_units or _metres(task), task.state_names
+        warnings = find_warnings(
+            data, names=list(map(str, files)), units=units, columns=task.observation_names, seen=seen
+        )
         lengths = data["episode"].unique(return_counts=True)[1]
         labels = int(data["has_action"].sum())
         return {

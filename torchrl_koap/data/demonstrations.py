@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from tensordict import TensorDict
 
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.quality import constant_actions
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories
 from torchrl_koap.files import DataError
@@ -78,7 +79,7 @@ def make_demonstrations(
     action_dim: int | None = None,
     robot: Sequence[str | int] | None = None,
     command: Sequence[str | int] = (),
-    action_kind: ActionKind = "delta",
+    action_kind: ActionKind | Sequence[ActionKind] = "delta",
     targets: Sequence[str | int] | None = None,
     max_steps: int | None = None,
 ) -> tuple[TensorDict, Task]:
@@ -101,9 +102,10 @@ def make_demonstrations(
             reads these. Default: all that are no command.
         command (sequence of str or int): neighbouring columns that repeat the last command. Their differences are the
             actions, so nothing that learns ever sees them.
-        action_kind (str): ``"delta"``, velocities, efforts or changes: small where the robot stands still; or
-            ``"absolute"``, targets of the columns ``targets``.
-        targets (sequence of str or int, optional): for absolute actions, the state column that each action is the
+        action_kind (str, or sequence of str): ``"delta"``, velocities, efforts or changes: small where the robot stands
+            still; or ``"absolute"``, targets of the columns ``targets``. One for all actions or one for each, such as
+            of a gripper that is commanded by its width beside joints that are commanded by changes.
+        targets (sequence of str or int, optional): where all actions are absolute, the state column that each is the
             target of. Default: the robot's columns, if there are as many.
         max_steps (int, optional): steps after which an episode counts as failed. Default: 1.5 times the longest
             demonstration.
@@ -124,7 +126,8 @@ def make_demonstrations(
         >>> task.observation_dim, task.action_dim, task.robot, bool(data["has_action"].any())
         (3, 2, (0, 1), False)
     """
-    lookup(ACTION_KINDS, action_kind, "kind of action")
+    for kind in (action_kind,) if isinstance(action_kind, str) else action_kind:
+        lookup(ACTION_KINDS, kind, "kind of action")
     if isinstance(states, Recordings):
         if actions is not None:
             raise ValueError("recordings hold their actions already; actions must be None")
@@ -152,10 +155,11 @@ def make_demonstrations(
         problems.append(f"command columns must lie side by side, got {', '.join(names[c] for c in commanded)}")
     if len(commanded) == len(names):
         problems.append("every column is a command: nothing is left to plan and act on")
-    reached = _targets(action_kind, targets, own, names, len(acting), problems)
-    units = _units(action_units, len(acting), "action_units", problems)
-    own_units = _units(state_units, len(names), "state_units", problems)
-    problems += _constant_actions(recordings)
+    kinds: tuple[ActionKind, ...] = _each(action_kind, len(acting), "action_kind", problems)
+    reached = _targets(kinds, targets, own, names, problems)
+    units = _each(action_units, len(acting), "action_units", problems)
+    own_units = _each(state_units, len(names), "state_units", problems)
+    problems += constant_actions(np.concatenate(recordings.actions), acting)
     if problems:
         raise DataError(f"task {name!r}", problems)
     data = flatten_trajectories(
@@ -170,8 +174,8 @@ def make_demonstrations(
         observation_parts=parts,
         observation_units=own_units,
         actions={
-            name: Action(unit, action_kind, column)
-            for name, unit, column in zip(acting, units, moved or (None,) * len(acting), strict=True)
+            name: Action(unit, kind, column)
+            for name, unit, kind, column in zip(acting, units, kinds, moved or (None,) * len(acting), strict=True)
         },
         position=next(part for part in parts if part != _COMMAND),
         max_steps=max_steps or round(_SLACK * max(len(frames) for frames in recordings.states)),
@@ -217,43 +221,30 @@ def _columns(given: Sequence[str | int], names: Sequence[str], what: str, proble
 
 
 def _targets(
-    kind: str,
+    kinds: Sequence[str],
     given: Sequence[str | int] | None,
     own: Sequence[int],
     names: Sequence[str],
-    wide: int,
     problems: list[str],
 ) -> list[int]:
     """State columns that absolute actions are the targets of."""
-    if kind == "delta":
+    if "delta" in kinds:
         if given is not None:
             problems.append("targets are for action_kind='absolute'")
         return []
     columns = list(own) if given is None else _columns(given, names, "targets", problems)
-    if len(columns) != wide:
+    if len(columns) != len(kinds):
         what = "the robot's columns are" if given is None else "targets are"
         problems.append(
-            f"absolute actions have {wide} columns, {what} {len(columns)}: name in targets the column that each action"
-            " is the target of"
+            f"absolute actions have {len(kinds)} columns, {what} {len(columns)}: name in targets the column that each"
+            " action is the target of"
         )
     return columns
 
 
-def _units(given: Sequence[str] | str, wide: int, what: str, problems: list[str]) -> tuple[str, ...]:
-    units = (given,) * wide if isinstance(given, str) else tuple(given)
-    if len(units) != wide:
-        problems.append(f"{what} names {len(units)} columns, there are {wide}")
-    return units
-
-
-def _constant_actions(recordings: Recordings) -> list[str]:
-    steps = np.concatenate(recordings.actions)
-    steps = steps[np.isfinite(steps).all(-1)]
-    if len(steps) < 2:
-        return []
-    still = np.flatnonzero(np.ptp(steps, axis=0) == 0)
-    return [
-        f"action {recordings.action_names[column]!r} is {steps[0, column]:g} in all {len(steps)} labels: nothing can be"
-        " learnt of it; leave it out"
-        for column in still
-    ]
+def _each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any, ...]:
+    """What is said of every column, or once for all."""
+    said = (given,) * wide if isinstance(given, str) else tuple(given)
+    if len(said) != wide:
+        problems.append(f"{what} names {len(said)} columns, there are {wide}")
+    return said

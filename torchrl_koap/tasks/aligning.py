@@ -23,15 +23,10 @@ REGIONS = (((0.4, 0.6), (-0.25, -0.1)), ((0.4, 0.6), (0.2, 0.35)))  # of the cen
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether the tray lies in the target pose.
+    """Whether the tray lies in the target pose, bool ``[*B]`` of states ``[*B, 11]``.
 
-    Args:
-        task (Task): tells the state's columns.
-        state (Tensor): states ``[*B, 11]``, lengths in m.
-
-    Returns:
-        Tensor: bool ``[*B]``: within :data:`ALIGNED_DISTANCE` of the target, and the quaternions' cosine above that of
-        :data:`ROTATION_TOLERANCE` half turns.
+    Within :data:`ALIGNED_DISTANCE` of the target, and the quaternions' cosine above that of
+    :data:`ROTATION_TOLERANCE` half turns.
     """
     part = {name: state[..., columns] for name, columns in task.state_slices.items()}
     distance = (part["box_position"] - part["target_position"]).norm(dim=-1)
@@ -39,18 +34,8 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
     return (distance <= ALIGNED_DISTANCE) & (cosine >= math.cos(ROTATION_TOLERANCE * math.pi))
 
 
-def score(result: dict[str, Any], episodes: Any = None, contexts: Any = None) -> dict[str, float]:
-    """D3IL's figure: the mean of success and entropy, which needs two rollouts per context at least.
-
-    Args:
-        result (dict): figures of :func:`~torchrl_koap.evaluation.scores.score`; ``success_rate`` and ``mode_entropy``
-            are read.
-        episodes (optional): not looked at.
-        contexts (optional): not looked at.
-
-    Returns:
-        dict: ``d3il_score``; empty where the entropy is None.
-    """
+def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
+    """D3IL's figure ``d3il_score``, the mean of success and entropy; none where no context had two rollouts."""
     if result["mode_entropy"] is None:
         return {}
     return {"d3il_score": 0.5 * (result["success_rate"] + result["mode_entropy"])}

@@ -29,15 +29,7 @@ OBSTACLES = (
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether the tool is behind the finish line.
-
-    Args:
-        task (Task): not looked at.
-        state (Tensor): positions ``[*B, 2]`` of the tool (m).
-
-    Returns:
-        Tensor: bool ``[*B]``.
-    """
+    """Whether the tool is behind the finish line, bool ``[*B]`` of its positions ``[*B, 2]`` (m)."""
     return state[..., 1] > FINISH_Y
 
 
@@ -63,18 +55,8 @@ def mode_of_path(path: np.ndarray) -> int:
     return mode
 
 
-def score(result: dict[str, Any], episodes: Any = None, contexts: Any = None) -> dict[str, float]:
-    """D3IL's figure: 0.8 success + 0.2 entropy.
-
-    Args:
-        result (dict): figures of :func:`~torchrl_koap.evaluation.scores.score`; ``success_rate`` and ``mode_entropy``
-            are read.
-        episodes (optional): not looked at.
-        contexts (optional): not looked at.
-
-    Returns:
-        dict: ``d3il_score``.
-    """
+def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
+    """D3IL's figure ``d3il_score``: 0.8 success + 0.2 entropy."""
     return {"d3il_score": 0.8 * result["success_rate"] + 0.2 * result["mode_entropy"]}
 
 

@@ -49,15 +49,7 @@ _CAPTION = (
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether every box is in the bin of its colour.
-
-    Args:
-        task (Task): tells the boxes and the columns of their positions.
-        state (Tensor): states ``[*B, d]``, positions in m.
-
-    Returns:
-        Tensor: bool ``[*B]``.
-    """
+    """Whether every box is in the bin of its colour, bool ``[*B]`` of states ``[*B, d]``."""
     done = torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
     for box in task.objects:
         x, y = state[..., task.state_slices[f"{box}_xy"]].unbind(-1)
@@ -66,19 +58,10 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
     return done
 
 
-def score(result: dict[str, Any], episodes: Any = None, contexts: Any = None) -> dict[str, float]:
-    """D3IL's figure: success minus the divergence of the modes from equally frequent ones.
+def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
+    """D3IL's figure ``d3il_score``: success minus the divergence of the modes from equally frequent ones.
 
-    Equally frequent modes are those of our demonstrations. Two rollouts per context are needed at least.
-
-    Args:
-        result (dict): figures of :func:`~torchrl_koap.evaluation.scores.score`; ``success_rate`` and ``mode_entropy``
-            are read.
-        episodes (optional): not looked at.
-        contexts (optional): not looked at.
-
-    Returns:
-        dict: ``d3il_score``; empty where the entropy is None.
+    Equally frequent modes are those of our demonstrations. None where no context had two rollouts.
     """
     if result["mode_entropy"] is None:
         return {}

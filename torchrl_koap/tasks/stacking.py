@@ -33,14 +33,9 @@ def _boxes_of(task: Task, state: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether all boxes are piled in the zone.
+    """Whether all boxes are piled in the zone, bool ``[*B]`` of states ``[*B, d]``.
 
-    Args:
-        task (Task): tells the boxes and the columns of their positions.
-        state (Tensor): states ``[*B, d]``, positions in m.
-
-    Returns:
-        Tensor: bool ``[*B]``: all within :data:`ZONE_RADIUS` of its centre, heights more than :data:`HEIGHT_GAP` apart.
+    All within :data:`ZONE_RADIUS` of its centre, heights more than :data:`HEIGHT_GAP` apart.
     """
     boxes, near = _boxes_of(task, state)
     height = boxes[..., 2].sort(-1).values
@@ -48,15 +43,7 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
 
 
 def first_box_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether any box is in the zone.
-
-    Args:
-        task (Task): tells the boxes and the columns of their positions.
-        state (Tensor): states ``[*B, d]``, positions in m.
-
-    Returns:
-        Tensor: bool ``[*B]``.
-    """
+    """Whether any box is in the zone, bool ``[*B]`` of states ``[*B, d]``."""
     return _boxes_of(task, state)[1].any(-1)
 
 

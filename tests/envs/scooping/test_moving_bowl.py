@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -56,20 +54,6 @@ def test_a_context_has_the_spoon_at_one_of_its_starts_and_the_bowl_anywhere_in_i
         check_contexts(TASK, context_at(STARTS["left"])[None])
     with pytest.raises(ValueError, match="context 0 puts 'spoon' at"):
         check_contexts(TASK, contexts[:1, ::-1])
-
-
-def test_bodies_have_starts_of_their_own_or_share_them():
-    spoon, bowl = TASK.bodies
-
-    def changed(**change):
-        return replace(TASK, scene=replace(TASK.scene, **change))
-
-    with pytest.raises(ValueError, match="bodies have starts of their own or share them, not both"):
-        changed(shared_starts=spoon.starts)
-    with pytest.raises(ValueError, match="no region is for the body 'bowl'"):
-        changed(bodies=(spoon, replace(bowl, starts=())))
-    with pytest.raises(ValueError, match="shared_starts: 1 regions for 2 bodies"):
-        changed(bodies=(replace(spoon, starts=()), replace(bowl, starts=())), shared_starts=bowl.starts)
 
 
 def test_the_bowl_and_its_pieces_stand_where_the_context_says():

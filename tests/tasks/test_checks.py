@@ -1,0 +1,70 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Facts of a task that do not fit each other are named, all at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from torchrl_koap.tasks import Action, Body, Modes, Scene, Task
+
+TOY = {
+    "name": "toy",
+    "observation_parts": {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1},
+    "actions": {"x": Action("m"), "y": Action("m")},
+    "position": "tool",
+    "command": "command",
+}
+HERE = (((0.0, 0.1), (0.0, 0.1)),)
+BOX, LID = Body("box", "box_xy", starts=HERE), Body("lid", "box_xy", starts=HERE)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"position": "tol"}, "position: no part 'tol'; parts: command, tool"),
+        ({"command": "order"}, "command: no part 'order'"),
+        ({"actions": {}}, "actions: none"),
+        ({"state": {"tool": "plan"}}, "state: part 'tool' has an unknown feature 'plan'; known: plain, plane"),
+        ({"state": {"command": "plain"}}, "'command' repeats the command, which gives hidden actions away"),
+        ({"hidden": ("tool", "box_xy", "box_tan_yaw")}, "state: nothing remains"),
+        ({"actions": {"x": "m"}}, r"actions: wanted 'x': Action\('m'\), got 'm'"),
+        (
+            {"actions": {"x": Action(kind="change")}},
+            "actions: 'x' is of kind 'change'; known: delta, absolute, gripper",
+        ),
+        ({"actions": {"x": Action(column=5)}}, "actions: the state has 5 columns, got 5"),
+        ({"actions": {"x": Action("m", "absolute", 0), "y": Action()}}, "name the column .* or none names one"),
+        ({"actions": {"x": Action("m", "gripper"), "y": Action("m", "gripper")}}, "at most one is a gripper"),
+        ({"robot": (0, 9)}, "robot: the state has 5 columns, got 9"),
+        ({"interchangeable": (("box",),)}, "interchangeable: no body 'box'"),
+        ({"relative_positions": (("tool", "command"),)}, "'command' is no part of the state"),
+        ({"observation_parts": {**TOY["observation_parts"], "more": ("tool_0",)}}, "columns named twice: tool_0"),
+        (
+            {"scene": Scene(bodies=(BOX, LID), shared_starts=HERE)},
+            "scene: bodies have starts of their own or share them, not both",
+        ),
+        ({"scene": Scene(bodies=(BOX, replace(LID, starts=())))}, "scene: no region is for the body 'lid'"),
+        (
+            {"scene": Scene(bodies=(replace(BOX, starts=()), replace(LID, starts=())), shared_starts=HERE)},
+            "scene.shared_starts: 1 regions for 2 bodies",
+        ),
+        ({"modes": Modes(entropy="some")}, "modes.entropy: wanted one of all, contexts, solved_contexts, got 'some'"),
+    ],
+)
+def test_facts_that_do_not_fit_are_named(change, fault):
+    with pytest.raises(ValueError, match=fault):
+        Task(**(TOY | change))
+
+
+def test_all_faults_are_told_at_once():
+    with pytest.raises(ValueError, match=r"2 fault\(s\) in task 'toy'") as error:
+        Task(**(TOY | {"position": "tol", "hidden": ("bx",)}))
+    assert "no part 'tol'" in str(error.value) and "no part 'bx'" in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["../x", "a/b", "a\\b", ".."])
+def test_names_that_would_lead_out_of_a_folder_are_refused(name):
+    with pytest.raises(ValueError, match="part of the names of files"):
+        Task(**(TOY | {"name": name}))

@@ -1,0 +1,82 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Observation columns to state columns, and the layouts of all tasks."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_koap.tasks import TASKS, Columns, get_task
+
+PARTS = {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1}
+TOY = {"name": "toy", "observation_parts": PARTS, "command": "command"}
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_columns_of_every_task(name):
+    task = TASKS[name]
+    for slices, width in ((task.observation, task.observation_dim), (task.state_slices, task.state_dim)):
+        covered = [column for part in slices.values() for column in range(part.start, part.stop)]
+        assert covered == list(range(width))  # no gap, no overlap, in order
+    assert len(task.observation_names) == task.observation_dim and len(task.state_names) == task.state_dim
+    command = slice(0, 0) if task.command is None else task.observation[task.command]
+    assert not {*range(command.start, command.stop)} & {*task.state_columns}
+    assert set(task.hidden) < set(task.observation)
+
+
+@pytest.mark.parametrize(
+    ("name", "observed", "state"),
+    [
+        ("avoiding", 4, 2),
+        ("aligning", 20, 11),
+        ("sorting", 16, 18),
+        ("sorting_2", 10, 10),
+        ("sorting_6", 22, 26),
+        ("po_sorting", 16, 10),
+        ("stacking", 31, 26),
+        ("stacking_1", 31, 26),
+        ("stacking_unobserved_joints", 31, 19),
+    ],
+)
+def test_sizes(name, observed, state):
+    task = get_task(name)
+    assert (task.observation_dim, task.state_dim) == (observed, state)
+
+
+@pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.command is not None])
+def test_no_state_shows_the_command(name):
+    """Whatever the commanded columns hold, NaN included, the state is the same."""
+    task = get_task(name)
+    observation = torch.randn(5, task.observation_dim)
+    hidden = observation.clone()
+    hidden[:, task.observation[task.command]] = torch.nan
+    assert torch.equal(task.state_of(observation), task.state_of(hidden))
+
+
+def test_hidden_parts_are_no_state():
+    columns = Columns(**TOY, hidden=("box_xy",))
+    assert columns.state_columns == (2, 3, 6) and columns.observation_dim == 7
+
+
+def test_columns_have_names_and_units():
+    columns = Columns(**TOY, state={"tool": "plain", "box_tan_yaw": "tan_yaw"}, observation_units=("m",) * 6 + ("",))
+    assert columns.observation_names[:2] == ("command_0", "command_1")
+    assert columns.observation_names[-1] == "box_tan_yaw"
+    assert columns.state_names == ("tool_0", "tool_1", "box_tan_yaw_cos_2yaw", "box_tan_yaw_sin_2yaw")
+    assert columns.state_units == ("m", "m", "", "") and columns.state_dim == 4
+
+
+def test_a_feature_of_ones_own_is_an_import_string():
+    columns = Columns(**TOY, state={"tool": "plain", "box_xy": "torch:sin"})
+    assert columns.state_dim == 4 and columns.state_names[2:] == ("box_xy_0", "box_xy_1")
+    observation = torch.arange(7.0)[None]
+    wanted = torch.tensor([[2.0, 3.0, *torch.arange(4.0, 6.0).sin()]])
+    torch.testing.assert_close(columns.state_of(observation), wanted)
+    broken = Columns(**TOY, state={"tool": "torch:sinus"})
+    with pytest.raises(ValueError, match="a feature of task 'toy': module 'torch' has no 'sinus'"):
+        broken.state_of(observation)
+
+
+def test_wrong_observations_are_named():
+    with pytest.raises(ValueError, match="task 'sorting' has 16 columns, got 4"):
+        get_task("sorting").state_of(torch.zeros(2, 4))

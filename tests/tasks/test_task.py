@@ -1,0 +1,209 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Facts of the tasks are those of docs/d3il.md, survive JSON, and name modes and goals as environments do."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+import subprocess
+import sys
+
+import pytest
+import torch
+
+import torchrl_koap
+from torchrl_koap.tasks import TASKS, WINDOW, Action, Task, aligning, get_task
+
+TOY = {
+    "name": "toy",
+    "observation_parts": {"command": 2, "tool": 2, "box_xy": 2, "box_tan_yaw": 1},
+    "actions": {"x": Action("m"), "y": Action("m")},
+    "position": "tool",
+    "command": "command",
+}
+
+
+def test_facts_of_avoiding():
+    task = get_task("avoiding")
+    assert task.observation_dim == 4
+    assert task.action_dim == 2
+    assert task.observation[task.command] == slice(0, 2)
+    assert task.state_columns == (2, 3)
+    assert task.max_steps == 250
+    assert task.num_modes == 24
+    assert math.isclose(task.control_hz, 28.5714, rel_tol=1e-4)
+
+
+def test_tasks_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        get_task("avoiding").max_steps = 3
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_facts_fit_each_other(name):
+    task = get_task(name)
+    assert {body.position for body in task.bodies} <= set(task.observation)
+    command = set() if task.command is None else {task.command}
+    assert {*task.state, *task.hidden, *command, task.position} <= set(task.observation)
+    assert all(0 <= column < task.state_dim for column in (*task.moved_columns(or_robot=True), *task.robot))
+    assert len(task.moved_columns()) in (0, task.action_dim)
+    assert get_task(task.source).observation == task.observation
+    assert WINDOW == 16
+
+
+def test_stacking_without_joints_shows_and_commands_what_the_paper_does():
+    task, whole = get_task("stacking_unobserved_joints"), get_task("stacking_1")
+    observation = torch.randn(3, task.observation_dim)
+    hidden = observation.clone()
+    hidden[:, task.observation["measured_joints"]] = torch.nan
+    state = task.state_of(observation)
+    assert torch.equal(state, task.state_of(hidden))
+    assert torch.equal(state[:, :3], observation[:, task.observation["tcp_position"]])
+    assert torch.equal(state[:, 3:4], observation[:, task.observation["gripper_width"]])
+    assert torch.equal(state[:, 4:], whole.state_of(observation)[:, whole.state_slices["red_position"].start :])
+    # joints and gripper are commanded, and the controller decodes both
+    assert task.action_units == whole.action_units and task.action_rule is None and whole.action_rule is not None
+    assert task.controller_columns("robot") == (0, 1, 2, 3) and task.source == "stacking"
+
+
+def test_actions_say_what_they_move():
+    moving = {"x": Action("m", column=1), "y": Action("m", column=0)}
+    task = Task(**(TOY | {"actions": moving, "robot": (3, 4)}))
+    assert task.moved_columns() == task.moved_columns(or_robot=True) == (1, 0)
+    assert task.action_rule is None and task.delta_actions == (0, 1)
+    silent = Task(**(TOY | {"robot": (3, 4, 0)}))
+    assert silent.moved_columns() == () and silent.moved_columns(or_robot=True) == (3, 4)
+    reached = Task(**(TOY | {"actions": {name: Action("m", "absolute", column=2) for name in "xy"}, "robot": (3, 4)}))
+    assert reached.targets == (2, 2) and reached.moved_columns() == () and reached.delta_actions == ()
+    states = torch.arange(5.0).expand(1, 3, 5)
+    assert reached.action_rule(states, torch.ones(1, 3, 2)).tolist() == [[[3.0, 3.0]] * 3]
+    mixed = Task(**(TOY | {"actions": {"a": Action("rad"), "grip": Action("m", "gripper", column=4)}}))
+    assert mixed.gripper == (1, 4) and mixed.delta_actions == (0,) and mixed.targets == ()
+    assert get_task("stacking").moved_columns() == ()  # its axes do not share a filter
+
+
+def test_units_decide_nothing_but_which_errors_are_averaged():
+    actions = {"a": Action("rad"), "grip": Action("N"), "b": Action("rad", "absolute")}
+    task = Task(**(TOY | {"actions": actions}))
+    assert task.action_columns() == [0, 2] and task.action_columns("N") == [1] and task.action_columns("m") == []
+    assert task.delta_actions == (0, 1) and task.tool_columns is None and task.gripper is None
+
+
+@pytest.mark.parametrize("name", list(TASKS))
+def test_every_task_survives_json(name):
+    task = get_task(name)
+    written = json.dumps(task.to_json())
+    read = Task.from_json(json.loads(written))
+    assert read == task and json.dumps(read.to_json()) == written
+
+
+def test_json_of_another_kind_is_refused():
+    entries = get_task("avoiding").to_json()
+    with pytest.raises(ValueError, match="task: unknown entry 'colour'"):
+        Task.from_json(entries | {"colour": 1})
+    with pytest.raises(ValueError, match=r"scene.shapes: unknown entry 'size'"):
+        Task.from_json(entries | {"scene": {"shapes": [{"size": 1}]}})
+    with pytest.raises(ValueError, match="task: entry 'actions' is missing"):
+        Task.from_json({key: value for key, value in entries.items() if key != "actions"})
+    with pytest.raises(ValueError, match="task: wanted an object, got list"):
+        Task.from_json([])
+    with pytest.raises(TypeError, match="goal cannot be written to JSON: wanted an import string"):
+        Task(**TOY, goal=len).to_json()
+
+
+def test_the_package_loads_no_task_and_a_task_no_simulator():
+    code = (
+        "import sys, torchrl_koap; assert torchrl_koap.__version__; assert 'torchrl_koap.tasks' not in sys.modules;"
+        "torchrl_koap.get_task('stacking').state_dim; print([m for m in ('mujoco', 'gymnasium') if m in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert found.stdout.strip() == "[]", found.stderr
+    with pytest.raises(AttributeError, match="has no attribute 'register_tusk'"):
+        torchrl_koap.register_tusk  # noqa: B018
+
+
+@pytest.mark.parametrize("mode", range(24))
+def test_mode_names_follow_the_flags(mode):
+    envs = pytest.importorskip("torchrl_koap.envs.avoiding")
+    row1, row2, row3 = TASKS["avoiding"].modes.name_of(mode).split(", ")
+    flags = torch.zeros(9, dtype=torch.int64)
+    flags[("left", "right").index(row1)] = 1
+    flags[2 + ("left", "middle", "right").index(row2)] = 1
+    flags[5 + int(row3[-1]) - 1] = 1
+    assert envs.mode_index(flags) == mode
+
+
+@pytest.mark.parametrize("task", [name for name, task in TASKS.items() if task.modes.choices])
+def test_every_task_has_as_many_names_as_modes(task):
+    modes, number = TASKS[task].modes, TASKS[task].num_modes
+    assert len({modes.name_of(mode) for mode in range(number)}) == number and modes.name_of(number) == "no mode"
+
+
+@pytest.mark.parametrize(("task", "boxes"), [("sorting", 4), ("sorting_2", 2), ("sorting_6", 6), ("po_sorting", 4)])
+def test_names_of_sorting(task, boxes):
+    sorting = pytest.importorskip("torchrl_koap.envs.sorting")
+    for mode in range(TASKS[task].num_modes):
+        colours = ("red, blue".split(", ")[colour] for colour in sorting.mode_colours(mode, boxes))
+        assert TASKS[task].modes.name_of(mode) == ", ".join(colours)
+
+
+def test_names_of_stacking_and_aligning():
+    registry = pytest.importorskip("torchrl_koap.envs.registry")
+    letters = ("red", "green", "blue")
+    for order in itertools.permutations(range(3)):
+        mode = int(registry.mode_index_of("stacking")(torch.tensor(order)))
+        assert TASKS["stacking"].modes.name_of(mode) == ", ".join(letters[letter] for letter in order)
+        first = int(registry.mode_index_of("stacking_1")(torch.tensor(order)))
+        assert TASKS["stacking_1"].modes.name_of(first) == letters[order[0]]
+    assert [TASKS["aligning"].modes.name_of(mode) for mode in (0, 1)] == ["inside", "outside"]
+
+
+def test_the_planar_tolerance_of_aligning_leaves_room_for_the_height():
+    # the tray rests 9.1 mm below the target's centre
+    wanted = math.sqrt(aligning.DISTANCE_TOLERANCE**2 - 0.0091**2)
+    assert aligning.ALIGNED_DISTANCE == pytest.approx(wanted, abs=1e-4)
+
+
+def aligned(distance, degrees):
+    state = torch.zeros(11, dtype=torch.float64)
+    angle = torch.tensor(math.radians(degrees), dtype=torch.float64)
+    state[3:7] = torch.stack([torch.tensor(0.5 + distance), torch.tensor(0.25), angle.cos(), angle.sin()])
+    state[7:11] = torch.tensor([0.5, 0.25, 1.0, 0.0])
+    return get_task("aligning").goal_reached(state).item()
+
+
+def test_aligning():
+    assert aligned(0.015, 8.0) and not aligned(0.016, 0.0) and not aligned(0.0, 9.0) and not aligned(0.0, 180.0)
+
+
+def test_sorting_needs_every_box_in_its_own_bin():
+    task = get_task("sorting")
+    good = torch.zeros(task.observation_dim)
+    for box, place in {"red_1": 0.35, "red_2": 0.45, "blue_1": 0.6, "blue_2": 0.7}.items():
+        good[task.observation[f"{box}_xy"]] = torch.tensor([place, 0.3])
+    wrong, late = good.clone(), good.clone()
+    wrong[task.observation["red_2_xy"]] = torch.tensor([0.6, 0.3])
+    late[task.observation["blue_1_xy"]] = torch.tensor([0.6, 0.2])
+    assert task.goal_reached(task.state_of(torch.stack([good, wrong, late]))).tolist() == [True, False, False]
+    partial = get_task("po_sorting")
+    assert partial.goal_reached(partial.state_of(torch.stack([good, wrong]))).tolist() == [True, False]
+
+
+def test_stacking():
+    task, single = get_task("stacking"), get_task("stacking_1")
+    frames = torch.zeros(3, task.observation_dim)
+    for index, box in enumerate(task.objects):
+        part = task.observation[f"{box}_position"]
+        frames[0, part] = torch.tensor([0.5, 0.2 + 0.01 * index, 0.01 + 0.06 * index])
+        frames[1, part] = torch.tensor([0.5, 0.2, 0.01])  # all at one height
+        frames[2, part] = torch.tensor([0.5, 0.2 + 0.05 * index, 0.01])
+    assert task.goal_reached(task.state_of(frames)).tolist() == [True, False, False]
+    assert single.goal_reached(single.state_of(frames)).tolist() == [True, True, True]
+    assert not single.goal_reached(single.state_of(torch.zeros(1, 31))).item()
+
+
+def test_states_of_another_size_are_refused():
+    with pytest.raises(ValueError, match="a state of task 'aligning' has 11 columns, got 2"):
+        get_task("aligning").goal_reached(torch.zeros(1, 2))
