@@ -24,11 +24,11 @@ import warnings
 from pathlib import Path
 
 import torch
+from regimes import REGIMES, Regime, apply_regime
 from resumable_table import open_table
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import controller_view, make_demonstrations, select_state
-from torchrl_koap.data.regimes import REGIMES, Regime, apply_regime
 from torchrl_koap.envs.experts.random_play import record_random_play
 from torchrl_koap.modules import InverseDynamics, Normalizer
 from torchrl_koap.runs.progress import progress_bar

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import torch
 import unlabelled_data
+from regimes import REGIMES, RegimeSensor
 from resumable_table import open_table
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import step_mdp
@@ -36,7 +37,6 @@ from unlabelled_data import (
     shuffled_trajectories,
 )
 
-from torchrl_koap.data.regimes import REGIMES, RegimeSensor
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation.policy_files import BLEND_DECAY
 from torchrl_koap.modules import InverseDynamics, blend_plan

@@ -12,7 +12,6 @@ from tensordict import TensorDict
 from tiny_runs import koap
 from torch import nn
 
-from torchrl_koap.data.regimes import RegimeSensor
 from torchrl_koap.tasks import get_task
 
 
@@ -46,7 +45,7 @@ class Next(nn.Module):
 
 def shown(script, demonstrations, regime):
     data, _ = script.load_positions(str(demonstrations), 100)
-    sensor = RegimeSensor(data, regime)
+    sensor = script.RegimeSensor(data, regime)
     seen = data.copy().set("state", sensor.noisy(sensor.recorded)).set("observation", data["state"])
     return sensor, seen.set("episode", torch.unique(data["episode"], return_inverse=True)[1])
 

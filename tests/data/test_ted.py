@@ -132,7 +132,7 @@ def test_a_forged_checksum_does_not_let_anything_in(tmp_path):
     content = (path / "steps.safetensors").read_bytes()
     for forged in (content[:-8], content[:8] + b"[" + content[9:], b"\xff" * 20):
         (path / "steps.safetensors").write_bytes(forged)
-        change(path, sha256=sha256_of(path / "steps.safetensors"))
+        change(path, sha256=sha256_of(path / "steps.safetensors"), bytes=len(forged))
         with pytest.raises(DataError, match="steps.safetensors cannot be used"):
             load_ted(path)
 

@@ -88,7 +88,8 @@ def faults() -> Iterator[Fault]:
         for part, file in (("frames", INFO), ("frames", FIRST), ("network", WEIGHTS), ("network", PROJECTION)):
             stem = Path(file).name
             words = OWN_WEIGHTS if file == WEIGHTS else EMBED
-            yield Fault(f"{stem} {name}", words, stem.replace(".", r"\."), damaged(part, file, damage))
+            says = "episodes are missing: 0" if (file, name) == (FIRST, "missing") else stem.replace(".", r"\.")
+            yield Fault(f"{stem} {name}", words, says, damaged(part, file, damage))
     for name in ("codebase_version", "data_path"):
         yield Fault(f"info.json without {name}", EMBED, damage=info(without(name)), accepted=True)
     for name in ("features", "total_episodes"):

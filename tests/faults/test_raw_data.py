@@ -229,7 +229,8 @@ def forged(damage: Callable[[dict[str, Any]], object]) -> Callable[[Place], None
         damage(header)
         written = json.dumps(header).encode()
         path.write_bytes(len(written).to_bytes(8, "little") + written + content[8 + size :])
-        edit_json(path.with_name("about.json"), lambda about: about.update(sha256=sha256_of(path)))
+        sound = {"sha256": sha256_of(path), "bytes": path.stat().st_size}
+        edit_json(path.with_name("about.json"), lambda about: about.update(sound))
 
     return do
 

@@ -83,7 +83,7 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
     }
     with replacing_folder(folder) as aside:
         save_file({name: value.detach().cpu().clone().contiguous() for name, value in entries.items()}, aside / _STEPS)
-        about["sha256"] = sha256_of(aside / _STEPS)
+        about |= {"bytes": (aside / _STEPS).stat().st_size, "sha256": sha256_of(aside / _STEPS)}
         (aside / _ABOUT).write_text(json.dumps(about, indent=1))
     return folder
 
@@ -113,7 +113,7 @@ def read_about(folder: str | Path) -> dict[str, Any]:
 
     Returns:
         dict: ``task``, ``definition`` (None of a task that is only named), ``trajectories``, ``steps``, ``lengths``,
-        ``labelled_steps``, ``statistics``, ``notes`` and ``sha256``.
+        ``labelled_steps``, ``statistics``, ``notes``, and size and checksum of the steps.
 
     Raises:
         DataError: if the folder holds no data set, or one in another format.
@@ -127,7 +127,8 @@ def read_about(folder: str | Path) -> dict[str, Any]:
         raise DataError(path, str(error)) from error
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise DataError(path, f"it is no description of a data set in format {FORMAT}")
-    kinds = {"task": str, "sha256": str, "lengths": list, "trajectories": int, "steps": int, "labelled_steps": int}
+    kinds: dict[str, type] = dict.fromkeys(("trajectories", "steps", "labelled_steps", "bytes"), int)
+    kinds |= {"task": str, "sha256": str, "lengths": list}
     wrong = [name for name, kind in kinds.items() if not isinstance(about.get(name), kind)]
     if wrong:
         raise DataError(path, f"it says nothing of {', '.join(wrong)}, or nothing that can be read")
@@ -184,7 +185,7 @@ def read_steps(folder: str | Path) -> TensorDict:
     """
     about, path = read_about(folder), Path(folder) / _STEPS
     try:
-        changed = sha256_of(path) != about["sha256"]
+        changed = path.stat().st_size != about["bytes"] or sha256_of(path) != about["sha256"]
         entries = {} if changed else load_file(path)
     except FileNotFoundError:
         raise DataError(path, "it is missing") from None

@@ -150,7 +150,7 @@ FILES = [
     ),
     (edited("action", put(5, lambda row: row[:1])), "FILE: column 'action' has rows of 1 and 7 numbers"),
     (edited("action", lambda rows: ["up"] * len(rows)), "FILE: column 'action' must hold numbers or lists of numbers"),
-    (edited("action", lambda rows: [1.0] * len(rows)), "FILE: column 'action' holds numbers, that of another file"),
+    (edited("action", lambda rows: [1.0] * len(rows)), "FILE: column 'action' holds double, that of another file list"),
     (lambda t: t.slice(0, 0), "1 episodes are missing: 1"),
     (lambda t: t.slice(0, 4), "FILE: episode 1 has 4 rows, its description says 6"),
     (

@@ -208,17 +208,15 @@ def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
             continue
         missing = [name for name in (*needed, *pictures) if name not in schema.names]
         problems += [f"{file}: missing column {name!r}; the file has {', '.join(schema.names)}" for name in missing]
-        for name in schema.names:
-            if name in pictures:
-                kinds.setdefault(name, schema.field(name).type)
-            elif name in needed or name == ACTION:
-                kind = _double(pyarrow, schema.field(name).type)
-                kinds.setdefault(name, kind)
-                if kind is None:
-                    got = schema.field(name).type
-                    problems.append(f"{file}: column {name!r} must hold numbers or lists of numbers, got {got}")
-                elif kind != kinds[name]:
-                    problems.append(f"{file}: column {name!r} holds numbers, that of another file lists of them")
+        for name in {*needed, *pictures, ACTION}.intersection(schema.names):
+            got = schema.field(name).type
+            kind = _picture(pyarrow, got) if name in pictures else _double(pyarrow, got)
+            kinds.setdefault(name, kind)
+            if kind is None:
+                wanted = "pictures" if name in pictures else "numbers or lists of numbers"
+                problems.append(f"{file}: column {name!r} must hold {wanted}, got {got}")
+            elif kind != kinds[name]:
+                problems.append(f"{file}: column {name!r} holds {got}, that of another file {kinds[name]}")
     if problems:
         raise DataError(root, problems)
     try:
@@ -227,6 +225,12 @@ def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
     except (pyarrow.ArrowException, OSError) as error:
         raise DataError(root, f"it cannot be read: {str(error).splitlines()[0]}") from error
     return table.sort_by([(EPISODE, "ascending"), (FRAME, "ascending")])
+
+
+def _picture(pyarrow, kind):
+    """The type that a column of pictures is read as, None of anything else."""
+    held = pyarrow.types.is_struct(kind) and kind.get_field_index("bytes") >= 0
+    return pyarrow.struct([("bytes", pyarrow.binary())]) if held else None
 
 
 def _double(pyarrow, kind):

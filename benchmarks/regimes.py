@@ -34,11 +34,6 @@ class Regime:
         distractors (int): coordinates beside the state that move by themselves (a slow random oscillation each) and
             are embedded with it.
         hidden (tuple of int): columns of the state that no sensor shows.
-
-    Examples:
-        >>> from torchrl_koap.data.regimes import REGIMES
-        >>> REGIMES["noise"].noise, REGIMES["wide_64"].title
-        (3.0, '64 nonlinear columns')
     """
 
     name: str
@@ -65,14 +60,6 @@ def apply_regime(data: TensorDictBase, regime: str | Regime, *, seed: int = 0) -
 
     Raises:
         ValueError: for an unknown regime, or a state that has no such columns to hide.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data.regimes import apply_regime
-        >>> data = TensorDict({"state": torch.randn(50, 2).cumsum(0), "episode": torch.arange(50) // 25}, [50])
-        >>> apply_regime(data, "wide_64")["state"].shape
-        torch.Size([50, 64])
     """
     sensor = RegimeSensor(data, regime, seed=seed)
     return data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
@@ -95,15 +82,6 @@ class RegimeSensor:
 
     Raises:
         ValueError: for an unknown regime, or a state that has no such columns to hide.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.data.regimes import RegimeSensor
-        >>> data = TensorDict({"state": torch.randn(50, 2).cumsum(0), "episode": torch.arange(50) // 25}, [50])
-        >>> sensor = RegimeSensor(data, "wide_64")
-        >>> sensor.noisy(sensor.show(torch.zeros(3, 2))).shape
-        torch.Size([3, 64])
     """
 
     def __init__(self, data: TensorDictBase, regime: str | Regime, *, seed: int = 0):

@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.data.regimes import REGIMES, Regime, RegimeSensor, apply_regime
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from regimes import REGIMES, Regime, RegimeSensor, apply_regime  # noqa: E402
 
 
 def make_data(length=600, columns=2):
