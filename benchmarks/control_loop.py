@@ -28,10 +28,10 @@ class SlowPlanner(StatePlanner):
 
     seconds = 0.1
 
-    def plan(self, *arguments, **options):
+    def sample(self, *arguments, **options):
         """Plans, and waits for the rest of the time."""
         began = time.perf_counter()
-        plan = super().plan(*arguments, **options)
+        plan = super().sample(*arguments, **options)
         time.sleep(max(self.seconds - (time.perf_counter() - began), 0))
         return plan
 

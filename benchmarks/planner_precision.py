@@ -33,8 +33,7 @@ def update_of(width: int, depth: int, batch: int, dtype: torch.dtype | None):
     planner = StatePlanner(denoiser, state_dim=STATE_DIM, horizon=HORIZON)
     windows = TensorDict({"state": torch.randn(batch, HISTORY + HORIZON, STATE_DIM).cumsum(1)}, [batch])
     planner.fit_normalizers(windows["state"])
-    planner.training_dtype = dtype
-    loss = PlannerLoss(planner)
+    loss = PlannerLoss(planner, dtype=dtype)
     optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3, fused=True)
 
     def update() -> None:

@@ -21,8 +21,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
-from torchrl_koap.modules.diffusion.planner import StatePlanner
-from torchrl_koap.modules.diffusion.unet import TemporalUnet
+from torchrl_koap.modules.planning.planner import StatePlanner
+from torchrl_koap.modules.planning.unet import TemporalUnet
 from torchrl_koap.objectives import PlannerLoss
 
 ANCHORS = {"train_it_s": 1.19, "plan_1_ms": 309.0, "plan_60_ms": 3300.0}
@@ -64,7 +64,7 @@ def measure(planner: StatePlanner, repeats: int, clock: Callable[[], float]) -> 
         for batch in (1, 60):
             history = windows["state"][:batch, : planner.history]
             result[f"plan_{batch}_ms"] = 1e3 * median_seconds(
-                lambda history=history: planner.plan(history), repeats, clock
+                lambda history=history: planner.sample(history), repeats, clock
             )
     result["parameters"] = sum(parameter.numel() for parameter in planner.denoiser.parameters())
     return result

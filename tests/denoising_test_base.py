@@ -18,22 +18,17 @@ def noised_and_target(network, prediction, clean, noise, time):
 
 
 class DenoisingLossTestBase(LossTestBase):
-    """Tests of a denoising loss; a subclass also names the network."""
-
-    name = ""
-
-    def network(self, loss):
-        return getattr(loss, self.name)
+    """Tests of a denoising loss."""
 
     def weights(self, loss):
-        return getattr(loss, f"{self.name}_params").flatten_keys(".")
+        return loss.network_params.flatten_keys(".")
 
     def test_gradients_are_finite_and_reach_every_weight_but_not_the_statistics(self):
         loss = self.make_loss()
         self.total(loss(self.make_batch(16))).backward()
         weights = dict(self.weights(loss).items())
         trained = {name for name, value in weights.items() if value.requires_grad}
-        assert trained == {name for name, _ in self.network(loss).named_parameters()}
+        assert trained == {name for name, _ in loss.network.named_parameters()}
         for name in trained:
             assert weights[name].grad.isfinite().all() and weights[name].grad.abs().max() > 0, name
 
@@ -49,14 +44,14 @@ class DenoisingLossTestBase(LossTestBase):
             for name, value in self.weights(loss).items():
                 if value.requires_grad:
                     expected[name] = 0.9 * expected[name] + 0.1 * value.detach()
-        target = getattr(loss, f"target_{self.name}_params").flatten_keys(".")
+        target = loss.target_network_params.flatten_keys(".")
         for name, value in expected.items():
             torch.testing.assert_close(target[name], value)
             assert not target[name].requires_grad
-        network = self.network(loss)
+        network = loss.network
         history, noise = torch.randn(3, network.history, network.state_dim), torch.randn(3, *network.noise_shape)
         trained = network.sample(history, noise)
-        with getattr(loss, f"target_{self.name}_params").to_module(network):
+        with loss.target_network_params.to_module(network):
             averaged = network.sample(history, noise)
         assert not torch.allclose(trained, averaged)
         torch.testing.assert_close(network.sample(history, noise), trained)
@@ -70,7 +65,7 @@ class DenoisingLossTestBase(LossTestBase):
 
     def test_the_mode_reaches_the_network(self):
         loss = self.make_loss()
-        assert not self.network(loss.eval()).training and self.network(loss.train()).training
+        assert not loss.eval().network.training and loss.train().network.training
 
     def test_an_unknown_reduction_and_entries_set_by_hand_are_refused(self):
         with pytest.raises(ValueError, match="reduction must be 'none', 'mean' or 'sum', got 'median'"):

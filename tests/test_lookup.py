@@ -8,8 +8,8 @@ import torch
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import KoopmanOperator, make_koopman_inverse_dynamics
-from torchrl_koap.modules.diffusion.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.normalizer import Normalizer
+from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
 from torchrl_koap.tasks import get_task
 
 TABLE = {"dense": 1, "diagonal": 2, "dpm++2m": None}

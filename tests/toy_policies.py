@@ -25,7 +25,7 @@ class CountingPlanner(nn.Module):
         super().__init__()
         self.calls = []
 
-    def plan(self, history, noise=None):
+    def sample(self, history, noise=None):
         assert history.shape[-2:] == (2, 2)
         self.calls.append(history[..., -1, 0].flatten().tolist())
         ahead = 1000.0 * torch.arange(1, self.horizon + 1)

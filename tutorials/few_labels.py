@@ -96,7 +96,7 @@ for _ in range(1000):
     optimizer.step()
     optimizer.zero_grad()
     average.step()
-planner_loss.target_planner_params.to_module(planner)
+planner_loss.target_network_params.to_module(planner)
 
 # %%
 # Rollouts

@@ -47,7 +47,7 @@ def plans_with(solver, steps):
     began = time.perf_counter()
     with torch.no_grad():
         noise = torch.randn(200, *planner.noise_shape, generator=torch.Generator().manual_seed(0))
-        plans = planner.plan(here, noise=noise)
+        plans = planner.sample(here, noise=noise)
     return plans, (time.perf_counter() - began) * 1e3
 
 

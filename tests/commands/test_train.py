@@ -49,8 +49,8 @@ def test_the_planner_kept_is_the_moving_average(trained_run):
     kept, _ = load_tensors(trained_run / "planner.safetensors")
     weights = [name for name in kept if name.startswith("denoiser.")]
     assert len(weights) > 10
-    assert all(torch.equal(kept[name], state[f"loss.target_planner_params.{name}"]) for name in weights)
-    assert any(not torch.equal(kept[name], state[f"loss.planner_params.{name}"]) for name in weights)
+    assert all(torch.equal(kept[name], state[f"loss.target_network_params.{name}"]) for name in weights)
+    assert any(not torch.equal(kept[name], state[f"loss.network_params.{name}"]) for name in weights)
 
 
 def test_the_same_seed_gives_the_same_run_another_seed_another(trained_run, demonstrations, tmp_path):

@@ -42,7 +42,7 @@ class Straight(torch.nn.Module):
 
     history, horizon, state_dim = 2, 14, 2
 
-    def plan(self, history, noise=None, generator=None):
+    def sample(self, history, noise=None, generator=None):
         step = history[:, -1] - history[:, -2] + torch.tensor([0.0, 0.01])
         ahead = torch.arange(1, 15)[:, None]
         return history[:, -1:] + ahead * step[:, None]

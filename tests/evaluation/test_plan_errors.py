@@ -32,7 +32,7 @@ class Planner(nn.Module):
     def split_window(self, window):
         return window[:, :2], window[:, 2:]
 
-    def plan(self, history, noise):
+    def sample(self, history, noise):
         sign = torch.where(noise[:, :1, :1] > 0, 1.0, -1.0) * torch.tensor([1.0, 0.0])
         return history[:, -1:] + sign * self.size * torch.arange(1.0, 5.0)[:, None]
 

@@ -155,9 +155,9 @@ def test_plans_of_a_rollout_start_where_the_arm_was(together):
 
 def test_latency_is_measured_per_plan_and_per_step():
     class Slow(CountingPlanner):
-        def plan(self, history, noise=None):
+        def sample(self, history, noise=None):
             torch.randn(400, 400) @ torch.randn(400, 400)
-            return super().plan(history, noise)
+            return super().sample(history, noise)
 
     planner = Slow()
     policy = make_policy(planner, EchoController(), state_columns=(1, 2), replan_interval=4)

@@ -70,7 +70,7 @@ def test_every_task_s_relations_fit_its_state_and_travel_with_the_planner(name):
     windows = torch.randn(50, 16, task.state_dim)
     planner.fit_normalizers(windows)
     assert planner.encode_history(windows[:5, :2]).shape == (5, width)
-    assert planner.plan(windows[:5, :2]).shape == (5, 14, task.state_dim)
+    assert planner.sample(windows[:5, :2]).shape == (5, 14, task.state_dim)
 
 
 def test_avoiding_has_none():

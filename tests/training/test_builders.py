@@ -82,7 +82,7 @@ def test_every_denoiser_plans(denoiser, relative):
     unfit = "width" if denoiser == "unet" else "channels"
     options = {name: value for name, value in PLANNER.items() if name != unfit}
     planner = build_planner(options | {"denoiser": denoiser, "relative": relative}, 2)
-    assert planner.plan(torch.zeros(3, 2, 2)).shape == (3, 14, 2)
+    assert planner.sample(torch.zeros(3, 2, 2)).shape == (3, 14, 2)
     assert (planner.solver, planner.num_steps, planner.clip, planner.relative) == ("dpm++2m", 10, 1.2, relative)
     assert planner.schedule.prediction == "sample"
 

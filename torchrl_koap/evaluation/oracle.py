@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.execution.plan_then_control import PlanThenControl, blend_plan
+from torchrl_koap.modules.planning.planner import StatePlanner
 from torchrl_koap.tasks import Task
 
 LOOK_AHEAD = 4  # control steps over which the plan is followed; the arm needs about three to follow a command

@@ -99,7 +99,7 @@ def sample_plans(planner: StatePlanner, history: Tensor, *, samples: int = SAMPL
     Returns:
         Tensor: ``[S, N, H, d]``.
     """
-    return sample_sequences(planner.plan, planner.noise_shape, history, samples=samples, seed=seed)
+    return sample_sequences(planner.sample, planner.noise_shape, history, samples=samples, seed=seed)
 
 
 @torch.no_grad()

@@ -20,13 +20,13 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import OUTCOMES
 from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
-from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.execution.command_leash import CommandLeash
 from torchrl_koap.modules.execution.plan_then_control import PlanThenControl
 from torchrl_koap.modules.execution.posture_tracking import PostureTracking
 from torchrl_koap.modules.execution.predictive_tracking import PredictiveTracking
 from torchrl_koap.modules.execution.receding_horizon import policy_transforms
 from torchrl_koap.modules.execution.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
+from torchrl_koap.modules.planning.planner import StatePlanner
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import ActionRule
 from torchrl_koap.training.response import tracked_columns

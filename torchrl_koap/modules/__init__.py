@@ -9,11 +9,6 @@ from torchrl_koap.modules.baselines.quantized import QuantizedInverseDynamics
 from torchrl_koap.modules.baselines.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
 from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
 from torchrl_koap.modules.baselines.window_variational import WindowVariationalInverseDynamics
-from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser
-from torchrl_koap.modules.diffusion.noise_schedule import NoiseSchedule
-from torchrl_koap.modules.diffusion.planner import StatePlanner
-from torchrl_koap.modules.diffusion.policy import DiffusionPolicy
-from torchrl_koap.modules.diffusion.unet import TemporalUnet
 from torchrl_koap.modules.execution.action_chunks import ChunkedPolicy
 from torchrl_koap.modules.execution.agent import Agent
 from torchrl_koap.modules.execution.asynchronous import AsynchronousAgent
@@ -39,6 +34,11 @@ from torchrl_koap.modules.koopman.latent_action import (
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
 from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.modules.normalizer import Normalizer
+from torchrl_koap.modules.planning.denoisers import MLPDenoiser
+from torchrl_koap.modules.planning.diffusion_policy import DiffusionPolicy
+from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
+from torchrl_koap.modules.planning.planner import StatePlanner
+from torchrl_koap.modules.planning.unet import TemporalUnet
 from torchrl_koap.modules.time_alignment import FrameGatherer
 
 __all__ = [

@@ -1,8 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Loss modules."""
 
-from torchrl_koap.objectives.denoising import DenoisingLoss
-from torchrl_koap.objectives.diffusion import DiffusionPolicyLoss, PlannerLoss
+from torchrl_koap.objectives.denoising import DenoisingLoss, DiffusionPolicyLoss, PlannerLoss
 from torchrl_koap.objectives.koopman import (
     KOAPLoss,
     KoopmanDynamicsLoss,

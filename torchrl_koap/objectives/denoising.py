@@ -1,34 +1,45 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What the denoising losses of planner and Diffusion Policy share: noise, timesteps, masks and reduction."""
+"""Denoising losses: what trains the planner on states, and the Diffusion Policy on labelled actions."""
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives.common import LossModule
 
-from torchrl_koap.modules.diffusion.base import ConditionedDiffusion
+from torchrl_koap import keys
+from torchrl_koap.modules.planning.diffusion_policy import DiffusionPolicy
+from torchrl_koap.modules.planning.planner import StatePlanner
+from torchrl_koap.modules.planning.sampler import ConditionalSampler
+from torchrl_koap.objectives.base import read_entry, read_mask
 
 
 class DenoisingLoss(LossModule):
-    """Mean squared error of a denoiser at random noise levels; base of the losses of planner and Diffusion Policy.
+    r"""Mean squared error of a denoiser at random noise levels.
 
-    A subclass has a ``name``, under which the network, its weights and their average live (``planner``,
-    ``planner_params``, ``target_planner_params``), and says what a batch holds (:meth:`read`).
+    With a normalised sequence ``x_0``, noise ``eps ~ N(0, I)`` and a random time ``t`` per sequence::
+
+        L = mean | denoiser(signal(t) x_0 + noise(t) eps, t, condition) - target |^2
+
+    where the schedule's prediction type says whether the target is the clean sequence or the noise. A subclass says
+    what a batch holds (:meth:`read`).
 
     Args:
-        network (ConditionedDiffusion): network to train, its normalisers already fitted.
+        network (ConditionalSampler): network to train, its normalisers already fitted.
 
     Keyword Args:
-        create_target_params (bool): keep an averaged copy of the weights, to be moved by
+        create_target_params (bool): keep an averaged copy of the weights in ``target_network_params``, to be moved by
             :class:`torchrl.objectives.SoftUpdate` and used for sampling. Defaults to True.
         reduction (str): ``"mean"`` | ``"sum"`` | ``"none"`` over the elements ``[*B, H, width]`` that count
             (``"none"``: 0 where they do not). Defaults to ``"mean"``.
+        dtype (torch.dtype, optional): of the denoiser's matrix products, such as ``torch.bfloat16``. Default: that of
+            its weights.
 
     Raises:
         ValueError: if ``reduction`` is unknown.
@@ -44,39 +55,33 @@ class DenoisingLoss(LossModule):
         torch.Size([8, 14, 2])
     """
 
-    name: str
+    network: ConditionalSampler
+    network_params: TensorDictParams
+    target_network_params: TensorDictParams
 
     def __init__(
         self,
-        network: ConditionedDiffusion,
+        network: ConditionalSampler,
         *,
         create_target_params: bool = True,
-        reduction: Literal["none", "mean", "sum"] | None = None,
+        reduction: Literal["none", "mean", "sum"] = "mean",
+        dtype: torch.dtype | None = None,
     ):
         super().__init__()
-        reduction = "mean" if reduction is None else reduction
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
-        self.reduction = reduction
-        self.convert_to_functional(network, self.name, create_target_params=create_target_params)
+        self.reduction, self.dtype = reduction, dtype
+        self.convert_to_functional(network, "network", create_target_params=create_target_params)
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Raw histories ``[*B, h, d]``, raw sequences ``[*B, H, width]``, and which of their steps count.
-
-        The mask is ``[*B, H, 1]``, or None where all do.
-        """
-        raise NotImplementedError
-
-    def encode(self, history: Tensor, sequence: Tensor, counts: Tensor | None) -> Tensor:
-        """The normalised sequences that noise is added to; a subclass says how.
+        """Reads raw histories and sequences of a batch, and which of their steps count.
 
         Args:
-            history (Tensor): raw histories ``[*B, h, d]``.
-            sequence (Tensor): raw plans or actions ``[*B, H, width]``.
-            counts (Tensor, optional): steps that count, bool ``[*B, H, 1]``; None: all.
+            tensordict (TensorDictBase): the batch.
 
         Returns:
-            Tensor: ``[*B, H, width]``, finite numbers also where steps do not count.
+            tuple: histories ``[*B, h, d]``, sequences ``[*B, H, width]`` (finite also where steps do not count) and
+            the steps that count, bool ``[*B, H, 1]``, or None where all do.
         """
         raise NotImplementedError
 
@@ -86,13 +91,13 @@ class DenoisingLoss(LossModule):
     def train(self, mode: bool = True):
         """Sets the mode of the loss, and of the network, which is no submodule of it."""
         super().train(mode)
-        getattr(self, self.name).train(mode)
+        self.network.train(mode)
         return self
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """Entries that must be there, as renamed by ``set_keys``."""
-        return self._entries()
+        return [self.tensor_keys.state]
 
     @in_keys.setter
     def in_keys(self, values: list[NestedKey]) -> None:
@@ -101,17 +106,18 @@ class DenoisingLoss(LossModule):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the loss; the input is not changed."""
-        names, network = self.tensor_keys, getattr(self, self.name)
+        names, network = self.tensor_keys, self.network
         history, sequence, counts = self.read(tensordict)
-        with getattr(self, f"{self.name}_params").to_module(network, preserve_module_state=False):
+        with self.network_params.to_module(network, preserve_module_state=False):
             with torch.no_grad():
-                condition = network.encode_history(history)
-                sample = self.encode(history, sequence, counts)
+                condition, clean = network.encode_history(history), network.encode(history, sequence)
+                if counts is not None:
+                    clean = torch.where(counts, clean, 0.0)
                 noise, time = tensordict.get(names.noise, None), tensordict.get(names.time, None)
-            error = network.denoising_error(condition, sample, noise, time)  # [*B, H, width]
+            error = network.denoising_error(condition, clean, noise, time, dtype=self.dtype)  # [*B, H, width]
 
-        result = TensorDict({f"loss_{self.name}": self._reduce(error, counts)}, batch_size=[])
-        self._clear_weakrefs(tensordict, result, f"{self.name}_params", f"target_{self.name}_params")
+        result = TensorDict({self.out_keys[0]: self._reduce(error, counts)}, batch_size=[])
+        self._clear_weakrefs(tensordict, result, "network_params", "target_network_params")
         return result
 
     def _reduce(self, error: Tensor, counts: Tensor | None) -> Tensor:
@@ -121,3 +127,143 @@ class DenoisingLoss(LossModule):
         if self.reduction == "none":
             return loss
         return loss.sum() / ((counts.sum() * error.shape[-1]).clamp_min(1) if self.reduction == "mean" else 1)
+
+
+class PlannerLoss(DenoisingLoss):
+    r"""Trains a planner on windows of states (:class:`DenoisingLoss`).
+
+    Args:
+        planner (StatePlanner): planner to train, its normalisers already fitted.
+
+    Keyword Args:
+        **options: as for :class:`DenoisingLoss`.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if an entry has another shape than the planner needs, or ``reduction`` is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
+        >>> from torchrl_koap.objectives import PlannerLoss
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> loss = PlannerLoss(planner)
+        >>> average = SoftUpdate(loss, eps=0.99)
+        >>> loss(TensorDict({"state": torch.randn(8, 16, 2)}, [8]))["loss_planner"].backward()
+        >>> average.step()
+        >>> with loss.target_network_params.to_module(planner):
+        ...     plan = planner(TensorDict({"history": torch.randn(3, 2, 2)}, [3]))["plan"]
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Entries of the input; the last two are read if they are there.
+
+        Attributes:
+            state (NestedKey): windows of raw states ``[*B, history + horizon, d]``. Defaults to ``"state"``.
+            noise (NestedKey): noise ``[*B, horizon, d]`` instead of random. Defaults to ``"planner_noise"``.
+            time (NestedKey): time ``[*B]`` in training steps instead of random. Defaults to ``"planner_time"``.
+        """
+
+        state: NestedKey = keys.STATE
+        noise: NestedKey = "planner_noise"
+        time: NestedKey = "planner_time"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_planner"]
+
+    def __init__(self, planner: StatePlanner, **options: Any):
+        super().__init__(planner, **options)
+
+    def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Reads histories and recorded futures, of which all steps count (:meth:`DenoisingLoss.read`)."""
+        return *self.network.split_window(read_entry(tensordict, self.tensor_keys.state)), None
+
+
+class DiffusionPolicyLoss(DenoisingLoss):
+    r"""Trains a Diffusion Policy on labelled steps of windows (:class:`DenoisingLoss`).
+
+    The sequence are the actions of frames ``history - 1 .. T - 2``. A step counts if it has a label and neither its
+    frame nor the next one is padded. The denoiser sees steps that do not count as the middle of the range of actions,
+    noise added; what was stored there (NaN) reaches neither value nor gradient. A batch without labels gives exactly 0.
+    Labels are what this method lives on: draw windows with ``labelled_share=1``
+    (:class:`~torchrl_koap.data.WindowSampler`).
+
+    Args:
+        policy (DiffusionPolicy): policy to train, its normalisers already fitted.
+
+    Keyword Args:
+        **options: as for :class:`DenoisingLoss`.
+
+    Raises:
+        KeyError: if an entry is missing.
+        ValueError: if an entry has another shape than the policy needs, or ``reduction`` is unknown.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import DiffusionPolicy, TemporalUnet
+        >>> from torchrl_koap.objectives import DiffusionPolicyLoss
+        >>> loss = DiffusionPolicyLoss(DiffusionPolicy(TemporalUnet(3, 4), state_dim=2, action_dim=3))
+        >>> batch = TensorDict({"state": torch.randn(8, 16, 2), "action": torch.randn(8, 16, 3),
+        ...                     "has_action": torch.ones(8, 16, 1, dtype=torch.bool)}, [8])
+        >>> loss(batch)["loss_policy"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Entries of the input; the last three are read if they are there. Masks may have a trailing 1 or not.
+
+        Attributes:
+            state (NestedKey): windows of raw states ``[*B, history + horizon, d]``. Defaults to ``"state"``.
+            action (NestedKey): raw actions ``[*B, history + horizon, act]``, NaN where unlabelled. Defaults to
+                ``"action"``.
+            has_action (NestedKey): labelled frames, bool ``[*B, history + horizon, 1]``. Defaults to ``"has_action"``.
+            padded (NestedKey): frames that repeat an edge of the trajectory, bool ``[*B, history + horizon]``. Defaults
+                to ``"padded"``.
+            noise (NestedKey): noise ``[*B, horizon, act]`` instead of random. Defaults to ``"policy_noise"``.
+            time (NestedKey): time ``[*B]`` in training steps instead of random. Defaults to ``"policy_time"``.
+        """
+
+        state: NestedKey = keys.STATE
+        action: NestedKey = keys.ACTION
+        has_action: NestedKey = keys.HAS_ACTION
+        padded: NestedKey = "padded"
+        noise: NestedKey = "policy_noise"
+        time: NestedKey = "policy_time"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_policy"]
+    network: DiffusionPolicy
+
+    def __init__(self, policy: DiffusionPolicy, **options: Any):
+        super().__init__(policy, **options)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries that must be there, as renamed by ``set_keys``."""
+        return [self.tensor_keys.state, self.tensor_keys.action, self.tensor_keys.has_action]
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
+
+    def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Reads histories, actions from now on and which of them are labelled (:meth:`DenoisingLoss.read`)."""
+        names, now = self.tensor_keys, self.network.history - 1
+        state, action = read_entry(tensordict, names.state), read_entry(tensordict, names.action)
+        history, _ = self.network.split_window(state)
+        wanted = (*state.shape[:-1], self.network.action_dim)
+        if action.shape != wanted:
+            raise ValueError(f"{names.action!r} must be {list(wanted)} ([*B, T, act]), got {list(action.shape)}")
+        counts = read_mask(tensordict, names.has_action, state)[..., now:-1]
+        if tensordict.get(names.padded, None) is not None:
+            padded = read_mask(tensordict, names.padded, state)[..., now:]
+            counts = counts & ~(padded[..., 1:] | padded[..., :-1])
+        counts = counts.unsqueeze(-1)
+        # zeroed before the network and the residual: masking afterwards would leave NaN in the gradient
+        return history, torch.where(counts, action[..., now:-1, :], 0.0), counts

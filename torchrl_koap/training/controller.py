@@ -183,7 +183,6 @@ def _train_policy(
     states = cut_windows(extrapolate_ends(seen, HORIZON - 1), WINDOW, select=["state"], pad_before=1)["state"]
     policy.fit_normalizers(states, data["action"][has_action])
     policy.to(options.device)
-    policy.training_dtype = training_dtype(options.precision, options.device)
     # at the end of a demonstration only the steps that were recorded count
     buffer = make_window_buffer(
         data,
@@ -194,7 +193,7 @@ def _train_policy(
         pad_after=HORIZON - 1,
         labelled_share=LABELLED_SHARES[phase.windows],
     )
-    loss = phase.loss(policy)
+    loss = phase.loss(policy, dtype=training_dtype(options.precision, options.device))
     augment = augmentation(task, actions=True)
     num_steps = max(round(options.steps * phase.share), 1)
     values = train_one(
@@ -206,7 +205,7 @@ def _train_policy(
         weight_decay=WEIGHT_DECAY,
         target_update=moving_average(loss, num_steps),
     )
-    loss.target_policy_params.to_module(policy)
+    loss.target_network_params.to_module(policy)
     return policy, values
 
 

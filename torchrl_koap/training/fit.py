@@ -99,7 +99,7 @@ def fit_planner(
         >>> states = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(3)]
         >>> data, task = make_demonstrations(states, control_hz=30, action_dim=2)
         >>> planner = fit_planner(data, task, steps=2, channels=(8, 16), progress=False)
-        >>> planner.plan(data["observation"][None, :2]).shape
+        >>> planner.sample(data["observation"][None, :2]).shape
         torch.Size([1, 14, 2])
     """
     data, task = _prepared(data, task, action_dim=1)  # no action is looked at

@@ -100,8 +100,7 @@ def learn_states(
     def draw() -> TensorDictBase:
         return augment(buffer.sample())[:, unseen:]
 
-    planner.training_dtype = training_dtype(options.precision, options.device)
-    loss = PlannerLoss(planner)
+    loss = PlannerLoss(planner, dtype=training_dtype(options.precision, options.device))
     with progress_bar(options.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
         values = train_phase(
             "planner",
@@ -117,7 +116,7 @@ def learn_states(
             resume=options.resume,
             progress=show_losses(bar),
         )
-    loss.target_planner_params.to_module(planner)
+    loss.target_network_params.to_module(planner)
     return values
 
 

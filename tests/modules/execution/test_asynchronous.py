@@ -33,10 +33,10 @@ class HeldPlanner(CountingPlanner):
         self.let_go, self.known = threading.Event(), []
         self.let_go.set()
 
-    def plan(self, history, noise=None, known=None):
+    def sample(self, history, noise=None, prefix=None):
         self.let_go.wait(10)
-        self.known.append(known)
-        return super().plan(history, noise)
+        self.known.append(prefix)
+        return super().sample(history, noise)
 
 
 def make_agent(interval=2, hz=30.0):
@@ -101,11 +101,11 @@ def test_a_plan_has_the_states_that_are_known(prediction):
     planner.fit_normalizers(torch.randn(50, 16, 2).cumsum(1))
     history, known, noise = torch.randn(3, 2, 2), torch.randn(3, 2, 2), torch.randn(3, 14, 2)
     with torch.no_grad():
-        free, bound = planner.plan(history, noise), planner.plan(history, noise, known=known)
+        free, bound = planner.sample(history, noise), planner.sample(history, noise, prefix=known)
     torch.testing.assert_close(bound[:, :2], known)
     assert not torch.allclose(free[:, 2:], bound[:, 2:])
-    with pytest.raises(ValueError, match=r"known states must be \[\*B, 1..13, 2\]"):
-        planner.plan(history, noise, known=torch.zeros(3, 14, 2))
+    with pytest.raises(ValueError, match=r"a prefix must be \[\*B, 1..13, 2\]"):
+        planner.sample(history, noise, prefix=torch.zeros(3, 14, 2))
 
 
 def test_the_command_is_held_back_as_in_the_policy_itself():

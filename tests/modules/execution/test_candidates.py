@@ -83,7 +83,7 @@ class TwoGaps(nn.Module):
     history, horizon, state_dim, noise_shape = 1, 6, 1, (6, 1)
     noise_key = "noise"
 
-    def plan(self, history, noise=None):
+    def sample(self, history, noise=None):
         way = torch.arange(1.0, 7)[:, None]
         return history[..., -1:, :] + way * torch.where(noise[..., :1, :] > 0, 1.0, -1.0)
 
@@ -127,8 +127,8 @@ def test_a_robot_between_two_gaps_keeps_its_word():
 def test_one_candidate_is_the_policy_of_before():
     planner = TwoGaps()
     history, noise = torch.zeros(3, 1, 1), torch.randn(3, 6, 1)
-    chosen = sample_coherent(planner.plan, planner.scale_columns, history, noise, number=1, in_force=None, fresh=None)
-    assert (chosen == planner.plan(history, noise)).all()
+    chosen = sample_coherent(planner.sample, planner.scale_columns, history, noise, number=1, in_force=None, fresh=None)
+    assert (chosen == planner.sample(history, noise)).all()
 
 
 def test_diffusion_policy_with_candidates_executes_one_of_its_chunks():

@@ -38,7 +38,7 @@ def test_the_stateless_policy_is_the_open_loop_one():
     with torch.no_grad():
         actions = what.module(*what.inputs.values())
         state = what.inputs["observations"][..., 2:]
-        plan = whole.planner.plan(state[:, -2:], what.inputs["noise"])
+        plan = whole.planner.sample(state[:, -2:], what.inputs["noise"])
     assert actions.shape == (1, 4, 3)
     torch.testing.assert_close(actions[:, 0], whole.act(state, plan))
 

@@ -204,8 +204,8 @@ def test_a_real_policy_collects_from_sixty_avoiding_environments(execution):
         planner, make_koopman_inverse_dynamics(2, 2), state_columns=(2, 3), history=5, execution=execution
     )
     calls = []
-    plan = planner.plan
-    planner.plan = lambda *arguments: calls.append(len(arguments[0])) or plan(*arguments)
+    plan = planner.sample
+    planner.sample = lambda *arguments: calls.append(len(arguments[0])) or plan(*arguments)
     collector = Collector(
         env, policy, frames_per_batch=60 * 6, total_frames=60 * 6, exploration_type=ExplorationType.DETERMINISTIC
     )

@@ -108,7 +108,7 @@ def test_chunks_for_export_begin_with_the_action_of_the_step():
     td = TensorDict({"observation_history": observed, "is_init": torch.ones(3, 1, dtype=torch.bool), "noise": noise}, 3)
     torch.testing.assert_close(policy(td)["action"], chunk[:, 0])
     states = policy.state_of(observed)
-    plan = policy.planner.plan(states[:, -policy.planner.history :], noise)
+    plan = policy.planner.sample(states[:, -policy.planner.history :], noise)
     torch.testing.assert_close(chunk, policy.track(observed, states, plan)[:, :4])
     assert not torch.allclose(chunk[:, 0], chunk[:, 1])
     policy.action_gain = torch.tensor([2.0, 2.0])

@@ -9,9 +9,9 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torchrl_koap.keys import ACTION
-from torchrl_koap.modules.diffusion.policy import ACTION_CHUNK, DiffusionPolicy
 from torchrl_koap.modules.execution.candidates import sample_coherent
 from torchrl_koap.modules.execution.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
+from torchrl_koap.modules.planning.diffusion_policy import ACTION_CHUNK, DiffusionPolicy
 
 
 class ChunkedPolicy(RecedingHorizonPolicy):

@@ -129,7 +129,7 @@ class AsynchronousAgent(Agent):
     def _make(self, history: Tensor, noise: Tensor, known: Tensor | None) -> tuple[Tensor, float]:
         began = time.perf_counter()
         planner = self.policy.planner
-        plan = planner.plan(history[..., -planner.history :, :], noise, known=known)
+        plan = planner.sample(history[..., -planner.history :, :], noise, prefix=known)
         return plan, time.perf_counter() - began
 
     def _steps(self, seconds: float) -> int:

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from torchrl_koap.keys import ACTION
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.execution.candidates import paths_apart, sample_coherent
 from torchrl_koap.modules.execution.receding_horizon import OBSERVATION_HISTORY, RecedingHorizonPolicy
+from torchrl_koap.modules.planning.planner import StatePlanner
 
 EXECUTIONS = ("feedback", "open_loop")
 
@@ -136,10 +136,10 @@ class PlanThenControl(RecedingHorizonPolicy):
         """
         seen = history[..., -self.planner.history :, :]
         if self.candidates == 1:
-            plan = self.planner.plan(seen, noise)
+            plan = self.planner.sample(seen, noise)
         else:
             plan = sample_coherent(
-                self.planner.plan,
+                self.planner.sample,
                 self.planner.scale_columns,
                 seen,
                 noise,
@@ -161,7 +161,7 @@ class PlanThenControl(RecedingHorizonPolicy):
             Tensor: ``[*B, replan_interval, act]``.
         """
         states = self.state_of(observations)
-        plan = self.planner.plan(states[..., -self.planner.history :, :], noise)
+        plan = self.planner.sample(states[..., -self.planner.history :, :], noise)
         return self.scaled(self._decode_ahead(observations, states, plan))
 
     def _decode_ahead(self, observations: Tensor, states: Tensor, plan: Tensor) -> Tensor:

@@ -9,9 +9,9 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.execution.plan_then_control import PlanThenControl, blend_plan
 from torchrl_koap.modules.koopman.command_posture import CommandPosture
+from torchrl_koap.modules.planning.planner import StatePlanner
 
 PULL = 0.3  # share of the distance to the posture that is gone at every step
 

@@ -9,9 +9,9 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_koap.modules.diffusion.planner import StatePlanner
 from torchrl_koap.modules.execution.plan_then_control import PlanThenControl, blend_plan
 from torchrl_koap.modules.koopman.command_response import CommandResponse
+from torchrl_koap.modules.planning.planner import StatePlanner
 
 SMOOTHNESS = 3.0  # weight of a change of the commanded velocity against a distance from the plan
 END_SPEED = 5.0  # weight of the speed at the end of the look-ahead: a short one is unstable without

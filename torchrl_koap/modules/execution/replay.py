@@ -10,7 +10,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torchrl_koap.modules.diffusion.planner import StatePlanner
+from torchrl_koap.modules.planning.planner import StatePlanner
 
 NOISE = "noise"
 RECORDED_FUTURE = "recorded_future"
@@ -96,7 +96,7 @@ class RecordedPlanner(nn.Module):
         >>> import torch
         >>> from torchrl_koap.modules import RecordedPlanner, StatePlanner, TemporalUnet
         >>> planner = RecordedPlanner(StatePlanner(TemporalUnet(2, 4), state_dim=2))
-        >>> planner.plan(torch.zeros(3, 2, 2), torch.ones(3, 14, 2)).shape
+        >>> planner.sample(torch.zeros(3, 2, 2), torch.ones(3, 14, 2)).shape
         torch.Size([3, 14, 2])
     """
 
@@ -107,7 +107,7 @@ class RecordedPlanner(nn.Module):
         for name in ("history", "horizon", "state_dim"):
             setattr(self, name, getattr(planner, name))
 
-    def plan(self, history: Tensor, future: Tensor) -> Tensor:
+    def sample(self, history: Tensor, future: Tensor) -> Tensor:
         """The futures that :class:`RecordedFutures` wrote, ``[*B, H, d]``.
 
         Args:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrl_koap.modules import StatePlanner, TemporalUnet
-from torchrl_koap.modules.diffusion.forecast import LinearForecast
+from torchrl_koap.modules.planning.forecast import LinearForecast
 
 
 def walks(count, *, frames=16, seed=0):
@@ -33,7 +33,7 @@ def test_plans_to_new_goals_before_any_training(relative):
     model.fit_normalizers(walks(60), groups=torch.arange(60))
     new = walks(5, seed=1) * 1.5
     with torch.no_grad():
-        plan = model.plan(new[:, :2])
+        plan = model.sample(new[:, :2])
     torch.testing.assert_close(plan, new[:, 2:], atol=2e-2, rtol=0)
 
 
@@ -42,11 +42,11 @@ def test_a_plan_comes_back_and_known_states_are_kept():
     windows = walks(40) + 0.1 * torch.randn(40, 16, 2, generator=torch.Generator().manual_seed(3))
     model.fit_normalizers(windows, groups=torch.arange(40))
     history, plan = model.split_window(windows)
-    encoded = model.encode_plan(history, plan)
+    encoded = model.encode(history, plan)
     assert encoded.abs().max() <= 1 + 1e-5
-    torch.testing.assert_close(model.decode_plan(history, encoded), plan, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(model.decode(history, encoded), plan, atol=1e-5, rtol=1e-5)
     with torch.no_grad():
-        again = model.plan(history[:3], known=plan[:3, :4])
+        again = model.sample(history[:3], prefix=plan[:3, :4])
     torch.testing.assert_close(again[:, :4], plan[:3, :4], atol=1e-5, rtol=1e-5)
 
 
@@ -56,7 +56,7 @@ def test_the_state_dict_holds_it_and_one_without_is_as_before():
     other.load_state_dict(model.state_dict())
     noise = torch.randn(2, 14, 2)
     with torch.no_grad():
-        assert torch.equal(model.plan(walks(2)[:, :2], noise), other.plan(walks(2)[:, :2], noise))
+        assert torch.equal(model.sample(walks(2)[:, :2], noise), other.sample(walks(2)[:, :2], noise))
     assert not any(name.startswith("forecast") for name in planner(False).state_dict())
 
 

@@ -40,7 +40,7 @@ class StepEmbedding(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules.diffusion.denoisers import StepEmbedding
+        >>> from torchrl_koap.modules.planning.denoisers import StepEmbedding
         >>> StepEmbedding(32)(torch.arange(5.0)).shape
         torch.Size([5, 32])
     """
@@ -76,7 +76,7 @@ class ConditionEncoder(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules.diffusion.denoisers import ConditionEncoder
+        >>> from torchrl_koap.modules.planning.denoisers import ConditionEncoder
         >>> ConditionEncoder(4, frequencies=3, width=64)(torch.randn(5, 4)).shape
         torch.Size([5, 64])
     """
@@ -98,7 +98,7 @@ class MLPDenoiser(nn.Module):
     """Residual network on the flattened plan: the cheapest denoiser, for one fixed horizon.
 
     On Avoiding its plans touch obstacles more often than those of
-    :class:`~torchrl_koap.modules.diffusion.unet.TemporalUnet`; it serves comparisons and toy problems.
+    :class:`~torchrl_koap.modules.planning.unet.TemporalUnet`; it serves comparisons and toy problems.
 
     Args:
         state_dim (int): number ``d`` of state columns.
@@ -114,7 +114,7 @@ class MLPDenoiser(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser
+        >>> from torchrl_koap.modules.planning.denoisers import MLPDenoiser
         >>> network = MLPDenoiser(state_dim=2, condition_dim=4, horizon=14)
         >>> network(torch.randn(3, 14, 2), torch.zeros(3), torch.randn(3, 4)).shape
         torch.Size([3, 14, 2])

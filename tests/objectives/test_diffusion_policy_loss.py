@@ -55,7 +55,6 @@ def batch_of(*batch, history=2):
 
 
 class TestDiffusionPolicyLoss(DenoisingLossTestBase):
-    name = "policy"
     default_keys = {
         "state": "state",
         "action": "action",
@@ -84,7 +83,7 @@ def test_value_in_closed_form(prediction, dtype, history):
     data = batch_of(5, history=history).apply(lambda x: x.to(dtype) if x.is_floating_point() else x)
     value = loss(data)["loss_policy"]
 
-    policy, noise, time = loss.policy, data["policy_noise"], data["policy_time"].to(dtype)
+    policy, noise, time = loss.network, data["policy_noise"], data["policy_time"].to(dtype)
     frames = slice(history - 1, history - 1 + HORIZON)
     counts = data["has_action"][:, frames]
     clean = (data["action"][:, frames] - policy.action_normalizer.offset) / policy.action_normalizer.scale
@@ -92,7 +91,7 @@ def test_value_in_closed_form(prediction, dtype, history):
     condition = data["state"][:, :history].flatten(1)
     condition = (condition - policy.condition_normalizer.offset) / policy.condition_normalizer.scale
     noisy, target = noised_and_target(policy, prediction, clean, noise, time)
-    with loss.policy_params.to_module(policy):
+    with loss.network_params.to_module(policy):
         output = policy.denoiser(noisy, time, condition)
     torch.testing.assert_close(value, torch.where(counts, (output - target) ** 2, 0.0), atol=1e-4, rtol=1e-4)
     assert value.dtype == dtype and 0 < counts.sum() < counts.numel()
@@ -190,7 +189,7 @@ def test_training_recovers_a_linear_law_from_few_labels():
     hidden = [frames for index, frames in enumerate(states) if not data["has_action"][data["episode"] == index].all()]
     assert len(hidden) == 50
     windows = torch.cat([frames[:30].unfold(0, 6, 1).transpose(1, 2) for frames in hidden])
-    with torch.no_grad(), loss.target_policy_params.to_module(policy):
+    with torch.no_grad(), loss.target_network_params.to_module(policy):
         chunk = policy.sample(windows[:, :2])
     expected = windows[:, 1:5] @ law.T
     error = (chunk - expected).square().mean((0, 2)).sqrt()

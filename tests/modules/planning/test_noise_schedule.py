@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_koap.modules.diffusion.noise_schedule import PREDICTIONS, SOLVERS, NoiseSchedule
+from torchrl_koap.modules.planning.noise_schedule import PREDICTIONS, SOLVERS, NoiseSchedule
 
 DEVICES = ["cpu"] + ["cuda"] * torch.cuda.is_available()
 

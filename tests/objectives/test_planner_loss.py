@@ -9,10 +9,10 @@ from denoising_test_base import PREDICTIONS, DenoisingLossTestBase, noised_and_t
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
-from torchrl_koap.modules.diffusion.denoisers import MLPDenoiser
-from torchrl_koap.modules.diffusion.noise_schedule import NoiseSchedule
-from torchrl_koap.modules.diffusion.planner import StatePlanner
-from torchrl_koap.modules.diffusion.unet import TemporalUnet
+from torchrl_koap.modules.planning.denoisers import MLPDenoiser
+from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
+from torchrl_koap.modules.planning.planner import StatePlanner
+from torchrl_koap.modules.planning.unet import TemporalUnet
 from torchrl_koap.objectives import PlannerLoss
 
 
@@ -42,7 +42,6 @@ def batch_of(*batch, dtype=torch.float32):
 
 
 class TestPlannerLoss(DenoisingLossTestBase):
-    name = "planner"
     default_keys = {"state": "state", "noise": "planner_noise", "time": "planner_time"}
     in_names, out_keys = ("state",), ("loss_planner",)
 
@@ -60,14 +59,14 @@ def test_value_in_closed_form(prediction, dtype):
     data = batch_of(5, dtype=dtype)
     value = loss(data)["loss_planner"]
 
-    planner, noise = loss.planner, data["planner_noise"]
+    planner, noise = loss.network, data["planner_noise"]
     state, time = data["state"], data["planner_time"].to(dtype)
     clean = state[:, 2:] - state[:, 1:2]
     clean = ((clean.flatten(1) - planner.plan_normalizer.offset) / planner.plan_normalizer.scale).reshape(5, 6, 2)
     condition = torch.cat([state[:, 0] - state[:, 1], state[:, 1]], -1)
     condition = (condition - planner.condition_normalizer.offset) / planner.condition_normalizer.scale
     noisy, target = noised_and_target(planner, prediction, clean, noise, time)
-    with loss.planner_params.to_module(planner):
+    with loss.network_params.to_module(planner):
         output = planner.denoiser(noisy, time, condition)
     torch.testing.assert_close(value, (output - target) ** 2, atol=1e-4, rtol=1e-4)
     assert value.dtype == dtype
@@ -118,8 +117,8 @@ def test_training_recovers_the_mean_and_spread_of_the_data():
         optimizer.zero_grad()
         average.step()
     history = torch.full((3000, 1, 1), 0.5)
-    with torch.no_grad(), loss.target_planner_params.to_module(planner):
-        plans = planner.plan(history)
+    with torch.no_grad(), loss.target_network_params.to_module(planner):
+        plans = planner.sample(history)
     assert plans.mean() == pytest.approx(2.5, abs=0.12)
     assert plans.std() == pytest.approx(0.5, abs=0.12)
 
@@ -173,10 +172,10 @@ def test_forward_and_plan_compile_without_a_graph_break(network):
     data = batch_of(4)
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(data)["loss_planner"], loss(data)["loss_planner"])
-    plan = torch.compile(loss.planner.plan, fullgraph=True, backend="aot_eager")
+    plan = torch.compile(loss.network.sample, fullgraph=True, backend="aot_eager")
     history, noise = windows(4)[:, :2], torch.randn(4, 6, 2)
     with torch.no_grad():
-        torch.testing.assert_close(plan(history, noise), loss.planner.plan(history, noise))
+        torch.testing.assert_close(plan(history, noise), loss.network.sample(history, noise))
 
 
 def test_half_precision_products_leave_weights_and_gradients_in_float32():
@@ -185,8 +184,7 @@ def test_half_precision_products_leave_weights_and_gradients_in_float32():
     windows = TensorDict({"state": torch.randn(64, 16, 2)}, [64])
     windows["planner_noise"], windows["planner_time"] = torch.randn(64, 14, 2), torch.full((64,), 20.0)
     exact = PlannerLoss(planner)(windows)["loss_planner"]
-    planner.training_dtype = torch.bfloat16
-    loss = PlannerLoss(planner)
+    loss = PlannerLoss(planner, dtype=torch.bfloat16)
     rounded = loss(windows)["loss_planner"]
     assert rounded.dtype == torch.float32
     assert rounded.item() != exact.item() and rounded.item() == pytest.approx(exact.item(), rel=0.01)

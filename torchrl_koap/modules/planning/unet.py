@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrl_koap.modules.diffusion.denoisers import ConditionEncoder, StepEmbedding, check_input
+from torchrl_koap.modules.planning.denoisers import ConditionEncoder, StepEmbedding, check_input
 
 
 class TemporalUnet(nn.Module):
@@ -40,7 +40,7 @@ class TemporalUnet(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules.diffusion.unet import TemporalUnet
+        >>> from torchrl_koap.modules.planning.unet import TemporalUnet
         >>> unet = TemporalUnet(state_dim=2, condition_dim=4)
         >>> unet(torch.randn(3, 14, 2), torch.zeros(3), torch.randn(3, 4)).shape
         torch.Size([3, 14, 2])

@@ -6,8 +6,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_koap.modules.diffusion.denoisers import ConditionEncoder, MLPDenoiser, StepEmbedding
-from torchrl_koap.modules.diffusion.unet import TemporalUnet
+from torchrl_koap.modules.planning.denoisers import ConditionEncoder, MLPDenoiser, StepEmbedding
+from torchrl_koap.modules.planning.unet import TemporalUnet
 
 MAKERS = {
     "unet": lambda **options: TemporalUnet(3, 6, channels=(16, 32), **options),

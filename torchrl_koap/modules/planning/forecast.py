@@ -15,7 +15,7 @@ _PENALTIES = tuple(10.0**power for power in range(-6, 8))  # the last one leaves
 
 
 class LinearForecast(nn.Module):
-    r"""Takes a ridge regression on the condition off a sequence, and adds it again.
+    r"""Subtracts a ridge regression on the condition from a sequence, and adds it again.
 
     .. math:: y = (x - W c - b - \text{offset}) / \text{scale}
 
@@ -30,7 +30,7 @@ class LinearForecast(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules.diffusion.forecast import LinearForecast
+        >>> from torchrl_koap.modules.planning.forecast import LinearForecast
         >>> condition, forecast = torch.randn(90, 3), LinearForecast(3, 2)
         >>> sequence = condition[:, :2] - 0.5 * condition[:, 2:]
         >>> penalty = forecast.fit(condition, sequence, torch.arange(90) // 30)
@@ -42,7 +42,7 @@ class LinearForecast(nn.Module):
         super().__init__()
         self.register_buffer("weight", torch.zeros(width, condition_dim))
         self.register_buffer("bias", torch.zeros(width))
-        self.rest = Normalizer(torch.zeros(width), torch.ones(width))
+        self.residual = Normalizer(torch.zeros(width), torch.ones(width))
 
     def fit(self, condition: Tensor, sequence: Tensor, groups: Tensor | None = None, *, mode: str = "minmax") -> float:
         """Fits the ridge and the statistics of what it leaves over.
@@ -76,11 +76,11 @@ class LinearForecast(nn.Module):
         rest = sequence - self._forecast(condition)
         fitted = Normalizer.fit(rest, mode=mode)
         nothing = (rest - fitted.offset).abs().amax(0) < _NOTHING  # such as a goal that never moves
-        self.rest = Normalizer(fitted.offset, torch.where(nothing, _NOTHING, fitted.scale)).to(self.bias)
+        self.residual = Normalizer(fitted.offset, torch.where(nothing, _NOTHING, fitted.scale)).to(self.bias)
         return fit.penalty
 
-    def take_off(self, condition: Tensor, sequence: Tensor) -> Tensor:
-        """Normalised deviation of a sequence from its forecast.
+    def encode(self, condition: Tensor, sequence: Tensor) -> Tensor:
+        """Maps sequences to their normalised deviation from the forecast.
 
         Args:
             condition (Tensor): normalised conditions ``[*B, c]``.
@@ -89,10 +89,10 @@ class LinearForecast(nn.Module):
         Returns:
             Tensor: ``[*B, w]``.
         """
-        return self.rest(sequence - self._forecast(condition))
+        return self.residual(sequence - self._forecast(condition))
 
-    def add(self, condition: Tensor, deviation: Tensor) -> Tensor:
-        """Inverse of :meth:`take_off`.
+    def decode(self, condition: Tensor, deviation: Tensor) -> Tensor:
+        """Maps deviations to sequences; the inverse of :meth:`encode`.
 
         Args:
             condition (Tensor): normalised conditions ``[*B, c]``.
@@ -101,7 +101,7 @@ class LinearForecast(nn.Module):
         Returns:
             Tensor: ``[*B, w]``.
         """
-        return self.rest.inverse(deviation) + self._forecast(condition)
+        return self.residual.inverse(deviation) + self._forecast(condition)
 
     def _forecast(self, condition: Tensor) -> Tensor:
         return nn.functional.linear(condition, self.weight, self.bias)

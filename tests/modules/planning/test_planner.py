@@ -1,0 +1,81 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The planner as a module: coordinates, modes of a bimodal future, and all that is a sampler's."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from sampler_test_base import SamplerTestBase, walks
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner, TemporalUnet
+
+
+def make_planner(**options):
+    torch.manual_seed(0)
+    denoiser = MLPDenoiser(2, 2 * options.get("history", 2), horizon=options.get("horizon", 14), width=16, depth=1)
+    return StatePlanner(denoiser, state_dim=2, **options)
+
+
+class TestStatePlanner(SamplerTestBase):
+    out_key, width = "plan", 2
+
+    def make(self, **options):
+        return make_planner(**options)
+
+    def make_unet(self, **options):
+        return StatePlanner(TemporalUnet(2, 4, channels=(16,)), state_dim=2, **options)
+
+    def fit(self, sampler, dtype=torch.float32):
+        sampler.fit_normalizers(walks(30, 2 + sampler.horizon, dtype=dtype))
+        return sampler
+
+
+class Bimodal(nn.Module):
+    """The optimal prediction of the clean plan if it is -1 or +1 with equal chances."""
+
+    def __init__(self, schedule):
+        super().__init__()
+        self.schedule = schedule
+
+    def forward(self, x, time, condition):
+        signal, noise = (level[time.long()][..., None, None] for level in (self.schedule.signal, self.schedule.noise))
+        return torch.tanh(signal * x / noise**2)
+
+
+@pytest.mark.parametrize("relative", [True, False])
+@pytest.mark.parametrize("mode", ["minmax", "standard"])
+def test_statistics_are_those_of_every_step(relative, mode):
+    planner, windows = make_planner(relative=relative), walks(50)
+    planner.fit_normalizers(windows, mode=mode)
+    history, plan = planner.split_window(windows)
+    encoded = planner.encode(history, plan)
+    torch.testing.assert_close(planner.decode(history, encoded), plan, atol=1e-6, rtol=0)
+    if mode == "minmax":
+        assert encoded.abs().max() == pytest.approx(1, abs=1e-5)
+        assert planner.encode_history(history).abs().max() == pytest.approx(1, abs=1e-5)
+        assert (encoded.abs().amax((0, 2)) > 0.99).all()
+    else:
+        torch.testing.assert_close(encoded.std(0, correction=0), torch.ones(14, 2), atol=1e-4, rtol=0)
+
+
+def test_relative_coordinates_do_not_move_with_the_data():
+    planner = make_planner()
+    history, plan = planner.split_window(walks(4))
+    shifted = torch.tensor([0.3, -0.2])
+    torch.testing.assert_close(planner.encode(history, plan), planner.encode(history + shifted, plan + shifted))
+    condition = planner.encode_history(history)
+    torch.testing.assert_close(condition[:, :2], history[:, 0] - history[:, 1])
+    torch.testing.assert_close(condition[:, 2:], history[:, 1])
+
+
+@pytest.mark.parametrize("exploration", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
+def test_both_modes_of_a_bimodal_future_appear(exploration):
+    schedule = NoiseSchedule(num_train_steps=200)
+    planner = StatePlanner(Bimodal(schedule), schedule, state_dim=1, history=1, horizon=1, relative=False, num_steps=40)
+    torch.manual_seed(0)
+    with set_exploration_type(exploration):
+        plans = planner.sample(torch.zeros(600, 1, 1))
+    torch.testing.assert_close(plans.abs(), torch.ones_like(plans), atol=0.02, rtol=0)
+    assert 0.42 < (plans > 0).float().mean() < 0.58

@@ -1,0 +1,118 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What planner and Diffusion Policy must do alike, as a base class: keys, noise, statistics, shapes, batches."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+DEVICES = ["cpu"] + ["cuda"] * torch.cuda.is_available()
+
+
+def walks(number: int, length: int = 16, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+    """Windows of random walks of two columns, ``[number, length, 2]``."""
+    generator = torch.Generator().manual_seed(3)
+    return (0.01 * torch.randn(number, length, 2, generator=generator, dtype=dtype)).cumsum(1)
+
+
+class SamplerTestBase:
+    """Tests of a sampler; a subclass says how it is made and fitted, which entry it writes and how wide it is."""
+
+    out_key, width = "", 0
+
+    def make(self, **options):
+        """A small one, always with the same weights."""
+        raise NotImplementedError
+
+    def make_unet(self, **options):
+        """One with a U-Net, for any horizon."""
+        raise NotImplementedError
+
+    def fit(self, sampler, dtype=torch.float32):
+        """Fits its statistics to windows of its horizon."""
+        raise NotImplementedError
+
+    def test_encoding_is_undone_by_decoding(self):
+        sampler = self.fit(self.make())
+        history, sequence = walks(5)[:, :2], torch.randn(5, 14, self.width)
+        again = sampler.decode(history, sampler.encode(history, sequence))
+        torch.testing.assert_close(again, sequence, atol=1e-5, rtol=1e-5)
+
+    @pytest.mark.parametrize("device", DEVICES)
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 3)])
+    def test_any_batch_dtype_and_device(self, batch, dtype, device):
+        sampler = self.fit(self.make_unet(num_steps=3, clip=1.0, horizon=6), dtype=torch.float64)
+        sampler.to(device=device, dtype=dtype)
+        history = torch.randn(*batch, 2, 2, dtype=dtype, device=device)
+        noise = sampler.draw_noise(history)
+        sequence = sampler(TensorDict({"history": history, "noise": noise}, batch))[self.out_key]
+        assert sequence.shape == (*batch, 6, self.width) and sequence.dtype == dtype and sequence.isfinite().all()
+        flat = sampler.sample(history.reshape(-1, 2, 2), noise.reshape(-1, 6, self.width))
+        torch.testing.assert_close(sequence.reshape(-1, 6, self.width), flat)
+
+    def test_given_noise_makes_samples_independent_of_the_batch(self):
+        sampler = self.make(num_steps=5, clip=1.0)
+        history, noise = torch.randn(6, 2, 2), torch.randn(6, *sampler.noise_shape)
+        together = sampler(TensorDict({"history": history, "noise": noise}, [6]))[self.out_key]
+        for row in range(6):
+            torch.testing.assert_close(sampler.sample(history[row], noise[row]), together[row], atol=1e-5, rtol=1e-4)
+
+    @pytest.mark.parametrize("exploration", ExplorationType)
+    def test_without_noise_every_sample_is_another_unless_a_generator_repeats_it(self, exploration):
+        sampler, history = self.make(clip=1.0), torch.randn(3, 2, 2)
+        with set_exploration_type(exploration):
+            assert not torch.equal(sampler.sample(history), sampler.sample(history))
+        first, second, other = (sampler.sample(history, generator=torch.Generator().manual_seed(s)) for s in (0, 0, 1))
+        assert torch.equal(first, second) and not torch.equal(first, other)
+
+    def test_a_prefix_is_kept_and_the_rest_fits_it(self):
+        sampler = self.fit(self.make())
+        history, prefix, noise = walks(3)[:, :2], 0.01 * torch.randn(3, 4, self.width), torch.randn(3, 14, self.width)
+        with torch.no_grad():
+            free, bound = sampler.sample(history, noise), sampler.sample(history, noise, prefix=prefix)
+        torch.testing.assert_close(bound[:, :4], prefix, atol=1e-5, rtol=1e-5)
+        assert not torch.allclose(free[:, 4:], bound[:, 4:])
+        for length in (0, 14):
+            with pytest.raises(ValueError, match=rf"a prefix must be \[\*B, 1..13, {self.width}\]"):
+                sampler.sample(history, noise, prefix=torch.zeros(3, length, self.width))
+
+    def test_keys_can_be_chosen_and_the_call_dispatched(self):
+        sampler = self.make(in_keys=[("a", "past")], out_keys=[("a", "next")], noise_key=("a", "luck"), num_steps=3)
+        history, noise = torch.randn(3, 2, 2), torch.randn(3, 14, self.width)
+        data = sampler(TensorDict({"a": {"past": history, "luck": noise}}, [3]))
+        torch.testing.assert_close(data["a", "next"], sampler.sample(history, noise))
+        assert self.make(num_steps=3)(history=history).shape == (3, 14, self.width)
+        with pytest.raises(ValueError, match="one in_key and one out_key"):
+            self.make(in_keys=["a", "b"])
+
+    def test_statistics_travel_in_the_state_dict(self):
+        sampler, fresh = self.fit(self.make(num_steps=3)), self.make(num_steps=3)
+        history, noise = walks(5)[:, :2], torch.randn(5, 14, self.width)
+        assert not torch.allclose(fresh.sample(history, noise), sampler.sample(history, noise))
+        fresh.load_state_dict(sampler.state_dict())
+        torch.testing.assert_close(fresh.sample(history, noise), sampler.sample(history, noise))
+        torch.testing.assert_close(copy.deepcopy(sampler).sample(history, noise), sampler.sample(history, noise))
+
+    def test_solvers_sizes_and_shapes_are_checked(self):
+        assert self.make(horizon=5).noise_shape == (5, self.width)
+        with pytest.raises(ValueError, match="did you mean 'ddim'"):
+            self.make(solver="dim")
+        with pytest.raises(ValueError, match="num_steps must lie in 1..50"):
+            self.make(num_steps=60)
+        with pytest.raises(ValueError, match="horizon must be at least 1"):
+            self.make(horizon=0)
+        sampler = self.make(num_steps=3)
+        for length in (1, 3):
+            with pytest.raises(ValueError, match=rf"'history' must be \[\*B, 2, 2\].* got \[5, {length}, 2\]"):
+                sampler(TensorDict({"history": torch.zeros(5, length, 2)}, [5]))
+        with pytest.raises(ValueError, match=rf"'noise' must be \[5, 14, {self.width}\].* got \[5, 12, {self.width}\]"):
+            sampler.sample(torch.zeros(5, 2, 2), torch.zeros(5, 12, self.width))
+        with pytest.raises(ValueError, match=rf"'{self.out_key}' must be \[\*B, 14, {self.width}\].* got \[5, 12"):
+            sampler.encode(torch.zeros(5, 2, 2), torch.zeros(5, 12, self.width))
+        with pytest.raises(ValueError, match=r"windows must be \[\*B, 16, 2\] \(history \+ horizon, state_dim\), got"):
+            sampler.split_window(torch.zeros(4, 15, 2))

@@ -1,0 +1,103 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Diffusion Policy: a generative model of the next actions given the last observed states, without a plan between."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor, nn
+
+from torchrl_koap import keys
+from torchrl_koap.modules.normalizer import Normalizer
+from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
+from torchrl_koap.modules.planning.sampler import ConditionalSampler, identity_normalizer
+
+ACTION_CHUNK = "action_chunk"
+
+
+class DiffusionPolicy(ConditionalSampler):
+    """Samples the next ``horizon`` actions given the last ``history`` states (Chi et al. 2023).
+
+    What the planner is for states, this is for actions: same denoiser, noise, solvers and condition. It learns from
+    labelled steps alone. The first action of a chunk is the one to take *now*, in the last frame of the history::
+
+        frame        0      1      2      3      ...  14          (history = 2, horizon = 14)
+                     x_0    x_1
+        chunk               a_1    a_2    a_3    ...  a_14        a_t moves x_t to x_{t+1}
+        entry               0      1      2      ...  13
+
+    KOAP's first public code diffuses ``a_2, a_3, ...`` here and begins to execute them in frame 1, one step too early.
+    Keywords that are not listed are those of :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`.
+
+    Args:
+        denoiser (nn.Module): ``denoiser(sequence [*B, H, act], time [*B], condition [*B, h * d + f]) -> [*B, H, act]``.
+        schedule (NoiseSchedule, optional): noise levels and what the denoiser predicts. Defaults to
+            ``NoiseSchedule()``.
+
+    Keyword Args:
+        state_dim (int): number ``d`` of state columns.
+        action_dim (int): number ``act`` of action entries.
+        relative (bool): the condition holds displacements from the present state. Defaults to False.
+        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``. Defaults to ``["history"]``.
+        out_keys (list of NestedKey): the entry of the actions ``[*B, H, act]``. Defaults to ``["action_chunk"]``.
+
+    Raises:
+        ValueError: for a history of another length or width, noise of another shape, an unknown solver.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import DiffusionPolicy, TemporalUnet
+        >>> policy = DiffusionPolicy(TemporalUnet(3, 4), state_dim=2, action_dim=3, num_steps=4)
+        >>> policy.fit_normalizers(torch.randn(100, 16, 2), torch.randn(500, 3))
+        >>> policy(TensorDict({"history": torch.randn(5, 2, 2)}, [5]))["action_chunk"].shape
+        torch.Size([5, 14, 3])
+    """
+
+    def __init__(
+        self,
+        denoiser: nn.Module,
+        schedule: NoiseSchedule | None = None,
+        *,
+        state_dim: int,
+        action_dim: int,
+        relative: bool = False,
+        **options: Any,
+    ):
+        if action_dim < 1:
+            raise ValueError(f"action_dim must be at least 1, got {action_dim}")
+        options = {"in_keys": [keys.HISTORY], "out_keys": [ACTION_CHUNK]} | options
+        super().__init__(denoiser, schedule, state_dim=state_dim, width=action_dim, relative=relative, **options)
+        self.action_dim = action_dim
+        self.action_normalizer = identity_normalizer(action_dim)
+
+    def fit_normalizers(self, windows: Tensor, actions: Tensor, *, mode: str = "minmax") -> None:
+        """Takes the statistics of condition and actions from data; call it before a loss is built on the policy.
+
+        Args:
+            windows (Tensor): raw states ``[*N, history + horizon, d]``; no label is needed for them.
+            actions (Tensor): labelled raw actions ``[*M, act]``. All steps of a chunk share their statistics.
+
+        Keyword Args:
+            mode (str): of the statistics, see :class:`~torchrl_koap.modules.Normalizer`.
+
+        Raises:
+            ValueError: for windows or actions of another shape, no actions, or actions that are not finite: they
+                must be those of the label budget.
+        """
+        if actions.ndim < 2 or actions.shape[-1] != self.action_dim:
+            raise ValueError(f"actions must be [*M, {self.action_dim}] (action_dim), got {list(actions.shape)}")
+        history, _ = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
+        example = self.action_normalizer.scale
+        condition = Normalizer.fit(self.condition(history), mode=mode)
+        self.action_normalizer = Normalizer.fit(actions, mode=mode).to(example)
+        self.condition_normalizer = condition.to(example)
+
+    def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Maps raw actions ``[*B, H, act]`` to normalised ones, wherever the state is."""
+        self._check_sequence(sequence)
+        return self.action_normalizer(sequence)
+
+    def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Maps normalised actions ``[*B, H, act]`` to raw ones, wherever the state is."""
+        return self.action_normalizer.inverse(sequence)

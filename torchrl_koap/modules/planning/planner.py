@@ -1,0 +1,123 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The planner: a generative model of the next states given the last observed ones. It never sees an action."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor, nn
+
+from torchrl_koap import keys
+from torchrl_koap.modules.normalizer import Normalizer
+from torchrl_koap.modules.planning.forecast import LinearForecast
+from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
+from torchrl_koap.modules.planning.sampler import ConditionalSampler, identity_normalizer
+
+
+class StatePlanner(ConditionalSampler):
+    """Samples the next ``horizon`` states given the last ``history`` ones: KOAP's pi_PL(x_{t+1:t+H} | x_{t-h+1:t}).
+
+    With ``relative=True`` a plan is modelled as displacements from the present state, and the condition is the
+    displacement of the older frames together with the present state itself::
+
+        frame        0      1       2      3          (history = 2)
+                     x_0    x_1     x_2    x_3
+        condition    x_0-x_1, x_1
+        plan                        x_2-x_1, x_3-x_1, ...
+
+    With ``forecast=True`` it is not the plan that is modelled but its deviation from a linear forecast
+    (:class:`~torchrl_koap.modules.planning.forecast.LinearForecast`), which carries over to goals never seen.
+
+    Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state
+    dict. Keywords that are not listed are those of :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`.
+
+    Args:
+        denoiser (nn.Module): ``denoiser(sequence [*B, H, d], time [*B], condition [*B, h * d + f]) -> [*B, H, d]``.
+        schedule (NoiseSchedule, optional): noise levels and what the denoiser predicts. Defaults to
+            ``NoiseSchedule()``.
+
+    Keyword Args:
+        state_dim (int): number ``d`` of state columns.
+        relative (bool): model displacements from the present state. Defaults to True.
+        forecast (bool): model deviations from a linear forecast. Defaults to False.
+        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``. Defaults to ``["history"]``.
+        out_keys (list of NestedKey): the entry of the plan ``[*B, H, d]``. Defaults to ``["plan"]``.
+
+    Raises:
+        ValueError: for a history of another length or width, noise of another shape, an unknown solver.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, num_steps=4)
+        >>> windows = torch.randn(100, 16, 2).cumsum(1)
+        >>> planner.fit_normalizers(windows)
+        >>> planner(TensorDict({"history": windows[:5, :2]}, [5]))["plan"].shape
+        torch.Size([5, 14, 2])
+    """
+
+    def __init__(
+        self,
+        denoiser: nn.Module,
+        schedule: NoiseSchedule | None = None,
+        *,
+        state_dim: int,
+        relative: bool = True,
+        forecast: bool = False,
+        **options: Any,
+    ):
+        options = {"in_keys": [keys.HISTORY], "out_keys": [keys.PLAN]} | options
+        super().__init__(denoiser, schedule, state_dim=state_dim, width=state_dim, relative=relative, **options)
+        entries = self.horizon * state_dim
+        self.plan_normalizer = identity_normalizer(entries)
+        self.forecast = LinearForecast(len(self.condition_normalizer.scale), entries) if forecast else None
+
+    def fit_normalizers(
+        self, windows: Tensor, *, mode: str = "minmax", seen: Tensor | None = None, groups: Tensor | None = None
+    ) -> None:
+        """Takes the statistics of condition and plan from data; call it before a loss is built on the planner.
+
+        Args:
+            windows (Tensor): raw states ``[*N, history + horizon, d]``.
+
+        Keyword Args:
+            mode (str): of the statistics, see :class:`~torchrl_koap.modules.Normalizer`.
+            seen (Tensor, optional): the windows as training augments them, which the forecast is fitted to. Default:
+                as they are.
+            groups (Tensor, optional): trajectory of every window ``[*N]``, for the forecast
+                (:meth:`~torchrl_koap.modules.planning.forecast.LinearForecast.fit`).
+        """
+        history, plan = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
+        example = self.plan_normalizer.scale
+        self.condition_normalizer = Normalizer.fit(self.condition(history), mode=mode).to(example)
+        self.plan_normalizer = Normalizer.fit(self._displaced(history, plan), mode=mode).to(example)
+        if self.forecast is not None:
+            history, plan = self.split_window((windows if seen is None else seen).reshape(-1, *windows.shape[-2:]))
+            plan = self.plan_normalizer(self._displaced(history, plan))
+            groups = None if groups is None else groups.flatten()
+            self.forecast.fit(self.encode_history(history), plan, groups, mode=mode)
+
+    def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Maps raw plans ``[*B, H, d]`` to normalised sequences (:meth:`ConditionalSampler.encode`)."""
+        self._check_sequence(sequence)
+        sequence = self.plan_normalizer(self._displaced(history, sequence))
+        if self.forecast is not None:
+            sequence = self.forecast.encode(self.encode_history(history), sequence)
+        return sequence.unflatten(-1, self.noise_shape)
+
+    def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Maps normalised sequences ``[*B, H, d]`` to raw plans (:meth:`ConditionalSampler.decode`)."""
+        sequence = sequence.flatten(-2)
+        if self.forecast is not None:
+            sequence = self.forecast.decode(self.encode_history(history), sequence)
+        plan = self.plan_normalizer.inverse(sequence).unflatten(-1, self.noise_shape)
+        return plan + history[..., -1:, :] if self.relative else plan
+
+    def scale_columns(self, plan: Tensor) -> Tensor:
+        """Raw plan ``[*B, H, d]`` in units of the columns' spread, the same for all its steps."""
+        return plan / self.plan_normalizer.scale.unflatten(-1, self.noise_shape).mean(0)
+
+    def _displaced(self, history: Tensor, plan: Tensor) -> Tensor:
+        """Raw plans as they are modelled, flat ``[*B, H * d]``."""
+        return (plan - history[..., -1:, :] if self.relative else plan).flatten(-2)

@@ -1,0 +1,252 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What planner and Diffusion Policy share: a sequence sampled given the last observed states."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules.normalizer import Normalizer
+from torchrl_koap.modules.planning.noise_schedule import SOLVERS, NoiseSchedule
+
+
+class ConditionalSampler(TensorDictModuleBase):
+    """Samples sequences from noise, given the last observed states; a subclass says what a sequence is.
+
+    A subclass maps raw sequences to normalised ones and back (:meth:`encode`, :meth:`decode`). Sampling always starts
+    from random noise, also under ``ExplorationType.DETERMINISTIC`` (or ``MODE``, ``MEAN``): one fixed start noise would
+    give one fixed mode. For evaluations that can be repeated put standard normal noise into the entry ``noise_key``.
+
+    Args:
+        denoiser (nn.Module): ``denoiser(sequence [*B, H, width], time [*B], condition [*B, h * d + f])``, of the shape
+            of the sequence.
+        schedule (NoiseSchedule, optional): noise levels and what the denoiser predicts. Defaults to
+            ``NoiseSchedule()``.
+
+    Keyword Args:
+        state_dim (int): number ``d`` of state columns.
+        width (int): columns of a sequence.
+        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``, raw units.
+        out_keys (list of NestedKey): the entry of the sequence ``[*B, H, width]``, raw units.
+        relative (bool): the condition holds older frames as displacements from the present one.
+        history (int): number ``h`` of observed frames, the present one included. Defaults to 2.
+        horizon (int): number ``H`` of frames of a sequence. Defaults to 14.
+        features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
+            further numbers that the condition holds, such as the relative positions of objects.
+        solver (str): a name in ``SOLVERS``. Defaults to ``"dpm++2m"``.
+        num_steps (int): solver steps. Defaults to 10.
+        clip (float, optional): bound of the normalised sequence at every solver step. Defaults to no bound.
+        noise_key (NestedKey, optional): entry of start noise ``[*B, H, width]``, read if present. Defaults to
+            ``"noise"``.
+
+    Raises:
+        ValueError: for sizes below 1, several in- or out-keys, an unknown solver.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet  # a subclass, of states
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, horizon=14)
+        >>> planner.noise_shape, planner.sample(torch.zeros(3, 2, 2)).shape
+        ((14, 2), torch.Size([3, 14, 2]))
+    """
+
+    def __init__(
+        self,
+        denoiser: nn.Module,
+        schedule: NoiseSchedule | None = None,
+        *,
+        state_dim: int,
+        width: int,
+        in_keys: list[NestedKey],
+        out_keys: list[NestedKey],
+        relative: bool,
+        history: int = 2,
+        horizon: int = 14,
+        features: nn.Module | None = None,
+        solver: str = "dpm++2m",
+        num_steps: int = 10,
+        clip: float | None = None,
+        noise_key: NestedKey | None = "noise",
+    ):
+        super().__init__()
+        sizes = {"state_dim": state_dim, "width": width, "history": history, "horizon": horizon}
+        for name, value in sizes.items():
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        if len(in_keys) != 1 or len(out_keys) != 1:
+            raise ValueError(f"one in_key and one out_key are needed, got {in_keys} and {out_keys}")
+        self.in_keys, self.out_keys, self.noise_key = list(in_keys), list(out_keys), noise_key
+        self.denoiser = denoiser
+        self.schedule = NoiseSchedule() if schedule is None else schedule
+        lookup(SOLVERS, solver, "solver")
+        self.schedule.noise_levels(num_steps)  # refuses a number out of range
+        self.solver, self.num_steps, self.clip = solver, num_steps, clip
+        self.state_dim, self.history, self.horizon, self.relative = state_dim, history, horizon, relative
+        self.features = features
+        condition_dim = history * state_dim + (0 if features is None else features.num_features)
+        self.condition_normalizer = identity_normalizer(condition_dim)
+        self._width = width
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """Shape ``(H, width)`` of a sequence, and so of its start noise."""
+        return self.horizon, self._width
+
+    def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Maps raw sequences to the normalised ones that noise is added to.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): raw sequences ``[*B, H, width]``.
+
+        Returns:
+            Tensor: ``[*B, H, width]``.
+
+        Raises:
+            ValueError: for sequences of another shape.
+        """
+        raise NotImplementedError
+
+    def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
+        """Maps normalised sequences ``[*B, H, width]`` to raw ones; the inverse of :meth:`encode`.
+
+        Args:
+            history (Tensor): raw histories ``[*B, h, d]``.
+            sequence (Tensor): normalised sequences ``[*B, H, width]``.
+
+        Returns:
+            Tensor: ``[*B, H, width]``.
+        """
+        raise NotImplementedError
+
+    def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
+        """Cuts windows of states ``[*B, history + horizon, d]`` into history and future."""
+        length = self.history + self.horizon
+        if window.ndim < 2 or window.shape[-2] != length or window.shape[-1] != self.state_dim:
+            raise ValueError(
+                f"windows must be [*B, {length}, {self.state_dim}] (history + horizon, state_dim),"
+                f" got {list(window.shape)}"
+            )
+        return window[..., : self.history, :], window[..., self.history :, :]
+
+    def condition(self, history: Tensor) -> Tensor:
+        """The condition ``[*B, h * d + f]`` of raw histories ``[*B, h, d]``, in raw units."""
+        displaced = history
+        if self.relative:
+            now = history[..., -1:, :]
+            displaced = torch.cat([history[..., :-1, :] - now, now], -2)
+        condition = displaced.flatten(-2)
+        return condition if self.features is None else torch.cat([condition, self.features(history)], -1)
+
+    def encode_history(self, history: Tensor) -> Tensor:
+        """Maps raw histories ``[*B, h, d]`` to the denoiser's condition ``[*B, h * d + f]``."""
+        if history.ndim < 2 or history.shape[-2:] != (self.history, self.state_dim):
+            raise ValueError(
+                f"{self.in_keys[0]!r} must be [*B, {self.history}, {self.state_dim}] (history, state_dim),"
+                f" got {list(history.shape)}"
+            )
+        return self.condition_normalizer(self.condition(history))
+
+    def denoising_error(
+        self,
+        condition: Tensor,
+        sequence: Tensor,
+        noise: Tensor | None = None,
+        time: Tensor | None = None,
+        *,
+        dtype: torch.dtype | None = None,
+    ) -> Tensor:
+        """Computes the squared error ``[*B, H, width]`` of the denoiser on noised sequences: what training minimises.
+
+        Args:
+            condition (Tensor): of :meth:`encode_history`, ``[*B, h * d + f]``.
+            sequence (Tensor): clean normalised sequences ``[*B, H, width]``.
+            noise (Tensor, optional): of the same shape. Default: random.
+            time (Tensor, optional): ``[*B]`` in training steps. Default: random.
+
+        Keyword Args:
+            dtype (torch.dtype, optional): of the denoiser's matrix products. Default: that of its weights.
+        """
+        with torch.no_grad():
+            noise = torch.randn_like(sequence) if noise is None else noise
+            time = self.schedule.sample_time(sequence) if time is None else time.to(sequence.dtype)
+            noisy, target = self.schedule.add_noise(sequence, noise, time), self.schedule.target(sequence, noise)
+        with torch.autocast(sequence.device.type, dtype, enabled=dtype is not None):
+            predicted = self.denoiser(noisy, time, condition)
+        return (predicted - target).square()
+
+    def draw_noise(self, history: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Draws start noise ``[*B, H, width]`` for histories ``[*B, h, d]``, standard normal."""
+        shape = (*history.shape[:-2], *self.noise_shape)
+        return torch.randn(shape, dtype=history.dtype, device=history.device, generator=generator)
+
+    def sample(
+        self,
+        history: Tensor,
+        noise: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        *,
+        prefix: Tensor | None = None,
+    ) -> Tensor:
+        """Samples sequences ``[*B, H, width]`` for histories ``[*B, h, d]``, both in raw units.
+
+        Args:
+            history (Tensor): observed states, the present one last.
+            noise (Tensor, optional): start noise ``[*B, H, width]``. Default: drawn.
+            generator (torch.Generator, optional): source of what is drawn.
+
+        Keyword Args:
+            prefix (Tensor, optional): first frames ``[*B, k, width]`` that the sequence has to have, ``k`` below the
+                horizon: what is executed anyway while it is sampled (real-time chunking, arXiv 2506.07339).
+
+        Raises:
+            ValueError: for a history, noise or prefix of another shape.
+        """
+        condition = self.encode_history(history)
+        noise = self.draw_noise(history, generator) if noise is None else noise
+        expected = (*history.shape[:-2], *self.noise_shape)
+        if noise.shape != expected:
+            raise ValueError(
+                f"{self.noise_key!r} must be {list(expected)} ([*B, horizon, columns]), got {list(noise.shape)}"
+            )
+        sequence = self.schedule.solve(
+            lambda x, time: self.denoiser(x, time, condition),
+            noise,
+            self.num_steps,
+            self.solver,
+            clip=self.clip,
+            prefix=None if prefix is None else self._encode_prefix(history, prefix),
+        )
+        return self.decode(history, sequence)
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the sampled sequence into the tensordict."""
+        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        return tensordict.set(self.out_keys[0], self.sample(tensordict.get(self.in_keys[0]), noise))
+
+    def _encode_prefix(self, history: Tensor, prefix: Tensor) -> Tensor:
+        """Normalised first frames; each has statistics of its own, so the rest is filled up before."""
+        frames = prefix.shape[-2]
+        if not 1 <= frames < self.horizon or prefix.shape[-1] != self._width:
+            raise ValueError(
+                f"a prefix must be [*B, 1..{self.horizon - 1}, {self._width}] (k, columns), got {list(prefix.shape)}"
+            )
+        rest = prefix[..., -1:, :].expand(*prefix.shape[:-2], self.horizon - frames, -1)
+        return self.encode(history, torch.cat([prefix, rest], -2))[..., :frames, :]
+
+    def _check_sequence(self, sequence: Tensor) -> None:
+        if sequence.shape[-2:] != self.noise_shape:
+            raise ValueError(
+                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self._width}] (horizon, columns),"
+                f" got {list(sequence.shape)}"
+            )
+
+
+def identity_normalizer(width: int) -> Normalizer:
+    """A normaliser of that many columns that changes nothing until statistics are loaded or fitted."""
+    return Normalizer(torch.zeros(width), torch.ones(width))
