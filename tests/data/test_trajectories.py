@@ -7,8 +7,9 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 
-from torchrl_koap.data import flatten_trajectories, mark_labels
+from torchrl_koap.data import cut_windows, extrapolate_ends, flatten_trajectories, make_window_buffer, mark_labels
 from torchrl_koap.keys import validate
 
 
@@ -59,3 +60,60 @@ def test_labels_are_marked_where_actions_are():
     bare = mark_labels(data.exclude("has_action", "action"), action_dim=2)
     validate(bare)
     assert not bare["has_action"].any()
+
+
+def flat(lengths, *, seed=0, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(seed)
+    episode = torch.arange(len(lengths)).repeat_interleave(torch.tensor(lengths))
+    state = torch.randn(len(episode), 2, generator=generator, dtype=dtype)
+    return TensorDict(
+        {"state": state, "episode": episode, "has_action": torch.ones(len(episode), 1).bool()}, [len(episode)]
+    )
+
+
+@pytest.mark.parametrize("over", [1, 3])
+def test_trajectories_go_on_at_their_last_mean_velocity(over):
+    data = flat([6, 4, 9], dtype=torch.float64)
+    extended = extrapolate_ends(data, 5, over=over)
+    assert torch.unique_consecutive(extended["episode"], return_counts=True)[1].tolist() == [11, 9, 14]
+    for episode, length in enumerate([6, 4, 9]):
+        before = data["state"][data["episode"] == episode]
+        after = extended["state"][extended["episode"] == episode]
+        assert torch.equal(after[:length], before)
+        velocity = (before[-1] - before[-1 - over]) / over
+        for ahead in range(1, 6):
+            torch.testing.assert_close(after[length - 1 + ahead], before[-1] + ahead * velocity)
+
+
+def test_a_trajectory_of_one_step_stands_still_and_short_ones_use_what_there_is():
+    data = flat([1, 2])
+    extended = extrapolate_ends(data, 2)["state"]
+    assert torch.equal(extended[1], data["state"][0]) and torch.equal(extended[2], data["state"][0])
+    torch.testing.assert_close(extended[-1], 3 * data["state"][2] - 2 * data["state"][1])
+
+
+@pytest.mark.parametrize("pad_before", [0, 1, 4])
+def test_windows_cut_at_once_are_those_of_the_buffer(pad_before):
+    data = flat([9, 5, 12])
+    cut = cut_windows(data, 5, select=["state", "episode"], pad_before=pad_before)
+    buffer = make_window_buffer(
+        data, 5, len(cut), select=["state", "episode"], pad_before=pad_before, replacement=False, drop_last=False
+    )
+    epoch = buffer.sample()
+    assert cut.shape == epoch.shape == (sum(n + pad_before - 4 for n in (9, 5, 12)), 5)
+
+    def rows(windows):
+        return sorted(map(tuple, windows["state"].flatten(1).tolist()))
+
+    assert rows(cut) == rows(epoch)
+    assert (cut["episode"] == cut["episode"][:, :1]).all()
+    first = cut["padded"].squeeze(-1)
+    assert first.sum() == 3 * sum(range(pad_before + 1))
+    for window, padded in zip(cut["state"], first, strict=True):
+        assert (window[: padded.sum() + 1] == window[0]).all()  # the first frame is repeated
+    assert set(cut.keys()) == {"state", "episode", "padded"}
+
+
+def test_windows_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match=r"1 of 3 trajectories are shorter than a window \(6 steps\): 1 \(5 steps\)"):
+        cut_windows(flat([9, 5, 12]), 6)

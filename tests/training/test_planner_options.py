@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchrl_koap.data import flatten_trajectories, select_state
+from torchrl_koap.data import GripperRecovery, NeighborRecovery, flatten_trajectories, select_state
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.diffusion_builders import build_planner
-from torchrl_koap.training.planner import learn_states
+from torchrl_koap.training.planner import augmentation, learn_states
 
 
 def planner_of(task="aligning", **options):
@@ -81,3 +81,25 @@ def test_a_task_brings_its_own_planner_unless_one_is_named():
     assert options(task="stacking", denoiser_width=64).denoiser_width == 64
     assert options(task="sorting", batch_size=16).batch_size == 16
     assert options(task="avoiding").denoiser == "unet"
+
+
+@pytest.mark.parametrize(("task", "shares"), [("stacking", [0.1]), ("stacking_1", [0.1]), ("sorting", [])])
+def test_tasks_with_a_gripper_have_it_for_their_planner(task, shares):
+    def found(**options):
+        return [step.share for step in augmentation(get_task(task), **options).module if type(step) is GripperRecovery]
+
+    assert found() == shares and found(actions=True) == []
+
+
+@pytest.mark.parametrize(("task", "shares"), [("scooping", [2.0]), ("scooping_moving_bowl", []), ("avoiding", [])])
+def test_scooping_has_it_for_its_planner(task, shares):
+    def found(**options):
+        return [step.share for step in augmentation(get_task(task), **options).module if type(step) is NeighborRecovery]
+
+    assert found() == shares and found(actions=True) == []
+
+
+def test_a_batch_without_neighbours_is_refused_before_any_work():
+    with pytest.raises(ValueError, match="batch_size: the neighbor_recovery of task 'scooping' looks for neighbours"):
+        resolve(TrainConfig(out="run", task="scooping", batch_size=1))
+    assert resolve(TrainConfig(out="run", task="scooping", method="dp", batch_size=1)).options.batch_size == 1

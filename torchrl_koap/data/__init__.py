@@ -1,22 +1,17 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Demonstrations: reading, storing, hiding labels, normalising, cutting into windows."""
 
-from torchrl_koap.data.augmentation import (
-    ObjectPermutation,
-    RandomPlanarTransform,
-    RecoveryAugmentation,
-    extrapolate_ends,
-)
 from torchrl_koap.data.demonstrations import make_demonstrations, save_demonstrations
 from torchrl_koap.data.formats import Recordings, make_recordings, read_recordings, write_recordings
-from torchrl_koap.data.gripper_recovery import GripperRecovery
 from torchrl_koap.data.label_budget import LabelBudget, LabelReport, hide_commands, subsample_trajectories
-from torchrl_koap.data.neighbor_recovery import NeighborRecovery
+from torchrl_koap.data.recovery import GripperRecovery, NeighborRecovery, RecoveryAugmentation
 from torchrl_koap.data.replay import D3ILExperienceReplay
 from torchrl_koap.data.sources import open_dataset
+from torchrl_koap.data.symmetries import ObjectPermutation, RandomPlanarTransform
 from torchrl_koap.data.ted import load_ted, read_about, save_ted, stored_task
 from torchrl_koap.data.trajectories import (
     controller_view,
+    extrapolate_ends,
     flatten_trajectories,
     mark_labels,
     select_state,

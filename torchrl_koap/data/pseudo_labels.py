@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from torchrl_koap.data.augmentation import extrapolate_ends
+from torchrl_koap.data.trajectories import extrapolate_ends
 from torchrl_koap.data.windows import WindowTable
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 

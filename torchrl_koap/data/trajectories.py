@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 
 from torchrl_koap import keys
 
@@ -210,3 +210,37 @@ def controller_view(
     if action_targets:
         view.set(keys.ACTION, view.get(keys.ACTION) - state[..., list(action_targets)])
     return view.set(keys.STATE, state[..., list(columns)])
+
+
+def extrapolate_ends(data: TensorDictBase, frames: int, *, key: NestedKey = keys.STATE, over: int = 3) -> TensorDict:
+    """Continues every trajectory at its last mean velocity, so that a plan made near the end has a future.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` with states ``[N, d]`` and ``episode``.
+        frames (int): frames to append to each trajectory.
+
+    Keyword Args:
+        key (NestedKey): states. Defaults to ``"state"``.
+        over (int): steps whose mean is the velocity. Defaults to ``3``.
+
+    Returns:
+        TensorDict: ``key`` and ``episode``, flat ``[N + trajectories * frames]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import extrapolate_ends
+        >>> line = TensorDict({"state": torch.arange(5.0)[:, None], "episode": torch.zeros(5, dtype=torch.int64)}, [5])
+        >>> extrapolate_ends(line, 2)["state"].flatten().tolist()
+        [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    """
+    lengths = trajectory_lengths(data).tolist()
+    states, episodes = [], []
+    for state, episode in zip(data.get(key).split(lengths), data.get(keys.EPISODE).split(lengths), strict=True):
+        steps = min(over, len(state) - 1)
+        velocity = (state[-1] - state[-1 - steps]) / max(steps, 1)
+        ahead = torch.arange(1, frames + 1, dtype=state.dtype, device=state.device)[:, None]
+        states.append(torch.cat([state, state[-1] + ahead * velocity]))
+        episodes.append(episode[:1].expand(len(state) + frames))
+    states = torch.cat(states)
+    return TensorDict({key: states, keys.EPISODE: torch.cat(episodes)}, batch_size=[len(states)])

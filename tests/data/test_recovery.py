@@ -1,0 +1,193 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recovery in closed form: of the robot, of a gripper that closed on nothing, and along differences of windows."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.data import GripperRecovery, NeighborRecovery, RecoveryAugmentation
+from torchrl_koap.tasks.action_rules import PLANNED_OPEN_ABOVE, gripper_command
+from torchrl_koap.tasks.panda_kinematics import tool_position
+
+OPEN, HELD = 0.08, 0.0617
+
+
+def moving_windows():
+    torch.manual_seed(0)
+    state = torch.randn(6, 16, 4).cumsum(1)
+    action = torch.cat([state[..., :2].diff(dim=1), torch.full((6, 1, 2), torch.nan)], 1)
+    return TensorDict({"state": state, "action": action}, [6])
+
+
+@pytest.mark.parametrize(("history", "decay"), [(2, 0.7), (1, 0.5), (4, 0.0)])
+def test_shift_is_constant_in_the_history_and_decays_geometrically(history, decay):
+    torch.manual_seed(0)
+    state = torch.randn(5, 3, 10, 2, dtype=torch.float64)
+    augment = RecoveryAugmentation(0.01, history=history, decay=decay)
+    shift = augment(TensorDict({"state": state.clone()}, [5, 3]))["state"] - state
+    delta = shift[..., 0, :]
+    assert (delta.abs() > 0).all() and delta.flatten(0, 1).unique(dim=0).shape[0] == 15  # one draw per window
+    for frame in range(10):
+        remaining = decay ** max(0, frame - history + 1)
+        torch.testing.assert_close(shift[..., frame, :], delta * remaining, atol=1e-14, rtol=0)
+
+
+def test_size_of_the_shift():
+    """delta = 2 sigma r n has variance 4 sigma^2 E[r^2] = 4/3 sigma^2 per axis."""
+    torch.manual_seed(0)
+    td = RecoveryAugmentation(0.004)(TensorDict({"state": torch.zeros(40_000, 3, 2, dtype=torch.float64)}, [40_000]))
+    assert td["state"][:, 0].mean().abs() < 1e-4
+    assert td["state"][:, 0].square().mean().sqrt().item() == pytest.approx(0.004 * math.sqrt(4 / 3), rel=0.02)
+
+
+def test_no_sigma_changes_nothing_and_options_are_checked():
+    state = torch.randn(4, 16, 2)
+    assert torch.equal(RecoveryAugmentation(0.0)(TensorDict({"state": state.clone()}, [4]))["state"], state)
+    renamed = RecoveryAugmentation(0.1, key=("a", "b"))(TensorDict({"a": {"b": state.clone()}}, [4]))
+    assert not torch.equal(renamed["a", "b"], state)
+    for options in ({"sigma": -1.0}, {"sigma": 1.0, "decay": 1.0}):
+        with pytest.raises(ValueError, match="sigma must be >= 0 and decay"):
+            RecoveryAugmentation(**options)
+
+
+def test_shifted_columns_may_be_chosen():
+    state = torch.zeros(50, 16, 4)
+    found = RecoveryAugmentation(0.01, columns=(0, 2))(TensorDict({"state": state}, [50]))["state"]
+    assert found[..., [0, 2]].any() and not found[..., [1, 3]].any()
+
+
+def test_joints_follow_the_tool_aside_and_come_back_with_it():
+    bent = torch.tensor([0.0, 0.3, 0.0, -2.0, 0.0, 2.2, 0.8], dtype=torch.float64)  # rad, over a table
+    joints = bent + 0.1 * torch.rand(30, 16, 7, dtype=torch.float64)
+    state = torch.cat([joints, torch.rand(30, 16, 1).double(), tool_position(joints)], -1)
+    augment = RecoveryAugmentation(0.02, columns=range(7), tool=(8, 9, 10), kinematics=tool_position)
+    found = augment(TensorDict({"state": state.clone()}, [30]))["state"]
+    torch.testing.assert_close(found[..., 8:], tool_position(found[..., :7]))
+    assert torch.equal(found[..., 7], state[..., 7])
+    away = (found - state)[..., 8:].norm(dim=-1)
+    assert 0.02 < away[:, 1].mean() < 0.05 and away[:, 15].mean() < 0.02 * away[:, 1].mean()
+    # the least motion: no part of it turns the elbow about and leaves the tool where it is
+    jacobian = torch.func.vmap(torch.func.jacfwd(tool_position))(state[:, 1, :7])
+    moved = (found - state)[:, 1, :7]
+    idle = moved - (torch.linalg.pinv(jacobian) @ jacobian @ moved[..., None])[..., 0]
+    assert idle.norm(dim=-1).max() < 1e-4 * moved.norm(dim=-1).mean()
+    with pytest.raises(ValueError, match="wanted columns and kinematics"):
+        RecoveryAugmentation(0.02, columns=(0, 1), tool=(2, 3, 4))
+
+
+def test_actions_follow_the_way_back():
+    """Actions that move the state stay its differences; labels that are hidden stay hidden."""
+    windows = moving_windows()
+    moved = RecoveryAugmentation(0.1, columns=[0, 1], moved_by=[0, 1])(windows.clone())
+    torch.testing.assert_close(moved["action"][:, :-1], moved["state"][..., :2].diff(dim=1))
+    assert moved["action"][:, -1].isnan().all() and not torch.equal(moved["action"][:, :-1], windows["action"][:, :-1])
+    torch.manual_seed(3)
+    with_actions = RecoveryAugmentation(0.1, columns=[0, 1], moved_by=[0, 1])(windows.clone())["state"]
+    torch.manual_seed(3)
+    assert torch.equal(with_actions, RecoveryAugmentation(0.1, columns=[0, 1])(windows.clone())["state"])
+
+
+def changed(widths, share=1.0, **options):
+    window = torch.stack([torch.arange(16.0), torch.tensor(widths)], -1)
+    return GripperRecovery(1, share=share, **options)(TensorDict({"state": window.clone()}, []))["state"]
+
+
+def test_open_fingers_are_seen_closed_and_open_again():
+    torch.manual_seed(0)
+    widths = changed([OPEN] * 16)[:, 1]
+    assert widths[0] == widths[1] < 0.05  # both observed frames
+    assert (widths[1:].diff() > 0).all() and widths[6] > 0.075 and widths[-1] <= OPEN
+    numbers = gripper_command(widths, open_above=PLANNED_OPEN_ABOVE)
+    assert (numbers[1:] >= OPEN).all()  # the number that opens, from the present step on
+
+
+@pytest.mark.parametrize(
+    "widths",
+    [
+        [HELD] * 16,
+        [OPEN] * 4 + [HELD] * 12,  # closes before the fingers could be open
+        [HELD] * 2 + [OPEN] * 14,  # lets go of something
+        [0.0, 0.03] + [OPEN] * 14,  # opens by itself, at the start of an episode
+    ],
+)
+def test_fingers_that_hold_or_move_are_left_alone(widths):
+    torch.testing.assert_close(changed(widths)[:, 1], torch.tensor(widths))
+
+
+def test_a_grasp_later_in_the_window_is_still_done():
+    widths = changed([OPEN] * 10 + [HELD] * 6)[:, 1]
+    assert widths[0] < 0.05 and widths[8] > 0.077
+    torch.testing.assert_close(widths[10:], torch.full([6], HELD))
+
+
+def test_no_other_column_is_touched_and_the_share_is_kept():
+    torch.manual_seed(0)
+    windows = torch.full([4000, 2, 16, 3], OPEN)
+    state = GripperRecovery(2, share=0.1)(TensorDict({"state": windows.clone()}, [4000, 2]))["state"]
+    assert (state[..., :2] == OPEN).all()
+    done = (state[..., 0, 2] < 0.05).float().mean()
+    assert 0.09 < done < 0.11
+    begin = state[..., 0, 2][state[..., 0, 2] < 0.05]
+    assert begin.min() < 0.002 and begin.max() > 0.048
+
+
+@pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
+def test_shares_out_of_range_are_refused(value):
+    with pytest.raises(ValueError, match="share and decay must be in"):
+        GripperRecovery(0, share=value)
+
+
+def test_hands_as_wide_as_open_ones_are_refused():
+    with pytest.raises(ValueError, match="empty must be above 0 and below open_above"):
+        GripperRecovery(0, empty=0.08)
+
+
+def moved(windows, share, **options):
+    return NeighborRecovery(share, **options)(TensorDict({"state": windows.clone()}, [len(windows)]))["state"]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_observed_frames_move_along_the_way_to_the_nearest_other_window_and_the_future_comes_back(dtype):
+    torch.manual_seed(0)
+    windows = torch.randn(50, 16, 3, dtype=dtype)
+    there = moved(windows, 0.6, history=2, decay=0.5)
+    assert there.dtype == dtype
+    shift = there - windows
+    for index, present in enumerate(windows[:, 1]):
+        others = [other for other in range(50) if other != index]
+        nearest = min(others, key=lambda other: float((windows[other, 1] - present).norm()))
+        way = windows[nearest, 1] - present
+        share = float(shift[index, 1] @ way / (way @ way))
+        assert 0 <= share <= 0.6
+        torch.testing.assert_close(shift[index, 1], share * way, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(shift[:, 0], shift[:, 1])  # both observed frames alike: its velocity stays
+    for step in range(1, 15):
+        torch.testing.assert_close(shift[:, 1 + step], 0.5**step * shift[:, 1], rtol=1e-4, atol=1e-5)
+
+
+def test_shares_are_spread_over_the_whole_range():
+    windows = torch.arange(1000.0).reshape(500, 2).mean(-1)[:, None, None].expand(500, 4, 1)  # neighbours 2 apart
+    torch.manual_seed(0)
+    sizes = (moved(windows, 1.0) - windows)[:, 0, 0].abs() / 2
+    assert sizes.min() < 0.02 and sizes.max() > 0.98 and abs(sizes.mean() - 0.5) < 0.05
+
+
+def test_nothing_is_moved_without_a_share():
+    windows = torch.randn(5, 16, 3)
+    assert torch.equal(moved(windows, 0.0), windows)
+
+
+@pytest.mark.parametrize("shape", [(16, 3), (1, 16, 3), (2, 2, 16, 3)])
+def test_windows_without_neighbours_are_refused(shape):
+    with pytest.raises(ValueError, match="batch .B, T, d. of two or more"):
+        NeighborRecovery(1.0)(TensorDict({"state": torch.zeros(shape)}, shape[:1]))
+
+
+@pytest.mark.parametrize(("share", "decay"), [(-0.1, 0.7), (float("nan"), 0.7), (1.0, 1.0), (1.0, -0.1)])
+def test_shares_and_decays_out_of_range_are_refused(share, decay):
+    with pytest.raises(ValueError, match="share must be >= 0"):
+        NeighborRecovery(share, decay=decay)

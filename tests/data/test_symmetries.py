@@ -1,0 +1,75 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Scenes are moved and turned as a whole, and alike objects exchanged."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.data import ObjectPermutation, RandomPlanarTransform
+
+
+def windows(count=64, width=8):
+    return torch.randn(count, 16, width, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+
+
+def moving_windows():
+    torch.manual_seed(0)
+    state = torch.randn(6, 16, 4).cumsum(1)
+    action = torch.cat([state[..., :2].diff(dim=1), torch.full((6, 1, 2), torch.nan)], 1)
+    return TensorDict({"state": state, "action": action}, [6])
+
+
+def test_a_moved_scene_keeps_every_distance_and_angle():
+    state = windows()
+    state[..., 4:6] /= state[..., 4:6].norm(dim=-1, keepdim=True)
+    augment = RandomPlanarTransform([(0, 1), (2, 3)], [(4, 5)], shift=0.3, turn=0.8)
+    moved = augment(TensorDict({"state": state}, [64]))["state"]
+
+    def seen_from_tool(values):
+        gap = values[..., 2:4] - values[..., 0:2]
+        cosine, sine = values[..., 4:6].unbind(-1)
+        return torch.stack([cosine * gap[..., 0] + sine * gap[..., 1], cosine * gap[..., 1] - sine * gap[..., 0]], -1)
+
+    torch.testing.assert_close(seen_from_tool(moved), seen_from_tool(state))
+    torch.testing.assert_close(moved[..., 4:6].norm(dim=-1), torch.ones(64, 16, dtype=torch.float64))
+    assert torch.equal(moved[..., 6:], state[..., 6:])
+    # one motion per window: steps keep their length, windows move differently
+    torch.testing.assert_close(moved[..., :2].diff(dim=-2).norm(dim=-1), state[..., :2].diff(dim=-2).norm(dim=-1))
+    shift = moved[:, 1, :2] - state[:, 1, :2]  # the turn is about the tool in the last observed frame
+    assert 0.2 < shift.std() < 0.4
+
+
+def test_a_scene_may_stay_where_it_is():
+    state = windows()
+    same = RandomPlanarTransform([(0, 1)], [(4, 5)], shift=0.0, turn=0.0)(TensorDict({"state": state}, [64]))["state"]
+    torch.testing.assert_close(same, state)
+    with pytest.raises(ValueError, match="shift and turn must be >= 0, got -1"):
+        RandomPlanarTransform([(0, 1)], [], shift=-1, turn=0)
+
+
+def test_alike_objects_are_exchanged_whole_and_all_the_time_of_a_window():
+    state = windows(count=400)
+    augment = ObjectPermutation([[(1, 2), (3, 4)], [(5,), (6,), (7,)]])
+    found = augment(TensorDict({"state": state}, [400]))["state"]
+    assert torch.equal(found[..., 0], state[..., 0])
+    kept = (found[..., 1:5] == state[..., 1:5]).all(-1).all(-1)
+    swapped = (found[..., 1:5] == state[..., [3, 4, 1, 2]]).all(-1).all(-1)
+    assert (kept ^ swapped).all() and 140 < swapped.sum() < 260
+    torch.testing.assert_close(found[..., 5:].sort(-1).values, state[..., 5:].sort(-1).values)
+    orders = {tuple(row.tolist()) for row in (found[:, 0, 5:, None] == state[:, 0, None, 5:]).int().argmax(-1)}
+    assert len(orders) == 6
+
+
+def test_actions_turn_with_the_scene():
+    """Actions that move the state stay its differences; labels that are hidden stay hidden."""
+    windows = moving_windows()
+    turn = {"shift": 0.1, "turn": 0.5}
+    moved = RandomPlanarTransform([(0, 1), (2, 3)], [], **turn, turned_actions=[0, 1])(windows.clone())
+    torch.testing.assert_close(moved["action"][:, :-1], moved["state"][..., :2].diff(dim=1))
+    assert moved["action"][:, -1].isnan().all() and not torch.equal(moved["action"][:, :-1], windows["action"][:, :-1])
+    torch.manual_seed(3)
+    with_actions = RandomPlanarTransform([(0, 1)], [], **turn, turned_actions=[0, 1])(windows.clone())["state"]
+    torch.manual_seed(3)
+    assert torch.equal(with_actions, RandomPlanarTransform([(0, 1)], [], **turn)(windows.clone())["state"])

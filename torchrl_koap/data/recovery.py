@@ -1,0 +1,257 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Recovery as augmentations of windows: what was observed is moved aside, and the future comes back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_koap.keys import ACTION, STATE
+
+_DIFFERENCE = 1e-3  # rad, of the numerical Jacobian
+_DAMPING = 1e-4  # m2 / rad2, added to the squared reach of the joints: bounds them where the arm is stretched out
+EMPTY = 0.05  # m; fingers nearer to each other than that hold nothing: the boxes of Stacking are 0.06 m wide
+
+
+def _remaining(state: Tensor, history: int, decay: float, ahead: int = 0) -> Tensor:
+    """Share of a shift that is left in every frame of windows ``[*B, T, d]``, so many frames later, ``[T, 1]``."""
+    frames = torch.arange(state.shape[-2], device=state.device) - (history - 1) + ahead
+    return (decay ** frames.clamp_min(0).to(state.dtype))[:, None]
+
+
+class RecoveryAugmentation(TensorDictModuleBase):
+    r"""Recovery augmentation: moves the observed frames of a window aside and lets the future come back.
+
+    .. math::
+        x'_{t-j} = x_{t-j} + \delta, \qquad x'_{t+i} = x_{t+i} + \rho^i \delta, \qquad
+        \delta = 2 \sigma\, r\, n, \; r \sim U(0, 1), \; n \sim N(0, I)
+
+    A planner trained on demonstrations alone has never seen a state beside them; executed in closed loop it drifts
+    there. The augmentation shows it such states together with the way back.
+
+    An arm with more joints than its tool needs is moved aside at the tool: the tool is displaced, and the joints follow
+    by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`. Joints shifted one by one would mostly
+    turn the elbow about, and a planner that has seen that learns to wander.
+
+    Args:
+        sigma (float): typical size of the shift, in the units of the state; with ``tool`` that of the tool (m).
+
+    Keyword Args:
+        history (int): observed frames of the window. Defaults to ``2``.
+        decay (float): ``rho``, how slowly it comes back. Defaults to ``0.7``.
+        columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
+        tool (sequence of int, optional): state columns of the tool's position; the shift is drawn there, and the
+            arm's joints, which are then ``columns``, follow.
+        kinematics (callable, optional): the function from joints ``[*B, J]`` to the position of the tool ``[*B, 3]``,
+            needed with ``tool``, such as :func:`~torchrl_koap.tasks.panda_kinematics.tool_position`.
+        moved_by (sequence of int, optional): for every action column the state column that it moves: actions are given
+            the way back too, ``a'_{t+i} = a_{t+i} + (rho^{i+1} - rho^i) delta``. Default: no action is touched.
+        key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
+        action_key (NestedKey): actions ``[*B, T, act]``, replaced with ``moved_by``; NaN stays. Defaults to
+            ``"action"``.
+
+    Raises:
+        ValueError: for a negative ``sigma``, a ``decay`` outside [0, 1), a ``tool`` without joints or kinematics.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import RecoveryAugmentation
+        >>> td = RecoveryAugmentation(0.004)(TensorDict({"state": torch.zeros(8, 16, 2)}, [8]))
+        >>> torch.allclose(td["state"][:, 2], 0.7 * td["state"][:, 1])
+        True
+    """
+
+    def __init__(
+        self,
+        sigma: float,
+        *,
+        history: int = 2,
+        decay: float = 0.7,
+        columns: Sequence[int] | None = None,
+        tool: Sequence[int] | None = None,
+        kinematics: Callable[[Tensor], Tensor] | None = None,
+        moved_by: Sequence[int] | None = None,
+        key: NestedKey = STATE,
+        action_key: NestedKey = ACTION,
+    ):
+        super().__init__()
+        if tool is not None and (columns is None or kinematics is None):
+            raise ValueError(f"a tool follows joints: wanted columns and kinematics, got {columns} and {kinematics}")
+        if sigma < 0 or not 0 <= decay < 1:
+            raise ValueError(f"sigma must be >= 0 and decay in [0, 1), got {sigma} and {decay}")
+        self.in_keys = self.out_keys = [key] if moved_by is None else [key, action_key]
+        self.moved_by = None if moved_by is None else list(moved_by)
+        self.sigma, self.history, self.decay = sigma, history, decay
+        self.columns = None if columns is None else list(columns)
+        self.tool = None if tool is None else list(tool)
+        self.kinematics = kinematics
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replaces the windows by shifted ones."""
+        state = tensordict.get(self.in_keys[0])
+        size = torch.rand(*state.shape[:-2], 1, 1, dtype=state.dtype, device=state.device)
+        shift = torch.randn(*state.shape[:-2], 1, state.shape[-1], dtype=state.dtype, device=state.device)
+        shift = 2 * self.sigma * size * self._of_joints(shift, state)
+        if self.columns is not None:
+            keep = torch.zeros_like(shift)
+            keep[..., self.columns] = 1
+            shift = shift * keep
+        remaining = _remaining(state, self.history, self.decay)
+        shifted = state + shift * remaining
+        if self.moved_by is not None:
+            following = _remaining(state, self.history, self.decay, ahead=1)
+            back = shift[..., self.moved_by] * (following - remaining)
+            tensordict.set(self.in_keys[1], tensordict.get(self.in_keys[1]) + back)
+        if self.tool is not None and self.sigma:
+            moved = self.kinematics(shifted[..., self.columns]) - self.kinematics(state[..., self.columns])
+            shifted[..., self.tool] = shifted[..., self.tool] + moved
+        return tensordict.set(self.in_keys[0], shifted)
+
+    def _of_joints(self, shift: Tensor, state: Tensor) -> Tensor:
+        """Shifts ``[*B, 1, d]`` whose joints move the tool, if there is one, by its own columns, with least motion."""
+        if self.tool is None or not self.sigma:
+            return shift
+        joints = state[..., self.history - 1, self.columns]
+        aside = _DIFFERENCE * torch.eye(joints.shape[-1], dtype=joints.dtype, device=joints.device)
+        ends = (self.kinematics(joints.unsqueeze(-2) + sign * aside) for sign in (1, -1))  # each [*B, J, 3]
+        jacobian = torch.sub(*ends).mT / (2 * _DIFFERENCE)  # [*B, 3, J]
+        damped = jacobian @ jacobian.mT + _DAMPING * torch.eye(3, dtype=joints.dtype, device=joints.device)
+        follow = jacobian.mT @ torch.linalg.solve(damped, shift[..., 0, self.tool].unsqueeze(-1))
+        return shift.index_copy(-1, torch.tensor(self.columns, device=shift.device), follow.mT)
+
+
+class GripperRecovery(TensorDictModuleBase):
+    r"""Gripper recovery augmentation: shows open fingers as closed on nothing, and a future in which they open.
+
+    .. math::
+        w'_{t-j} = w_0, \qquad w'_{t+i} = \min(w_{t+i},\; w_{open} - \rho^i (w_{open} - w_0)), \qquad
+        w_0 \sim U(0, w_{empty})
+
+    Demonstrations in which every grasp succeeds never show fingers that are closed with nothing between them. A planner
+    trained on them alone has no idea what comes next, plans that they stay as they are, and one grasp that misses ends
+    the episode: the fingers never open again. Windows are left alone in which the fingers hold something, or close
+    within the steps that they need to open.
+
+    Args:
+        column (int): state column of the width between the fingers (m).
+
+    Keyword Args:
+        share (float): share of the windows it is done to, if their fingers are open. Defaults to ``0.1``.
+        empty (float): widest fingers that hold nothing (m). Defaults to ``0.05``.
+        open_above (float): narrowest fingers that count as open (m). Defaults to ``0.075``.
+        steps (int): control steps that opening takes. Defaults to ``5``.
+        decay (float): ``rho``, share of the way that remains after a control step. Defaults to ``0.5``.
+        history (int): observed frames of the window. Defaults to ``2``.
+        key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
+
+    Raises:
+        ValueError: for a share or decay outside [0, 1], or an empty hand as wide as an open one.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import GripperRecovery
+        >>> _ = torch.manual_seed(0)
+        >>> augment = GripperRecovery(0, share=1.0)
+        >>> augment(TensorDict({"state": torch.full([1, 8, 1], 0.08)}, [1]))["state"][0, :, 0]
+        tensor([0.0384, 0.0384, 0.0592, 0.0696, 0.0748, 0.0774, 0.0787, 0.0794])
+        >>> augment(TensorDict({"state": torch.full([1, 4, 1], 0.06)}, [1]))["state"][0, :, 0]  # a box is held
+        tensor([0.0600, 0.0600, 0.0600, 0.0600])
+    """
+
+    def __init__(
+        self,
+        column: int,
+        *,
+        share: float = 0.1,
+        empty: float = EMPTY,
+        open_above: float = 0.075,
+        steps: int = 5,
+        decay: float = 0.5,
+        history: int = 2,
+        key: NestedKey = STATE,
+    ):
+        super().__init__()
+        if not 0 <= share <= 1 or not 0 <= decay <= 1:
+            raise ValueError(f"share and decay must be in [0, 1], got {share} and {decay}")
+        if not 0 < empty < open_above:
+            raise ValueError(f"empty must be above 0 and below open_above, got {empty} and {open_above}")
+        self.in_keys = self.out_keys = [key]
+        self.column, self.share, self.history = column, share, history
+        self.empty, self.open_above, self.steps, self.decay = empty, open_above, steps, decay
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replaces the windows by ones of which some show fingers that open."""
+        state = tensordict.get(self.in_keys[0])
+        width = state[..., self.column]
+        kind = {"dtype": width.dtype, "device": width.device}
+        chosen, begin = torch.rand(2, *width.shape[:-1], 1, **kind)
+        looked_at = width[..., : self.history + self.steps]
+        chosen = (chosen < self.share) & (looked_at > self.open_above).all(-1, keepdim=True)
+        ahead = (torch.arange(width.shape[-1], **kind) - (self.history - 1)).clamp_min(0)
+        widest = width[..., self.history - 1 : self.history]
+        opening = widest - self.decay**ahead * (widest - self.empty * begin)
+        state = state.clone()
+        state[..., self.column] = torch.where(chosen, torch.minimum(width, opening), width)
+        return tensordict.set(self.in_keys[0], state)
+
+
+class NeighborRecovery(TensorDictModuleBase):
+    r"""Recovery augmentation along recorded differences: moves observed frames towards a neighbour's, and back.
+
+    .. math::
+        x'_{t-j} = x_{t-j} + \delta, \qquad x'_{t+i} = x_{t+i} + \rho^i \delta, \qquad
+        \delta = s\, r\, (y_t - x_t), \; r \sim U(0, 1)
+
+    with the present frame :math:`y_t` of the window of the batch that is nearest to it there.
+    :class:`~torchrl_koap.data.RecoveryAugmentation` displaces the robot, which takes columns that are its position. In
+    the embedding of a camera's picture none is, and a random vector is no picture; the difference of two pictures
+    nearly is one, and the nearest other one mostly shows the robot a little beside where it is.
+
+    Args:
+        share (float): ``s``, farthest share of the way to the neighbour; 0 changes nothing.
+
+    Keyword Args:
+        history (int): observed frames of the window. Defaults to ``2``.
+        decay (float): ``rho``, how slowly it comes back. Defaults to ``0.85``.
+        key (NestedKey): window of states ``[B, T, d]``, replaced. Defaults to ``"state"``.
+
+    Raises:
+        ValueError: for a negative ``share`` or a ``decay`` outside [0, 1); at a call, for windows that are not a batch
+            of two or more.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.data import NeighborRecovery
+        >>> windows = torch.tensor([0.0, 1.0, 5.0]).reshape(3, 1, 1).expand(3, 4, 1)
+        >>> moved = NeighborRecovery(1.0)(TensorDict({"state": windows}, [3]))["state"]
+        >>> bool((moved[2, 0] >= 1).all()), bool((moved[2, 0] <= 5).all())  # the third one's neighbour is the second
+        (True, True)
+    """
+
+    def __init__(self, share: float, *, history: int = 2, decay: float = 0.85, key: NestedKey = STATE):
+        super().__init__()
+        if not 0 <= share < math.inf or not 0 <= decay < 1:
+            raise ValueError(f"share must be >= 0 and decay in [0, 1), got {share} and {decay}")
+        self.in_keys = self.out_keys = [key]
+        self.share, self.history, self.decay = share, history, decay
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replaces the windows by displaced ones."""
+        state = tensordict.get(self.in_keys[0])
+        if state.ndim != 3 or len(state) < 2:
+            raise ValueError(f"neighbours are looked for in a batch [B, T, d] of two or more, got {list(state.shape)}")
+        present = state[:, self.history - 1]
+        apart = torch.cdist(present, present)
+        apart.fill_diagonal_(torch.inf)
+        way = present[apart.argmin(-1)] - present
+        way = self.share * torch.rand(len(state), 1, dtype=state.dtype, device=state.device) * way
+        remaining = _remaining(state, self.history, self.decay)
+        return tensordict.set(self.in_keys[0], state + way[:, None] * remaining)
