@@ -18,4 +18,4 @@ def copied_run(trained_run, tmp_path):
 @pytest.fixture
 def no_report(monkeypatch):
     """Rollouts without pictures, which have tests of their own."""
-    monkeypatch.setattr("torchrl_koap.commands.eval.write_report", lambda *arguments, **options: None)
+    monkeypatch.setattr("torchrl_koap.commands.run_commands.write_report", lambda *arguments, **options: None)

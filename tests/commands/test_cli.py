@@ -101,7 +101,7 @@ def test_films_of_an_evaluation_go_to_wandb_on_this_machine(copied_run, tmp_path
         (folder / "plots").mkdir()
         pictures[0].save(folder / "plots" / "rollouts.gif", save_all=True, append_images=pictures[1:])
 
-    monkeypatch.setattr("torchrl_koap.commands.eval.write_report", report)
+    monkeypatch.setattr("torchrl_koap.commands.run_commands.write_report", report)
     assert koap("eval", copied_run, "--episodes", "1", "--threads", "1", "--logger", "wandb") == 0
     film = (copied_run / "plots" / "rollouts.gif").read_bytes()
     logged = [path for path in (copied_run / "wandb").rglob("*") if path.is_file()]

@@ -7,28 +7,28 @@ met here as well.
 
 from __future__ import annotations
 
-import contextlib
 import os
-import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any
 
 from torchrl_koap import __version__
-from torchrl_koap.commands.interrupts import describe_interrupt, ending_at_once, ending_like_ctrl_c
-from torchrl_koap.commands.printing import HINT, complain, discard_output, one_line, open_closed_streams, show
-from torchrl_koap.commands.sanity import check_options
+from torchrl_koap.commands.printing import HINT, complain, one_line, show
+from torchrl_koap.commands.shell import (
+    ReadEnough,
+    describe_interrupt,
+    ending_at_once,
+    ending_like_ctrl_c,
+    open_closed_streams,
+    wide_enough,
+    written_output,
+)
 
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, RuntimeError, KeyError, OSError, MemoryError)
 DESCRIPTION = "Imitation learning with few action labels. `koap --version` prints the version."
 _MAY_BE_EMPTY = ("--action-units", "--state-units")  # the unit of a number without one
-_LEAST_COLUMNS = 40  # the help of a terminal with a single column never ends
-
-
-class _ReadEnough(Exception):
-    """Whoever reads what is printed has gone."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with ending_like_ctrl_c():
             return _run(arguments)
-    except _ReadEnough:  # `koap ... | head`
+    except ReadEnough:  # `koap ... | head`
         discard_output()
         return 141
     except KeyboardInterrupt as error:
@@ -62,18 +62,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     if arguments == ["--version"]:
-        with _output():
+        with written_output():
             print(f"koap {__version__}")
         return 0
     _check_words(arguments)
-    tyro, subcommand, without_progress_bars = _commands()
-    with _output(), _wide_enough():
+    tyro, subcommand, check_options, without_progress_bars = _commands()
+    with written_output(), wide_enough():
         command = tyro.cli(subcommand, args=arguments, prog="koap", description=DESCRIPTION)
     check_options(command)
     with without_progress_bars() if command.quiet else nullcontext():
         result = command()
     if not command.quiet:
-        with _output():
+        with written_output():
             show(result)
     return 1 if isinstance(result, Mapping) and result.get("failed") else 0
 
@@ -90,7 +90,7 @@ def _check_words(arguments: Sequence[str]) -> None:
             )
 
 
-def _commands() -> tuple[Any, Any, Any]:
+def _commands() -> tuple[Any, ...]:
     """What takes seconds to import."""
     if sys.flags.optimize > 1:
         raise RuntimeError(
@@ -102,6 +102,7 @@ def _commands() -> tuple[Any, Any, Any]:
         try:
             import tyro
 
+            from torchrl_koap.commands.command import check_options
             from torchrl_koap.commands.subcommands import Subcommand
             from torchrl_koap.runs.progress import without_progress_bars
         except (ImportError, AttributeError) as error:
@@ -113,43 +114,12 @@ def _commands() -> tuple[Any, Any, Any]:
             if backend and backend in str(error):
                 raise ValueError(f"MPLBACKEND={backend} is no backend of matplotlib; unset it") from error
             raise
-    return tyro, Subcommand, without_progress_bars
+    return tyro, Subcommand, check_options, without_progress_bars
 
 
 def _is_expected(error: Exception) -> bool:
     # the simulator's own error for a machine that has too little memory or no graphics derives from nothing else
     return isinstance(error, EXPECTED) or type(error).__module__.partition(".")[0] == "mujoco"
-
-
-@contextlib.contextmanager
-def _output() -> Iterator[None]:
-    """What is printed inside has arrived when the block ends, or an error says that it has not."""
-    try:
-        try:
-            yield
-        finally:
-            sys.stdout.flush()
-    except BrokenPipeError:
-        raise _ReadEnough from None
-    except OSError as error:
-        discard_output()
-        raise OSError(f"the output could not be written: {error.strerror or error}") from error
-
-
-@contextlib.contextmanager
-def _wide_enough() -> Iterator[None]:
-    """Inside the block a terminal has a few columns at least."""
-    earlier = os.environ.get("COLUMNS")
-    if shutil.get_terminal_size().columns >= _LEAST_COLUMNS:
-        yield
-        return
-    os.environ["COLUMNS"] = str(_LEAST_COLUMNS)
-    try:
-        yield
-    finally:
-        os.environ.pop("COLUMNS")
-        if earlier is not None:
-            os.environ["COLUMNS"] = earlier
 
 
 if __name__ == "__main__":

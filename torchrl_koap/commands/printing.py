@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -38,32 +37,6 @@ def show(result: Any) -> None:
     width = min(max((len(name) for name, _ in lines), default=0), 45)
     for name, text in lines:
         print(f"{name:<{width}}  {text}")
-
-
-def open_closed_streams() -> None:
-    """Sends stdin, stdout and stderr nowhere if the process was started without them (``2>&-``).
-
-    The next file that is opened would otherwise get their number, and what a library prints would land in it.
-    """
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
-        try:
-            os.fstat(number)
-        except OSError:
-            nowhere = os.open(os.devnull, os.O_RDWR)
-            if nowhere != number:
-                os.dup2(nowhere, number)
-                os.close(nowhere)
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(number, "r" if number == 0 else "w", encoding="utf-8", closefd=False))
-
-
-def discard_output() -> None:
-    """Sends what is left for stdout nowhere: the interpreter would complain about it once more when it ends."""
-    if sys.stdout is sys.__stdout__:
-        with contextlib.suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, sys.stdout.fileno())
-            os.close(nowhere)
 
 
 def _lines(name: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -7,16 +7,11 @@ from typing import Annotated
 
 import tyro
 
-from torchrl_koap.commands.bench import Bench
-from torchrl_koap.commands.curve import Curve
 from torchrl_koap.commands.data_commands import Convert, Demos, Validate
 from torchrl_koap.commands.doctor import Doctor
 from torchrl_koap.commands.embed import Embed
-from torchrl_koap.commands.eval import Eval
 from torchrl_koap.commands.export import Export
-from torchrl_koap.commands.inspect import Inspect
-from torchrl_koap.commands.latency import Latency
-from torchrl_koap.commands.suggest import Suggest
+from torchrl_koap.commands.run_commands import Bench, Curve, Eval, Inspect, Latency, Suggest
 from torchrl_koap.commands.train import Train
 
 Subcommand = (

@@ -13,8 +13,8 @@ import pytest
 from tiny_runs import TINY, write_demonstrations
 
 from torchrl_koap.commands import cli
-from torchrl_koap.commands.interrupts import Interrupted, describe_interrupt, ending_like_ctrl_c
-from torchrl_koap.commands.sanity import check_options
+from torchrl_koap.commands.command import check_options
+from torchrl_koap.commands.shell import Interrupted, describe_interrupt, ending_like_ctrl_c
 
 COMMAND = (sys.executable, "-m", "torchrl_koap.commands.cli")
 
@@ -130,7 +130,7 @@ def test_a_full_device(words):
 
 CLOSED = """
 import os, sys
-from torchrl_koap.commands.printing import open_closed_streams
+from torchrl_koap.commands.shell import open_closed_streams
 open_closed_streams()
 print("lost"), print("lost", file=sys.stderr), sys.stdin.read(), sys.stdout.flush(), sys.stderr.flush()
 os.write(1, b"lost"), os.write(2, b"lost")

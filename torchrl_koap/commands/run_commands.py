@@ -1,0 +1,148 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The commands that evaluate runs or compare them: eval, inspect, suggest, latency, curve, bench."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from torchrl_koap.commands.command import Command, Options
+from torchrl_koap.evaluation import (
+    EvalConfig,
+    InspectConfig,
+    SuggestConfig,
+    SuggestedLabels,
+    evaluate,
+    inspect,
+    suggest,
+)
+from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop
+from torchrl_koap.evaluation.offline import KIND, describe_offline
+from torchrl_koap.reports.pictures import draw_pictures
+from torchrl_koap.reports.run_report import write_report
+from torchrl_koap.runs.progress import check_logger, log_scores, open_logger
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.studies import BenchConfig, CurveConfig, run_bench, run_curve
+
+
+@dataclass(kw_only=True)
+class Eval(Command):
+    """Evaluate a trained run, in closed loop or, without an environment, on recorded data, and write its report.
+
+    Attributes:
+        run: run directory of `koap train`, or pretrained:NAME, a trained policy of the repository.
+        config: all options of the rollouts.
+        report: draw the pictures and write the report.
+        animate: make an animation of the rollouts for the report.
+        logger: where scores go besides the run directory: wandb (offline unless WANDB_MODE says otherwise) or
+            tensorboard; each needs its extra.
+    """
+
+    run: tyro.conf.Positional[str]
+    config: Options[EvalConfig]
+    report: bool = True
+    animate: bool = True
+    logger: str = "csv"
+
+    def __call__(self) -> dict[str, Any] | str:
+        """Evaluates and reports; the figures of an evaluation without an environment come in words."""
+        check_logger(self.logger)
+        result = evaluate(self.run, self.config)
+        folder = Path(self.run) if self.config.out is None else self.config.out
+        if self.report:
+            write_report(folder, animation=self.animate)
+        with open_logger(self.logger, folder) as logger:
+            if logger is not None:
+                log_scores(logger, result)
+        return describe_offline(result) if result.get("kind") == KIND else result
+
+
+@dataclass(kw_only=True)
+class Inspect(Command):
+    """Find out which part of a trained run fails, and what its latent actions hold.
+
+    Attributes:
+        run: run directory of `koap train`, or pretrained:NAME.
+        config: all options.
+    """
+
+    run: tyro.conf.Positional[str]
+    config: Options[InspectConfig]
+
+    def __call__(self) -> dict[str, Any]:
+        """Inspects, writes ``inspect.json`` and draws."""
+        found = inspect(self.run, self.config)
+        RunDirectory(found.folder).write_json("inspect.json", found.result)
+        draw_pictures(found.folder, names=("inspect.png", "latent.png"))
+        if (found.folder / "index.html").exists():
+            write_report(found.folder, draw=False)
+        return found.result
+
+
+@dataclass(kw_only=True)
+class Suggest(Command):
+    """Say which unlabelled demonstrations of a trained run to label next; no label outside the budget is read.
+
+    Attributes:
+        run: run directory of `koap train`.
+        config: all options.
+    """
+
+    run: tyro.conf.Positional[Path]
+    config: Options[SuggestConfig]
+
+    def __call__(self) -> SuggestedLabels:
+        """Ranks the unlabelled demonstrations and writes ``suggestions.json``."""
+        found = suggest(self.run, self.config)
+        RunDirectory(self.run).write_json("suggestions.json", asdict(found))
+        return found
+
+
+@dataclass(kw_only=True)
+class Latency(Command):
+    """Run a control loop in real time with a trained policy and count the steps that come too late.
+
+    Attributes:
+        run: run directory of `koap train`, or pretrained:NAME.
+        config: length and rate of the loop.
+    """
+
+    run: tyro.conf.Positional[str]
+    config: Options[LatencyConfig]
+
+    def __call__(self) -> dict[str, Any]:
+        """Measures."""
+        return measure_control_loop(self.run, self.config)
+
+
+@dataclass(kw_only=True)
+class Curve(Command):
+    """Measure success against the number of labels: methods x label fractions x seeds.
+
+    Attributes:
+        config: all options.
+    """
+
+    config: Options[CurveConfig]
+
+    def __call__(self) -> dict[str, Any]:
+        """Does what is missing of the curve and writes its report."""
+        return run_curve(self.config)
+
+
+@dataclass(kw_only=True)
+class Bench(Command):
+    """Reproduce a comparison of the paper: a curve per task, and one report over all.
+
+    Attributes:
+        config: all options.
+    """
+
+    config: Options[BenchConfig]
+
+    def __call__(self) -> dict[str, Any]:
+        """Does what is missing of the comparison and writes its report."""
+        return run_bench(self.config)
