@@ -18,6 +18,7 @@ from torchrl_koap.commands.printing import HINT, complain, one_line, show
 from torchrl_koap.commands.shell import (
     ReadEnough,
     describe_interrupt,
+    discard_output,
     ending_at_once,
     ending_like_ctrl_c,
     open_closed_streams,
