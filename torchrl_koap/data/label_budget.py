@@ -35,12 +35,9 @@ class LabelReport:
     Args:
         unit (str): what was drawn.
         requested (float or int): the fraction or count that was asked for.
-        selected_units (int): trajectories, windows or transitions drawn.
-        total_units (int): how many there were to draw from.
-        labelled_transitions (int): distinct transitions that keep their action.
-        total_transitions (int): all transitions.
-        trajectories_touched (int): trajectories with at least one label.
-        total_trajectories (int): all trajectories.
+        selected_units (int): units that were drawn, of ``total_units``.
+        labelled_transitions (int): distinct transitions that keep their action, of ``total_transitions``.
+        trajectories_touched (int): trajectories with at least one label, of ``total_trajectories``.
         seed (int): seed of the draw.
         available_units (int): units with a label in the data as they came; those that could be drawn.
         available_transitions (int): transitions with a label in the data as they came.
@@ -70,15 +67,15 @@ class LabelReport:
         return dataclasses.asdict(self)
 
     def __str__(self) -> str:
-        share = self.labelled_transitions / self.total_transitions
-        had = (
-            f"; the data came with {self.available_transitions} labels, on {self.available_units} {_plural(self.unit)}"
-        )
+        share, units = self.labelled_transitions / self.total_transitions, _plural(self.unit)
+        had = ""
+        if self.available_transitions < self.total_transitions:
+            had = f"; the data came with {self.available_transitions} labels, on {self.available_units} {units}"
         return (
-            f"{self.selected_units} of {self.total_units} {_plural(self.unit)} drawn: {self.labelled_transitions} of"
+            f"{self.selected_units} of {self.total_units} {units} drawn: {self.labelled_transitions} of"
             f" {self.total_transitions} transitions labelled ({share:.2%}),"
-            f" {self.trajectories_touched} of {self.total_trajectories} trajectories touched"
-        ) + (had if self.available_transitions < self.total_transitions else "")
+            f" {self.trajectories_touched} of {self.total_trajectories} trajectories touched{had}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,17 +257,15 @@ def _positions(present: np.ndarray, usable: np.ndarray, wanted: tuple[int, ...])
 def hide_commands(data: TensorDictBase, command: slice) -> TensorDictBase:
     """Blanks the command columns of every trajectory that has a hidden action.
 
-    The difference of two commands is the sum of the actions between them, labelled or not, so the commands around a
-    hidden action must not be seen, and neither must commands further away. Only trajectories whose actions are all
-    labelled keep them. ``state``, which never holds commands, stays as it is.
+    The difference of two commands is the sum of the actions between them, so only trajectories whose actions are all
+    labelled keep theirs. ``state``, which never holds commands, stays as it is.
 
     Args:
         data (TensorDictBase): flat data ``[N]``; not changed.
         command (slice): columns of the observation that repeat the command.
 
     Returns:
-        TensorDictBase: a copy with NaN in those columns of ``observation`` and ``("next", "observation")``. It passes
-        ``validate(data, command=command)``.
+        TensorDictBase: a copy with NaN in those columns of ``observation`` and ``("next", "observation")``.
 
     Examples:
         >>> import torch
