@@ -16,7 +16,7 @@ from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.features import tan_yaw
 from torchrl_koap.tasks.stacking import BOXES, HEIGHT_GAP, TARGET, TARGET_HALF, ZONE_RADIUS
 
-OPEN_ABOVE = 0.075  # a greater gripper number opens the fingers, any other closes them
+OPEN_ABOVE = 0.075  # a greater gripper command opens the fingers, any other closes them
 COLOURS = {"red": (1, 0, 0, 1), "green": (0, 1, 0, 1), "blue": (0, 0, 1, 1)}
 JOINT_BOUND = 0.03  # rad per control step
 GRIPPER_BOUND = 0.08  # m
@@ -75,11 +75,11 @@ class StackingEnv(ManipulationEnv):
     =============== ========= ================= ===============================================================
     key             shape     dtype             meaning
     =============== ========= ================= ===============================================================
-    ``observation`` [n, 31]   ``dtype``         0-6 last commanded joints (rad), 7 last gripper number (m), 8-10 red
+    ``observation`` [n, 31]   ``dtype``         0-6 last commanded joints (rad), 7 last gripper command (m), 8-10 red
                                                 box position (m), 11 its tan(yaw), 12-15 green, 16-19 blue, 20-26
                                                 measured joints, 27 distance of the fingers (m), 28-30 TCP position;
                                                 after a reset the commands are the measured joints and distance
-    ``action``      [n, 8]    ``dtype``         0-6 change of the commanded joints (rad), 7 the gripper number itself
+    ``action``      [n, 8]    ``dtype``         0-6 change of the commanded joints (rad), 7 the gripper command itself
                                                 (m): above 0.075 the fingers open, else they close and press
     ``success``     [n, 1]    bool              ``num_boxes`` boxes are in place, see below
     ``mode``        [n, 3]    int64             boxes in the order of their arrival: 0 red, 1 green, 2 blue, -1 none

@@ -154,7 +154,7 @@ register_task(
         max_steps=400,
         hidden=tuple(f"{box}_tan_yaw" for box in _BY_BOXES[4].objects),
         noise=PO_NOISE,
-        data="sorting",
+        data_from="sorting",
         defaults=Defaults(
             preset="semi_supervised",  # positions are noisy
             demonstrations=1000,

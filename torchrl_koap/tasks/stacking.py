@@ -106,7 +106,7 @@ _STACKING_1 = register_task(
         modes=Modes((("first box", NAMES),), "torchrl_koap.envs.stacking:first_box", "solved_contexts"),
         score="torchrl_koap.evaluation.scores:first_box_scores",
         env_options={"num_boxes": 1},
-        data="stacking",
+        data_from="stacking",
     )
 )
 # as the paper has it: joints are commanded but not seen, and the gripper's number is decoded like any other action

@@ -153,7 +153,7 @@ class Task(Columns):
             offer). None: a robot with data and no simulator.
         env_options (dict): its further keyword arguments.
         expert (str, optional): import string of the scripted expert (:mod:`torchrl_koap.envs.experts.recording`).
-        data (str): name of the task whose demonstrations are used, if another one.
+        data_from (str, optional): name of the task whose demonstrations are used, if another one.
         scene (Scene): the bodies that a context places, where they start, and how all looks from above.
         label_levels (tuple of float): shares of labelled windows of the label levels 1, 2, ...
         defaults (Defaults): settings that are the task's own.
@@ -189,7 +189,7 @@ class Task(Columns):
     env: str | None = None
     env_options: Mapping[str, Any] = field(default_factory=dict)
     expert: str | None = None
-    data: str = ""
+    data_from: str | None = None
     scene: Scene = Scene()
     label_levels: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.25)
     defaults: Defaults = Defaults()
@@ -281,7 +281,7 @@ class Task(Columns):
     @property
     def source(self) -> str:
         """Name of the task whose demonstrations are used."""
-        return self.data or self.name
+        return self.data_from or self.name
 
     @cached_property
     def tool_position(self) -> Callable[[Tensor], Tensor] | None:

@@ -28,7 +28,7 @@ from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.stacking import BOXES, TARGET
 
 ORDERS = tuple(itertools.permutations(range(3)))
-GRIPPER_OPEN, GRIPPER_CLOSED = 0.08, 0.06  # gripper numbers: the distances of the fingers that will result (m)
+GRIPPER_OPEN, GRIPPER_CLOSED = 0.08, 0.06  # gripper commands: the distances of the fingers that will result (m)
 HALF_SIZES = np.array([size[:2] for _, size in BOXES])
 BOX_HEIGHT = 0.06
 ON_TABLE = 0.011  # height of the centre of a box that lies on the table (m)
@@ -100,7 +100,7 @@ class StackingExpert(Expert):
             observation (array): [n, 31] as :class:`~torchrl_koap.envs.StackingEnv` gives it.
 
         Returns:
-            np.ndarray: change of the commanded joints (rad) and gripper number (m) [n, 8], float64.
+            np.ndarray: change of the commanded joints (rad) and gripper command (m) [n, 8], float64.
 
         Raises:
             ValueError: if the shape is wrong.
@@ -147,7 +147,7 @@ class _Person:
         self._enter(_REACH)
 
     def decide(self, tcp: np.ndarray, yaw: float, width: float, boxes: np.ndarray) -> float:
-        """Moves the command by one control step, given what is seen; returns the gripper number."""
+        """Moves the command by one control step, given what is seen; returns the gripper command."""
         self._time += 1
         self._since += 1
         self._speed, self._seen = np.linalg.norm(tcp - self._seen), tcp.copy()
