@@ -14,7 +14,6 @@ by ``episode_index`` and ``frame_index``.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.files import DataError, check_file, read_bytes
 
@@ -109,7 +109,7 @@ def read_lerobot(
         state_names=names if len(set(names)) == len(names) else None,
         action_names=_names(known.get(ACTION) or {}, ACTION, width if actions is None else actions.shape[1]),
         sources=[f"episode {number}" for number in rows.numbers],
-        control_hz=control_hz or _rate(info),
+        control_hz=_rate(info) if control_hz is None else control_hz,
         skipped=images,
         source=str(root),
     )
@@ -159,18 +159,19 @@ def read_rows(root: str | Path, features: Sequence[str], *, pictures: Sequence[s
     for name in table.column_names:
         if name not in (*pictures, "__filename"):
             try:
-                columns[name] = _numbers(table, name, _announced(read_info(root)) if name == ACTION else 0)
+                announced = _announced(read_info(root)) if name == ACTION else 1
+                columns[name] = numbers(table[name], name, announced=announced, files=files)
             except ValueError as error:
                 problems.append(str(error))
     if problems:
         raise DataError(root, problems)
     episode, frame = (columns.pop(name)[:, 0] for name in (EPISODE, FRAME))
-    numbers, starts = np.unique(episode, return_index=True)
+    found, starts = np.unique(episode.astype(int), return_index=True)
     ends, expected = [*starts[1:], len(episode)], _expected_lengths(root)
-    missing = sorted(expected.keys() - {*numbers.tolist()})
+    missing = sorted(expected.keys() - {*found.tolist()})
     problems = [f"{len(missing)} episodes are missing: {', '.join(map(str, missing[:10]))}"] if missing else []
     spans = [slice(int(start), int(end)) for start, end in zip(starts, ends, strict=True)]
-    for number, span in zip(numbers.astype(int).tolist(), spans, strict=True):
+    for number, span in zip(found.tolist(), spans, strict=True):
         length, wanted = span.stop - span.start, expected.get(number)
         if wanted not in (None, length):
             problems.append(f"{files[span.start]}: episode {number} has {length} rows, its description says {wanted}")
@@ -178,19 +179,7 @@ def read_rows(root: str | Path, features: Sequence[str], *, pictures: Sequence[s
             problems.append(f"{files[span.start]}: column {FRAME!r} of episode {number} must count 0, 1, 2, ...")
     if problems:
         raise DataError(root, problems)
-    return Rows(columns, numbers.astype(int).tolist(), spans)
-
-
-def import_pyarrow():
-    """The package pyarrow, or an error that names the extra."""
-    if importlib.util.find_spec("pyarrow") is None:
-        raise RuntimeError("LeRobot data sets need an extra: pip install 'torchrl_koap[lerobot]'")
-    import pyarrow
-    import pyarrow.compute
-    import pyarrow.dataset
-    import pyarrow.parquet
-
-    return pyarrow
+    return Rows(columns, found.tolist(), spans)
 
 
 def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
@@ -210,7 +199,7 @@ def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
         problems += [f"{file}: missing column {name!r}; the file has {', '.join(schema.names)}" for name in missing]
         for name in {*needed, *pictures, ACTION}.intersection(schema.names):
             got = schema.field(name).type
-            kind = _picture(pyarrow, got) if name in pictures else _double(pyarrow, got)
+            kind = _picture(pyarrow, got) if name in pictures else number_type(got)
             kinds.setdefault(name, kind)
             if kind is None:
                 wanted = "pictures" if name in pictures else "numbers or lists of numbers"
@@ -231,34 +220,6 @@ def _picture(pyarrow, kind):
     """The type that a column of pictures is read as, None of anything else."""
     held = pyarrow.types.is_struct(kind) and kind.get_field_index("bytes") >= 0
     return pyarrow.struct([("bytes", pyarrow.binary())]) if held else None
-
-
-def _double(pyarrow, kind):
-    """The type that a column of numbers is read as, None of anything else."""
-    types = pyarrow.types
-    nested = types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
-    inner = kind.value_type if nested else kind
-    if not (types.is_floating(inner) or types.is_integer(inner)):
-        return None
-    return pyarrow.list_(pyarrow.float64()) if nested else pyarrow.float64()
-
-
-def _numbers(table, name: str, announced: int) -> np.ndarray:
-    """A column as float64 ``[rows, width]``; rows that are empty, ``announced`` wide if all are, are NaN."""
-    pyarrow, column = import_pyarrow(), table[name].combine_chunks()
-    if not pyarrow.types.is_list(column.type):
-        return column.to_numpy(zero_copy_only=False).reshape(-1, 1)
-    there = column.is_valid().to_numpy(zero_copy_only=False)
-    sizes = pyarrow.compute.list_value_length(column).drop_null().to_numpy()
-    widths = np.unique(sizes)
-    if len(widths) > 1 or 0 in widths:
-        file = table["__filename"][int(np.flatnonzero(there)[(sizes != sizes[0]).argmax()])]
-        counts = " and ".join(map(str, widths))
-        raise ValueError(f"{file}: column {name!r} has rows of {counts} numbers, wanted the same number in all")
-    values = np.full((len(column), int(widths[0]) if len(widths) else max(announced, 1)), np.nan)
-    if len(widths):
-        values[there] = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, values.shape[1])
-    return values
 
 
 def _expected_lengths(root: Path) -> dict[int, int | None]:

@@ -130,11 +130,10 @@ def _from_video(folder: Path, info: dict, camera: str, number: int, span: slice,
 
     size, first = int(info.get("chunks_size") or 1000), 0
     names = {"video_key": camera, "episode_index": number, "episode_chunk": number // size}
-    places = _places(folder, camera)
-    if places:
-        file, start = places[number]
-        names |= {"chunk_index": file[0], "file_index": file[1]}
-        first = round(start * float(info["fps"]))
+    about = _about_video(folder, camera, number)
+    if about is not None:  # format 3.0
+        names |= {"chunk_index": about[0], "file_index": about[1]}
+        first = round(about[2] * float(info["fps"]))
     path, length = folder / str(info.get("video_path")).format(**names), span.stop - span.start
     frames = list(islice(imageio.v3.imiter(path), first, first + length))
     if len(frames) < length:
@@ -142,15 +141,13 @@ def _from_video(folder: Path, info: dict, camera: str, number: int, span: slice,
     return np.stack(frames)[..., :3]
 
 
-def _places(folder: Path, camera: str) -> dict[int, tuple[tuple[int, int], float]]:
-    """Format 3.0: of every episode chunk and number of its video, and where in it (s) it begins."""
+def _about_video(folder: Path, camera: str, number: int) -> tuple[int, int, float] | None:
+    """Chunk and number of an episode's video, and where in it the episode begins (s); None before format 3.0."""
     import pyarrow.parquet
 
-    found = {}
-    key = f"videos/{camera}"
-    columns = ["episode_index", f"{key}/chunk_index", f"{key}/file_index", f"{key}/from_timestamp"]
-    for file in sorted((folder / "meta/episodes").rglob("*.parquet")):
-        for row in pyarrow.parquet.read_table(file, columns=columns).to_pylist():
-            number, chunk, place, start = (row[name] for name in columns)
-            found[number] = (chunk, place), start
-    return found
+    columns = [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    for file in (folder / "meta/episodes").rglob("*.parquet"):
+        for row in pyarrow.parquet.read_table(file, columns=["episode_index", *columns]).to_pylist():
+            if row["episode_index"] == number:
+                return row[columns[0]], row[columns[1]], row[columns[2]]
+    return None

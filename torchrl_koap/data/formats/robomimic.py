@@ -15,6 +15,7 @@ import importlib.util
 import json
 import re
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,6 @@ import numpy as np
 
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.files import DataError
-
-_MOST_AXES = 2  # entries with more are images
 
 
 def is_hdf5(path: str | Path) -> bool:
@@ -69,46 +68,40 @@ def read_robomimic(
     try:
         stream = h5py.File(file, "r")
     except OSError as error:
-        raise DataError(file, [f"no HDF5 file: {str(error).splitlines()[0]}"]) from error
+        raise DataError(file, f"no HDF5 file: {str(error).splitlines()[0]}") from error
     with stream:
         if "data" not in stream or not isinstance(stream["data"], h5py.Group):
-            raise DataError(file, [f"no group 'data'; the file holds {', '.join(stream) or 'nothing'}"])
+            raise DataError(file, f"no group 'data'; the file holds {', '.join(stream) or 'nothing'}")
         demos = sorted(stream["data"], key=_number)
         problems = [f"data/{name} has no group 'obs'" for name in demos if "obs" not in stream[f"data/{name}"]]
         if problems or not demos:
-            raise DataError(file, problems or ["'data' holds no trajectories"])
+            raise DataError(file, problems or "'data' holds no trajectories")
         first = stream[f"data/{demos[0]}/obs"]
         usable = [name for name in sorted(first) if _is_table(first[name])]
         skipped = [name for name in sorted(first) if name not in usable]
         chosen = usable if observations is None else list(observations)
-        for name in demos:
-            group = stream[f"data/{name}/obs"]
-            problems += [
-                f"data/{name}/obs has no entry {entry!r}; it has {', '.join(sorted(group))}"
-                for entry in chosen
-                if entry not in group
-            ]
-            problems += [
-                f"data/{name}/obs/{entry} is {list(group[entry].shape)}: an image cannot be part of the state"
-                for entry in chosen
-                if entry in group and not _is_table(group[entry])
-            ]
         if not chosen:
             problems.append(f"no entry of obs is a table of numbers; there are {', '.join(skipped)}")
+        for name, entry in product(demos, chosen):
+            group = stream[f"data/{name}/obs"]
+            if entry not in group:
+                problems.append(f"data/{name}/obs has no entry {entry!r}; it has {', '.join(sorted(group))}")
+            elif not _is_table(group[entry]):
+                shape = list(group[entry].shape)
+                problems.append(f"data/{name}/obs/{entry} is {shape}: an image cannot be part of the state")
         if control_hz is None:
             control_hz = _control_frequency(stream["data"].attrs.get("env_args"))
-            if control_hz is None:
-                problems.append("env_args holds no control_freq: pass control_hz")
+        if control_hz is None:
+            problems.append("env_args holds no control_freq: pass control_hz")
         if problems:
             raise DataError(file, problems)
         states, actions = [], []
-        for name in demos:
-            group = stream[f"data/{name}"]
-            frames, steps = _frames(group["obs"], chosen), np.asarray(group["actions"]) if "actions" in group else None
+        for group in (stream[f"data/{name}"] for name in demos):
+            frames = _frames(group["obs"], chosen)
             if "next_obs" in group and all(entry in group["next_obs"] for entry in chosen):
                 frames = np.concatenate([frames, _frames(group["next_obs"], chosen)[-1:]])
             states.append(frames)
-            actions.append(steps)
+            actions.append(np.asarray(group["actions"]) if "actions" in group else None)
         names = [label for entry in chosen for label in _labels(entry, first[entry].shape)]
     return make_recordings(
         states,
@@ -130,7 +123,7 @@ def _number(name: str) -> tuple[int, str]:
 def _is_table(entry: Any) -> bool:
     import h5py
 
-    return isinstance(entry, h5py.Dataset) and 1 <= entry.ndim <= _MOST_AXES and entry.dtype.kind in "fiu"
+    return isinstance(entry, h5py.Dataset) and entry.ndim in (1, 2) and entry.dtype.kind in "fiu"
 
 
 def _labels(name: str, shape: Sequence[int]) -> list[str]:

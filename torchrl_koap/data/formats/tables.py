@@ -16,14 +16,15 @@ What is not read (further entries of an archive, parquet columns without numbers
 from __future__ import annotations
 
 import csv
-import importlib.util
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.files import DataError
 from torchrl_koap.lookup import lookup
@@ -37,7 +38,16 @@ EPISODES = ("episode_index", "episode", "trajectory")
 _COUNTERS = ("frame_index", "index", "task_index", "step")
 _UNEVEN = 0.2  # share of the median step by which steps in time may differ before a rate cannot be read off
 
-Trajectory = tuple[np.ndarray, "np.ndarray | None"]
+
+@dataclass(frozen=True)
+class _Table:
+    """What a file holds: trajectories, names of their columns where it has any, rate, and what is not read."""
+
+    trajectories: list[tuple[np.ndarray, np.ndarray | None]]
+    state_names: list[str] | None
+    action_names: list[str] | None
+    rate: float | None
+    unread: list[str]
 
 
 def is_table_folder(folder: str | Path) -> bool:
@@ -90,36 +100,33 @@ def read_tables(
             f" {' or '.join(map(repr, ACTIONS))}"
         )
     problems: list[str] = []
-    states, actions, sources, rates, named, skipped = [], [], [], [], [], []
+    tables: dict[Path, _Table] = {}
     for file in files:
         try:
-            found, names, hz, unused = _READERS[file.suffix](file, action_columns)
+            tables[file] = _READERS[file.suffix](file, action_columns)
         except _UNREADABLE as error:
             problems.append(f"{file}: {error or type(error).__name__}")
-            continue
-        for index, (frames, steps) in enumerate(found):
-            states.append(frames)
-            actions.append(steps)
-            sources.append(file.name if len(found) == 1 else f"{file.name}[{index}]")
-        rates += [hz] if hz else []
-        skipped += unused
-        named.append((file, names))
-    problems += _other_columns(named)
+    names = [_common_names(tables, kind, problems) for kind in ("state", "action")]
     if control_hz is None and not problems:
-        control_hz = _common_rate(rates, problems)
+        control_hz = _common_rate([table.rate for table in tables.values() if table.rate], problems)
     if problems:
         raise DataError(folder, problems)
-    state_names, action_names = _merged(named)
+    found = [
+        (frames, steps, file.name if len(table.trajectories) == 1 else f"{file.name}[{index}]")
+        for file, table in tables.items()
+        for index, (frames, steps) in enumerate(table.trajectories)
+    ]
+    states, actions, sources = zip(*found, strict=True)
     return make_recordings(
         states,
         actions,
         action_dim=action_dim,
-        state_names=state_names,
-        action_names=action_names,
+        state_names=names[0],
+        action_names=names[1],
         sources=sources,
         control_hz=control_hz,
         source=str(folder),
-        skipped=skipped,
+        skipped=[name for table in tables.values() for name in table.unread],
     )
 
 
@@ -127,7 +134,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*") if path.suffix in _READERS and path.is_file())
 
 
-def _read_npz(file: Path, action_columns: Sequence[str] | None):
+def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
     with np.load(file, allow_pickle=False) as archive:
         entries = {name: archive[name] for name in archive.files}
     key = next((name for name in STATES if name in entries), None)
@@ -136,17 +143,17 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None):
             f"has no states: wanted one of {', '.join(STATES)}, it holds {', '.join(entries) or 'nothing'}"
         )
     acting = next((name for name in ACTIONS if name in entries), None)
-    steps = None if acting is None else entries[acting]
-    names = {
-        kind: [str(name) for name in entries[f"{kind}_names"]] if f"{kind}_names" in entries else None
-        for kind in ("state", "action")
-    }
-    hz = float(entries["control_hz"]) if "control_hz" in entries else None
+    names = [
+        [str(name) for name in entries[entry]] if entry in entries else None
+        for entry in ("state_names", "action_names")
+    ]
+    rate = float(entries["control_hz"]) if "control_hz" in entries else None
     read = {key, acting, "state_names", "action_names", "control_hz"}
-    return [(entries[key], steps)], names, hz, [name for name in entries if name not in read]
+    steps = None if acting is None else entries[acting]
+    return _Table([(entries[key], steps)], *names, rate, [name for name in entries if name not in read])
 
 
-def _read_csv(file: Path, action_columns: Sequence[str] | None):
+def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
     with file.open(newline="", encoding="utf-8-sig") as stream:
         rows = list(csv.reader(stream))
     if len(rows) < 2:
@@ -166,47 +173,39 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None):
                 values[number, column] = float(text) if text.strip() else np.nan
             except ValueError:
                 raise ValueError(f"row {number + 2}, column {header[column]!r}: {text!r} is no number") from None
-    return *_split_columns({name: values[:, index] for index, name in enumerate(header)}, action_columns), []
+    return _split({name: values[:, index] for index, name in enumerate(header)}, action_columns, [])
 
 
-def _read_parquet(file: Path, action_columns: Sequence[str] | None):
-    if importlib.util.find_spec("pyarrow") is None:
-        raise RuntimeError("parquet files are read with an extra: pip install 'torchrl_koap[lerobot]'")
-    import pyarrow
-    import pyarrow.parquet
-
+def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
+    pyarrow = import_pyarrow()
     try:
         table = pyarrow.parquet.read_table(file)
     except pyarrow.ArrowException as error:
         raise ValueError(f"cannot be read: {str(error).splitlines()[0]}") from error
     columns: dict[str, np.ndarray] = {}
-    unused = []
+    unread = []
     for name in table.column_names:
-        kind = table.schema.field(name).type
-        values = table.column(name)
-        if pyarrow.types.is_list(kind) or pyarrow.types.is_fixed_size_list(kind):
-            rows = values.to_pylist()
-            width = next((len(row) for row in rows if row is not None), 0)
-            block = np.array([[np.nan] * width if row is None else row for row in rows], dtype=np.float64)
-            columns |= {f"{name}_{index}": block[:, index] for index in range(width)}
-        elif pyarrow.types.is_boolean(kind):
-            columns[name] = np.array([np.nan if value is None else value for value in values.to_pylist()], float)
-        elif pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind):
-            columns[name] = values.to_numpy().astype(np.float64)
-        else:  # text, dates, pictures
-            unused.append(name)
-    return *_split_columns(columns, action_columns), unused
+        values = table[name]
+        if pyarrow.types.is_boolean(values.type):
+            values = values.cast(pyarrow.int8())
+        kind = number_type(values.type)
+        if kind is None:  # text, dates, pictures
+            unread.append(name)
+            continue
+        block = numbers(values.cast(kind), name)
+        alone = not pyarrow.types.is_list(kind)
+        columns |= {name if alone else f"{name}_{index}": block[:, index] for index in range(block.shape[1])}
+    return _split(columns, action_columns, unread)
 
 
 _READERS = {".npz": _read_npz, ".csv": _read_csv, ".parquet": _read_parquet}
 
 
-def _split_columns(columns: Mapping[str, np.ndarray], action_columns: Sequence[str] | None):
-    """Trajectories, names and rate of a table whose columns have names."""
-    if action_columns is None:
-        acting = [name for name in columns if name == "action" or name.startswith(("action_", "action."))]
-    else:
-        acting = _known(columns, action_columns)
+def _split(columns: Mapping[str, np.ndarray], action_columns: Sequence[str] | None, unread: list[str]) -> _Table:
+    """Trajectories of a table with named columns."""
+    acting = [name for name in columns if name == "action" or name.startswith(("action_", "action."))]
+    if action_columns is not None:
+        acting = [name for name in action_columns if lookup(columns, name, "action column") is not None]
     time = next((name for name in TIMES if name in columns), None)
     episode = next((name for name in EPISODES if name in columns), None)
     apart = {time, episode, *_COUNTERS, *acting}
@@ -219,14 +218,8 @@ def _split_columns(columns: Mapping[str, np.ndarray], action_columns: Sequence[s
     starts = np.flatnonzero(np.r_[True, np.diff(number) != 0])
     pieces = [slice(start, end) for start, end in zip(starts, [*starts[1:], len(frames)], strict=True)]
     found = [(frames[piece], None if steps is None else steps[piece]) for piece in pieces]
-    hz = _rate([columns[time][piece] for piece in pieces]) if time else None
-    return found, {"state": observed, "action": acting or None}, hz
-
-
-def _known(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> list[str]:
-    for name in names:
-        lookup(columns, name, "action column")
-    return list(names)
+    rate = _rate([columns[time][piece] for piece in pieces]) if time else None
+    return _Table(found, observed, acting or None, rate, unread)
 
 
 def _rate(times: Sequence[np.ndarray]) -> float:
@@ -253,19 +246,16 @@ def _common_rate(rates: Sequence[float], problems: list[str]) -> float | None:
     return float(np.median(rates))
 
 
-def _other_columns(named: Sequence[tuple[Path, Mapping[str, Sequence[str] | None]]]) -> list[str]:
-    problems = []
-    for kind in ("state", "action"):
-        known = [(file, tuple(names[kind])) for file, names in named if names[kind] is not None]
-        problems += [
-            f"{file}: {kind} columns are {', '.join(names)}; those of {known[0][0].name} are {', '.join(known[0][1])}"
-            for file, names in known[1:]
-            if names != known[0][1]
-        ]
-    return problems
-
-
-def _merged(named) -> tuple[Sequence[str] | None, Sequence[str] | None]:
-    return tuple(
-        next((names[kind] for _, names in named if names[kind] is not None), None) for kind in ("state", "action")
-    )
+def _common_names(tables: Mapping[Path, _Table], kind: str, problems: list[str]) -> list[str] | None:
+    """Names of the state or action columns that all files with any have."""
+    every = {file: table.state_names if kind == "state" else table.action_names for file, table in tables.items()}
+    named = {file: names for file, names in every.items() if names is not None}
+    if not named:
+        return None
+    first, wanted = next(iter(named.items()))
+    problems += [
+        f"{file}: {kind} columns are {', '.join(names)}; those of {first.name} are {', '.join(wanted)}"
+        for file, names in named.items()
+        if names != wanted
+    ]
+    return wanted

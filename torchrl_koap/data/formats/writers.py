@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.lerobot import ACTION, EPISODE, FRAME, STATE, import_pyarrow
+from torchrl_koap.data.formats.arrow import import_pyarrow
+from torchrl_koap.data.formats.lerobot import ACTION, EPISODE, FRAME, STATE
 from torchrl_koap.data.formats.lerobot_frames import EMBODIMENT
 from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, replacing_file
@@ -131,18 +132,19 @@ class LeRobotWriter:
             "index": sum(self._lengths) + numbers,
             "task_index": np.zeros(len(states), dtype=np.int64),
         }
-        self._write(_DATA.format(**self._place(number)), columns)
+        self._write(_DATA.format(chunk_index=number // _CHUNK, file_index=number % _CHUNK), columns)
         self._lengths.append(len(states))
 
     def close(self) -> Path:
         """Writes the description, which makes the data set a finished one; returns the folder."""
-        lengths, places = np.array(self._lengths), [self._place(number) for number in range(len(self._lengths))]
-        ends = lengths.cumsum()
+        lengths = np.array(self._lengths)
+        ends, files = lengths.cumsum(), np.arange(len(lengths))
         listed = {
-            EPISODE: np.arange(len(lengths)),
+            EPISODE: files,
             "tasks": [[self._task]] * len(lengths),
             "length": lengths,
-            **{f"data/{name}": np.array([place[name] for place in places]) for name in ("chunk_index", "file_index")},
+            "data/chunk_index": files // _CHUNK,
+            "data/file_index": files % _CHUNK,
             "dataset_from_index": ends - lengths,
             "dataset_to_index": ends,
         }
@@ -174,9 +176,6 @@ class LeRobotWriter:
         with replacing_file(self._folder / "meta" / "info.json") as aside:
             aside.write_text(json.dumps(info, indent=2) + "\n")
         return self._folder
-
-    def _place(self, number: int) -> dict[str, int]:
-        return {"chunk_index": number // _CHUNK, "file_index": number % _CHUNK}
 
     def _vectors(self, values: np.ndarray) -> Any:
         flat = self._pyarrow.array(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
