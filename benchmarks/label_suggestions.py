@@ -24,13 +24,13 @@ from tensordict import TensorDictBase
 from torchrl_koap.data import controller_view, cut_windows, make_window_buffer
 from torchrl_koap.evaluation.active_labelling import CRITERIA, rank_trajectories
 from torchrl_koap.evaluation.latent_space import infer_steps
-from torchrl_koap.modules import KoopmanInverseDynamics, Normalizer
+from torchrl_koap.modules import PRESETS, KoopmanInverseDynamics, Normalizer
 from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.tasks import WINDOW, Task, get_task
 from torchrl_koap.training.action_errors import rmse_mm
-from torchrl_koap.training.builders import NORMALIZATION, build_controller
-from torchrl_koap.training.closed_form import DEFAULT_PENALTY, fit_closed_form
+from torchrl_koap.training.builders import build_controller
+from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.loop import train_phase
 
@@ -52,7 +52,7 @@ def train_unlabelled(data: TensorDictBase, task: Task, preset: str, updates: int
     controller = build_controller(options, data["state"].shape[-1], task.action_dim, within(data, [0]))
     window = max(WINDOW, controller.num_window_frames)
     history = controller.num_past
-    controller.fit_scales(cut_windows(data, window, select=["state"], pad_before=history)["state"])
+    controller.prepare(cut_windows(data, window, select=["state"], pad_before=history)["state"])
     keys = ["state", "action", "has_action"]
     buffer = make_window_buffer(within(data, []), window, 256, select=keys, pad_before=history)
     loss = KOAPLoss(controller, action_coeff=0.0)
@@ -66,9 +66,10 @@ def error_of(
     """Action error on the steps ``test`` (:func:`infer_steps`) of a decoder fitted to labelled data."""
     normalizer = Normalizer.fit(labelled["action"], mode=mode, mask=labelled["has_action"])
     controller.action_normalizer.load_state_dict(normalizer.state_dict())
-    fit_closed_form(controller, labelled, shared_axes=task.moved_columns())
+    fit_closed_form(controller, labelled, **axes_of(task, task.controller_columns("robot")))
     with torch.no_grad():
-        return rmse_mm(controller.decode(test["latent_action"]), test["action"])
+        decoded = controller.raw_action(controller.decode(test["latent_action"]), test["state"])
+        return rmse_mm(decoded, test["action"])
 
 
 def chosen_by(criterion: str, steps: TensorDictBase, first: int, count: int, seed: int) -> list[int]:
@@ -81,7 +82,7 @@ def chosen_by(criterion: str, steps: TensorDictBase, first: int, count: int, see
         steps["latent_action"],
         steps["episode"],
         labelled,
-        penalty=DEFAULT_PENALTY,
+        penalty=PRESETS["default"]["penalty"],
         criterion=criterion,
         count=count - 1,
         seed=seed,
@@ -121,7 +122,7 @@ def main() -> None:
     steps = infer_steps(controller, data)
     print(f"{len(steps)} steps, trained in {time.perf_counter() - began:.0f} s")
 
-    mode = NORMALIZATION[arguments.preset]["action"]
+    mode = PRESETS[arguments.preset]["normalization"]["action"]
     errors: dict[tuple[str, int], list[float]] = {}
     labels: dict[tuple[str, int], list[int]] = {}
     names = steps["episode"].unique()

@@ -83,9 +83,9 @@ def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int |
     for name in WEIGHTS:
         if (folder / name).exists():
             tensors, about = load_tensors(folder / name)
-            # a closed-form decoder was fitted to features of exactly these frequencies: of them nothing is rounded
-            only = ("covariance_root",) if name == "controller.safetensors" and (folder / WEIGHTS[0]).exists() else ()
-            save_tensors(folder / name, compact(tensors, only=only), about)
+            # a closed-form decoder was fitted to exactly these frequencies: of a controller nothing is rounded
+            exact = name == "controller.safetensors" and (folder / WEIGHTS[0]).exists()
+            save_tensors(folder / name, tensors if exact else compact(tensors), about)
     write_digests(published)
     (folder / "README.md").write_text(card)
     return folder

@@ -35,7 +35,7 @@ from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.training import fit_controller
 from torchrl_koap.training.action_errors import first_actions, rmse
-from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
+from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 
 TABLE = Path(__file__).parent / "results" / "unlabelled_data.csv"
@@ -106,8 +106,7 @@ def refit(controller: InverseDynamics, data: TensorDictBase, task: Task) -> tupl
     controller = copy.deepcopy(controller)
     mode = Normalizer.fit(data["action"], mode="rms", mask=data["has_action"])
     controller.action_normalizer.load_state_dict(mode.state_dict())
-    axes = likely_axes(task, task.controller_columns("robot"))
-    return controller, fit_closed_form(controller, data, guessed_axes=axes)
+    return controller, fit_closed_form(controller, data, **axes_of(task, task.controller_columns("robot")))
 
 
 def choice_of(controller: InverseDynamics, fit: dict) -> str:

@@ -143,6 +143,39 @@ class LossTestBase:
             with pytest.raises(KeyError, match=f"{name}.*there are"):
                 loss(self.make_batch(4).exclude(self.entry(name)))
 
+    # labels
+
+    @property
+    def reads_labels(self) -> bool:
+        return "has_action" in self.in_names
+
+    def test_hidden_actions_reach_neither_value_nor_gradient(self):
+        if not self.reads_labels:  # none is read at all
+            batch = self.make_batch(6)
+            return self.assert_same(self.make_loss()(batch), self.make_loss()(batch.exclude("action", "has_action")))
+        results = []
+        for stored in (0.0, 1e30, torch.inf, torch.nan):
+            loss, batch = self.make_loss(), self.make_batch(6)
+            batch["action"] = torch.where(batch["has_action"], batch["action"], stored)
+            found = loss(batch)
+            self.total(found).backward()
+            gradients = {name: value.grad for name, value in loss.named_parameters() if value.grad is not None}
+            results.append({**found, **gradients})
+        for result in results[1:]:
+            for name, value in result.items():
+                assert value.isfinite().all() and torch.equal(value, results[0][name]), name
+
+    def test_without_labels_the_loss_of_actions_and_its_gradients_are_exactly_zero(self):
+        if not self.reads_labels:
+            return
+        loss, batch = self.make_loss(), self.make_batch(6)
+        batch["has_action"] = torch.zeros_like(batch["has_action"])
+        batch["action"] = torch.full_like(batch["action"], torch.nan)
+        value = loss(batch)[self.out_keys[-1]]
+        assert value == 0 and value.requires_grad  # in the graph: distributed training needs that
+        value.backward()
+        assert all((value.grad == 0).all() for value in loss.parameters() if value.grad is not None)
+
     # reductions and shapes
 
     def test_reductions_agree(self):

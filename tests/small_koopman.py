@@ -23,11 +23,11 @@ LOSSES = (KoopmanReconstructionLoss, KoopmanDynamicsLoss, LatentActionLoss, KOAP
 NETWORKS = ("mlp", "lstm", "fourier")
 
 
-def make_network(kind="mlp", *, clamped=False, normalizers=True, dropout=0.0, seed=0):
+def make_network(kind="mlp", *, clamped=False, normalizers=True, seed=0):
     torch.manual_seed(seed)
     frames = {"num_past": HISTORY, "look_ahead": K, "clamped": clamped}
     if kind == "mlp":
-        latent_action = LatentActionMLP(3, 4, hidden_dims=(16,), dropout=dropout, **frames)
+        latent_action = LatentActionMLP(3, 4, hidden_dims=(16,), **frames)
     elif kind == "lstm":
         latent_action = LatentActionLSTM(3, 4, hidden_dim=8, **frames)
     else:
@@ -35,15 +35,15 @@ def make_network(kind="mlp", *, clamped=False, normalizers=True, dropout=0.0, se
     operator = KoopmanOperator(4, input_dim=latent_action.latent_dim if kind == "fourier" else None)
     if kind == "fourier":
         torch.nn.init.normal_(operator.input, std=0.1)
+    state = Normalizer(3, offset=torch.tensor([0.1, -0.2, 0.0]), scale=torch.tensor([2.0, 1.0, 3.0]))
+    action = Normalizer(2, offset=torch.tensor([0.3, 0.0]), scale=torch.tensor([0.5, 2.0]))
+    normalized = {"state_normalizer": state, "action_normalizer": action} if normalizers else {}
     network = KoopmanInverseDynamics(
         latent_action,
         LinearActionDecoder(latent_action.latent_dim, 2),
         lifting=KoopmanLifting(3, 4, hidden_dims=(16,), include_state=kind == "fourier"),
         operator=operator,
-        state_normalizer=Normalizer(torch.tensor([0.1, -0.2, 0.0]), torch.tensor([2.0, 1.0, 3.0]))
-        if normalizers
-        else None,
-        action_normalizer=Normalizer(torch.tensor([0.3, 0.0]), torch.tensor([0.5, 2.0])) if normalizers else None,
+        **normalized,
     )
     return network
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import KoopmanOperator, make_koopman_inverse_dynamics
+from torchrl_koap.modules import make_koopman_inverse_dynamics
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
 from torchrl_koap.tasks import get_task
@@ -42,8 +42,6 @@ def test_without_a_near_name_all_are_listed(name):
     ("call", "message"),
     [
         (lambda name: get_task(name), "unknown task"),
-        (lambda name: KoopmanOperator(4, structure=name), "unknown operator structure"),
-        (lambda name: KoopmanOperator(4, init=name), "unknown operator init"),
         (lambda name: make_koopman_inverse_dynamics(2, 2, preset=name), "unknown preset"),
         (lambda name: make_koopman_inverse_dynamics(2, 2, network=name), "unknown network"),
         (lambda name: NoiseSchedule(prediction=name), "unknown prediction"),

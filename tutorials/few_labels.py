@@ -63,7 +63,7 @@ inverse_dynamics = make_koopman_inverse_dynamics(
     action_normalizer=Normalizer.fit(data["action"], mode="rms", mask=data["has_action"]),
 )
 history = inverse_dynamics.num_past
-inverse_dynamics.fit_scales(cut_windows(data, 16, select=["state"], pad_before=history)["state"])
+inverse_dynamics.prepare(cut_windows(data, 16, select=["state"], pad_before=history)["state"])
 loss = KOAPLoss(inverse_dynamics, action_coeff=0.0)
 buffer = make_window_buffer(data, 16, 256, select=["state", "action", "has_action"], pad_before=history)
 optimizer = torch.optim.AdamW(loss.parameters(), 1e-3)
@@ -75,7 +75,7 @@ for _ in range(200):
 # %%
 # The labels are spent last: the linear decoder is fitted to them in closed form.
 
-fit = fit_closed_form(inverse_dynamics, data, shared_axes=task.moved_columns())
+fit = fit_closed_form(inverse_dynamics, data, axes=task.moved_columns())
 print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
 
 # %%

@@ -45,14 +45,13 @@ task = get_task("avoiding")
 demonstrations = select_state(record_demonstrations("avoiding", episodes=24)[0], task.state_columns)
 data, report = LabelBudget(count=2).apply(demonstrations, command=task.command_columns)
 model = KoopmanInverseDynamics(
-    LatentActionMLP(2, 16, hidden_dims=(32, 32), num_past=1, look_ahead=(2, 3), relative=True, linear_skip=True),
+    LatentActionMLP(2, 16, hidden_dims=(32, 32), num_past=1, look_ahead=(2, 3), relative=True),
     LinearActionDecoder(16, 2),
-    lifting=KoopmanLifting(2, 16, hidden_dims=(32, 32), include_state=True, in_key="normalized_state"),
+    lifting=KoopmanLifting(2, 16, hidden_dims=(32, 32), include_state=True),
     operator=KoopmanOperator(16),
     state_normalizer=Normalizer.fit(data["state"], mode="standard"),
     action_normalizer=Normalizer.fit(data["action"], mode="rms", mask=data["has_action"]),
 )
-print("the inference path:", [type(module).__name__ for module in model.module])
 for name, part in {
     "latent action": model.latent_action,
     "lifting": model.lifting,
@@ -71,7 +70,7 @@ for name, part in {
 windows = cut_windows(data, 16, select=["state", "action", "has_action"], pad_before=model.num_past)
 buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(windows)), batch_size=128)
 buffer.extend(windows)
-model.fit_scales(windows["state"])
+model.prepare(windows["state"])
 loss = KOAPLoss(model)
 optimizer = torch.optim.AdamW(loss.parameters(), 1e-3)
 history = []

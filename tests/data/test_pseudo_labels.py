@@ -113,7 +113,7 @@ def test_a_known_law_is_recovered():
     windows = torch.stack(list(data["state"].split(29)))
     actions = torch.stack(list(data["action"].split(29)))
     mask = torch.stack([part.squeeze(-1) for part in data["has_action"].split(29)])
-    controller.fit_decoder(TensorDict({"state": windows, "action": actions}, [12, 29]), mask)
+    controller.fit_labels(TensorDict({"state": windows, "action": actions}, [12, 29]), mask)
     result = relabel(controller, data, window=5)
     inner = truth["step_count"] < 27  # states after the last step are not part of the data
     torch.testing.assert_close(result["action"][inner], truth["action"][inner], atol=1e-2, rtol=0)

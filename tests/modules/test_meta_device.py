@@ -17,7 +17,6 @@ from torchrl_koap.modules import (
     NonlinearInverseDynamics,
     Normalizer,
     QuantizedInverseDynamics,
-    RecurrentInverseDynamics,
     StatePlanner,
     SupervisedInverseDynamics,
     TemporalUnet,
@@ -34,7 +33,6 @@ PLANNERS = {
 CONTROLLERS = {
     **{preset: partial(make_koopman_inverse_dynamics, preset=preset) for preset in PRESETS},
     "supervised": SupervisedInverseDynamics,
-    "recurrent": RecurrentInverseDynamics,
     "variational": VariationalInverseDynamics,
     "quantized": QuantizedInverseDynamics,
     "nonlinear": NonlinearInverseDynamics,
@@ -44,7 +42,7 @@ CONTROLLERS = {
 def make(name, fitted):
     if name in PLANNERS:
         return PLANNERS[name]().eval()
-    normalizer = (lambda: Normalizer.fit(torch.randn(9, 2))) if fitted else Normalizer
+    normalizer = (lambda: Normalizer.fit(torch.randn(9, 2))) if fitted else (lambda: Normalizer(2))
     return CONTROLLERS[name](2, 2, state_normalizer=normalizer(), action_normalizer=normalizer()).eval()
 
 

@@ -137,18 +137,6 @@ def test_what_is_stored_at_unlabelled_and_padded_steps_reaches_neither_value_nor
         assert gradient.abs().max() > 0, name
 
 
-@pytest.mark.parametrize("reduction", ["mean", "sum"])
-def test_a_batch_without_labels_gives_exactly_zero(reduction):
-    data = batch_of(4)
-    data["has_action"] = torch.zeros_like(data["has_action"])
-    data["action"] = torch.full_like(data["action"], torch.nan)
-    loss = make_loss(reduction=reduction)
-    value = loss(data)["loss_policy"]
-    assert value == 0 and value.requires_grad
-    value.backward()
-    assert all((p.grad == 0).all() for p in loss.parameters() if p.requires_grad)
-
-
 def test_the_future_states_are_not_read():
     data, loss = batch_of(4), make_loss()
     other = data.clone()

@@ -45,16 +45,17 @@ class NearestNeighbours(InverseDynamics):
             distance = distance.masked_fill(mask, torch.inf)
         return (torch.softmax(-distance, -1) @ actions).unflatten(0, features.shape[:-1])
 
-    def forward(self, tensordict):
-        """Writes the action of every frame."""
-        found = self.average(self.features(tensordict.get(self.in_key)), self.windows, self.actions)
-        return tensordict.set(self.out_key, self.raw_action(found))
+    def predict(self, state, frames=None):
+        """Normalised action of every frame."""
+        features = self.features(state)
+        features = features if frames is None else features[..., frames.start : frames.stop, :]
+        return self.average(features, self.windows, self.actions)
 
     @torch.no_grad()
-    def fit_decoder(self, windows, mask, *, groups=None):
+    def fit_labels(self, windows, mask, **_):
         """Remembers the windows of the labelled frames."""
         self.windows = self.features(windows["state"])[mask].clone()
-        self.actions = self.normalize_action(windows["action"][mask])
+        self.actions = self.normalize_action(windows["action"][mask], windows["state"][mask])
         return {"labels_used": int(mask.sum())}
 
     def _load_from_state_dict(self, state_dict, prefix, *rest):
@@ -77,7 +78,9 @@ class NeighboursLoss(LossModule):
         frames = slice(BEFORE, tensordict["state"].shape[-2] - AFTER)
         shown = tensordict["has_action"][:, frames, 0]
         features = self.controller.features(tensordict["state"])[:, frames][shown]
-        actions = self.controller.normalize_action(tensordict["action"][:, frames][shown])
+        actions = self.controller.normalize_action(
+            tensordict["action"][:, frames][shown], tensordict["state"][:, frames][shown]
+        )
         itself = torch.cdist(features, features) < 1e-6  # the same step may be in two windows
         itself &= ~itself.all(-1, keepdim=True)
         found = self.controller.average(features, features, actions, itself)

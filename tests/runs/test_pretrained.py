@@ -54,8 +54,9 @@ def test_an_installed_wheel_has_none(tmp_path, monkeypatch):
 def test_a_published_policy_is_small_and_plans_the_same(run, policies):
     tensors, about = load_tensors(policies / "avoiding" / "controller.safetensors")
     assert about["task"] == "avoiding"
-    small = {name.rpartition(".")[-1] for name, tensor in tensors.items() if tensor.dtype == torch.int8}
-    assert small == {"covariance_root"}  # frequencies stay as the decoder knows them
+    assert not any(
+        tensor.dtype == torch.int8 for tensor in tensors.values()
+    )  # frequencies are as the decoder knows them
     small, whole = ((folder / "planner.safetensors").stat().st_size for folder in (policies / "avoiding", run))
     assert small < 0.6 * whole
     planner, exact = load_run(policies / "avoiding").planner, load_run(run).planner

@@ -29,7 +29,7 @@ class Model(nn.Module):
     def __init__(self, *, fitted=True, width=4, seed=0):
         super().__init__()
         torch.manual_seed(seed)
-        self.normalizer = Normalizer.fit(torch.randn(20, 3)) if fitted else Normalizer()
+        self.normalizer = Normalizer.fit(torch.randn(20, 3)) if fitted else Normalizer(3)
         self.layer = nn.Linear(3, width)
 
     def forward(self, x):

@@ -14,14 +14,9 @@ from tiny_runs import demonstration
 from torchrl_koap.data import LabelBudget, save_ted
 from torchrl_koap.envs.registry import make_env_of, mode_index_of
 from torchrl_koap.keys import validate
-from torchrl_koap.modules import PRESETS
-from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.builders import (
-    NORMALIZATION,
-    build_controller,
-)
+from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.diffusion_builders import DENOISERS, build_planner
 from torchrl_koap.training.methods import METHODS
@@ -105,7 +100,7 @@ def test_every_controller_acts_and_takes_over_weights(method, preset, data):
     labelled, _ = LabelBudget(count=2).apply(data)
     tracking = {"states": [0, 1], "commands": [0, 1], "actions": [0, 1]}
     posture = {"state_dim": 3, "commands": [0, 1], "actions": [0, 1]}
-    options = {"method": method, "preset": preset, "revised": True, "tracking": tracking, "posture": posture}
+    options = {"method": method, "preset": preset, "tracking": tracking, "posture": posture}
     torch.manual_seed(0)
     controller = build_controller(options, 2, 2, labelled).eval()
     if METHODS[method].keeps_posture:  # its scales are those of its labels
@@ -128,7 +123,6 @@ def test_statistics_are_those_of_all_states_and_of_the_labelled_actions(data):
     paper = build_controller({"method": "dd", "preset": "paper"}, 2, 2, labelled)
     torch.testing.assert_close(paper.action_normalizer.inverse(torch.ones(1, 2))[0], shown.amax(0))
     torch.testing.assert_close(paper.state_normalizer.inverse(-torch.ones(1, 2))[0], data["state"].amin(0))
-    assert set(NORMALIZATION) == set(PRESETS)
 
 
 def test_unknown_controllers_and_tasks_suggest_the_nearest():
@@ -148,24 +142,13 @@ def test_environments_and_modes_of_a_task():
 
 def test_absolute_actions_are_centred_and_read_off_the_present_frame():
     entry = resolve(TrainConfig(out=Path("run"), task="scooping")).controller
-    assert entry["absolute"] and "absolute" not in resolve(TrainConfig(out=Path("run"), task="stacking")).controller
+    assert entry["preset"] == "absolute"
+    assert resolve(TrainConfig(out=Path("run"), task="stacking")).controller["preset"] == "default"
     state, action = torch.randn(60, 6) * torch.arange(1.0, 7.0), torch.randn(60, 2) + 5
     labelled = TensorDict({"state": state, "action": action, "has_action": torch.ones(60, 1, dtype=torch.bool)}, [60])
     controller = build_controller(entry, 6, 2, labelled)
-    assert controller.latent_action.place > 0 and (controller.action_normalizer.offset > 4).all()
+    assert controller.latent_action.position_weight > 0 and (controller.action_normalizer.offset > 4).all()
     assert controller.state_normalizer.scale.unique().numel() == 1
-    assert build_controller(entry | {"method": "linear_steps"}, 6, 2, labelled).latent_action.place > 0
-    plain = build_controller({**entry, "absolute": False}, 6, 2, labelled)
-    assert plain.latent_action.place == 0 and not plain.action_normalizer.offset.any()
-
-
-def test_runs_of_before_have_the_single_lifting():
-    config = TrainConfig(out=Path("run"), task="avoiding", preset="semi_supervised")
-    entry = resolve(config).controller
-    data = TensorDict({"state": torch.randn(60, 20), "action": torch.randn(60, 2)}, [60])
-    data["has_action"] = torch.ones(60, 1, dtype=torch.bool)
-    assert isinstance(build_controller(entry, 20, 2, data).lifting, CompactLifting)
-    entry.pop("lifting")
-    earlier = build_controller(entry, 20, 2, data).lifting
-    assert not isinstance(earlier, CompactLifting) and earlier.latent_dim == 2
-    assert "lifting" not in resolve(TrainConfig(out=Path("run"), task="avoiding")).controller
+    assert build_controller(entry | {"method": "linear_steps"}, 6, 2, labelled).latent_action.position_weight > 0
+    plain = build_controller({**entry, "preset": "default"}, 6, 2, labelled)
+    assert plain.latent_action.position_weight == 0 and not plain.action_normalizer.offset.any()

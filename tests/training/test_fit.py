@@ -168,15 +168,15 @@ def test_a_forecast_is_the_default_without_an_environment(tmp_path):
         ("koap", 0, []),
     ],
 )
-def test_a_lifting_is_unfolded_for_as_many_updates_as_it_is_trained_and_on_the_same_trajectories(
+def test_a_lifting_starts_from_isomap_for_as_many_updates_as_it_is_trained_and_on_the_same_trajectories(
     monkeypatch, method, steps, asked
 ):
     seen = []
 
-    def unfold(lifting, windows, updates, progress):
+    def pretrain(lifting, windows, updates, progress):
         seen.append((updates, len(windows)))
 
-    monkeypatch.setattr(CompactLifting, "unfold", unfold)
+    monkeypatch.setattr(CompactLifting, "pretrain", pretrain)
     walks = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(4)]
     wide = [np.tanh(walk @ np.random.default_rng(9).normal(size=(2, 20)) / 4) for walk in walks]
     data, task = make_demonstrations(wide, [np.diff(walks[0], axis=0), None, None, None], control_hz=30)

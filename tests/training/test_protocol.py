@@ -3,17 +3,13 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-
 import pytest
 from tiny_runs import TINY, koap
 
 from torchrl_koap.evaluation import load_run
-from torchrl_koap.modules import SupervisedInverseDynamics, WindowVariationalInverseDynamics
+from torchrl_koap.modules import SupervisedInverseDynamics, VariationalInverseDynamics
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.resolved import resolve
 
 
@@ -33,21 +29,10 @@ def test_relabel_is_a_decision_diffuser(relabel_run):
     assert any("action_normalizer" in name for name in names)
 
 
-def test_runs_of_before_keep_their_method(relabel_run, tmp_path):
-    folder = tmp_path / "run"
-    shutil.copytree(relabel_run, folder, ignore=shutil.ignore_patterns(".lock"))
-    config = json.loads((folder / "config.json").read_text())
-    assert config["controller"].pop("revised") is True
-    (folder / "config.json").write_text(json.dumps(config))
-    with pytest.raises(Exception, match="controller.safetensors"):  # no Diffusion Policy's weights lie there
-        load_run(folder)
-    assert get_method("relabel").earlier == "dp_relabel" and get_method("vae").earlier == "vae_steps"
-
-
 def test_the_auto_encoder_reads_the_window_that_policies_hand_it():
     resolved = resolve(TrainConfig(out="run", method="vae"))
     model = resolved.method.build(2, 2, {}, resolved.controller)
-    assert isinstance(model, WindowVariationalInverseDynamics) and model.num_window_frames == 16
+    assert isinstance(model, VariationalInverseDynamics) and model.num_window_frames == 16
 
 
 @pytest.mark.parametrize(

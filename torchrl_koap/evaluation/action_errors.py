@@ -14,11 +14,12 @@ from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
 from torchrl_koap.evaluation.plan_errors import SAMPLES, sample_sequences, score_sequences
-from torchrl_koap.modules import DiffusionPolicy, LinearActionDecoder, LinearInverseDynamics
+from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics
+from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.units import unit_groups
 from torchrl_koap.training.action_errors import episodes_outside, first_actions
-from torchrl_koap.training.closed_form import fit_closed_form
+from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 
 _MOST_FOLDS = 20  # labelled trajectories that are left out in turn, at most
 
@@ -57,7 +58,7 @@ def errors_left_out(
     task: Task,
     *,
     closed_form: bool,
-    guessed_axes: Sequence[int] = (),
+    columns: Sequence[int],
 ) -> dict[str, Any]:
     """Errors on labels inside the budget: each labelled trajectory in turn is hidden and the decoder is fitted again.
 
@@ -72,7 +73,7 @@ def errors_left_out(
     Keyword Args:
         closed_form (bool): the controller's decoder is fitted in closed form. Otherwise it would have to be trained
             again for each trajectory, and there is only a note.
-        guessed_axes (sequence of int): as in training (:func:`~torchrl_koap.training.closed_form.likely_axes`).
+        columns (sequence of int): state columns that the controller reads.
 
     Returns:
         dict: of :func:`summarise_errors`, or a ``note`` why there is none.
@@ -92,7 +93,7 @@ def errors_left_out(
         fold["has_action"] = labelled["has_action"] & ~hidden.unsqueeze(-1)
         fold["action"] = torch.where(fold["has_action"], labelled["action"], math.nan)
         again = copy.deepcopy(controller)
-        fit_closed_form(again, fold, shared_axes=task.moved_columns(), guessed_axes=guessed_axes)
+        fit_closed_form(again, fold, **axes_of(task, columns))
         ridge = LinearInverseDynamics(labelled["state"].shape[-1], task.action_dim).to(labelled["state"].dtype)
         fit_closed_form(ridge, fold)
         predicted, true, episode = first_actions(again, labelled, [int(number)])
@@ -183,10 +184,8 @@ def _linear_policy(policy: DiffusionPolicy, known: TensorDictBase, action: Tenso
     condition, asked = (
         policy.encode_history(frames.float().to(device)).cpu() for frames in (known["state"][:, : policy.history], past)
     )
-    ridge = LinearActionDecoder(condition.shape[-1], action.shape[-1]).to(condition.dtype)
-    every = torch.ones(len(condition), dtype=torch.bool)
-    ridge.fit_ridge(condition, action, every, groups=known["episode"][:, -1], default_penalty=0.15)
-    return ridge.linear(asked).detach()
+    fit = ridge(condition, action, groups=known["episode"][:, -1], default_penalty=DEFAULT_PENALTY)
+    return fit.predict(asked)
 
 
 def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, task: Task) -> dict[str, Any]:

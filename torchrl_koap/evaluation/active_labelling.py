@@ -101,7 +101,7 @@ def rank_trajectories(
 
     Keyword Args:
         penalty (float): the ridge, in units of the mean square norm of the labelled latent actions (of all, where none
-            is labelled), as in :class:`~torchrl_koap.modules.koopman.action_decoder.RidgeFit`.
+            is labelled), as in :class:`~torchrl_koap.modules.RidgeFit`.
         criterion (str): ``"a_optimal"``, ``"uncertainty"`` or ``"random"``.
         count (int): trajectories to choose.
         bias (bool): the decoder has a fitted mean.
@@ -297,7 +297,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
         penalty=penalty,
         criterion=config.criterion,
         count=count,
-        bias=bool(controller.action_decoder.mean_leverage),
+        bias=bool(controller.action_decoder.linear.bias.any()),
         seed=config.seed,
     )
     unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]

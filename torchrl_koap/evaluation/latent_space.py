@@ -17,7 +17,8 @@ from torch import Tensor
 from torchrl_koap.data import cut_windows, trajectory_lengths
 from torchrl_koap.evaluation.findings import MODELS, ON_THE_CIRCLE, OUTSIDE_THE_BUDGET, unit_circle_sides
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
-from torchrl_koap.modules import KoopmanInverseDynamics, LinearActionDecoder
+from torchrl_koap.modules import KoopmanInverseDynamics
+from torchrl_koap.modules.ridge import ridge
 
 _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
 
@@ -58,7 +59,7 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
         data (TensorDictBase): flat ``[N]`` with ``state``, ``action``, ``has_action`` and ``episode``.
 
     Returns:
-        TensorDict: ``[M]`` with ``latent_action [M, m]``, ``action``, ``has_action [M]`` and ``episode [M]``.
+        TensorDict: ``[M]`` with ``latent_action [M, m]``, ``state``, ``action``, ``has_action [M]``, ``episode [M]``.
     """
     keys = [STATE, ACTION, HAS_ACTION, EPISODE]
     windows = cut_windows(data, controller.num_window_frames, select=keys, pad_before=controller.num_past)
@@ -66,7 +67,7 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
     parts = windows[STATE].split(4096)
     latent = torch.cat([controller.infer(part, range(now, now + 1)).squeeze(-2) for part in parts])
     here = windows[:, now]
-    entries = {"latent_action": latent, ACTION: here[ACTION], EPISODE: here[EPISODE]}
+    entries = {"latent_action": latent} | {key: here[key] for key in (STATE, ACTION, EPISODE)}
     return TensorDict(entries | {HAS_ACTION: here[HAS_ACTION].squeeze(-1)}, [len(latent)])
 
 
@@ -149,9 +150,8 @@ def prediction_errors(
     for states in new.split(1024):
         true = states[:, now + 1 : now + 1 + horizon]
         lifted = controller.lift(states[:, : now + 1 + horizon])
-        past = lifted[:, : now + 1]  # a recurrent decoder needs it as well
-        rolled = controller.rollout_latent(past[:, -1], controller.infer(states, frames))
-        decoded = [controller.lifting.decode(path)[:, now + 1 :] for path in (torch.cat([past, rolled], 1), lifted)]
+        rolled = controller.rollout_latent(lifted[:, now], controller.infer(states, frames))
+        decoded = [controller.lifting.decode(path) for path in (rolled, lifted[:, now + 1 :])]
         predicted = {
             "koopman": _raw(controller, decoded[0]),
             "reconstruction": _raw(controller, decoded[1]),
@@ -232,10 +232,7 @@ def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[f
     """
     if fit.all() or not fit.any():
         raise ValueError(f"a probe is fitted on some steps and tested on others, got {int(fit.sum())} of {len(fit)}")
-    decoder = LinearActionDecoder(latent.shape[-1], action.shape[-1]).to(latent)
-    decoder.fit_ridge(latent, action, fit, groups=groups)
-    with torch.no_grad():
-        return explained(decoder.linear(latent[~fit]), action[~fit])
+    return explained(ridge(latent[fit], action[fit], groups=groups[fit]).predict(latent[~fit]), action[~fit])
 
 
 def analyse_latent(
@@ -260,14 +257,12 @@ def analyse_latent(
         seed (int): seed of the half of the trajectories that is fitted on.
 
     Returns:
-        dict: ``eigenvalues`` (where the operator is a matrix), ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET`
+        dict: ``eigenvalues``, ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET`
         the probe, the number of labels it read and the ``R^2`` of the model's own decoder on the same steps; or a
         ``note`` where fewer than two trajectories have labels. Of data that lack labels the probe takes half of the
         labelled trajectories.
     """
-    result: dict[str, Any] = {}
-    if hasattr(controller.operator, "eigenvalues"):
-        result["eigenvalues"] = spectrum(controller.operator.eigenvalues())
+    result: dict[str, Any] = {"eigenvalues": spectrum(controller.operator.eigenvalues())}
     fit_on = split_trajectories(data[EPISODE], labelled, seed=seed)
     reach = controller.num_window_frames - 1 - controller.num_past
     horizon = min(horizon, max(1, int(trajectory_lengths(data).min()) - reach))
@@ -288,7 +283,8 @@ def analyse_latent(
     latent, action, fit = steps["latent_action"], steps[ACTION], torch.isin(steps[EPISODE], fit_on)
     budget = data[EPISODE][labelled].unique()
     with torch.no_grad():
-        own = explained(controller.decode(latent[~fit]), action[~fit])
+        decoded = controller.raw_action(controller.decode(latent[~fit]), steps[STATE][~fit])
+        own = explained(decoded, action[~fit])
     result[OUTSIDE_THE_BUDGET] = {
         "labels_read": len(steps),
         "held_out_steps": int((~fit).sum()),

@@ -15,7 +15,6 @@ from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.evaluation.training_data import hide_labels_again, load_training_data
 from torchrl_koap.tasks.units import thousandths
-from torchrl_koap.training.closed_form import likely_axes
 
 if TYPE_CHECKING:
     from torchrl_koap.evaluation.trained_run import TrainedRun
@@ -97,7 +96,7 @@ def _actions(trained: TrainedRun, data: TensorDictBase, labelled: TensorDictBase
             seen,
             task,
             closed_form=trained.method.closed_form,
-            guessed_axes=likely_axes(task, trained.columns),
+            columns=trained.columns,
         ),
     }
 

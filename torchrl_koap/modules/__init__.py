@@ -1,14 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Networks as TensorDictModules: planner, lifting, latent actions, decoder, policies."""
 
-from torchrl_koap.modules.baselines.finite_scalar_quantization import FiniteScalarQuantizer
 from torchrl_koap.modules.baselines.linear import LinearInverseDynamics
 from torchrl_koap.modules.baselines.nonlinear import NonlinearInverseDynamics
 from torchrl_koap.modules.baselines.principal import PrincipalInverseDynamics
-from torchrl_koap.modules.baselines.quantized import QuantizedInverseDynamics
-from torchrl_koap.modules.baselines.supervised import RecurrentInverseDynamics, SupervisedInverseDynamics
+from torchrl_koap.modules.baselines.quantized import FiniteScalarQuantizer, QuantizedInverseDynamics
+from torchrl_koap.modules.baselines.supervised import SupervisedInverseDynamics
 from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
-from torchrl_koap.modules.baselines.window_variational import WindowVariationalInverseDynamics
 from torchrl_koap.modules.execution.action_chunks import ChunkedPolicy
 from torchrl_koap.modules.execution.agent import Agent
 from torchrl_koap.modules.execution.asynchronous import AsynchronousAgent
@@ -21,7 +19,7 @@ from torchrl_koap.modules.execution.predictive_tracking import PredictiveTrackin
 from torchrl_koap.modules.execution.receding_horizon import RecedingHorizonPolicy, policy_transforms
 from torchrl_koap.modules.execution.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
-from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder, RidgeFit
+from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.koopman.command_posture import CommandPosture
 from torchrl_koap.modules.koopman.command_response import CommandResponse
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
@@ -31,7 +29,8 @@ from torchrl_koap.modules.koopman.latent_action import (
     LatentActionMLP,
     LatentActionModule,
 )
-from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
+from torchrl_koap.modules.koopman.lifting import KoopmanLifting
+from torchrl_koap.modules.koopman.operator import KoopmanOperator
 from torchrl_koap.modules.koopman.presets import PRESETS, make_koopman_inverse_dynamics
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.denoisers import MLPDenoiser
@@ -39,7 +38,8 @@ from torchrl_koap.modules.planning.diffusion_policy import DiffusionPolicy
 from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.planning.planner import StatePlanner
 from torchrl_koap.modules.planning.unet import TemporalUnet
-from torchrl_koap.modules.time_alignment import FrameGatherer
+from torchrl_koap.modules.ridge import RidgeFit, ridge
+from torchrl_koap.modules.windows import WindowReader
 
 __all__ = [
     "PRESETS",
@@ -54,7 +54,6 @@ __all__ = [
     "Execution",
     "ExecutionConfig",
     "FiniteScalarQuantizer",
-    "FrameGatherer",
     "InverseDynamics",
     "KoopmanInverseDynamics",
     "KoopmanLifting",
@@ -79,15 +78,15 @@ __all__ = [
     "RecedingHorizonPolicy",
     "RecordedFutures",
     "RecordedPlanner",
-    "RecurrentInverseDynamics",
     "RidgeFit",
     "SeededNoise",
     "StatePlanner",
     "SupervisedInverseDynamics",
     "TemporalUnet",
     "VariationalInverseDynamics",
-    "WindowVariationalInverseDynamics",
+    "WindowReader",
     "blend_plan",
     "make_koopman_inverse_dynamics",
     "policy_transforms",
+    "ridge",
 ]

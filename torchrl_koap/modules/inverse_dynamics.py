@@ -3,31 +3,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
 from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE
-from torchrl_koap.modules.time_alignment import FrameGatherer
+from torchrl_koap.modules.windows import WindowReader
 
 
 class InverseDynamics(TensorDictModuleBase):
-    """Base class of every controller, and all that losses, training and policies ask of one.
+    """Maps windows of raw states to the raw action of every frame; all that losses, training and policies ask of it.
 
-    * :attr:`in_key`, :attr:`out_key`, :meth:`set_keys`: the entries read and written;
-    * :attr:`num_past`, :attr:`num_window_frames`, :meth:`span`: which frames of a window are read and which count;
-    * :meth:`fit_scales`: statistics of its inputs, taken from unlabelled windows (nothing by default);
-    * :meth:`normalize_state`, :meth:`normalize_action`, :meth:`raw_action`: units.
-
-    A subclass writes ``forward``. With a ``reader`` all of the above is done; one without says itself what it needs
-    (``num_past``, ``num_window_frames``, ``span``).
+    A subclass writes :meth:`predict`, and of the rest what it needs. Training calls, in this order, :meth:`prepare`,
+    its losses, :meth:`finish`, and :meth:`fit_labels` where the method has a decoder in closed form.
 
     Args:
-        reader (FrameGatherer, optional): gathers what a frame reads.
+        reader (WindowReader, optional): reads what a frame is predicted from. A subclass without one has ``num_past``,
+            ``num_window_frames`` and :meth:`valid_frames` of its own.
 
     Keyword Args:
-        state_normalizer (nn.Module, optional): maps raw states to the networks' units.
+        columns (sequence of int, optional): state columns that are read. Default: all.
+        targets (sequence of int): for actions that say where to go, the state column of each: an action is learned as
+            the distance to it. Default: actions are learned as they are.
+        state_normalizer (nn.Module, optional): maps the columns that are read to the networks' units.
         action_normalizer (nn.Module, optional): its ``inverse`` maps predicted actions to raw units.
         in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
         out_key (NestedKey): raw actions ``[*B, T, act]``, the last out-key; frame ``t`` holds the action from ``x_t``
@@ -36,28 +38,26 @@ class InverseDynamics(TensorDictModuleBase):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules import InverseDynamics
-        >>> from torchrl_koap.modules.time_alignment import FrameGatherer
+        >>> from torchrl_koap.modules import InverseDynamics, WindowReader
         >>> class NextStep(InverseDynamics):
-        ...     def forward(self, tensordict):
-        ...         read = self.reader.gather(tensordict.get(self.in_key))
-        ...         return tensordict.set(self.out_key, read[..., -1, :])
-        >>> model = NextStep(FrameGatherer(1, num_past=0, look_ahead=1, least=1))
+        ...     def predict(self, state, frames=None):
+        ...         return self.reader.gather(self.normalize_state(state), frames)[..., -1, :]
+        >>> model = NextStep(WindowReader(1, num_past=0, look_ahead=1, min_offset=1))
         >>> squares = torch.arange(4.0).square()[:, None]
         >>> model(TensorDict({"state": squares}))["action"].flatten().tolist()  # the last frame has no successor
         [1.0, 3.0, 5.0, 0.0]
-        >>> model.num_past, model.num_window_frames, model.span(4)
+        >>> model.num_past, model.num_window_frames, model.valid_frames(4)
         (0, 2, range(0, 3))
     """
 
-    reader: FrameGatherer | None
-    state_normalizer: nn.Module | None
-    action_normalizer: nn.Module | None
+    reader: WindowReader | None
 
     def __init__(
         self,
-        reader: FrameGatherer | None = None,
+        reader: WindowReader | None = None,
         *,
+        columns: Sequence[int] | None = None,
+        targets: Sequence[int] = (),
         state_normalizer: nn.Module | None = None,
         action_normalizer: nn.Module | None = None,
         in_key: NestedKey = STATE,
@@ -65,7 +65,9 @@ class InverseDynamics(TensorDictModuleBase):
     ):
         super().__init__()
         self.in_keys, self.out_keys = [in_key], [out_key]
-        self.reader = reader
+        self.register_module("reader", reader)  # where a part holds it, a property of the subclass finds it there
+        self.columns = None if columns is None else list(columns)
+        self.targets = list(targets)
         self.state_normalizer, self.action_normalizer = state_normalizer, action_normalizer
 
     @property
@@ -100,48 +102,148 @@ class InverseDynamics(TensorDictModuleBase):
         """Frames of the shortest window in which a frame (number ``num_past``) has all it reads and its successor."""
         return self.reader.num_window_frames
 
-    def span(self, num_frames: int) -> range:
-        """Frames of a window of ``num_frames`` that count in the losses.
+    def valid_frames(self, num_frames: int) -> range:
+        """Returns the frames of a window of ``num_frames`` that count in the losses.
 
         Raises:
             ValueError: if the window is too short to hold one.
         """
-        return self.reader.span(num_frames)
+        return self.reader.valid_frames(num_frames)
 
     def normalize_state(self, state: Tensor) -> Tensor:
-        """Raw states ``[*B, T, d]`` to the networks' units."""
+        """Selects the columns of raw states ``[*B, T, d]`` that are read, in the networks' units."""
+        state = state if self.columns is None else state[..., self.columns]
         return state if self.state_normalizer is None else self.state_normalizer(state)
 
-    def normalize_action(self, action: Tensor) -> Tensor:
-        """Raw actions ``[*B, act]`` to the networks' units."""
+    def normalize_action(self, action: Tensor, state: Tensor) -> Tensor:
+        """Maps raw actions ``[*B, act]``, taken in states ``[*B, d]``, to the networks' units."""
+        action = action - state[..., self.targets] if self.targets else action
         return action if self.action_normalizer is None else self.action_normalizer(action)
 
-    def raw_action(self, action: Tensor) -> Tensor:
-        """Inverse of :meth:`normalize_action`: actions ``[*B, act]`` in raw units."""
-        return action if self.action_normalizer is None else self.action_normalizer.inverse(action)
+    def raw_action(self, action: Tensor, state: Tensor) -> Tensor:
+        """Inverts :meth:`normalize_action`."""
+        action = action if self.action_normalizer is None else self.action_normalizer.inverse(action)
+        return action + state[..., self.targets] if self.targets else action
 
-    @torch.no_grad()
-    def fit_scales(self, windows: Tensor) -> None:
-        """Sets the spread of every step read from windows of raw states ``[*B, T, d]``; no label is read.
+    def prepare(self, windows: Tensor, *, updates: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
+        """Sets before training what is known of the inputs: the spread of every step read.
 
-        Does nothing for a controller that has no ``reader``.
+        Args:
+            windows (Tensor): raw states ``[*B, T, d]``; no label is read.
+
+        Keyword Args:
+            updates (int): updates that a network may be trained for before its losses; here none is.
+            progress (callable, optional): called with the number of these updates that are done, and of all.
         """
         if self.reader is not None:
-            self.reader.fit_scales(self.normalize_state(windows))
+            self.reader.fit(self.normalize_state(windows))
+
+    def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Predicts actions in normalised units; a subclass says how.
+
+        Args:
+            state (Tensor): window of raw states ``[*B, T, d]``.
+            frames (range, optional): frames to predict for. Default: all ``T``; offsets beyond the window are clamped.
+
+        Returns:
+            Tensor: ``[*B, len(frames), act]``.
+        """
+        raise NotImplementedError
+
+    def finish(self, windows: Tensor) -> None:
+        """Fits after training, to raw states ``[*B, T, d]`` without labels, what is fitted then: here nothing."""
+
+    def fit_labels(
+        self,
+        windows: TensorDictBase,
+        mask: Tensor,
+        *,
+        groups: Tensor | None = None,
+        axes: Sequence[int] = (),
+        guessed: bool = False,
+    ) -> dict[str, Any]:
+        """Fits a decoder in closed form on the labelled frames of windows; a subclass that has one says how.
+
+        Args:
+            windows (TensorDictBase): raw states ``[*B, T, d]`` and actions ``[*B, T, act]``.
+            mask (Tensor): labelled frames to use, bool ``[*B, T]``; no action outside of it is read. Frames that do not
+                count in the losses (:meth:`valid_frames`) are left out.
+
+        Keyword Args:
+            groups (Tensor, optional): trajectory of every window, int64 ``[*B]``, left out together.
+            axes (sequence of int): the state column, of those read, that each action entry moves.
+            guessed (bool): the axes are only likely.
+
+        Returns:
+            dict: numbers for the summary, mostly :meth:`~torchrl_koap.modules.ridge.RidgeFit.summary`.
+
+        Raises:
+            ValueError: if no labelled frame counts, or shapes disagree.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no decoder in closed form")
+
+    def labelled_frames(
+        self,
+        read: Callable[[Tensor, range], Tensor],
+        windows: TensorDictBase,
+        mask: Tensor,
+        groups: Tensor | None = None,
+        *,
+        batch_size: int = 4096,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Selects what :meth:`fit_labels` fits a decoder to.
+
+        Args:
+            read (callable): maps raw states ``[N, T, d]`` and a range of frames to what the decoder reads of them,
+                ``[N, frames, m]``.
+            windows (TensorDictBase): as for :meth:`fit_labels`, as the following two.
+            mask (Tensor): labelled frames.
+            groups (Tensor, optional): trajectory of every window.
+
+        Keyword Args:
+            batch_size (int): windows that are read at once.
+
+        Returns:
+            tuple of Tensor: inputs ``[n, m]``, normalised actions ``[n, act]``, and groups ``[n]`` if they were given.
+
+        Raises:
+            ValueError: if no labelled frame counts, or shapes disagree.
+        """
+        shape = windows.get(self.in_key).shape[:-1]
+        if mask.shape != shape or mask.dtype != torch.bool:
+            raise ValueError(f"mask must be bool {list(shape)} ([*B, T]), got {mask.dtype} {list(mask.shape)}")
+        if groups is not None and groups.shape != shape[:-1]:
+            raise ValueError(f"groups must be {list(shape[:-1])} ([*B]), got {list(groups.shape)}")
+        frames = self.valid_frames(mask.shape[-1])
+        part = slice(frames.start, frames.stop)
+        mask = mask[..., part]
+        rows = mask.any(-1)
+        if not rows.any():
+            raise ValueError(f"no labelled frame lies in frames {frames.start}..{frames.stop - 1} of any window")
+        states, action, mask = windows.get(self.in_key)[rows], windows.get(self.out_key)[rows], mask[rows]
+        inputs = torch.cat([read(some, frames) for some in states.split(batch_size)])[mask]
+        action = self.normalize_action(action[:, part][mask], states[:, part][mask])
+        return inputs, action, None if groups is None else groups[rows].unsqueeze(-1).expand_as(mask)[mask]
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action of every frame."""
+        state = tensordict.get(self.in_key)
+        return tensordict.set(self.out_key, self.raw_action(self.predict(state), state))
 
 
 class LatentInverseDynamics(InverseDynamics):
-    """Base of the controllers with a latent: states to latents to actions.
+    """Base class of the controllers with a latent: states to latents to actions.
 
     A subclass says how a latent is inferred (:meth:`infer`). ``forward`` writes the latent under ``"latent_action"``
-    and then the raw action of every frame; offsets beyond the window are clamped to it.
+    and then the raw action of every frame.
 
     Args:
-        reader (FrameGatherer): gathers what a latent is inferred from.
+        reader (WindowReader, optional): reads what a latent is inferred from.
         action_decoder (nn.Module): maps latents to actions in normalised units.
 
     Keyword Args:
-        **kwargs: normalisers and keys, see :class:`InverseDynamics`.
+        **kwargs: columns, normalisers and keys, see :class:`InverseDynamics`.
 
     Examples:
         >>> import torch
@@ -151,13 +253,15 @@ class LatentInverseDynamics(InverseDynamics):
         (['latent_action', 'action'], torch.Size([3, 16, 8]))
     """
 
-    def __init__(self, reader: FrameGatherer, action_decoder: nn.Module, **kwargs):
+    samples_latents = False  # whether sample() draws from a distribution
+
+    def __init__(self, reader: WindowReader | None, action_decoder: nn.Module, **kwargs):
         super().__init__(reader, **kwargs)
         self.out_keys = [LATENT_ACTION, *self.out_keys]
         self.action_decoder = action_decoder
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Latents of a window of raw states; a subclass says how.
+        """Infers the latents of a window of raw states; a subclass says how.
 
         Args:
             state (Tensor): window of raw states ``[*B, T, d]``.
@@ -168,11 +272,22 @@ class LatentInverseDynamics(InverseDynamics):
         """
         raise NotImplementedError
 
+    def sample(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Samples latents, where there is a distribution of them; otherwise :meth:`infer`."""
+        return self.infer(state, frames)
+
     def decode(self, latent: Tensor) -> Tensor:
-        """Actions ``[*B, T, act]`` in normalised units."""
+        """Decodes latents ``[*B, T, m]`` to actions ``[*B, T, act]`` in normalised units."""
         return self.action_decoder(latent)
 
+    def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Predicts actions ``[*B, len(frames), act]`` in normalised units."""
+        return self.decode(self.infer(state, frames))
+
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes latent and action of every frame."""
-        latent = self.infer(tensordict.get(self.in_key))
-        return tensordict.set(self.out_keys[0], latent).set(self.out_key, self.raw_action(self.decode(latent)))
+        state = tensordict.get(self.in_key)
+        latent = self.infer(state)
+        tensordict.set(self.out_keys[0], latent)
+        return tensordict.set(self.out_key, self.raw_action(self.decode(latent), state))

@@ -4,50 +4,48 @@
 from __future__ import annotations
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from torchrl_koap.lookup import lookup
 
 
-def _minmax(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _minmax(values: Tensor) -> tuple[Tensor, Tensor]:
     low, high = values.amin(0), values.amax(0)
     return (high + low) / 2, (high - low) / 2
 
 
-def _standard(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _standard(values: Tensor) -> tuple[Tensor, Tensor]:
     return values.mean(0), values.std(0, correction=0)
 
 
-def _shared(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _shared(values: Tensor) -> tuple[Tensor, Tensor]:
     return values.mean(0), values.std(0, correction=0).amax().expand(values.shape[-1]).clone()
 
 
-def _rms(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _rms(values: Tensor) -> tuple[Tensor, Tensor]:
     return torch.zeros_like(values[0]), values.square().mean(0).sqrt()
 
 
-def _identity(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    return torch.zeros_like(values[0]), torch.ones_like(values[0])
-
-
-MODES = {"minmax": _minmax, "standard": _standard, "shared": _shared, "rms": _rms, "identity": _identity}
+MODES = {"minmax": _minmax, "standard": _standard, "shared": _shared, "rms": _rms}
 
 
 class Normalizer(nn.Module):
     r"""Shifts and scales each column: :math:`y = (x - \text{offset}) / \text{scale}`.
 
-    Made by :meth:`fit`. Without arguments it has no statistics: calling it is an error until a state dict with
-    statistics is loaded.
+    Changes nothing until it is given statistics: by :meth:`fit`, by the keywords, or by a state dict.
 
     Args:
-        offset (Tensor, optional): ``[d]``.
-        scale (Tensor, optional): ``[d]``, positive.
+        width (int): number of columns ``d``.
+
+    Keyword Args:
+        offset (Tensor, optional): ``[d]``. Defaults to 0.
+        scale (Tensor, optional): ``[d]``, positive. Defaults to 1.
 
     Shape:
         every method takes and gives ``[*B, d]``, in the floating type of its argument.
 
     Raises:
-        ValueError: if offset and scale do not fit each other, are not finite, or a scale is not positive.
+        ValueError: if offset and scale are not ``[d]``, not finite, or a scale is not positive.
 
     Examples:
         >>> import torch
@@ -57,37 +55,35 @@ class Normalizer(nn.Module):
         tensor([[-0.5000,  0.0000]])
         >>> normalizer.inverse(torch.tensor([[-0.5, 0.0]]))
         tensor([[1., 5.]])
-        >>> restored = Normalizer()
-        >>> _ = restored.load_state_dict(normalizer.state_dict())
-        >>> restored.scale
-        tensor([2., 1.])
+        >>> restored = Normalizer(2)
+        >>> restored.load_state_dict(normalizer.state_dict())
+        <All keys matched successfully>
     """
 
-    offset: torch.Tensor | None
-    scale: torch.Tensor | None
+    offset: Tensor
+    scale: Tensor
 
-    def __init__(self, offset: torch.Tensor | None = None, scale: torch.Tensor | None = None):
+    def __init__(self, width: int, *, offset: Tensor | None = None, scale: Tensor | None = None):
         super().__init__()
-        if (offset is None) != (scale is None):
-            raise ValueError("a normalizer needs both offset and scale, or neither")
-        if offset is not None:
-            if offset.ndim != 1 or offset.shape != scale.shape:
-                raise ValueError(f"offset and scale must be [d], got {list(offset.shape)} and {list(scale.shape)}")
-            if not offset.is_meta and not (offset.isfinite().all() and scale.isfinite().all() and (scale > 0).all()):
-                raise ValueError("offset must be finite, scale finite and positive")
-            offset, scale = offset.detach().clone(), scale.detach().clone()
+        offset = torch.zeros(width) if offset is None else offset.detach().clone()
+        scale = torch.ones(width) if scale is None else scale.detach().clone()
+        if offset.shape != (width,) or scale.shape != (width,):
+            raise ValueError(f"offset and scale must be [{width}], got {list(offset.shape)} and {list(scale.shape)}")
+        if not offset.is_meta and not (offset.isfinite().all() and scale.isfinite().all() and (scale > 0).all()):
+            raise ValueError("offset must be finite, scale finite and positive")
         self.register_buffer("offset", offset)
         self.register_buffer("scale", scale)
 
     @classmethod
-    def fit(cls, values: torch.Tensor, *, mode: str = "minmax", mask: torch.Tensor | None = None) -> Normalizer:
+    def fit(cls, values: Tensor, *, mode: str = "minmax", mask: Tensor | None = None) -> Normalizer:
         """Takes the statistics of a data set.
 
         Args:
             values (Tensor): ``[*N, d]``.
             mode (str): ``"minmax"`` maps the range of each column to [-1, 1], ``"standard"`` its mean and standard
-                deviation to 0 and 1, ``"rms"`` its root mean square to 1 and 0 to 0, ``"identity"`` changes nothing.
-                A column whose scale would be zero, up to rounding, keeps the scale 1.
+                deviation to 0 and 1, ``"shared"`` likewise with the largest standard deviation for all columns,
+                ``"rms"`` its root mean square to 1 and 0 to 0. A column whose scale would be zero, up to rounding,
+                keeps the scale 1.
             mask (Tensor, optional): ``[*N]`` or ``[*N, 1]`` bool, rows to use; the others may hold NaN. For actions
                 this is ``has_action``.
 
@@ -120,42 +116,23 @@ class Normalizer(nn.Module):
         rounding = 4 * torch.finfo(values.dtype).eps * rows.abs().amax(0)
         scale = torch.where(scale <= rounding, 1.0, scale)
         scale = torch.where(scale.to(values.dtype) > 0, scale, 1.0)  # too small for the type of the values
-        return cls(offset.to(values.dtype), scale.to(values.dtype))
+        return cls(rows.shape[-1], offset=offset.to(values.dtype), scale=scale.to(values.dtype))
 
-    @property
-    def is_fitted(self) -> bool:
-        """Whether there are statistics."""
-        return self.offset is not None
-
-    def forward(self, values: torch.Tensor) -> torch.Tensor:
+    def forward(self, values: Tensor) -> Tensor:
         """Normalises values ``[*B, d]``."""
         offset, scale = self._statistics(values)
         return (values - offset) / scale
 
-    def inverse(self, values: torch.Tensor) -> torch.Tensor:
+    def inverse(self, values: Tensor) -> Tensor:
         """Turns normalised values ``[*B, d]`` back."""
         offset, scale = self._statistics(values)
         return values * scale + offset
 
     def extra_repr(self) -> str:
-        """Size for printing."""
-        return f"{self.offset.shape[0]} columns" if self.is_fitted else "no statistics"
+        """Returns the size, for printing."""
+        return f"{len(self.offset)} columns"
 
-    def _statistics(self, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        if self.offset is None or self.scale is None:
-            raise RuntimeError("this normalizer has no statistics: use Normalizer.fit, or load a state dict with them")
+    def _statistics(self, values: Tensor) -> tuple[Tensor, Tensor]:
         if values.shape[-1:] != self.offset.shape:
-            raise ValueError(f"wanted {self.offset.shape[0]} columns, got shape {list(values.shape)}")
+            raise ValueError(f"wanted {len(self.offset)} columns, got shape {list(values.shape)}")
         return self.offset.to(values.dtype), self.scale.to(values.dtype)
-
-    def _load_from_state_dict(self, state_dict, prefix, local_metadata, strict, missing_keys, *args):
-        # buffers that are None are unknown to nn.Module: make room for the statistics, or report that they are missing
-        for name in ("offset", "scale"):
-            saved = state_dict.get(prefix + name)
-            if getattr(self, name) is None:
-                if saved is None:
-                    if strict:
-                        missing_keys.append(prefix + name)
-                else:
-                    setattr(self, name, torch.empty_like(saved, device=torch.get_default_device()))
-        super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing_keys, *args)

@@ -158,7 +158,8 @@ class WindowLoss(LossModule):
         action = read_entry(tensordict, self.tensor_keys.action)[..., frames, :]
         counts = read_mask(tensordict, self.tensor_keys.has_action, state)[..., frames] & recorded[..., frames]
         # zeroed before the residual: masking afterwards would leave NaN in the gradient
-        return self.network.normalize_action(torch.where(counts.unsqueeze(-1), action, 0.0)), counts
+        action = torch.where(counts.unsqueeze(-1), action, 0.0)
+        return self.network.normalize_action(action, state[..., frames, :]), counts
 
     def _action_error(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Mean squared error ``[*B, frames]`` of actions that must have as many columns as they are decoded to."""

@@ -15,10 +15,9 @@ from torchrl_koap.objectives.base import WindowLoss
 
 
 class QuantizedDynamicsLoss(WindowLoss):
-    """Error of the next step, at unit scale, predicted from the past and the code of the transition, ``loss_dynamics``.
+    """Computes the error of the next step, predicted from the past and the code of the transition, ``loss_dynamics``.
 
-    No label is read: actions are decoded by :class:`~torchrl_koap.objectives.LatentDecoderLoss`, afterwards (LAPO) or,
-    with ``train_encoder=True``, in the same update (the first public code).
+    No label is read: actions are decoded by :class:`~torchrl_koap.objectives.ActionLoss`, afterwards.
 
     Args:
         network (QuantizedInverseDynamics): the model.
@@ -48,9 +47,8 @@ class QuantizedDynamicsLoss(WindowLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Computes the loss from ``state``."""
         state, recorded = self._inputs(tensordict)
-        span = self.network.span(state.shape[-2])
+        span = self.network.valid_frames(state.shape[-2])
         with self.network_params.to_module(self.network, preserve_module_state=False):
-            read = self.network.read(state, span)
-            past, step = self.network.split(read)
-            error = (self.network.predict_step(past, self.network.quantized(read)) - step).square().mean(-1)
+            predicted, step = self.network.predict_step(state, span)
+            error = (predicted - step).square().mean(-1)
         return TensorDict({"loss_dynamics": self._reduce(error, recorded[..., span.start : span.stop])})

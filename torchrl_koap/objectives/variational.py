@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-r"""The loss of the variational auto-encoder of short trajectories.
+r"""The loss of the variational auto-encoder of windows.
 
 .. math::
-    L = \overline{|g_\psi(u_t, x_t) - s_t|^2} + \beta \, \overline{D_{KL}(q(u_t \mid s_t, x_t) \,\|\, N(0, 1))},
+    L = \overline{|g_\psi(u_t) - s_t|^2} + \beta \, \overline{D_{KL}(q(u_t \mid x_{0:T}) \,\|\, N(0, 1))},
     \qquad u_t = \mu_t + \sigma_t \epsilon
 """
 
@@ -20,11 +20,10 @@ from torchrl_koap.objectives.base import WindowLoss
 
 
 class VariationalLoss(WindowLoss):
-    """Reconstruction of the steps around a frame from a sampled latent, and the divergence of the latent.
+    """Computes the error of what frames read, reconstructed from sampled latents, and the divergence of the latents.
 
     The squared error is averaged over the entries of a reconstruction, at unit scale; the divergence is summed over
-    those of a latent. No label is read: actions are decoded by :class:`~torchrl_koap.objectives.LatentDecoderLoss`,
-    afterwards (the paper) or, with ``train_encoder=True``, in the same update (the first public code).
+    those of a latent. No label is read: :class:`~torchrl_koap.objectives.ActionLoss` fits the action decoder.
 
     Args:
         network (VariationalInverseDynamics): the model.
@@ -81,14 +80,12 @@ class VariationalLoss(WindowLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Computes both terms from ``state``."""
         state, recorded = self._inputs(tensordict)
-        span = self.network.span(state.shape[-2])
+        span = self.network.valid_frames(state.shape[-2])
         counts = recorded[..., span.start : span.stop]
         with self.network_params.to_module(self.network, preserve_module_state=False):
-            read = self.network.read(state, span)
-            present, steps = self.network.split(read)
-            mean, log_variance = self.network.posterior(read)
+            read, mean, log_variance = self.network.posterior(state, span)
             sample = mean + (0.5 * log_variance).exp() * self._noise(tensordict, mean)
-            error = (self.network.reconstruct(sample, present) - steps).square().mean(-1)
+            error = (self.network.reconstruct(sample) - read).square().mean(-1)
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1)
         losses = {
             "loss_reconstruction": self._reduce(error, counts),

@@ -29,8 +29,6 @@ CONTROLLER = {
     "decoder": str | None,
     "preset": str,
     "state": str,
-    "revised": bool,
-    "lifting": str,
 }
 _LARGEST = 2**63 - 1
 

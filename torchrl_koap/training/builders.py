@@ -10,17 +10,9 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import Normalizer
+from torchrl_koap.modules import PRESETS, Normalizer
 from torchrl_koap.training.method import Method, normalizers_of
 from torchrl_koap.training.methods import get_method
-
-# what every preset was designed with: how states and actions are normalised
-NORMALIZATION = {
-    "default": {"state": "standard", "action": "rms"},
-    "semi_supervised": {"state": "standard", "action": "rms"},
-    "paper": {"state": "minmax", "action": "minmax"},
-    "released": {"state": "minmax", "action": "minmax"},
-}
 
 
 def build_controller(
@@ -48,14 +40,11 @@ def build_controller(
         ValueError: for an unknown method, decoder or preset.
     """
     method = method_named(options) if method is None else method
-    modes = lookup(NORMALIZATION, options["preset"], "preset")
+    modes = lookup(PRESETS, options["preset"], "preset")["normalization"]
     if labelled is None:
-        normalizers = normalizers_of(Normalizer(), Normalizer())
+        normalizers = normalizers_of(Normalizer(state_dim), Normalizer(action_dim))
     else:
         seen = labelled["has_action"] if method.labelled_only else None
-        if options.get("absolute") and options["preset"] == "default":
-            # places are far from zero compared with their spread; among principal components size is information
-            modes = {"state": "shared", "action": "standard"}
         normalizers = normalizers_of(
             Normalizer.fit(labelled["state"], mode=modes["state"], mask=seen),
             Normalizer.fit(labelled["action"], mode=modes["action"], mask=labelled["has_action"]),
@@ -69,5 +58,4 @@ def method_named(options: Mapping[str, Any]) -> Method:
     Raises:
         ValueError: if there is none.
     """
-    method = get_method(options["method"], options.get("decoder"))
-    return get_method(method.earlier) if method.earlier and not options.get("revised") else method
+    return get_method(options["method"], options.get("decoder"))

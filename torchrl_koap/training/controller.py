@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -15,17 +14,16 @@ from torch import nn
 from torchrl_koap.data import cut_windows, extrapolate_ends, make_window_buffer
 from torchrl_koap.data.pseudo_labels import relabel
 from torchrl_koap.modules import KoopmanInverseDynamics
-from torchrl_koap.modules.koopman.compact_lifting import UNFOLD_UPDATES
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import training_dtype
-from torchrl_koap.runs.progress import count_up_to, progress_bar, show_losses
+from torchrl_koap.runs.progress import progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import save_tensors, save_weights
 from torchrl_koap.tasks import HORIZON, WINDOW
 from torchrl_koap.training.builders import build_controller
-from torchrl_koap.training.closed_form import fit_closed_form, likely_axes
+from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.loop import moving_average, train_phase
-from torchrl_koap.training.method import COEFFICIENTS, LABELLED_SHARES, Method, Phase
+from torchrl_koap.training.method import LABELLED_SHARES, Method, Phase
 from torchrl_koap.training.planner import WEIGHT_DECAY, augmentation
 from torchrl_koap.training.posture import POSTURE_SHARE, UPDATES, fit_posture
 from torchrl_koap.training.resolved import ResolvedConfig
@@ -129,12 +127,15 @@ def _train_network(
     windows = cut_windows(data, window, select=["state", "has_action"], pad_before=history)
     if method.labelled_only:
         windows = windows[windows["has_action"].squeeze(-1).any(-1)]
-    controller.fit_scales(windows["state"])
-    values: dict[str, float] = {}
     budget = train_one.controller_budget
-    if budget and method.phases and getattr(controller, "unfolds", False):
-        with progress_bar(2 * min(budget, UNFOLD_UPDATES), "unfolding", smoothing=0.05, mininterval=0.5) as bar:
-            controller.unfold(windows["state"], min(budget, UNFOLD_UPDATES), count_up_to(bar))
+    with progress_bar(None, "lifting", delay=0.5, mininterval=0.5) as bar:  # most have nothing to train before
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        controller.prepare(windows["state"], updates=budget if method.phases else 0, progress=progress)
+    values: dict[str, float] = {}
     for phase in method.phases if budget else ():
         buffer = make_window_buffer(
             data,
@@ -154,21 +155,16 @@ def _train_network(
         )
     controller.eval()
     fit: dict[str, Any] = {}
-    if hasattr(controller, "fit_unlabelled"):
-        controller.fit_unlabelled(windows["state"])
+    controller.finish(windows["state"])
     if method.closed_form:
-        columns = task.controller_columns(options.controller_state)
-        fit = fit_closed_form(
-            controller, data, shared_axes=task.moved_columns(), guessed_axes=likely_axes(task, columns)
-        )
+        fit = fit_closed_form(controller, data, **axes_of(task, task.controller_columns(options.controller_state)))
     return controller, fit, values
 
 
 def _coefficients(options: TrainConfig, phase: Phase) -> dict[str, float]:
     """The coefficients that were asked for, of those that the loss of a phase takes."""
-    takes = inspect.signature(phase.loss).parameters
-    asked = {name: getattr(options, name) for name in COEFFICIENTS if name in takes}
-    return {name: value for name, value in asked.items() if value is not None}
+    asked = {"koopman_coeff": options.koopman_coeff, "action_coeff": options.action_coeff}
+    return {name: asked[name] for name in phase.coefficients if asked[name] is not None}
 
 
 def _train_policy(

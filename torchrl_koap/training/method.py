@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -30,14 +29,15 @@ class Phase:
         loss (callable): the loss of a network, a ``LossModule`` whose ``loss_*`` entries are minimised and logged.
         windows (str): ``"all"`` (labelled or not), ``"mixed"`` (a quarter of every batch has labels) or ``"labelled"``.
         share (float): of the updates that a controller may have.
+        coefficients (tuple of str): those of :data:`COEFFICIENTS` that ``loss`` takes as keyword arguments.
 
     Raises:
         ValueError: for an unknown kind of windows, or a share outside (0, 1].
 
     Examples:
-        >>> from torchrl_koap.objectives import InverseDynamicsLoss
+        >>> from torchrl_koap.objectives import ActionLoss
         >>> from torchrl_koap.training import Phase
-        >>> Phase("controller", InverseDynamicsLoss, "labelled").share
+        >>> Phase("controller", ActionLoss, "labelled").share
         1.0
     """
 
@@ -45,6 +45,7 @@ class Phase:
     loss: Callable[[Any], LossModule]
     windows: str = "all"
     share: float = 1.0
+    coefficients: tuple[str, ...] = ()
 
     def __post_init__(self):
         lookup(LABELLED_SHARES, self.windows, "kind of windows")
@@ -58,9 +59,8 @@ class Method:
 
     A ``"controller"`` maps windows of states ``[*B, T, d]`` to actions ``[*B, T, act]`` and follows the plans of the
     planner that all controllers share: a :class:`~torchrl_koap.modules.InverseDynamics`, whose docstring lists what is
-    asked of one. With ``closed_form`` it also has ``fit_decoder(windows, mask, groups=)``, called once after all
-    updates with windows of which frame ``num_past`` counts where ``mask`` is True; it returns numbers for the summary,
-    or a :class:`~torchrl_koap.modules.RidgeFit`.
+    asked of one. With ``closed_form`` its ``fit_labels`` is called once after all updates, with windows of which frame
+    ``num_past`` counts where ``mask`` is True; it returns numbers for the summary.
 
     A ``"policy"`` has no planner beside it: see :class:`~torchrl_koap.modules.DiffusionPolicy` for what it offers.
 
@@ -84,8 +84,6 @@ class Method:
         keeps_posture (bool): its controller has a ``posture`` (:class:`~torchrl_koap.modules.CommandPosture`), fitted
             to the commands of labelled steps; plans are followed by it
             (:class:`~torchrl_koap.modules.PostureTracking`); ``build`` finds it under ``"posture"``.
-        earlier (str): the method that runs hold which name this one but were trained before it was what it is now:
-            those whose ``controller`` entry does not say ``"revised"``.
 
     Raises:
         ValueError: for an unknown kind, a name that cannot be a folder's, or two phases of one name.
@@ -109,7 +107,6 @@ class Method:
     teacher: str = ""
     other_decoder: str = ""
     presets: tuple[str, ...] = ("default",)
-    earlier: str = ""
     tracks: bool = False
     keeps_posture: bool = False
 
@@ -141,9 +138,7 @@ def loss_coefficients(method: Method) -> set[str]:
         >>> sorted(loss_coefficients(get_method("koap_paper"))), loss_coefficients(get_method("dd"))
         (['action_coeff', 'koopman_coeff'], set())
     """
-    return {
-        name for phase in method.phases for name in inspect.signature(phase.loss).parameters if name in COEFFICIENTS
-    }
+    return {name for phase in method.phases for name in phase.coefficients}
 
 
 def normalizers_of(state: nn.Module, action: nn.Module) -> Mapping[str, nn.Module]:

@@ -35,15 +35,12 @@ from torchrl_koap.modules import (
     QuantizedInverseDynamics,
     SupervisedInverseDynamics,
     VariationalInverseDynamics,
-    WindowVariationalInverseDynamics,
     make_koopman_inverse_dynamics,
 )
 from torchrl_koap.objectives import (
+    ActionLoss,
     DiffusionPolicyLoss,
-    InverseDynamicsLoss,
     KOAPLoss,
-    LatentDecoderLoss,
-    NonlinearLoss,
     QuantizedDynamicsLoss,
     VariationalLoss,
 )
@@ -55,15 +52,8 @@ from torchrl_koap.training.posture import build_posture
 LOOK_AHEAD = (1, 2, 3, 4, 5)
 GROUP = "torchrl_koap.methods"  # of entry points
 
-# where actions say where the robot is to be, what is read off the present frame counts more than the steps around it
-PLACE = {"place": 1.0, "curvature": 10.0, "position_scale": 2.0, "motion_scale": 3.0, "num_features": 1024}
-
 
 def _koap(state_dim, action_dim, normalizers, options, **overrides):
-    if options.get("absolute") and PRESETS[options["preset"]]["network"] == "fourier":
-        overrides = PLACE | overrides
-    if "lifting" in PRESETS[options["preset"]]:  # runs of before had no other and did not say so
-        overrides = {"lifting": options.get("lifting", "single")} | overrides
     return make_koopman_inverse_dynamics(state_dim, action_dim, preset=options["preset"], **normalizers, **overrides)
 
 
@@ -107,15 +97,12 @@ def without_actions(network: nn.Module, *, koopman_coeff: float = 1.0) -> LossMo
     return KOAPLoss(network, action_coeff=0.0, koopman_coeff=koopman_coeff)
 
 
-_LABELS = (Phase("controller", InverseDynamicsLoss, "labelled"),)
-_JOINT = (Phase("controller", KOAPLoss, "mixed"),)
+_BOTH = ("koopman_coeff", "action_coeff")
+_UNLABELLED = Phase("controller", without_actions, coefficients=("koopman_coeff",))
+_LABELS = (Phase("controller", ActionLoss, "labelled"),)
+_JOINT = (Phase("controller", KOAPLoss, "mixed", coefficients=_BOTH),)
 # the decoder that is fitted afterwards, on a frozen encoder
-_DECODER = Phase("decoder", LatentDecoderLoss, "labelled", share=0.5)
-
-
-def _decoder_of_samples(network: nn.Module) -> LossModule:
-    """Fits the action decoder to samples of the latent instead of its mean."""
-    return LatentDecoderLoss(network, samples=True)
+_DECODER = Phase("decoder", partial(ActionLoss, freeze_latents=True), "labelled", share=0.5)
 
 
 _POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
@@ -159,7 +146,7 @@ for _method in (
         "koap",
         "KOAP",
         _koap,
-        (Phase("controller", without_actions),),
+        (_UNLABELLED,),
         closed_form=True,
         other_decoder="koap_sgd",
         presets=_ANY_PRESET,
@@ -168,7 +155,7 @@ for _method in (
         "koap_mpc",
         "KOAP, plans followed by prediction",
         _koap_mpc,
-        (Phase("controller", without_actions),),
+        (_UNLABELLED,),
         closed_form=True,
         presets=_ANY_PRESET,
         tracks=True,
@@ -177,7 +164,7 @@ for _method in (
         "koap_posture",
         "KOAP, plans followed by the commands of their states",
         _koap_posture,
-        (Phase("controller", without_actions),),
+        (_UNLABELLED,),
         closed_form=True,
         presets=_ANY_PRESET,
         keeps_posture=True,
@@ -188,7 +175,7 @@ for _method in (
         "koap_labelled_only",
         "KOAP, labelled windows alone",
         _koap,
-        (Phase("controller", without_actions, "labelled"),),
+        (replace(_UNLABELLED, windows="labelled"),),
         closed_form=True,
         labelled_only=True,
         presets=_ANY_PRESET,
@@ -198,7 +185,10 @@ for _method in (
         "pretrain",
         "KOAP, pre-trained and fine-tuned",
         _koap,
-        (Phase("controller", without_actions, share=0.5), Phase("finetune", KOAPLoss, "labelled", share=0.5)),
+        (
+            replace(_UNLABELLED, share=0.5),
+            Phase("finetune", KOAPLoss, "labelled", share=0.5, coefficients=_BOTH),
+        ),
         presets=_ANY_PRESET,
     ),
     Method("linear_steps", "ridge on KOAP's scaled steps", partial(_koap, num_features=0), closed_form=True),
@@ -214,15 +204,11 @@ for _method in (
     Method(
         "vae",
         "variational autoencoder of whole windows",
-        partial(_network, kind=WindowVariationalInverseDynamics),
-        (Phase("controller", VariationalLoss, share=0.5), replace(_DECODER, loss=_decoder_of_samples)),
-        earlier="vae_steps",
-    ),
-    Method(
-        "vae_steps",
-        "variational autoencoder of the steps around a frame",
         partial(_network, kind=VariationalInverseDynamics),
-        (Phase("controller", VariationalLoss, share=0.5), _DECODER),
+        (
+            Phase("controller", VariationalLoss, share=0.5),
+            replace(_DECODER, loss=partial(ActionLoss, freeze_latents=True, sample=True)),
+        ),
     ),
     Method(
         "lapo",
@@ -234,7 +220,7 @@ for _method in (
         "nonlinear",
         "KOAP with nonlinear maps",
         partial(_network, kind=NonlinearInverseDynamics),
-        (Phase("controller", NonlinearLoss, "mixed"),),
+        _JOINT,
     ),
     Method("dp", "Diffusion Policy", _diffusion_policy, _POLICY, kind="policy"),
     Method(
@@ -243,7 +229,6 @@ for _method in (
         partial(_supervised, look_ahead=1),
         _LABELS,
         teacher="dd_lookahead",
-        earlier="dp_relabel",
     ),
     Method(
         "dp_relabel",

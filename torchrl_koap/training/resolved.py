@@ -110,22 +110,18 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
     else:
         planner = _planner_entry(options, task, method)
     preset = options.preset or _own_preset(method, task)
+    if preset == "default" and not task.delta_actions and not task.targets:
+        preset = "absolute"
     controller: dict[str, Any] = {
         "method": options.method,
         "decoder": options.decoder,
         "preset": preset,
         "state": options.controller_state if method.has_planner else "all",
     }
-    if "lifting" in PRESETS[preset]:
-        controller["lifting"] = PRESETS[preset]["lifting"]
-    if method.earlier:
-        controller["revised"] = True
     if method.tracks:
         controller["tracking"] = tracked_columns(task)
     if method.keeps_posture:
         controller["posture"] = posture_columns(task)
-    if not task.delta_actions and not task.targets:
-        controller["absolute"] = True
     return ResolvedConfig(
         options=options,
         task=task,

@@ -31,7 +31,7 @@ def embedded(motion, columns=24, noise=0.02):
 
 def train(lifting, windows, steps=250):
     """A short training on the reconstruction alone."""
-    lifting.fit_unlabelled(windows)
+    lifting.prepare(windows)
     optimiser = torch.optim.Adam(lifting.parameters(), 5e-3)
     for step in range(steps):
         batch = windows[torch.randint(len(windows), (32,), generator=torch.Generator().manual_seed(step))]
@@ -93,7 +93,8 @@ class TestCompactLifting:
         windows = embedded(turning(bodies=bodies).sin())
         lifting = CompactLifting(24, 2)
         train(lifting, windows)
-        assert lifting.choose_size(windows) == kept
+        lifting.finish(windows)
+        assert int(lifting.kept.sum()) == kept
         lifted = lifting.encode(windows)
         assert (lifted.flatten(0, 1).std(0) > 1e-3).sum() == kept
         error = (lifting.decode(lifted) - windows).square().mean() / windows.var()
@@ -105,14 +106,14 @@ class TestCompactLifting:
         windows = windows + 0.02 * torch.randn(windows.shape, generator=torch.Generator().manual_seed(0))
         torch.manual_seed(0)
         lifting, told = CompactLifting(24, 1), []
-        lifting.fit_unlabelled(windows)
+        lifting.prepare(windows)
 
         def matches():
             lifted = lifting.small.encode(lifting.components(windows)).flatten()
             return torch.corrcoef(torch.stack([lifted, place.flatten()]))[0, 1].abs()
 
         assert matches() < 0.9
-        lifting.unfold(windows, 300, lambda done, wanted: told.append((done, wanted)))
+        lifting.pretrain(windows, 300, lambda done, wanted: told.append((done, wanted)))
         assert matches() > 0.99
         assert told[0] == (1, 600) and told[-1] == (600, 600)
         error = lifting.reconstruction_error(lifting.encode(windows), windows).mean()
@@ -121,7 +122,7 @@ class TestCompactLifting:
     def test_training_makes_the_error_smaller(self):
         windows = embedded(turning(bodies=2).sin())
         lifting = CompactLifting(24, 2)
-        lifting.fit_unlabelled(windows)
+        lifting.prepare(windows)
         before = lifting.reconstruction_error(lifting.encode(windows), windows).mean()
         train(lifting, windows)
         assert lifting.reconstruction_error(lifting.encode(windows), windows).mean() < 0.5 * before
@@ -129,7 +130,7 @@ class TestCompactLifting:
     def test_the_error_counts_components_by_how_far_they_stand_out(self):
         windows = embedded(turning(bodies=2).sin())
         lifting = CompactLifting(24, 2)
-        lifting.fit_unlabelled(windows)
+        lifting.prepare(windows)
         lifted, weights = lifting.encode(windows), lifting.components.weights
         assert weights.max() > 2 * weights[weights > 0].min()
         target = windows @ lifting.components.analysis.mT
@@ -142,12 +143,12 @@ class TestCompactLifting:
     def test_coordinates_left_out_do_not_shrink_the_others(self):
         windows = embedded(turning(bodies=2).sin())
         lifting = CompactLifting(24, 2)
-        lifting.fit_unlabelled(windows)
+        lifting.prepare(windows)
         sizes = []
         for kept in ([1, 1, 0, 0, 0, 0], [0, 0, 1, 1, 1, 1]):
             lifting.kept.copy_(torch.tensor(kept))
             infer = LatentActionSmoothed(lifting, 0, num_past=8, look_ahead=range(2, 9))
-            infer.fit_unlabelled(windows)
+            infer.finish(windows)
             motion = infer.infer(infer.gather(windows, range(8, 9)))[..., : infer.lifted.latent_dim]
             sizes.append(motion.square().sum(-1).mean())
         torch.testing.assert_close(torch.stack(sizes), torch.ones(2), rtol=0.05, atol=0)
@@ -155,8 +156,8 @@ class TestCompactLifting:
     def test_its_size_is_kept_by_the_weights(self):
         windows = embedded(turning().sin())
         lifting, other = CompactLifting(24, 2), CompactLifting(24, 2)
-        lifting.fit_unlabelled(windows)
-        lifting.choose_size(windows)
+        lifting.prepare(windows)
+        lifting.finish(windows)
         other.load_state_dict(lifting.state_dict())
         torch.testing.assert_close(other.encode(windows), lifting.encode(windows))
 
@@ -174,14 +175,14 @@ class TestCompactLifting:
     def test_the_model_of_the_preset(self):
         model = make_koopman_inverse_dynamics(24, 2, preset="semi_supervised", num_features=16)
         windows = embedded(turning().sin())
-        model.fit_scales(windows)
+        model.prepare(windows)
         batch = TensorDict({"state": windows, "action": torch.zeros(400, 17, 2)}, [400])
         batch["has_action"] = torch.zeros(400, 17, 1, dtype=torch.bool)
         losses = KOAPLoss(model)(batch)
         sum(losses[name] for name in ("loss_reconstruction", "loss_koopman")).backward()
         for network in (model.lifting.small, model.lifting.large):
             assert network.encoder[0].weight.grad is not None
-        model.fit_unlabelled(windows)
+        model.finish(windows)
         assert int(model.lifting.kept.sum()) in (2, 4)
 
     def test_narrow_states_are_kept_as_they_are(self):

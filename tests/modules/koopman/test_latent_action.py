@@ -59,27 +59,6 @@ def test_absolute_frames_are_gathered_as_they_are():
         assert torch.equal(read[:, t - 1], expected)
 
 
-@pytest.mark.parametrize("kind", [LatentActionMLP, LatentActionFourier])
-def test_relative_frames_have_unit_spread_and_the_current_one_is_untouched(kind):
-    more = {} if kind is LatentActionFourier else {"relative": True}
-    network = kind(2, 3, num_past=2, look_ahead=(2, 4), **more)
-    state = windows(200) * torch.tensor([1e-3, 50.0]) + 7.0
-    span = network.span(16)
-    plain = network.gather(state, span)
-    for t in span:
-        x = {offset: state[:, t + offset] for offset in (-2, -1, 0, 2, 4)}
-        expected = torch.stack([x[-1] - x[-2], x[0] - x[-1], x[0], x[2] - x[0], x[4] - x[2]], 1)
-        torch.testing.assert_close(plain[:, t - span.start], expected)
-    network.fit_scales(state)
-    network.fit_scales(state.reshape(20, 10, 16, 2))  # again, with other batch dimensions: the same
-    scaled = network.gather(state, span)
-    assert torch.equal(scaled[..., 2, :], plain[..., 2, :])
-    spread = scaled.square().mean((0, 1)).sqrt()
-    torch.testing.assert_close(spread[[0, 1, 3, 4]], torch.ones(4, 2))
-    torch.testing.assert_close(network.scales[[0, 1, 3, 4]], plain.square().mean((0, 1)).sqrt()[[0, 1, 3, 4]])
-    assert "scales" in network.state_dict()
-
-
 def test_relative_latent_actions_of_a_shifted_window_differ_by_the_current_frame_alone():
     network = LatentActionFourier(2, 8, position_scale=1e9)
     state = windows(4)
@@ -89,24 +68,16 @@ def test_relative_latent_actions_of_a_shifted_window_differ_by_the_current_frame
     assert not torch.allclose(near.infer(near.gather(state)), near.infer(near.gather(moved)), atol=1e-3)
 
 
-def test_scales_of_a_column_that_never_moves_and_of_absolute_frames():
-    state = windows(50)
-    state[..., 1] = 4.0
-    network = LatentActionMLP(2, 3, relative=True)
-    network.fit_scales(state)
-    assert (network.scales[:, 1] == 1).all() and network.gather(state).isfinite().all()
-    absolute = LatentActionMLP(2, 3)
-    absolute.fit_scales(state)
-    assert (absolute.scales == 1).all()
-
-
 def test_a_window_too_short_leaves_the_scales_as_they_were():
     network = LatentActionMLP(2, 3, relative=True)
-    network.fit_scales(windows(50))
-    before = network.scales.clone()
+    network.prepare(windows(50))
+    before = network.reader.scales.clone()
     with pytest.raises(ValueError, match="too short"):
-        network.fit_scales(windows(50, num_frames=5))
-    assert torch.equal(network.scales, before) and not torch.equal(before, torch.ones_like(before))
+        network.prepare(windows(50, num_frames=5))
+    assert torch.equal(network.reader.scales, before) and not torch.equal(before, torch.ones_like(before))
+    absolute = LatentActionMLP(2, 3)
+    absolute.prepare(windows(50))
+    assert absolute.reader.scales is None and not any("scales" in name for name in absolute.state_dict())
 
 
 def test_the_lstm_reads_its_frames_in_order():
@@ -118,16 +89,6 @@ def test_the_lstm_reads_its_frames_in_order():
     for t in range(2, 12):
         last = reference(state[[t - 2, t - 1, t, t + 4]][None])[0][0, -1]
         torch.testing.assert_close(latent[t], network.readout(last))
-
-
-def test_linear_skip_is_added():
-    torch.manual_seed(0)
-    network = LatentActionMLP(2, 3, linear_skip=True, dropout=0.5)
-    frames = network.gather(windows(4))
-    assert not torch.equal(network.infer(frames), network.infer(frames))  # dropout while training
-    network.eval()
-    expected = network.network(frames.flatten(-2)) + frames.flatten(-2) @ network.skip.weight.T
-    torch.testing.assert_close(network.infer(frames), expected)
 
 
 # Fourier observables
@@ -144,7 +105,7 @@ def fourier_parts(num_features, curvature=0.3, motion_scale=0.7, position_scale=
         motion_scale=motion_scale,
         position_scale=position_scale,
     ).double()
-    frames = network.gather(windows(10, dtype=torch.float64), network.span(16)).flatten(0, 1)
+    frames = network.gather(windows(10, dtype=torch.float64), network.reader.valid_frames(16)).flatten(0, 1)
     motion = frames[:, [0, 2, 3]].flatten(1)  # D = 6 relative entries
     place = torch.cat([motion / (motion_scale * math.sqrt(6)), frames[:, 1] / position_scale], 1)
     kernel = motion @ motion.T / 6 + curvature * torch.exp(-torch.cdist(place, place).square() / 2)
@@ -192,9 +153,9 @@ def test_frequencies_are_drawn_anew_and_trained():
 def test_steps_tells_where_a_latent_action_holds_the_steps_of_an_axis():
     network = LatentActionFourier(3, 8, num_past=2, look_ahead=(2, 5))
     state = torch.randn(40, 16, 3, generator=torch.Generator().manual_seed(0)).cumsum(1)
-    network.fit_scales(state)
+    network.prepare(state)
     latent = network.infer(network.gather(state, range(4, 5)))[:, 0]
-    entries, factors = network.steps((2, 0))
+    entries, factors = network.axis_features((2, 0))
     expected = torch.stack([state[:, b] - state[:, a] for a, b in ((2, 3), (3, 4), (4, 6), (6, 9))], 1)[..., [2, 0]]
     torch.testing.assert_close(latent[:, entries] * factors, expected)
 
@@ -203,7 +164,7 @@ def test_the_place_is_a_further_linear_part_and_changes_nothing_else():
     torch.manual_seed(0)
     plain = LatentActionFourier(3, 8, num_past=1, look_ahead=(2, 3))
     torch.manual_seed(0)
-    placed = LatentActionFourier(3, 8, num_past=1, look_ahead=(2, 3), place=2.0)
+    placed = LatentActionFourier(3, 8, num_past=1, look_ahead=(2, 3), position_weight=2.0)
     frames = torch.randn(5, 4, 3)
     with_place = placed.infer(frames)
     assert placed.latent_dim == plain.latent_dim + 3 == with_place.shape[-1]

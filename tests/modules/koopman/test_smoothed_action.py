@@ -7,9 +7,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.modules import KoopmanLifting, Normalizer, make_koopman_inverse_dynamics
+from torchrl_koap.modules import PRESETS, KoopmanLifting, Normalizer, make_koopman_inverse_dynamics
 from torchrl_koap.modules.koopman.smoothed_action import LIFTED, RAW, LatentActionSmoothed
 from torchrl_koap.training.closed_form import fit_closed_form
+
+BLOCKS = (LIFTED, RAW)
 
 
 def make_infer(columns=2, dim=2, **options):
@@ -38,7 +40,7 @@ def make_data(columns, episodes=60, length=30, noise=0.0):
 def test_the_block_chosen_is_written_and_the_other_is_zero():
     infer = make_infer()
     windows = torch.randn(6, 17, 2).cumsum(1)
-    infer.fit_unlabelled(windows)
+    infer.finish(windows)
     size = infer.lifted.latent_dim
     latent = infer.infer(infer.gather(windows))
     assert latent.shape == (6, 17, infer.latent_dim) and (latent[..., size:] == 0).all() and latent[..., :size].any()
@@ -51,10 +53,10 @@ def test_the_block_chosen_is_written_and_the_other_is_zero():
 def test_the_successor_is_never_read():
     infer = make_infer()
     windows = torch.randn(6, 17, 2).cumsum(1)
-    infer.fit_unlabelled(windows)
+    infer.finish(windows)
     changed = windows.clone()
     changed[:, 9] += 1.0
-    for block in infer.choices:
+    for block in infer.blocks:
         infer.choose(block)
         before, after = (infer.infer(infer.gather(value, range(8, 9))) for value in (windows, changed))
         assert torch.equal(before, after)
@@ -77,21 +79,21 @@ def test_the_raw_block_may_not_reach_further():
 def test_steps_of_the_state_are_where_they_are_said_to_be():
     infer = make_infer()
     windows = torch.randn(50, 17, 2).cumsum(1)
-    infer.fit_unlabelled(windows)
+    infer.finish(windows)
     for block, past in ((LIFTED, 8), (RAW, 4)):
         infer.choose(block)
         if block == LIFTED:
             infer.smoother.gain.copy_(torch.eye(len(infer.smoother.gain)))
         latent = infer.infer(infer.gather(windows, range(8, 9)))[:, 0]
-        entries, factors = infer.steps([0, 1])
+        entries, factors = infer.axis_features([0, 1])
         steps = latent[:, entries] * factors
         torch.testing.assert_close(steps[:, past - 1], windows[:, 8] - windows[:, 7])
     assert infer.holds_steps
     wide = make_infer(columns=20)
     with pytest.raises(ValueError, match="no columns of the state"):
-        wide.steps([0])
+        wide.axis_features([0])
     held = []
-    for block in wide.choices:
+    for block in wide.blocks:
         wide.choose(block)
         held.append((block, wide.holds_steps))
     assert held == [(LIFTED, False), (RAW, True)]
@@ -110,33 +112,23 @@ def test_the_raw_block_is_kept_where_its_held_out_error_is_clearly_smaller(colum
         action_normalizer=Normalizer.fit(data["action"], mode="rms"),
     )
     windows = data["state"].view(-1, 30, columns)
-    model.fit_scales(windows)
-    model.fit_unlabelled(windows)
+    model.prepare(windows)
+    model.finish(windows)
     data["has_action"] = data["has_action"] & (data["episode"] < 3)[:, None]
     errors = {}
-    for block in model.latent_action.choices:
-        model.latent_action.choose(block)
-        errors[block] = fit_closed_form_of_block(model, data)
+    for block in BLOCKS:
+        with monkeypatch.context() as patch:
+            patch.setattr(LatentActionSmoothed, "blocks", (block,))
+            errors[block] = fit_closed_form(model, data)["held_out_error"]
     ratio = errors[RAW] / errors[LIFTED]
     for share, kept in ((1.01 * ratio, RAW), (0.99 * ratio, LIFTED)):
-        monkeypatch.setattr("torchrl_koap.training.closed_form.RAW_SHARE", share)
+        monkeypatch.setattr("torchrl_koap.modules.koopman.inverse_dynamics.RAW_SHARE", share)
         fit = fit_closed_form(model, data)
         assert fit["block"] == model.latent_action.chosen == kept
         assert fit["held_out_error"] == pytest.approx(errors[kept], rel=1e-4)
 
 
-def fit_closed_form_of_block(model, data):
-    """Held-out error of the block that is chosen."""
-    from torchrl_koap.data import cut_windows
-
-    windows = cut_windows(data, 17, select=["state", "action", "has_action", "episode"], pad_before=8)
-    mask = torch.zeros(windows["has_action"].shape[:2], dtype=torch.bool)
-    mask[:, 8] = windows["has_action"][:, 8, 0]
-    fit = model.fit_decoder(windows, mask, groups=windows["episode"][:, -1], bias=False)
-    return fit.errors[fit.penalty]
-
-
-@pytest.mark.parametrize("preset", ["default", "semi_supervised", "paper", "released"])
+@pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("columns", [2, 33, 2000])
 def test_every_preset_is_built_for_narrow_and_wide_states(preset, columns):
     model = make_koopman_inverse_dynamics(columns, 2, preset=preset)

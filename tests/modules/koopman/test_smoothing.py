@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchrl_koap.modules.koopman.smoothing import WindowSmoother, noise_covariance
+from torchrl_koap.modules.koopman.smoothing import WienerSmoother, noise_covariance
 
 FRAMES = [-4, -3, -2, -1, 0, 2, 3, 4]
 
@@ -30,7 +30,7 @@ def test_the_noise_of_every_column_is_found(noise):
 def test_smoothing_takes_noise_out_and_leaves_clean_windows():
     index = [4 + frame for frame in FRAMES]
     clean, noisy = make_motion(0.3)
-    smoother = WindowSmoother(len(index), 2)
+    smoother = WienerSmoother(len(index), 2)
     assert torch.allclose(smoother(noisy[:, index]), noisy[:, index], atol=1e-6)  # before the fit
     smoother.fit(noisy[:, index], noisy)
     error = (smoother(noisy[:, index]) - clean[:, index]).square().mean().sqrt()
@@ -43,13 +43,13 @@ def test_smoothing_takes_noise_out_and_leaves_clean_windows():
 def test_a_constant_column_is_no_division_by_zero():
     _, noisy = make_motion(0.3)
     noisy[..., 1] = 2.0
-    smoother = WindowSmoother(12, 2)
+    smoother = WienerSmoother(12, 2)
     smoother.fit(noisy, noisy)
     assert smoother.gain.isfinite().all() and torch.allclose(smoother(noisy)[..., 1], noisy[..., 1])
 
 
 def test_wrong_shapes_are_refused():
-    smoother = WindowSmoother(12, 2)
+    smoother = WienerSmoother(12, 2)
     with pytest.raises(ValueError, match=r"windows must be \[N, 12, 2\], got \[5, 11, 2\]"):
         smoother.fit(torch.zeros(5, 11, 2), torch.zeros(5, 11, 2))
     with pytest.raises(ValueError, match=r"T >= 5, d\], got \[5, 4, 2\]"):

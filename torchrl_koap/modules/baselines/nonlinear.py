@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,19 +13,18 @@ from torchrl.modules import MLP
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import LatentActionMLP
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
+from torchrl_koap.modules.windows import WindowReader
 
 
 class NonlinearInverseDynamics(LatentInverseDynamics):
-    r"""As KOAP, but with nonlinear latent dynamics and a nonlinear action decoder.
+    r"""Works as KOAP does, but with nonlinear latent dynamics and a nonlinear action decoder.
 
     .. math::
         z_t = g_\theta(x_t), \qquad u_t = f_\theta(x_{t-n}, \dots, x_t, x_{t+k}), \qquad
         \hat z_{t+1} = h_\theta(z_t, u_t), \qquad \hat a_t = d_\phi(u_t)
 
-    All parts are perceptrons and trained together by :class:`~torchrl_koap.objectives.NonlinearLoss`. As in KOAP,
+    All parts are perceptrons and trained together by :class:`~torchrl_koap.objectives.KOAPLoss`. As in KOAP,
     ``f`` reads steps at unit scale and never ``x_{t+1}``, which the dynamics have to predict.
-
-    KOAP's first public code has LSTMs in place of ``g``, ``h`` and ``d``.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -36,10 +36,7 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         lifting_dims (sequence of int): widths of ``g`` and its inverse. Defaults to ``(64, 64)``, as KOAP's default.
         num_past (int): number ``n`` of frames before the present one. Defaults to ``4``.
         look_ahead (int or sequence of int): offsets ``k >= 2``. Defaults to ``(2, 3, 4, 5)``.
-        state_normalizer (nn.Module, optional): maps raw states to the networks' units.
-        action_normalizer (nn.Module, optional): its ``inverse`` maps decoded actions to raw units.
-        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
-        out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
+        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
         ValueError: for a negative ``num_past`` or an offset below 2; at the call for states of another size.
@@ -54,8 +51,6 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         (torch.Size([3, 16, 2]), torch.Size([3, 16, 32]))
     """
 
-    reader: LatentActionMLP
-
     def __init__(
         self,
         state_dim: int,
@@ -68,21 +63,25 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         look_ahead: int | Sequence[int] = (2, 3, 4, 5),
         **kwargs,
     ):
-        reader = LatentActionMLP(
-            state_dim, latent_dim, hidden_dims=hidden_dims, num_past=num_past, look_ahead=look_ahead, relative=True
-        )
+        frames: dict[str, Any] = {"num_past": num_past, "look_ahead": look_ahead, "relative": True}
+        latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=hidden_dims, **frames)
         layers = {"num_cells": hidden_dims, "activation_class": nn.ReLU}
-        super().__init__(reader, MLP(latent_dim, action_dim, **layers), **kwargs)
-        self.latent_dim = latent_dim
+        super().__init__(None, MLP(latent_dim, action_dim, **layers), **kwargs)
+        self.latent_dim, self.latent_action = latent_dim, latent_action
         self.lifting = KoopmanLifting(state_dim, latent_dim, hidden_dims=lifting_dims)
         self.dynamics = MLP(2 * latent_dim, latent_dim, **layers)
 
+    @property
+    def reader(self) -> WindowReader:  # type: ignore[override]
+        """The reader of the network ``f``."""
+        return self.latent_action.reader
+
     def lift(self, state: Tensor) -> Tensor:
-        """Lifted states ``[*B, T, m]`` of raw states ``[*B, T, d]``."""
+        """Lifts raw states ``[*B, T, d]`` to ``[*B, T, m]``."""
         return self.lifting.encode(self.normalize_state(state))
 
     def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """The prediction of ``z_{t+1}``.
+        """Predicts ``z_{t+1}``.
 
         Args:
             lifted (Tensor): lifted states ``z_t``, ``[*B, T, m]``.
@@ -94,13 +93,5 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         return self.dynamics(torch.cat([lifted, latent_action], -1))
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Latent actions of a window of raw states.
-
-        Args:
-            state (Tensor): window of raw states ``[*B, T, d]``.
-            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
-
-        Returns:
-            Tensor: ``[*B, len(frames), m]``.
-        """
-        return self.reader.infer(self.reader.gather(self.normalize_state(state), frames))
+        """Infers the latent actions ``[*B, len(frames), m]`` of a window of raw states ``[*B, T, d]``."""
+        return self.latent_action.infer(self.latent_action.gather(self.normalize_state(state), frames))

@@ -4,23 +4,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
-from torchrl_koap.modules.koopman.action_decoder import INPUT_NOISE, LinearActionDecoder, RidgeFit
-from torchrl_koap.modules.time_alignment import FrameGatherer
+from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
+from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, ridge
+from torchrl_koap.modules.windows import WindowReader
 
 COUNTS = (2, 4, 8, 16, 32, 64)
 
 
 class PrincipalInverseDynamics(LatentInverseDynamics):
-    """Ridge regression from the leading principal components of what a window holds: a control for latent actions.
+    """Decodes the leading principal components of what a window holds by ridge regression.
 
     A window is the present frame and the scaled steps around it, those that ``semi_supervised`` reads. The components
-    come from all windows, labelled or not (:meth:`fit_unlabelled`); their number from the held-out labelled error.
+    come from all windows, labelled or not (:meth:`finish`); their number from the held-out labelled error.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -30,8 +32,8 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         counts (sequence of int): numbers of components to choose among. Defaults to ``(2, 4, 8, 16, 32, 64)``.
         num_past (int): frames before the present one. Defaults to ``8``.
         look_ahead (sequence of int): offsets ``k >= 2``. Defaults to ``(2, ..., 8)``.
-        default_penalty (float): ridge where fewer than three trajectories have labels. Defaults to ``0.15``.
-        **kwargs: normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
+        penalty (float): ridge where fewer than three trajectories have labels. Defaults to ``0.15``.
+        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Examples:
         >>> import torch
@@ -39,10 +41,10 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         >>> from torchrl_koap.modules.baselines.principal import PrincipalInverseDynamics
         >>> states = torch.randn(60, 17, 3).cumsum(1)
         >>> model = PrincipalInverseDynamics(3, 2, counts=(4, 48))
-        >>> model.fit_scales(states), model.fit_unlabelled(states)
+        >>> model.prepare(states), model.finish(states)
         (None, None)
         >>> windows = TensorDict({"state": states, "action": (states.roll(-2, 1) - states)[..., :2]}, [60])
-        >>> fit = model.fit_decoder(windows, torch.ones(60, 17, dtype=torch.bool))
+        >>> fit = model.fit_labels(windows, torch.ones(60, 17, dtype=torch.bool))
         >>> int(model.gate.sum()), model(windows.select("state"))["action"].shape
         (48, torch.Size([60, 17, 2]))
     """
@@ -58,26 +60,26 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         counts: Sequence[int] = COUNTS,
         num_past: int = 8,
         look_ahead: Sequence[int] = (2, 3, 4, 5, 6, 7, 8),
-        default_penalty: float = 0.15,
+        penalty: float = DEFAULT_PENALTY,
         **kwargs,
     ):
-        reader = FrameGatherer(state_dim, num_past=num_past, look_ahead=look_ahead)
+        reader = WindowReader(state_dim, num_past=num_past, look_ahead=look_ahead)
         self._counts = tuple(sorted({min(count, reader.num_features) for count in counts}))
         super().__init__(reader, LinearActionDecoder(self._counts[-1], action_dim), **kwargs)
-        self.default_penalty = default_penalty
+        self.penalty = penalty
         self.register_buffer("basis", torch.eye(self._counts[-1], reader.num_features))
         self.register_buffer("gate", torch.ones(self._counts[-1]))
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """The components ``[*B, len(frames), count]`` of windows of raw states; those not chosen are 0."""
+        """Computes the components ``[*B, len(frames), count]`` of windows of raw states; those not chosen are 0."""
         return self.reader(self.normalize_state(state), frames) @ self.basis.mT * self.gate
 
     def decode(self, latent: Tensor) -> Tensor:
-        """Actions in normalised units."""
+        """Decodes components ``[*B, T, count]`` to actions ``[*B, T, act]`` in normalised units."""
         return self.action_decoder.linear(latent)
 
     @torch.no_grad()
-    def fit_unlabelled(self, windows: Tensor, *, most: int = 4096) -> None:
+    def finish(self, windows: Tensor, *, most: int = 4096) -> None:
         """Sets the components to those of windows of raw states ``[N, T, d]``; no label is read.
 
         Args:
@@ -98,34 +100,33 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         self.basis.zero_()[: len(found)] = found.to(self.basis)
 
     @torch.no_grad()
-    def fit_decoder(self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None) -> RidgeFit:
+    def fit_labels(
+        self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None, **_: Any
+    ) -> dict[str, Any]:
         """Fits the ridge for every number of components and keeps the one with the smallest held-out error.
 
         Args:
-            windows (TensorDictBase): raw states ``[N, T, d]`` and actions ``[N, T, act]``.
-            mask (Tensor): labelled frames, bool ``[N, T]``.
-            groups (Tensor, optional): trajectory of every window, int64 ``[N]``, left out together.
+            windows (TensorDictBase): see :meth:`InverseDynamics.fit_labels`, as the following ones.
+            mask (Tensor): labelled frames.
+
+        Keyword Args:
+            groups (Tensor, optional): trajectory of every window.
 
         Returns:
-            RidgeFit: of the number chosen.
+            dict: penalty, number of labels and held-out error of the number chosen.
 
         Raises:
-            ValueError: if no labelled frame lies in the span.
+            ValueError: if no labelled frame counts, or shapes disagree.
         """
-        span = self.span(mask.shape[-1])
-        frames = slice(span.start, span.stop)
-        rows = mask[:, frames].any(-1)
-        mask = mask[rows][:, frames]
         self.gate.fill_(1.0)
-        latent = self.infer(windows.get(self.in_key)[rows], span)
-        action = windows.get(self.out_key)[rows][:, frames]
-        action = self.normalize_action(torch.where(mask.unsqueeze(-1), action, 0.0))
-        groups = None if groups is None else groups[rows].unsqueeze(-1).expand_as(mask)
-
-        def fit(count: int) -> RidgeFit:
-            self.gate.copy_(torch.arange(len(self.gate), device=self.gate.device) < count)
-            options = {"groups": groups, "default_penalty": self.default_penalty, "bias": False}
-            return self.action_decoder.fit_ridge(latent * self.gate, action, mask, input_noise=INPUT_NOISE, **options)
-
-        fits = {count: fit(count) for count in self._counts}
-        return fit(min(fits, key=lambda count: fits[count].errors[fits[count].penalty]))
+        latent, action, groups = self.labelled_frames(self.infer, windows, mask, groups)
+        numbers = torch.arange(len(self.gate), device=self.gate.device)
+        options: dict[str, Any] = {"groups": groups, "default_penalty": self.penalty, "bias": False}
+        fits = {
+            count: ridge(latent * (numbers < count), action, input_noise=INPUT_NOISE, **options)
+            for count in self._counts
+        }
+        best = min(fits, key=lambda count: fits[count].error)
+        self.gate.copy_(numbers < best)
+        self.action_decoder.assign(fits[best])
+        return fits[best].summary()

@@ -3,33 +3,92 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_koap.modules.baselines.finite_scalar_quantization import FiniteScalarQuantizer
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
-from torchrl_koap.modules.time_alignment import FrameGatherer
+from torchrl_koap.modules.windows import WindowReader
+
+
+class FiniteScalarQuantizer(nn.Module):
+    r"""Bounds every entry of a code and rounds it to one of a few levels; gradients pass straight through.
+
+    .. math::
+        c_i = \frac{1}{\lfloor L_i / 2 \rfloor}
+            \operatorname{round}(\tfrac{L_i - 1}{2} \tanh(z_i + s_i) - o_i),
+        \qquad o_i = \tfrac12 [L_i \text{ even}], \quad \tfrac{L_i - 1}{2} \tanh(s_i) = o_i
+
+    after Mentzer et al. 2023 (arXiv 2309.15505). An even number of levels has no middle one: they lie half a level
+    lower, and the shift ``s`` keeps 0 at the code 0. There is no codebook to train and no term for it in a loss; a
+    codebook is the ``prod(levels)`` codes there are. Several of them stand side by side.
+
+    Args:
+        features (int): size ``m`` of what is quantised; a linear map takes it to the entries of the codes, and a second
+            one the codes back to ``m``.
+
+    Keyword Args:
+        levels (sequence of int): levels of every entry, 3 or more. Defaults to ``(8, 5, 5, 5)``, 1000 codes.
+        num_codebooks (int): number ``C`` of codes side by side. Defaults to ``2``.
+
+    Shape:
+        ``forward``: ``[*B, m] -> [*B, m]``; codes are ``[*B, C * len(levels)]``.
+
+    Raises:
+        ValueError: for fewer than 3 levels or no codebook.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import FiniteScalarQuantizer
+        >>> quantizer = FiniteScalarQuantizer(16)
+        >>> quantizer(torch.randn(5, 7, 16)).shape
+        torch.Size([5, 7, 16])
+        >>> quantizer.quantize(torch.tensor([-9.0, -9.0, 0.0, 0.2, 9.0, 9.0, 0.0, 0.4])).tolist()
+        [-1.0, -1.0, 0.0, 0.0, 0.75, 1.0, 0.0, 0.5]
+    """
+
+    def __init__(self, features: int, *, levels: Sequence[int] = (8, 5, 5, 5), num_codebooks: int = 2):
+        super().__init__()
+        if not levels or min(levels) < 3:
+            raise ValueError(f"every entry of a code needs 3 levels or more, got levels {tuple(levels)}")
+        if num_codebooks < 1:
+            raise ValueError(f"num_codebooks must be >= 1, got {num_codebooks}")
+        self.num_codebooks, self.num_codes = num_codebooks, math.prod(levels)
+        self.levels = tuple(levels) * num_codebooks
+        self.project_in = nn.Linear(features, len(self.levels))
+        self.project_out = nn.Linear(len(self.levels), features)
+
+    def bound(self, values: Tensor) -> Tensor:
+        """Squashes values ``[*B, C * len(levels)]`` to the range of the levels, which are the whole numbers in it."""
+        levels = torch.tensor(self.levels, dtype=values.dtype, device=values.device)
+        half_range, offset = (levels - 1) / 2, (levels % 2 == 0).to(values.dtype) / 2
+        return half_range * (values + (offset / half_range).atanh()).tanh() - offset
+
+    def quantize(self, values: Tensor) -> Tensor:
+        """Rounds values to codes ``[*B, C * len(levels)]`` in [-1, 1]; the gradient is that of :meth:`bound`."""
+        bounded = self.bound(values)
+        half = torch.tensor([number // 2 for number in self.levels], device=values.device)
+        return (bounded + (bounded.round() - bounded).detach()) / half
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Maps features ``[*B, m]`` to ``[*B, m]`` by way of their code."""
+        return self.project_out(self.quantize(self.project_in(features)))
 
 
 class QuantizedInverseDynamics(LatentInverseDynamics):
-    r"""An inverse model squeezes the steps around a frame into a discrete code; a forward model predicts from it.
+    r"""Squeezes the steps around a frame into a discrete code, from which a forward model predicts the next state.
 
     .. math::
         u_t = \mathrm{FSQ}(f_\theta(s_t, x_t)), \qquad
         \hat x_{t+1} - x_t = h_\psi(x_{t-n+1} - x_{t-n}, \dots, x_t - x_{t-1}, x_t, u_t), \qquad a_t = d_\phi(u_t)
 
-    with ``s_t`` the steps between the frames ``x_{t-n}, ..., x_{t+k}``
-    (:class:`~torchrl_koap.modules.time_alignment.FrameGatherer`) and the quantisation of
-    :class:`~torchrl_koap.modules.baselines.finite_scalar_quantization.FiniteScalarQuantizer`. Trained in two stages:
-    :class:`~torchrl_koap.objectives.QuantizedDynamicsLoss` on all windows, then
-    :class:`~torchrl_koap.objectives.LatentDecoderLoss` on the labelled frames with the inverse model frozen. Actions
-    are decoded from the code alone.
-
-    KOAP's first public code differs: it trains both at once, so that the labels
-    shape the codes, and its action decoder reads ``x_t`` beside the code.
+    with ``s_t`` the steps between the frames ``x_{t-n}, ..., x_{t+k}`` (:class:`~torchrl_koap.modules.WindowReader`).
+    Trained in two stages: :class:`~torchrl_koap.objectives.QuantizedDynamicsLoss` on all windows, then
+    :class:`~torchrl_koap.objectives.ActionLoss` with ``freeze_latents`` on the labelled frames. Actions are decoded
+    from the code alone.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -43,10 +102,7 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         num_past (int): number ``n`` of frames before the present one. Defaults to ``4``.
         look_ahead (int or sequence of int): offsets ``k``; 1 must be one of them, the transition that is encoded.
             Defaults to ``(1, 2, 3, 4, 5)``.
-        state_normalizer (nn.Module, optional): maps raw states to the networks' units.
-        action_normalizer (nn.Module, optional): its ``inverse`` maps decoded actions to raw units.
-        in_key (NestedKey): window of raw states ``[*B, T, d]``. Defaults to ``"state"``.
-        out_key (NestedKey): raw actions ``[*B, T, act]``. Defaults to ``"action"``.
+        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
         ValueError: for a negative ``num_past``, a look-ahead without 1, or fewer than 3 levels; at the call for states
@@ -57,10 +113,9 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import QuantizedInverseDynamics
         >>> model = QuantizedInverseDynamics(2, 2)
-        >>> states = torch.randn(3, 16, 2)
-        >>> td = model(TensorDict({"state": states}, [3]))
-        >>> td["action"].shape, td["latent_action"].shape, model.code_indices(states).shape
-        (torch.Size([3, 16, 2]), torch.Size([3, 16, 16]), torch.Size([3, 16, 2]))
+        >>> td = model(TensorDict({"state": torch.randn(3, 16, 2)}, [3]))
+        >>> td["action"].shape, td["latent_action"].shape
+        (torch.Size([3, 16, 2]), torch.Size([3, 16, 16]))
     """
 
     def __init__(
@@ -76,7 +131,7 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         look_ahead: int | Sequence[int] = (1, 2, 3, 4, 5),
         **kwargs,
     ):
-        reader = FrameGatherer(state_dim, num_past=num_past, look_ahead=look_ahead, least=1)
+        reader = WindowReader(state_dim, num_past=num_past, look_ahead=look_ahead, min_offset=1)
         if reader.look_ahead[0] != 1:
             raise ValueError(f"look_ahead must contain 1, the transition that is encoded, got {reader.look_ahead}")
         layers = {"num_cells": hidden_dims, "activation_class": nn.ReLU}
@@ -86,63 +141,21 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         self.quantizer = FiniteScalarQuantizer(latent_dim, levels=levels, num_codebooks=num_codebooks)
         self.dynamics = MLP((num_past + 1) * state_dim + latent_dim, state_dim, **layers)
 
-    def read(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """What the inverse model reads.
-
-        Args:
-            state (Tensor): window of raw states ``[*B, T, d]``.
-            frames (range, optional): frames to read for. Default: all ``T`` of the window.
-
-        Returns:
-            Tensor: ``[*B, len(frames), num_features]``, in the networks' units.
-        """
-        return self.reader(self.normalize_state(state), frames)
-
-    def split(self, read: Tensor) -> tuple[Tensor, Tensor]:
-        """What the forward model may read, ``[*B, T, (num_past + 1) * d]``, and the step that it predicts.
-
-        The step ``x_{t+1} - x_t`` is ``[*B, T, d]``, divided by its spread.
-        """
-        size = self.reader.state_dim
-        past, step, _ = read.tensor_split(((self.num_past + 1) * size, (self.num_past + 2) * size), -1)
-        return past, step
-
-    def quantized(self, read: Tensor) -> Tensor:
-        """Latents ``[*B, T, m]`` by way of their codes."""
-        return self.quantizer(self.encoder(read))
-
-    def predict_step(self, past: Tensor, latent: Tensor) -> Tensor:
-        """The next step, at unit scale.
-
-        Args:
-            past (Tensor): what the forward model may read (:meth:`split`), ``[*B, T, (num_past + 1) * d]``.
-            latent (Tensor): quantised latents ``[*B, T, m]``.
-
-        Returns:
-            Tensor: ``[*B, T, d]``.
-        """
-        return self.dynamics(torch.cat([past, latent], -1))
-
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Quantised latents of a window of raw states.
+        """Infers quantised latents ``[*B, len(frames), m]`` of a window of raw states ``[*B, T, d]``."""
+        return self.quantizer(self.encoder(self.reader(self.normalize_state(state), frames)))
+
+    def predict_step(self, state: Tensor, frames: range | None = None) -> tuple[Tensor, Tensor]:
+        """Predicts the next step from the past and the code of the transition.
 
         Args:
             state (Tensor): window of raw states ``[*B, T, d]``.
-            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+            frames (range, optional): frames to predict for. Default: all ``T`` of the window.
 
         Returns:
-            Tensor: ``[*B, len(frames), m]``.
+            tuple of Tensor: the prediction and the step ``x_{t+1} - x_t`` itself, both ``[*B, len(frames), d]`` and
+            divided by the step's spread.
         """
-        return self.quantized(self.read(state, frames))
-
-    def code_indices(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Numbers of the codes: how many are in use tells how rich the latent is.
-
-        Args:
-            state (Tensor): window of raw states ``[*B, T, d]``.
-            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
-
-        Returns:
-            Tensor: int64 ``[*B, len(frames), num_codebooks]``.
-        """
-        return self.quantizer.codes_to_indices(self.quantizer.encode(self.encoder(self.read(state, frames))))
+        read, size = self.reader(self.normalize_state(state), frames), self.reader.state_dim
+        past, step, _ = read.tensor_split(((self.num_past + 1) * size, (self.num_past + 2) * size), -1)
+        return self.dynamics(torch.cat([past, self.quantizer(self.encoder(read))], -1)), step

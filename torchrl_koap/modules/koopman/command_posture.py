@@ -73,7 +73,8 @@ class CommandPosture(nn.Module):
             layers += [nn.Linear(size, width), nn.SiLU()]
             size = width
         self.lifting, self.decoder = nn.Sequential(*layers), nn.Linear(size, len(actions))
-        self.inputs, self.outputs = Normalizer(), Normalizer()
+        inputs = state_dim + (0 if features is None else features.num_features)
+        self.inputs, self.outputs = Normalizer(inputs), Normalizer(len(actions))
 
     @property
     def num_axes(self) -> int:

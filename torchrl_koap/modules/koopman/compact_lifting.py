@@ -6,25 +6,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_koap.keys import LIFTED_STATE, STATE
-from torchrl_koap.modules.koopman.geodesic_coordinates import geodesic_coordinates
+from torchrl_koap.modules.koopman.isomap import isomap
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
 from torchrl_koap.modules.koopman.smoothing import noise_covariance
 
 MOST_WINDOWS = 2000  # for the covariance of the noise; neighbouring windows hold nearly the same frames
 MIN_NOISE = 0.5  # no sum of columns is believed to have less than so much of the noise that independent columns give it
 MIN_RATIO = 2.0  # a component with less variance than so many times the noise's is left out
-AVERAGED, UNFOLDED = 5, 2000  # frames of each mean, and means, that coordinates along the surface are found of
-UNFOLD_UPDATES, UNFOLD_RATE = 1000, 3e-3  # with which the networks learn these coordinates
+AVERAGED, MEANS = 5, 2000  # frames of each mean, and means, that Isomap finds coordinates of
+PRETRAINING_UPDATES, PRETRAINING_RATE = 1000, 3e-3  # with which the networks learn these coordinates
 GAIN = 0.7  # twice the coordinates are read if they leave less than this share of the reconstruction error
 
 
 class NoiseAdjustedComponents(nn.Module):
-    r"""Linear components of the state, ordered by how far they stand out of the measurement noise.
+    r"""Computes linear components of the state, ordered by how far they stand out of the measurement noise.
 
     .. math::
         y = \Lambda^{-1/2} U^T W^T x, \qquad W^T R W = I, \quad W^T C W = U \Lambda U^T
@@ -68,11 +68,11 @@ class NoiseAdjustedComponents(nn.Module):
         self.register_buffer("weights", torch.ones(num_components))
 
     def forward(self, state: Tensor) -> Tensor:
-        """Components ``[*B, k]`` of states ``[*B, d]``."""
+        """Computes the components ``[*B, k]`` of states ``[*B, d]``."""
         return state @ self.analysis.mT
 
     def invert(self, components: Tensor) -> Tensor:
-        """States ``[*B, d]`` with the given components ``[*B, k]``; what those leave out is 0."""
+        """Maps components ``[*B, k]`` back to states ``[*B, d]``; what they leave out is 0."""
         return components @ self.synthesis.mT
 
     @torch.no_grad()
@@ -118,7 +118,7 @@ def _credible(noise: Tensor) -> Tensor:
     return vectors * values.clamp_min(MIN_NOISE) @ vectors.mT * spread * spread[:, None]
 
 
-class CompactLifting(KoopmanLifting):
+class CompactLifting(TensorDictModuleBase):
     r"""Lifts wide states to few coordinates, and finds out without labels whether twice as many are needed.
 
     .. math::
@@ -127,7 +127,7 @@ class CompactLifting(KoopmanLifting):
 
     ``P`` are the :class:`NoiseAdjustedComponents` and ``w`` their variances in units of the noise, so that columns of
     much noise or little motion do not fill the coordinates. ``g_1`` has ``m`` coordinates and ``g_2`` twice as many;
-    both are trained. :meth:`choose_size` keeps the smaller one unless the larger one leaves less than 70 % of its
+    both are trained. :meth:`finish` keeps the smaller one unless the larger one leaves less than 70 % of its
     reconstruction error, as it does where something moves by itself beside the robot. The coordinates of the other are
     0.
 
@@ -151,7 +151,7 @@ class CompactLifting(KoopmanLifting):
     """
 
     kept: Tensor
-    unfolds = True
+    keeps_state = False  # the state is no part of the lifted state
 
     def __init__(
         self,
@@ -163,20 +163,14 @@ class CompactLifting(KoopmanLifting):
         in_key: NestedKey = STATE,
         out_key: NestedKey = LIFTED_STATE,
     ):
-        TensorDictModuleBase.__init__(self)  # its networks are the two below
+        super().__init__()
         self.in_keys, self.out_keys = [in_key], [out_key]
         self.state_dim, self.coordinates, self.latent_dim = state_dim, coordinates, 3 * coordinates
-        self.include_state, self.encoder_skip, self.decoder_skip = False, None, None
         self.components = NoiseAdjustedComponents(state_dim, min(num_components, state_dim))
         count = len(self.components.weights)
         self.small = KoopmanLifting(count, coordinates, hidden_dims=hidden_dims, linear_skip=True)
         self.large = KoopmanLifting(count, 2 * coordinates, hidden_dims=hidden_dims, linear_skip=True)
         self.register_buffer("kept", torch.ones(self.latent_dim))
-
-    @property
-    def keeps_state(self) -> bool:
-        """The state is no part of the lifted state."""
-        return False
 
     def encode(self, state: Tensor) -> Tensor:
         """Lifts states ``[*B, T, d]`` to ``[*B, T, 3 m]``; coordinates that were not chosen are 0."""
@@ -197,13 +191,13 @@ class CompactLifting(KoopmanLifting):
         return self.components.invert(share[0] * small + share[1] * large)
 
     def reconstruction_error(self, lifted: Tensor, state: Tensor) -> Tensor:
-        """Squared error ``[*B, T]`` in components, weighted by their variance in units of the noise."""
+        """Computes the squared error ``[*B, T]`` in components, weighted by their variance in units of the noise."""
         target = self.components(state)
         errors = [((made - target).square() * self.components.weights).mean(-1) for made in self._decoded(lifted)]
         return (errors[0] + errors[1]) / 2
 
     @torch.no_grad()
-    def fit_unlabelled(self, windows: Tensor) -> None:
+    def prepare(self, windows: Tensor) -> None:
         """Fits the components, and sets the linear part of both networks to the first of them; before training.
 
         Args:
@@ -213,7 +207,7 @@ class CompactLifting(KoopmanLifting):
         self.components.fit(windows)
         components, size = self.components(windows), self.components.weights.sqrt()
         for network in (self.small, self.large):
-            network.fit_linear(components * size)
+            network.prepare(components * size)
             for linear, factor in (
                 (network.encoder_skip, size),
                 (network.decoder_skip, torch.where(size > 0, 1 / size.clamp_min(1e-6), 0.0)[:, None]),
@@ -222,31 +216,30 @@ class CompactLifting(KoopmanLifting):
                 linear.weight.mul_(factor)
 
     @torch.enable_grad()
-    def unfold(
-        self, windows: Tensor, updates: int = UNFOLD_UPDATES, progress: Callable[[int, int], None] | None = None
-    ) -> None:
-        """Trains both networks to coordinates along the surface that states lie on, and back, before any loss does.
+    def pretrain(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
+        """Trains both networks to Isomap coordinates and back, before any loss does.
 
         A state that is a nonlinear picture of a few coordinates may be folded up so much that no gradient of the losses
         unfolds it: an encoder that starts at linear components leaves states together that are far apart. These start
-        at :func:`~torchrl_koap.modules.koopman.geodesic_coordinates.geodesic_coordinates` of means of a few successive
-        frames, which have less noise than any of them.
+        at :func:`~torchrl_koap.modules.koopman.isomap.isomap` of means of a few successive frames, which have less
+        noise than any of them.
 
         Args:
             windows (Tensor): ``[*B, T, d]`` in the networks' units, ``T >= 5``; no label is read.
-            updates (int): of each network. Defaults to ``1000``.
+            updates (int): of each network, at most; more than 1000 are not made.
             progress (callable, optional): called with the number of updates done and wanted, of both networks.
         """
+        updates = min(updates, PRETRAINING_UPDATES)
         weights, components = self.components.weights, self.components(windows.flatten(0, -3)).detach()
         spans = components.unfold(1, AVERAGED, AVERAGED).flatten(0, 1)  # [N, k, AVERAGED]
-        chosen = torch.randperm(len(spans), generator=torch.Generator().manual_seed(0))[:UNFOLDED]
+        chosen = torch.randperm(len(spans), generator=torch.Generator().manual_seed(0))[:MEANS]
         spans = spans[chosen.to(spans.device)]
         components = spans[..., AVERAGED // 2]
-        wanted = geodesic_coordinates(spans.mean(-1) * weights.sqrt(), 2 * self.coordinates)
+        wanted = isomap(spans.mean(-1) * weights.sqrt(), 2 * self.coordinates)
         for number, (network, size) in enumerate(((self.small, self.coordinates), (self.large, 2 * self.coordinates))):
             target, parameters = wanted[:, :size], list(network.parameters())
-            optimizer = torch.optim.Adam(parameters, lr=UNFOLD_RATE)
-            schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, UNFOLD_RATE, total_steps=updates + 1)
+            optimizer = torch.optim.Adam(parameters, lr=PRETRAINING_RATE)
+            schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, PRETRAINING_RATE, total_steps=updates + 1)
             for done in range(1, updates + 1):
                 optimizer.zero_grad()
                 there = (network.encode(components) - target).square().mean()
@@ -259,7 +252,7 @@ class CompactLifting(KoopmanLifting):
             optimizer.zero_grad()
 
     @torch.no_grad()
-    def choose_size(self, windows: Tensor, *, batch_size: int = 2048) -> int:
+    def finish(self, windows: Tensor, *, batch_size: int = 2048) -> None:
         """Keeps the coordinates of one network, by what both leave of the state; after training.
 
         Args:
@@ -267,9 +260,6 @@ class CompactLifting(KoopmanLifting):
 
         Keyword Args:
             batch_size (int): windows lifted at once.
-
-        Returns:
-            int: coordinates kept, ``m`` or ``2 m``.
         """
         self.kept.fill_(1.0)
         sums = torch.zeros(2, dtype=torch.float64)
@@ -279,4 +269,7 @@ class CompactLifting(KoopmanLifting):
                 sums[index] += ((made - target).square() * self.components.weights).sum().double().cpu()
         large = bool(sums[1].sqrt() < GAIN * sums[0].sqrt())
         self.kept[: self.coordinates], self.kept[self.coordinates :] = float(not large), float(large)
-        return int(self.kept.sum())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the lifted states."""
+        return tensordict.set(self.out_keys[0], self.encode(tensordict.get(self.in_keys[0])))

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Named combinations of lifting, operator, latent-action network and decoder: one line of keywords per choice."""
+"""Named variants of KOAP: everything that one is, from normalisation to the decoder's penalty, in one entry."""
 
 from __future__ import annotations
 
@@ -7,78 +7,67 @@ from typing import Any
 
 from torch import nn
 
-from torchrl_koap.keys import STATE
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
-from torchrl_koap.modules.koopman.inverse_dynamics import NORMALIZED_STATE, KoopmanInverseDynamics
+from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionLSTM, LatentActionMLP
-from torchrl_koap.modules.koopman.lifting import KoopmanLifting, KoopmanOperator
+from torchrl_koap.modules.koopman.lifting import KoopmanLifting
+from torchrl_koap.modules.koopman.operator import KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
 
+_DEFAULT: dict[str, Any] = {
+    "normalization": {"state": "standard", "action": "rms"},  # modes of Normalizer.fit, for whoever makes them
+    "latent_dim": 32,
+    "hidden_dim": 64,
+    "include_state": True,
+    "network": "fourier",
+    "num_features": 512,
+    "num_past": 4,
+    "look_ahead": (2, 3, 4, 5),
+    "clamped": False,
+    "penalty": 0.15,
+}
+
 PRESETS: dict[str, dict[str, Any]] = {
-    # best measured (docs/results/avoiding.md): observables of the frames relative to the current one, an input matrix
-    # B, no clamped look-ahead, a decoder in closed form
-    "default": {
-        "latent_dim": 32,
-        "hidden_dim": 64,
-        "recurrent_lifting": False,
-        "include_state": True,
-        "structure": "dense",
-        "operator_init": "identity",
-        "network": "fourier",
-        "num_features": 512,
-        "num_past": 4,
-        "look_ahead": (2, 3, 4, 5),
-        "clamped": False,
+    # best measured: observables of the frames relative to the current one, an input matrix B, no clamped look-ahead, a
+    # decoder in closed form
+    "default": _DEFAULT,
+    # actions that say where the robot is to be: what is read off the present frame counts more than the steps around it
+    "absolute": _DEFAULT
+    | {
+        # such places are far from zero compared with their spread; among principal components size is information
+        "normalization": {"state": "shared", "action": "standard"},
+        "num_features": 1024,
+        "curvature": 10.0,
+        "motion_scale": 3.0,
+        "position_scale": 2.0,
+        "position_weight": 1.0,
+        "penalty": 1e-3,
     },
     # where observations are noisy or wide: few coordinates that unlabelled windows determine, smoothed
     # (docs/results/unlabelled_data.md)
-    "semi_supervised": {
+    "semi_supervised": _DEFAULT
+    | {
         "latent_dim": None,
-        "hidden_dim": 64,
-        "recurrent_lifting": False,
         "include_state": False,
-        "structure": "dense",
-        "operator_init": "identity",
         "lifting": "compact",
         "network": "smoothed",
-        "num_features": 512,
         "num_past": 8,
         "look_ahead": (2, 3, 4, 5, 6, 7, 8),
-        "clamped": False,
     },
     # the paper: g MLP, f LSTM, dense K, look-ahead k = 8
     "paper": {
+        "normalization": {"state": "minmax", "action": "minmax"},
         "latent_dim": 64,
         "hidden_dim": 128,
-        "recurrent_lifting": False,
         "include_state": False,
-        "structure": "dense",
-        "operator_init": "identity",
         "network": "lstm",
         "num_past": 1,
         "look_ahead": 8,
-        "relative": False,
         "clamped": True,
-        "linear_skip": False,
-        "dropout": 0.0,
-    },
-    # KOAP's first public code: recurrent g, feed-forward f on raw states, diagonal K, k = 7 steps ahead in effect
-    "released": {
-        "latent_dim": 512,
-        "hidden_dim": 256,
-        "recurrent_lifting": True,
-        "include_state": False,
-        "structure": "diagonal",
-        "operator_init": "normal",
-        "network": "mlp",
-        "num_past": 1,
-        "look_ahead": 7,
         "relative": False,
-        "clamped": True,
-        "linear_skip": False,
-        "dropout": 0.1,
+        "penalty": 0.15,
     },
 }
 
@@ -87,15 +76,13 @@ LIFTINGS = ("single", "compact")
 # a smoothed lifting keeps states of at most so many columns as they are
 NARROW = 8
 
+_KERNEL: dict[str, Any] = {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0}
 # what only one kind of latent-action network takes, and its value where a preset does not name it
 NETWORK_OPTIONS: dict[str, dict[str, Any]] = {
-    "fourier": {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0, "place": 0.0},
+    "fourier": _KERNEL | {"position_weight": 0.0},
+    "smoothed": _KERNEL | {"lifting": "single"},  # or "compact": CompactLifting, where the lifting is learned
     "lstm": {"relative": False},
-    "smoothed": {
-        **{"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0},
-        "lifting": "single",  # or "compact": CompactLifting, where the lifting is learned
-    },
-    "mlp": {"relative": False, "linear_skip": False, "dropout": 0.0},
+    "mlp": {"relative": False},
 }
 
 
@@ -106,18 +93,22 @@ def make_koopman_inverse_dynamics(
     preset: str = "default",
     state_normalizer: nn.Module | None = None,
     action_normalizer: nn.Module | None = None,
+    columns: tuple[int, ...] | None = None,
+    targets: tuple[int, ...] = (),
     **overrides,
 ) -> KoopmanInverseDynamics:
     """Builds a :class:`KoopmanInverseDynamics` from a preset; keywords override single choices.
 
     Args:
-        state_dim (int): size of a state.
+        state_dim (int): number of state columns that are read.
         action_dim (int): size of an action.
 
     Keyword Args:
-        preset (str): ``"default"``, ``"semi_supervised"``, ``"paper"`` or ``"released"``.
-        state_normalizer (nn.Module, optional): see :class:`KoopmanInverseDynamics`.
-        action_normalizer (nn.Module, optional): see :class:`KoopmanInverseDynamics`.
+        preset (str): ``"default"``, ``"absolute"``, ``"semi_supervised"`` or ``"paper"``.
+        state_normalizer (nn.Module, optional): see :class:`~torchrl_koap.modules.InverseDynamics`, as the next three.
+        action_normalizer (nn.Module, optional): of actions.
+        columns (tuple of int, optional): state columns that are read.
+        targets (tuple of int): columns that absolute actions are learned as distances to.
         **overrides: any entry of ``PRESETS[preset]``, and of ``NETWORK_OPTIONS`` for the network chosen.
 
     Returns:
@@ -128,9 +119,9 @@ def make_koopman_inverse_dynamics(
 
     Examples:
         >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
-        >>> model = make_koopman_inverse_dynamics(2, 2, preset="released")
-        >>> sum(p.numel() for p in model.parameters())
-        1387524
+        >>> model = make_koopman_inverse_dynamics(2, 2, preset="paper")
+        >>> model.latent_action.reader.look_ahead, model.latent_action.latent_dim
+        ((8,), 64)
     """
     choice = lookup(PRESETS, preset, "preset")
     network = overrides.get("network", choice["network"])
@@ -141,49 +132,41 @@ def make_koopman_inverse_dynamics(
         lookup(choice, name, f"option of the inverse dynamics with network {network!r}:")
     choice.update(overrides)
 
-    hidden, skip = choice["hidden_dim"], network == "smoothed"
+    hidden = (choice["hidden_dim"],) * 2
     latent_dim, include_state = choice["latent_dim"], choice["include_state"]
     if latent_dim is None:  # the state as it is where it is narrow, else a coordinate per action
         include_state = include_state or state_dim <= NARROW
         latent_dim = state_dim if include_state else action_dim
     if "latent_dim" not in overrides and "include_state" not in overrides and latent_dim < state_dim:
         include_state = False  # a preset's size is too small for a wide state to be part of the lifting
-    frames = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *options) if key != "lifting"}
+    settings = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *options) if key != "lifting"}
     # networks are built in this order: their first weights are drawn one after the other
     latent_action = None
     if network == "fourier":
-        latent_action = LatentActionFourier(state_dim, **frames)
+        latent_action = LatentActionFourier(state_dim, **settings)
     elif network == "lstm":
-        latent_action = LatentActionLSTM(state_dim, latent_dim, hidden_dim=hidden, **frames)
+        latent_action = LatentActionLSTM(state_dim, latent_dim, hidden_dim=hidden[0], **settings)
     elif network == "mlp":
-        latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=(hidden, hidden), **frames)
-    in_key = NORMALIZED_STATE if state_normalizer is not None else STATE
+        latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=hidden, **settings)
     if lookup(LIFTINGS, choice.get("lifting", "single"), "lifting") == "compact" and not include_state:
-        widths: dict[str, Any] = {"hidden_dims": (hidden, hidden)} if "hidden_dim" in overrides else {}
-        lifting = CompactLifting(state_dim, latent_dim, in_key=in_key, **widths)
+        widths: dict[str, Any] = {"hidden_dims": hidden} if "hidden_dim" in overrides else {}
+        lifting = CompactLifting(state_dim, latent_dim, **widths)
     else:
+        linear_skip = network == "smoothed" and not include_state
         lifting = KoopmanLifting(
-            state_dim,
-            latent_dim,
-            hidden_dims=(hidden, hidden),
-            include_state=include_state,
-            recurrent=choice["recurrent_lifting"],
-            linear_skip=skip and not include_state and not choice["recurrent_lifting"],
-            in_key=in_key,
+            state_dim, latent_dim, hidden_dims=hidden, include_state=include_state, linear_skip=linear_skip
         )
-    latent_action = LatentActionSmoothed(lifting, **frames) if latent_action is None else latent_action
-    operator = KoopmanOperator(
-        lifting.latent_dim,
-        input_dim=latent_action.latent_dim if network in ("fourier", "smoothed") else None,
-        structure=choice["structure"],
-        init=choice["operator_init"],
-    )
-    decoder = LinearActionDecoder(latent_action.latent_dim, action_dim)
+    latent_action = LatentActionSmoothed(lifting, **settings) if latent_action is None else latent_action
+    has_input = network in ("fourier", "smoothed")
+    operator = KoopmanOperator(lifting.latent_dim, input_dim=latent_action.latent_dim if has_input else None)
     return KoopmanInverseDynamics(
         latent_action,
-        decoder,
+        LinearActionDecoder(latent_action.latent_dim, action_dim),
         lifting=lifting,
         operator=operator,
+        penalty=choice["penalty"],
+        columns=columns,
+        targets=targets,
         state_normalizer=state_normalizer,
         action_normalizer=action_normalizer,
     )

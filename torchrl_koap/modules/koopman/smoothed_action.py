@@ -10,24 +10,23 @@ from torch import Tensor, nn
 
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
-from torchrl_koap.modules.koopman.smoothing import WindowSmoother
-from torchrl_koap.modules.time_alignment import FrameGatherer
+from torchrl_koap.modules.koopman.smoothing import WienerSmoother
+from torchrl_koap.modules.windows import WindowReader
 
 LIFTED, RAW = "lifted", "raw"
-BLOCKS = (LIFTED, RAW)
 
 
 class LatentActionSmoothed(LatentActionModule):
-    r"""Observables of a lifted and smoothed window, or of the raw one where few labels say that it is better.
+    r"""Computes observables of a lifted and smoothed window, or of the raw one where few labels say that it is better.
 
     .. math::
         w_t = (g(x_{t-n}), \dots, g(x_t), g(x_{t+2}), \dots, g(x_{t+k})), \quad
         u_t = (\gamma_1\, \phi(A w_t),\; \gamma_2\, \phi(x_{t-4}, \dots, x_{t+5}))
 
-    ``g`` is the lifting to a few coordinates, ``A`` the gain of a :class:`WindowSmoother` and ``phi`` the observables
+    ``g`` is the lifting to a few coordinates, ``A`` the gain of a :class:`WienerSmoother` and ``phi`` the observables
     of :class:`LatentActionFourier` (steps and random Fourier features). All of it comes from unlabelled windows
-    (:meth:`fit_unlabelled`). One of ``gamma`` is 1 and the other 0: :meth:`choose` is asked with the held-out error of
-    the labelled steps, within the budget.
+    (:meth:`finish`). One of ``gamma`` is 1 and the other 0: :meth:`choose` is asked with the held-out error of the
+    labelled steps, within the budget.
 
     With a lifting that keeps the state (``include_state``, all columns) the first block is the smoothed state itself.
 
@@ -51,13 +50,14 @@ class LatentActionSmoothed(LatentActionModule):
         >>> from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
         >>> infer = LatentActionSmoothed(KoopmanLifting(64, 2), 32, num_past=8, look_ahead=range(2, 9))
         >>> windows = torch.randn(20, 17, 64)
-        >>> infer.fit_unlabelled(windows)
-        >>> infer.infer(infer.gather(windows)).shape, infer.choices
+        >>> infer.finish(windows)
+        >>> infer.infer(infer.gather(windows)).shape, infer.blocks
         (torch.Size([20, 17, 606]), ('lifted', 'raw'))
     """
 
     gates: Tensor
     spread: Tensor
+    blocks = (LIFTED, RAW)
 
     def __init__(
         self,
@@ -69,45 +69,38 @@ class LatentActionSmoothed(LatentActionModule):
         curvature: float = 0.1,
         motion_scale: float = 1.0,
         position_scale: float = 4.0,
+        num_past: int = 8,
+        look_ahead: Sequence[int] = (2, 3, 4, 5, 6, 7, 8),
         **kwargs,
     ):
-        num_past, look_ahead = kwargs.get("num_past", 8), tuple(kwargs.get("look_ahead", range(2, 9)))
         if raw_past > num_past or max(raw_look_ahead) > max(look_ahead):
             raise ValueError(
                 f"the raw block reads {raw_past} frames back and {max(raw_look_ahead)} ahead: no further than the"
                 f" lifted one, {num_past} and {max(look_ahead)}"
             )
         dim = lifting.latent_dim
+        # random features as they are: training them was measured to change nothing
         kernel = {"curvature": curvature, "motion_scale": motion_scale, "position_scale": position_scale}
-        lifted = LatentActionFourier(dim, num_features, num_past=num_past, look_ahead=look_ahead, **kernel)
+        kernel["trainable"] = False
+        frames = {"num_past": num_past, "look_ahead": look_ahead}
+        lifted = LatentActionFourier(dim, num_features, **frames, **kernel)
         raw = LatentActionFourier(
             lifting.state_dim, num_features, num_past=raw_past, look_ahead=raw_look_ahead, **kernel
         )
-        kwargs |= {"num_past": num_past, "look_ahead": look_ahead}
-        super().__init__(lifting.state_dim, lifted.latent_dim + raw.latent_dim, **kwargs)
-        del self._buffers["scales"]  # each block has its own
-        self.identity = lifting.keeps_state
+        super().__init__(lifting.state_dim, lifted.latent_dim + raw.latent_dim, **frames, **kwargs)
+        self.reader = WindowReader(dim, relative=False, **frames)  # of lifted frames, which are smoothed together
+        self.keeps_state = lifting.keeps_state
         self.lifted, self.raw = lifted, raw
-        self._lifting = (lifting,)  # shared: the Koopman model holds its weights
-        self.smoother = WindowSmoother(self.num_frames, dim)
+        self._lifting = (lifting,)  # in a tuple: the Koopman model holds its weights
+        self.smoother = WienerSmoother(self.reader.num_frames, dim)
         self.register_buffer("spread", torch.ones(dim))
         self.register_buffer("gates", torch.tensor([1.0, 0.0]))
         self.chosen = LIFTED
-        for block in (lifted, raw):  # random features as they are: training them was measured to change nothing
-            for name in ("frequency", "phase"):
-                values = getattr(block, name).data
-                delattr(block, name)
-                block.register_buffer(name, values)
-
-    @property
-    def choices(self) -> tuple[str, ...]:
-        """Blocks among which the held-out labelled error may choose."""
-        return BLOCKS
 
     @property
     def holds_steps(self) -> bool:
-        """The raw block does, and the lifted one where the state is its own lifting."""
-        return self.identity or self.chosen == RAW
+        """Whether :meth:`axis_features` has an answer: the raw block does, the lifted one if it keeps the state."""
+        return self.keeps_state or self.chosen == RAW
 
     @torch.no_grad()
     def choose(self, block: str) -> None:
@@ -116,30 +109,20 @@ class LatentActionSmoothed(LatentActionModule):
         Raises:
             ValueError: if there is no such block.
         """
-        if block not in BLOCKS:
-            raise ValueError(f"unknown block {block!r} of the latent action; there are {list(BLOCKS)}")
-        self.gates.copy_(torch.tensor([float(name == block) for name in BLOCKS]))
+        if block not in self.blocks:
+            super().choose(block)
+        self.gates.copy_(torch.tensor([float(name == block) for name in self.blocks]))
         self.chosen = block
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
         super()._load_from_state_dict(state_dict, prefix, *args)
-        self.chosen = BLOCKS[int(self.gates.argmax())]
+        self.chosen = self.blocks[int(self.gates.argmax())]  # kept beside the gates, which a compiled graph cannot read
 
     def _lift(self, state: Tensor) -> Tensor:
         return self._lifting[0].encode(state) / self.spread
 
-    def _frames(self, lifted: Tensor, frames: range | None) -> Tensor:
-        """Frames ``[*B, T, F, m]`` that are smoothed together."""
-        reader = FrameGatherer(lifted.shape[-1], num_past=self.num_past, look_ahead=self.look_ahead, relative=False)
-        return reader.gather(lifted, frames)
-
-    def _steps(self, smoothed: Tensor) -> Tensor:
-        """Steps and the present frame, as :meth:`FrameGatherer.gather` orders them, without scales."""
-        n, steps = self.num_past, smoothed.diff(dim=-2)
-        return torch.cat([steps[..., :n, :], smoothed[..., n : n + 1, :], steps[..., n:, :]], -2)
-
     def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """What every frame reads for the chosen block.
+        """Reads for the chosen block.
 
         Args:
             state (Tensor): states ``[*B, T, d]`` in the networks' units.
@@ -150,56 +133,56 @@ class LatentActionSmoothed(LatentActionModule):
         """
         if self.chosen == RAW:
             return self.raw.gather(state, frames)
-        return self._steps(self.smoother(self._frames(self._lift(state), frames))) / self.lifted.scales
+        smoothed = self.smoother(self.reader.gather(self._lift(state), frames))
+        return self.reader.steps(smoothed) / self.lifted.reader.scales
 
-    def infer(self, frames: Tensor) -> Tensor:
-        """Evaluates the observables of the chosen block; the other is 0."""
+    def infer(self, read: Tensor) -> Tensor:
+        """Evaluates the observables of the chosen block ``[*B, T, m]``; the other is 0."""
         if self.chosen == RAW:
-            return nn.functional.pad(self.raw.infer(frames), (self.lifted.latent_dim, 0))
-        return nn.functional.pad(self.lifted.infer(frames), (0, self.raw.latent_dim))
+            return nn.functional.pad(self.raw.infer(read), (self.lifted.latent_dim, 0))
+        return nn.functional.pad(self.lifted.infer(read), (0, self.raw.latent_dim))
+
+    def prepare(self, windows: Tensor) -> None:
+        """Fits as :meth:`finish` does, to the lifting as it is before training."""
+        self.finish(windows)
 
     @torch.no_grad()
-    def fit_scales(self, windows: Tensor) -> None:
-        """Fits spreads, smoother and scales to windows ``[*B, T, d]`` in the networks' units; no label is read."""
-        self.fit_unlabelled(windows)
-
-    @torch.no_grad()
-    def fit_unlabelled(self, windows: Tensor, *, batch_size: int = 2048) -> None:
-        """Fits what is left of the lifting: spread of its coordinates, smoother, spread of the steps.
+    def finish(self, windows: Tensor, *, batch_size: int = 2048) -> None:
+        """Fits what depends on the lifting: spread of its coordinates, smoother, spread of the steps.
 
         Args:
-            windows (Tensor): ``[N, T, d]`` in the networks' units.
+            windows (Tensor): ``[N, T, d]`` in the networks' units; no label is read.
 
         Keyword Args:
             batch_size (int): windows lifted at once.
         """
         windows = windows.flatten(0, -3)
-        span = self.span(windows.shape[-2])
+        now = self.reader.valid_frames(windows.shape[-2])[:1]
         self.spread.fill_(1.0)
         lifted = torch.cat([self._lift(part) for part in windows.split(batch_size)])
         spread = lifted.flatten(0, 1).std(0)
         self.spread.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
         lifted = lifted / self.spread
-        read = self._frames(lifted, range(span.start, span.start + 1)).squeeze(-3)
+        read = self.reader.gather(lifted, now).squeeze(-3)
         self.smoother.fit(read, lifted)
-        steps = self._steps(self.smoother(read)).square().mean(0).sqrt()
+        steps = self.reader.steps(self.smoother(read)).square().mean(0).sqrt()
         moving = spread > 1e-9
         # a lifting may leave coordinates at 0: those that are left count as if there were no others
         steps = steps * (moving.sum() / moving.numel()).clamp_min(1e-9).sqrt()
-        steps[self.num_past] = 1.0
-        self.lifted.scales.copy_(torch.where(steps > 1e-9, steps, torch.ones_like(steps)))
-        self.raw.fit_scales(windows)
+        steps[self.reader.num_past] = 1.0
+        self.lifted.reader.scales.copy_(torch.where(steps > 1e-9, steps, torch.ones_like(steps)))
+        self.raw.reader.fit(windows)
 
-    def steps(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Where the chosen block holds the steps along state columns, see :meth:`LatentActionModule.steps`.
+    def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Says where the chosen block holds the steps along state columns (:meth:`LatentActionModule.axis_features`).
 
         Raises:
             ValueError: if the chosen block does not hold the state's own columns.
         """
         if self.chosen == RAW:
-            entries, factors = self.raw.steps(axes)
+            entries, factors = self.raw.axis_features(axes)
             return entries + self.lifted.latent_dim, factors
-        if not self.identity:
+        if not self.keeps_state:
             raise ValueError("the lifted block has no columns of the state: the lifting is learned")
-        entries, factors = self.lifted.steps(axes)
+        entries, factors = self.lifted.axis_features(axes)
         return entries, factors * self.spread[list(axes)]

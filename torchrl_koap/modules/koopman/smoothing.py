@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 
-class WindowSmoother(nn.Module):
+class WienerSmoother(nn.Module):
     r"""Estimates the noise-free frames of a window from all of its frames (a Wiener smoother in closed form).
 
     .. math::
@@ -24,12 +24,12 @@ class WindowSmoother(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules.koopman.smoothing import WindowSmoother
+        >>> from torchrl_koap.modules.koopman.smoothing import WienerSmoother
         >>> _ = torch.manual_seed(0)
         >>> turn = torch.rand(2000, 1) * 6.28 + torch.arange(12) * 0.2
         >>> clean = turn.sin()[..., None]  # [N, T, 1]
         >>> noisy = clean + 0.2 * torch.randn_like(clean)
-        >>> smoother = WindowSmoother(12, 1)
+        >>> smoother = WienerSmoother(12, 1)
         >>> smoother.fit(noisy, noisy)
         >>> error = (smoother(noisy) - clean).square().mean().sqrt()
         >>> bool(error < 0.6 * 0.2)
@@ -44,7 +44,7 @@ class WindowSmoother(nn.Module):
         self.register_buffer("gain", torch.eye(num_frames * dim))
 
     def forward(self, windows: Tensor) -> Tensor:
-        """Smoothed windows ``[*B, F, dim]``."""
+        """Smooths windows ``[*B, F, dim]``."""
         mean = windows.mean(-2, keepdim=True)
         return ((windows - mean).flatten(-2) @ self.gain.mT).unflatten(-1, (self.num_frames, self.dim)) + mean
 
@@ -74,7 +74,7 @@ class WindowSmoother(nn.Module):
 
 
 def noise_covariance(windows: Tensor) -> Tensor:
-    r"""Covariance of white measurement noise from the autocovariances of steps at lags 1, 2 and 3.
+    r"""Computes the covariance of white measurement noise from the autocovariances of steps at lags 1, 2 and 3.
 
     With steps :math:`v_t = x_{t+1} - x_t` of a smooth motion plus noise of covariance ``R``, noise adds ``2 R`` at lag
     0 and ``-R`` at lag 1. A parabola in the lag through lags 2 and 3 says what the motion alone has at lag 1.

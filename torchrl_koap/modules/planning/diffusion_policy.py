@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl_koap import keys
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
-from torchrl_koap.modules.planning.sampler import ConditionalSampler, identity_normalizer
+from torchrl_koap.modules.planning.sampler import ConditionalSampler
 
 ACTION_CHUNK = "action_chunk"
 
@@ -69,7 +69,7 @@ class DiffusionPolicy(ConditionalSampler):
         options = {"in_keys": [keys.HISTORY], "out_keys": [ACTION_CHUNK]} | options
         super().__init__(denoiser, schedule, state_dim=state_dim, width=action_dim, relative=relative, **options)
         self.action_dim = action_dim
-        self.action_normalizer = identity_normalizer(action_dim)
+        self.action_normalizer = Normalizer(action_dim)
 
     def fit_normalizers(self, windows: Tensor, actions: Tensor, *, mode: str = "minmax") -> None:
         """Takes the statistics of condition and actions from data; call it before a loss is built on the policy.

@@ -6,8 +6,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.normalizer import Normalizer
+from torchrl_koap.modules.ridge import ridge
 
 _MOST_ROWS = 20_000  # windows that the ridge is fitted to at most, spread evenly
 _NOTHING = 1e-3  # of the range of an entry: scale of what is forecast without error
@@ -42,7 +42,7 @@ class LinearForecast(nn.Module):
         super().__init__()
         self.register_buffer("weight", torch.zeros(width, condition_dim))
         self.register_buffer("bias", torch.zeros(width))
-        self.residual = Normalizer(torch.zeros(width), torch.ones(width))
+        self.residual = Normalizer(width)
 
     def fit(self, condition: Tensor, sequence: Tensor, groups: Tensor | None = None, *, mode: str = "minmax") -> float:
         """Fits the ridge and the statistics of what it leaves over.
@@ -61,22 +61,20 @@ class LinearForecast(nn.Module):
         """
         groups = torch.arange(len(condition), device=condition.device) if groups is None else groups
         rows = slice(None, None, -(-len(condition) // _MOST_ROWS))
-        ridge = LinearActionDecoder(condition.shape[-1], sequence.shape[-1]).to(condition)
-        every = torch.ones(len(condition), dtype=torch.bool, device=condition.device)
-        fit = ridge.fit_ridge(
+        fit = ridge(
             condition[rows],
             sequence[rows],
-            every[rows],
             groups=groups[rows],
             penalties=_PENALTIES,
             default_penalty=_PENALTIES[-1],  # where too few trajectories are there to choose by
         )
-        self.weight.copy_(ridge.linear.weight.detach())
-        self.bias.copy_(ridge.linear.bias.detach())
+        self.weight.copy_(fit.weight)
+        self.bias.copy_(fit.bias)
         rest = sequence - self._forecast(condition)
         fitted = Normalizer.fit(rest, mode=mode)
         nothing = (rest - fitted.offset).abs().amax(0) < _NOTHING  # such as a goal that never moves
-        self.residual = Normalizer(fitted.offset, torch.where(nothing, _NOTHING, fitted.scale)).to(self.bias)
+        scale = torch.where(nothing, _NOTHING, fitted.scale)
+        self.residual = Normalizer(len(scale), offset=fitted.offset, scale=scale).to(self.bias)
         return fit.penalty
 
     def encode(self, condition: Tensor, sequence: Tensor) -> Tensor:

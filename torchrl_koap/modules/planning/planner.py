@@ -11,7 +11,7 @@ from torchrl_koap import keys
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.forecast import LinearForecast
 from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
-from torchrl_koap.modules.planning.sampler import ConditionalSampler, identity_normalizer
+from torchrl_koap.modules.planning.sampler import ConditionalSampler
 
 
 class StatePlanner(ConditionalSampler):
@@ -70,7 +70,7 @@ class StatePlanner(ConditionalSampler):
         options = {"in_keys": [keys.HISTORY], "out_keys": [keys.PLAN]} | options
         super().__init__(denoiser, schedule, state_dim=state_dim, width=state_dim, relative=relative, **options)
         entries = self.horizon * state_dim
-        self.plan_normalizer = identity_normalizer(entries)
+        self.plan_normalizer = Normalizer(entries)
         self.forecast = LinearForecast(len(self.condition_normalizer.scale), entries) if forecast else None
 
     def fit_normalizers(

@@ -88,7 +88,7 @@ class ConditionalSampler(TensorDictModuleBase):
         self.state_dim, self.history, self.horizon, self.relative = state_dim, history, horizon, relative
         self.features = features
         condition_dim = history * state_dim + (0 if features is None else features.num_features)
-        self.condition_normalizer = identity_normalizer(condition_dim)
+        self.condition_normalizer = Normalizer(condition_dim)
         self._width = width
 
     @property
@@ -245,8 +245,3 @@ class ConditionalSampler(TensorDictModuleBase):
                 f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self._width}] (horizon, columns),"
                 f" got {list(sequence.shape)}"
             )
-
-
-def identity_normalizer(width: int) -> Normalizer:
-    """A normaliser of that many columns that changes nothing until statistics are loaded or fitted."""
-    return Normalizer(torch.zeros(width), torch.ones(width))

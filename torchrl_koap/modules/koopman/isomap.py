@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Coordinates along the curved surface that points lie on, from distances between neighbours: Isomap."""
+"""Isomap: coordinates along the curved surface that points lie on, from distances between neighbours."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor
 
 
 @torch.no_grad()
-def geodesic_coordinates(points: Tensor, dims: int, *, neighbours: int = 12, landmarks: int = 200) -> Tensor:
-    r"""Coordinates whose straight distances are those along the surface, as nearly as so many can be.
+def isomap(points: Tensor, dims: int, *, neighbours: int = 12, landmarks: int = 200) -> Tensor:
+    r"""Computes coordinates whose straight distances are those along the surface, as nearly as so many can be.
 
     .. math::
         z_i = -\tfrac12\, \Lambda^{-1/2} V^T (D^2_{i} - \overline{D^2})
@@ -37,9 +37,9 @@ def geodesic_coordinates(points: Tensor, dims: int, *, neighbours: int = 12, lan
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules.koopman.geodesic_coordinates import geodesic_coordinates
+        >>> from torchrl_koap.modules.koopman.isomap import isomap
         >>> turn = 4.5 * torch.rand(300, generator=torch.Generator().manual_seed(0))
-        >>> along = geodesic_coordinates(torch.stack([turn.cos(), turn.sin()], -1), 1)[:, 0]  # three quarters of a ring
+        >>> along = isomap(torch.stack([turn.cos(), turn.sin()], -1), 1)[:, 0]  # three quarters of a ring
         >>> abs(torch.corrcoef(torch.stack([along, turn]))[0, 1]) > 0.999
         tensor(True)
     """

@@ -16,12 +16,16 @@ from torchrl_koap.modules import (
     LatentActionLSTM,
     LatentActionMLP,
     LinearActionDecoder,
+    WindowReader,
 )
-from torchrl_koap.modules.time_alignment import check_offsets, frame_index, frame_span
 from torchrl_koap.objectives import KOAPLoss, KoopmanDynamicsLoss
 
 T = 16
 CASES = [(1, 8), (0, 2), (4, (2, 3, 4, 6, 8)), (2, (5, 3)), (1, 7)]
+
+
+def reader_of(num_past, look_ahead, **options):
+    return WindowReader(1, num_past=num_past, look_ahead=look_ahead, **options)
 
 
 def offsets(num_past, look_ahead):
@@ -34,20 +38,20 @@ def offsets(num_past, look_ahead):
 
 def test_frames_read_for_each_action():
     """f for a_1 reads x_0, x_1 and x_{1+k}; the last index is clamped to the window's end."""
-    index = frame_index(range(T), T, 1, 8)
+    index = reader_of(1, 8).index(T)
     assert index.dtype == torch.int64
     assert index[1].tolist() == [0, 1, 9]
     assert index[7].tolist() == [6, 7, 15]
     assert [row[-1] for row in index[7:].tolist()] == [15] * 9
     assert index[0].tolist() == [0, 0, 8]
-    assert frame_span(T, 1, 8) == range(1, 8)
-    assert frame_span(T, 1, 8, clamped=True) == range(1, 14)
+    assert reader_of(1, 8).valid_frames(T) == range(1, 8)
+    assert reader_of(1, 8, clamped=True).valid_frames(T) == range(1, 14)
 
 
 @pytest.mark.parametrize("num_frames", [11, 14, 16])
 @pytest.mark.parametrize(("num_past", "look_ahead"), CASES)
 def test_clamping_and_spans_by_brute_force(num_past, look_ahead, num_frames):
-    rows = frame_index(range(num_frames), num_frames, num_past, look_ahead).tolist()
+    rows = reader_of(num_past, look_ahead).index(num_frames).tolist()
     wanted = offsets(num_past, look_ahead)
     unclamped, clamped = [], []
     for t, row in enumerate(rows):
@@ -59,41 +63,80 @@ def test_clamping_and_spans_by_brute_force(num_past, look_ahead, num_frames):
         if t - num_past >= 0 and t + 1 < num_frames and all(frame > t + 1 for frame in ahead):
             clamped.append(t)
     if unclamped:
-        assert list(frame_span(num_frames, num_past, look_ahead)) == unclamped
-    assert list(frame_span(num_frames, num_past, look_ahead, clamped=True)) == clamped
+        assert list(reader_of(num_past, look_ahead).valid_frames(num_frames)) == unclamped
+    assert list(reader_of(num_past, look_ahead, clamped=True).valid_frames(num_frames)) == clamped
     part = range(2, 6)
-    assert frame_index(part, num_frames, num_past, look_ahead).tolist() == rows[2:6]
+    assert reader_of(num_past, look_ahead).index(num_frames, part).tolist() == rows[2:6]
 
 
 @pytest.mark.parametrize(("num_past", "look_ahead"), CASES)
 def test_the_next_state_is_read_in_no_frame_that_counts(num_past, look_ahead):
     for clamped in (False, True):
-        for t in frame_span(T, num_past, look_ahead, clamped=clamped):
-            assert t + 1 not in frame_index(range(t, t + 1), T, num_past, look_ahead).flatten().tolist()
-    leak = frame_index(range(T - 2, T - 1), T, num_past, look_ahead).flatten().tolist()
-    assert T - 1 in leak and T - 2 not in frame_span(T, num_past, look_ahead, clamped=True)
+        for t in reader_of(num_past, look_ahead, clamped=clamped).valid_frames(T):
+            assert t + 1 not in reader_of(num_past, look_ahead).index(T, range(t, t + 1)).flatten().tolist()
+    leak = reader_of(num_past, look_ahead).index(T, range(T - 2, T - 1)).flatten().tolist()
+    assert T - 1 in leak and T - 2 not in reader_of(num_past, look_ahead, clamped=True).valid_frames(T)
 
 
 @pytest.mark.parametrize("clamped", [False, True])
 @pytest.mark.parametrize(("num_past", "look_ahead"), CASES)
 def test_the_shortest_window_holds_one_frame_and_one_less_is_an_error(num_past, look_ahead, clamped):
     needed = num_past + 1 + (2 if clamped else max(offsets(num_past, look_ahead)))
-    assert frame_span(needed, num_past, look_ahead, clamped=clamped) == range(num_past, num_past + 1)
+    assert reader_of(num_past, look_ahead, clamped=clamped).valid_frames(needed) == range(num_past, num_past + 1)
     for number in (needed - 1, 1, 0):
         with pytest.raises(ValueError, match=f"a window of {number} frames is too short .* at least {needed} frames"):
-            frame_span(number, num_past, look_ahead, clamped=clamped)
+            reader_of(num_past, look_ahead, clamped=clamped).valid_frames(number)
 
 
 @pytest.mark.parametrize("look_ahead", [1, 0, -3, (8, 1), ()])
 def test_offsets_that_would_read_the_answer_are_refused(look_ahead):
     with pytest.raises(ValueError, match=r"x_\(t\+1\) is never an input"):
-        check_offsets(1, look_ahead)
+        reader_of(1, look_ahead)
 
 
 def test_num_past_must_not_be_negative():
     with pytest.raises(ValueError, match="num_past must be >= 0 frames, got -1"):
         LatentActionMLP(2, 2, num_past=-1)
-    assert check_offsets(0, [8, 2, 4]) == (2, 4, 8)
+    assert reader_of(0, [8, 2, 4]).look_ahead == (2, 4, 8)
+
+
+# steps and their scales
+
+
+def test_scales_make_every_step_of_unit_spread():
+    state = torch.randn(50, 12, 3, generator=torch.Generator().manual_seed(1)).cumsum(1) * torch.tensor(
+        [1.0, 1e-3, 5.0]
+    )
+    reader = WindowReader(3, num_past=2, look_ahead=(1, 4), min_offset=1)
+    frames = reader.valid_frames(12)
+    plain = reader.gather(state, frames)
+    for t in frames:
+        x = {offset: state[:, t + offset] for offset in (-2, -1, 0, 1, 4)}
+        expected = torch.stack([x[-1] - x[-2], x[0] - x[-1], x[0], x[1] - x[0], x[4] - x[1]], 1)
+        torch.testing.assert_close(plain[:, t - frames.start], expected)
+    reader.fit(state)
+    reader.fit(state.reshape(10, 5, 12, 3))  # again, with other batch dimensions: the same
+    read = reader(state, frames).unflatten(-1, (5, 3))
+    steps = [0, 1, 3, 4]
+    torch.testing.assert_close(read[..., steps, :].square().mean((0, 1)).sqrt(), torch.ones(4, 3))
+    torch.testing.assert_close(reader.scales[steps], plain.square().mean((0, 1)).sqrt()[steps])
+    assert torch.equal(read[..., 2, :], state[:, 2:8]) and "scales" in reader.state_dict()
+
+
+def test_a_column_that_never_moves_is_left_alone():
+    reader = WindowReader(1, look_ahead=(1, 2, 3, 4, 5), min_offset=1)
+    reader.fit(torch.zeros(4, 12, 1))
+    assert torch.equal(reader.scales, torch.ones(10, 1))
+
+
+def test_wrong_windows_and_offsets_are_named():
+    reader = WindowReader(2, num_past=4, look_ahead=(1, 5), min_offset=1)
+    with pytest.raises(ValueError, match="at least 10 frames are needed"):
+        reader.valid_frames(9)
+    with pytest.raises(ValueError, match="2 columns"):
+        reader(torch.zeros(10, 3))
+    with pytest.raises(ValueError, match="must be >= 1, got"):
+        WindowReader(2, look_ahead=0, min_offset=1)
 
 
 # what is really read: the gradient's sparsity
@@ -112,12 +155,12 @@ def test_gradients_reach_the_documented_frames_and_no_others(kind, num_past, loo
     state = torch.randn(T, 2, requires_grad=True)
     latent = network(TensorDict({"state": state}))["latent_action"]
     weights = torch.randn(latent.shape[-1])
-    index = frame_index(range(T), T, num_past, look_ahead)
+    index = reader_of(num_past, look_ahead).index(T)
     for t in range(T):
         (gradient,) = torch.autograd.grad(latent[t] @ weights, state, retain_graph=True)
         read = {frame for frame in range(T) if gradient[frame].abs().max() > 0}
         assert read == set(index[t].tolist())
-        if t in frame_span(T, num_past, look_ahead, clamped=True):
+        if t in reader_of(num_past, look_ahead, clamped=True).valid_frames(T):
             assert (gradient[t + 1] == 0).all()
 
 
@@ -188,7 +231,7 @@ def exact_model(k, *, num_past=1, clamped=False):
 def test_a_known_linear_system_gives_its_own_actions_back(k, num_past):
     data = replay(k, 3, 2)
     model = exact_model(k, num_past=num_past)
-    span = frame_span(T, num_past, k)
+    span = model.valid_frames(T)
     action = model(data.select("state"))["action"]
     frames = slice(span.start, span.stop)
     torch.testing.assert_close(action[..., frames, :], data["action"][..., frames, :], rtol=1e-6, atol=1e-6)
@@ -213,7 +256,7 @@ def test_a_known_linear_system_gives_its_own_actions_back(k, num_past):
 @pytest.mark.parametrize("k", [2, 8])
 def test_latent_actions_of_a_linear_system_drive_its_rollout(k):
     data, model = replay(k, 4), exact_model(k)
-    span = frame_span(T, 1, k)
+    span = model.valid_frames(T)
     latent = model.infer(data["state"], span)
     rolled = model.rollout_latent(model.lift(data["state"])[:, span.start], latent)
     torch.testing.assert_close(rolled, data["state"][:, span.start + 1 : span.stop + 1], rtol=1e-6, atol=1e-6)
@@ -235,20 +278,20 @@ def test_a_decoder_fitted_in_closed_form_finds_the_actions_of_a_linear_system(k)
         operator=KoopmanOperator(6 * k),
     ).double()
     mask = data["has_action"].squeeze(-1)
-    span = frame_span(T, 1, k)
+    span = model.valid_frames(T)
     frames = slice(span.start, span.stop)
-    model.fit_decoder(data, mask, penalties=(1e-14,))
+    model.fit_labels(data, mask, penalties=(1e-14,), bias=True)
     test = replay(k, 5)
     action = model(test.select("state"))["action"]
     torch.testing.assert_close(action[:, frames], test["action"][:, frames], rtol=1e-4, atol=1e-4)
     for shift in (-1, 1):
         moved = data.clone()
         moved["action"] = data["action"].roll(-shift, -2)
-        fit = model.fit_decoder(moved, mask, penalties=(1e-14,))
+        fit = model.fit_labels(moved, mask, penalties=(1e-14,), bias=True)
         shifted = model(test.select("state"))["action"]
         inside = range(span.start + 1, span.stop - 1)
         assert (shifted[:, inside] - test["action"][:, inside]).square().mean() > 0.1
-        assert fit.num_labels == 60 * len(span)
+        assert fit["labels_used"] == 60 * len(span)
 
 
 def test_clamped_frames_beyond_the_last_are_where_the_answer_leaks():

@@ -1,0 +1,137 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What every controller must do, as a base class: ``class TestMine(InverseDynamicsTestBase)`` inherits the tests.
+
+A subclass says how to build its network, which frames an action may read and which frames count.
+"""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.modules import Normalizer
+
+T = 9
+STATE = {"offset": torch.tensor([0.1, -0.2, 0.0]), "scale": torch.tensor([2.0, 1.0, 3.0])}
+ACTION = {"offset": torch.tensor([0.3, 0.0]), "scale": torch.tensor([0.5, 2.0])}
+KEYS = {"state": "state", "action": "action", "has_action": "has_action", "padded": "padded"}
+
+
+def normalizers():
+    """Those of states with three columns and of actions with two."""
+    return {"state_normalizer": Normalizer(3, **STATE), "action_normalizer": Normalizer(2, **ACTION)}
+
+
+def partly_labelled(*batch, share=0.5, spread=1.0):
+    """Windows of which some frames have labels and some repeat an edge."""
+    generator = torch.Generator().manual_seed(4)
+    has_action = torch.rand(*batch, T, 1, generator=generator) < share
+    action = torch.where(has_action, torch.randn(*batch, T, 2, generator=generator), torch.nan)
+    padded = torch.zeros(*batch, T, dtype=torch.bool)
+    padded[..., :3] = torch.rand(*batch, 1, generator=generator) < 0.4
+    state = spread * torch.randn(*batch, T, 3, generator=generator)
+    return TensorDict({"state": state, "action": action, "has_action": has_action, "padded": padded}, batch)
+
+
+def recorded(batch, span):
+    """Which frames of a span start a recorded transition."""
+    padded = batch["padded"]
+    return ~(padded[..., span.start : span.stop] | padded[..., span.start + 1 : span.stop + 1])
+
+
+def few_labels():
+    """1280 windows of x_{t+1} = 0.9 x_t + a_t, of which the first 32 have labels."""
+    generator = torch.Generator().manual_seed(0)
+    action = torch.randn(1280, 12, 2, generator=generator)
+    states = [torch.randn(1280, 2, generator=generator)]
+    for t in range(11):
+        states.append(0.9 * states[-1] + action[:, t])
+    data = TensorDict({"state": torch.stack(states, 1), "action": action}, [1280])
+    data["has_action"] = torch.zeros(1280, 12, 1, dtype=torch.bool)
+    data["has_action"][:32] = True
+    return data
+
+
+def train(network, data, *stages):
+    """Trains by a loss on some of the first windows each: ``(loss, updates, windows)``."""
+    generator = torch.Generator().manual_seed(0)
+    for loss, updates, rows in stages:
+        optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
+        for _ in range(updates):
+            sum(loss(data[torch.randint(rows, (32,), generator=generator)]).values()).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+
+
+def reached(network, loss):
+    """Names of the parts that a loss has gradients for."""
+    network.zero_grad()
+    loss.backward(retain_graph=True)
+    named = [(name, value.grad) for name, value in network.named_parameters() if value.grad is not None]
+    return {name.split(".")[0] for name, gradient in named if gradient.any()}
+
+
+class InverseDynamicsTestBase:
+    """Tests of a controller of states with three columns and actions with two; windows have nine frames."""
+
+    reads: tuple = (-2, -1, 0, 2, 3)  # offsets of the frames that an action may read
+    frames = range(2, 6)  # that count
+    latent = True  # whether it writes latents
+
+    def make_network(self, seed: int = 0, **options):
+        """The network with the normalisers above, the same for the same seed."""
+        raise NotImplementedError
+
+    def fitted(self, network):
+        """The network with scales, and whatever it needs to have actions."""
+        network.prepare(partly_labelled(20)["state"].to(network.state_normalizer.scale))
+        return network
+
+    def test_an_action_depends_on_the_frames_it_may_read_and_no_others(self):
+        network, state = self.fitted(self.make_network()), torch.randn(1, T, 3, requires_grad=True)
+        action = network(TensorDict({"state": state}, [1]))["action"]
+        for t in range(T):
+            (gradient,) = torch.autograd.grad(action[0, t].sum(), state, retain_graph=True)
+            read = {min(max(t + offset, 0), T - 1) for offset in self.reads}
+            assert set(gradient[0].abs().sum(-1).nonzero().flatten().tolist()) == read
+        assert network.valid_frames(T) == self.frames and network.num_past == -min(self.reads)
+        shortest = network.num_past + 1 + max(self.reads)
+        assert network.num_window_frames == shortest
+        with pytest.raises(ValueError, match=f"at least {shortest} frames are needed"):
+            network.valid_frames(shortest - 1)
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_batch_dimensions_types_keys_units_and_state_dict(self, dtype):
+        network = self.fitted(self.make_network(in_key=("in", "x")).to(dtype))
+        state = torch.randn(2, 4, T, 3, dtype=dtype)
+        written = network(TensorDict({"in": {"x": state}}, [2, 4]))
+        action = written["action"]
+        assert action.shape == (2, 4, T, 2) and action.dtype == dtype
+        assert list(network.out_keys) == (["latent_action", "action"] if self.latent else ["action"])
+        predicted = network.predict(state)
+        torch.testing.assert_close(action, predicted * ACTION["scale"].to(dtype) + ACTION["offset"].to(dtype))
+        torch.testing.assert_close(network.predict(state, range(2, 5)), predicted[..., 2:5, :])
+        if self.latent:
+            torch.testing.assert_close(predicted, network.decode(written["latent_action"]))
+            torch.testing.assert_close(network.infer(state), written["latent_action"])
+        network.set_keys(state="s", action=("out", "a"))
+        assert (network.in_key, network.out_key) == ("s", ("out", "a"))
+        torch.testing.assert_close(network(TensorDict({"s": state[1, 3]}, []))["out", "a"], action[1, 3])
+        assert network(TensorDict({"s": state[:0]}, [0, 4]))["out", "a"].shape == (0, 4, T, 2)
+        other = self.make_network(seed=1).to(dtype)
+        other.load_state_dict(network.state_dict())
+        assert torch.equal(other(TensorDict({"state": state}, [2, 4]))["action"], action)
+
+    def test_columns_that_are_not_read_and_targets_of_actions(self):
+        plain, state = self.fitted(self.make_network()), torch.randn(4, T, 5)
+        network = self.make_network(columns=(4, 0, 2), targets=(1, 3))
+        network.load_state_dict(plain.state_dict())
+        distance = plain(TensorDict({"state": state[..., [4, 0, 2]]}, [4]))["action"]
+        action = network(TensorDict({"state": state}, [4]))["action"]
+        torch.testing.assert_close(action, distance + state[..., [1, 3]])
+        torch.testing.assert_close(network.normalize_action(action, state), network.predict(state))
+
+    def test_states_of_another_width_are_refused(self):
+        with pytest.raises(ValueError, match="columns, got shape"):
+            self.make_network()(TensorDict({"state": torch.randn(2, T, 4)}, [2]))

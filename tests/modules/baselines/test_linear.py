@@ -1,0 +1,85 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Ridge regression on raw frames: exact on a linear system, aligned in time, blind to hidden labels."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from inverse_dynamics_test_base import InverseDynamicsTestBase, normalizers
+from tensordict import TensorDict
+
+from torchrl_koap.modules import LinearInverseDynamics
+
+
+class TestLinearInverseDynamics(InverseDynamicsTestBase):
+    latent = False
+
+    def make_network(self, seed=0, **options):
+        torch.manual_seed(seed)
+        return LinearInverseDynamics(3, 2, num_past=2, look_ahead=(2, 3), **normalizers(), **options)
+
+
+def linear_windows(*batch, frames=12, look_ahead=5, num_past=2, dtype=torch.float64, seed=0):
+    """Actions that are a fixed affine map of x_{t-2}, x_{t-1}, x_t, x_{t+5}, where these lie in the window."""
+    generator = torch.Generator().manual_seed(seed)
+    state = torch.randn(*batch, frames, 3, generator=generator, dtype=torch.float64)
+    true = torch.randn(2, 4 * 3, generator=torch.Generator().manual_seed(99), dtype=torch.float64)
+    action = torch.full((*batch, frames, 2), torch.nan, dtype=torch.float64)
+    for t in range(num_past, frames - look_ahead):
+        read = torch.cat([state[..., t - 2, :], state[..., t - 1, :], state[..., t, :], state[..., t + 5, :]], -1)
+        action[..., t, :] = read @ true.T + torch.tensor([0.5, -2.0])
+    return TensorDict({"state": state.to(dtype), "action": action.to(dtype)}, batch)
+
+
+def test_ridge_recovers_a_linear_system_and_generalises():
+    model = LinearInverseDynamics(3, 2, num_past=2, look_ahead=5).double()
+    windows = linear_windows(40)
+    fit = model.fit_labels(windows, torch.ones(40, 12, dtype=torch.bool))
+    assert fit["labels_used"] == 40 * 5  # frames 2..6 see everything
+    unseen = linear_windows(6, 2, seed=1)
+    predicted = model(unseen.clone())["action"]
+    torch.testing.assert_close(predicted[..., 2:7, :], unseen["action"][..., 2:7, :], atol=1e-4, rtol=0)
+
+
+def test_ridge_reads_no_action_outside_the_mask():
+    windows, mask = linear_windows(40), torch.zeros(40, 12, dtype=torch.bool)
+    mask[:5] = True
+    models = [LinearInverseDynamics(3, 2, num_past=2, look_ahead=5).double() for _ in range(2)]
+    models[0].fit_labels(windows, mask)
+    poisoned = windows.clone()
+    poisoned["action"][5:] = 1e9
+    models[1].fit_labels(poisoned, mask, groups=torch.arange(40))
+    models[1].fit_labels(poisoned, mask)
+    for name, value in models[0].state_dict().items():
+        assert torch.equal(value, models[1].state_dict()[name]), name
+    with pytest.raises(ValueError, match="no labelled frame lies in frames 2..6"):
+        models[0].fit_labels(windows, torch.zeros_like(mask))
+
+
+def test_groups_are_left_out_together():
+    """With the same action all over a group, leaving out single steps looks better than leaving out the group."""
+    generator = torch.Generator().manual_seed(0)
+    windows = linear_windows(30)
+    windows["action"] = torch.randn(30, 1, 2, generator=generator, dtype=torch.float64).expand(30, 12, 2).clone()
+    windows["state"] = windows["state"] * 0.01 + torch.randn(30, 1, 3, generator=generator, dtype=torch.float64)
+    mask = torch.ones(30, 12, dtype=torch.bool)
+    errors = []
+    for groups in (None, torch.arange(30)):
+        model = LinearInverseDynamics(3, 2, num_past=2, look_ahead=5).double()
+        errors.append(model.fit_labels(windows, mask, groups=groups)["held_out_error"])
+    assert errors[1] > errors[0]
+
+
+def test_constant_columns_do_not_disturb_the_ridge():
+    windows = linear_windows(40)
+    constant = torch.full((40, 12, 1), 7.0, dtype=torch.float64)
+    wide = TensorDict({"state": torch.cat([windows["state"], constant], -1), "action": windows["action"]}, [40])
+    model = LinearInverseDynamics(4, 2, num_past=2, look_ahead=5).double()
+    model.fit_labels(wide, torch.ones(40, 12, dtype=torch.bool))
+    predicted = model(wide.clone())["action"][:, 2:7]
+    torch.testing.assert_close(predicted, windows["action"][:, 2:7], atol=1e-4, rtol=0)
+
+
+def test_look_ahead_of_the_next_state_is_refused():
+    with pytest.raises(ValueError, match="must be >= 2"):
+        LinearInverseDynamics(2, 2, look_ahead=1)

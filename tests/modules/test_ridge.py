@@ -1,0 +1,290 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Ridge regression in closed form: against numpy, and its held-out errors against brute-force refits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap.modules.ridge import held_out_errors, ridge, shared_filter, thin_svd
+
+PENALTIES = (1e-4, 1e-2, 1.0)
+
+
+def make_data(n=40, m=6, act=2, noise=0.3, seed=0):
+    rng = np.random.default_rng(seed)
+    latent = rng.normal(size=(n, m)) @ rng.normal(size=(m, m)) + rng.normal(size=m)
+    action = latent @ rng.normal(size=(m, act)) + rng.normal(size=act) + noise * rng.normal(size=(n, act))
+    return latent, action
+
+
+def fit(latent, action, **options):
+    return ridge(torch.as_tensor(latent), torch.as_tensor(action), **options)
+
+
+def unit_of(latent, bias=True):
+    centred = latent - latent.mean(0) if bias else latent
+    return (centred**2).sum(-1).mean()
+
+
+def solve(latent, action, ridge, bias=True):
+    """Ridge regression with an unpenalised constant, by the normal equations of the extended matrix."""
+    m = latent.shape[-1]
+    extended = np.concatenate([latent, np.ones((len(latent), 1))], 1) if bias else latent
+    penalty = ridge * np.eye(extended.shape[-1])
+    if bias:
+        penalty[m, m] = 0.0
+    solution = np.linalg.solve(extended.T @ extended + penalty, extended.T @ action)
+    return (solution[:m], solution[m]) if bias else (solution, np.zeros(action.shape[-1]))
+
+
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize(("n", "m"), [(40, 6), (6, 10), (2, 3)])
+@pytest.mark.parametrize("penalty", PENALTIES)
+def test_weights_against_the_normal_equations(n, m, penalty, bias):
+    latent, action = make_data(n, m)
+    result = fit(latent, action, penalties=(penalty,), bias=bias)
+    weight, constant = solve(latent, action, penalty * unit_of(latent, bias), bias)
+    np.testing.assert_allclose(result.weight.numpy().T, weight, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(result.bias.numpy(), constant, rtol=1e-7, atol=1e-9)
+    assert result.penalty == penalty and result.num_labels == n
+
+
+def test_input_noise_is_the_fit_to_many_noisy_copies():
+    latent, action = make_data(60, 4, noise=0.1)
+    noise = 0.02
+    result = fit(latent, action, penalties=(1e-9,), input_noise=noise)
+    rng = np.random.default_rng(1)
+    centred, target = latent - latent.mean(0), action - action.mean(0)
+    sigma = np.sqrt(noise * unit_of(latent))
+    rows = rng.integers(60, size=60_000)
+    seen = centred[rows] + sigma * rng.normal(size=(len(rows), 4))
+    expected = np.linalg.lstsq(seen, target[rows], rcond=None)[0]
+    without = np.linalg.lstsq(centred, target, rcond=None)[0]
+    found = result.weight.numpy().T
+    assert np.abs(found - expected).max() < 0.1 * np.abs(without - expected).max()
+    assert result.penalty == pytest.approx(noise * 60)
+
+
+def test_input_noise_leaves_out_smaller_penalties_alone():
+    latent, action = make_data(200, 4, noise=0.1)
+    free, floored = (fit(latent, action, input_noise=noise) for noise in (0.0, 1e-6))
+    assert min(free.errors) == pytest.approx(1e-6) and min(floored.errors) == pytest.approx(200e-6)
+    assert all(floored.errors[penalty] == free.errors[penalty] for penalty in free.errors if penalty > 200e-6)
+    with pytest.raises(ValueError, match="input_noise must be finite and not negative, got -1"):
+        fit(latent, action, input_noise=-1.0)
+
+
+def brute_force(latent, action, groups, penalty, bias):
+    """Refits without each group, at the penalty of the whole set, and predicts what was left out."""
+    ridge = penalty * unit_of(latent, bias)
+    residual = np.empty_like(action)
+    for group in np.unique(groups):
+        out = groups == group
+        weight, constant = solve(latent[~out], action[~out], ridge, bias)
+        residual[out] = action[out] - latent[out] @ weight - constant
+    return residual
+
+
+@pytest.mark.parametrize("bias", [True, False])
+@pytest.mark.parametrize("size", [None, 2, 5, 20])
+@pytest.mark.parametrize("m", [6, 60])
+def test_held_out_errors_against_refits(size, bias, m):
+    latent, action = make_data(40, m)
+    rng = np.random.default_rng(3)
+    groups = np.arange(40) if size is None else rng.permutation(np.arange(40) // size)
+    given = None if size is None else torch.from_numpy(groups * 7 - 3)  # any numbers will do
+    result = fit(latent, action, groups=given, penalties=PENALTIES, bias=bias)
+    residuals = {penalty: brute_force(latent, action, groups, penalty, bias) for penalty in PENALTIES}
+    for penalty, residual in residuals.items():
+        assert result.errors[penalty] == pytest.approx(np.sqrt((residual**2).mean()), rel=1e-6)
+    assert result.penalty == min(PENALTIES, key=lambda penalty: (residuals[penalty] ** 2).mean())
+    assert result.error == result.errors[result.penalty]
+
+
+def test_groups_choose_a_stronger_penalty_where_steps_of_a_group_resemble_each_other():
+    rng = np.random.default_rng(0)
+    groups = np.repeat(np.arange(6), 20)
+    latent = rng.normal(size=(6, 30))[groups] + 0.01 * rng.normal(size=(120, 30))
+    action = (latent[:, :2] + rng.normal(size=(6, 2))[groups]) + 0.01 * rng.normal(size=(120, 2))
+    single = fit(latent, action)
+    grouped = fit(latent, action, groups=torch.from_numpy(groups))
+    assert grouped.penalty > single.penalty
+    assert min(grouped.errors.values()) > 3 * min(single.errors.values())  # leaving out one step flatters
+
+
+def test_few_groups():
+    latent, action = make_data()
+    one = torch.zeros(40, dtype=torch.int64)
+    two = torch.arange(40) % 2
+    assert fit(latent, action, groups=one, penalties=PENALTIES).errors == pytest.approx(
+        fit(latent, action, penalties=PENALTIES).errors
+    )
+    for groups in (one, two):
+        result = fit(latent, action, groups=groups, default_penalty=0.05)
+        assert result.penalty == 0.05 and list(result.errors) == [0.05]
+    chosen = fit(latent, action, groups=torch.arange(40) % 3, default_penalty=0.05, penalties=PENALTIES)
+    assert chosen.errors.keys() == set(PENALTIES)
+    # groups are counted among the labelled steps
+    mask = torch.arange(40) % 3 != 2
+    assert list(fit(latent, action, mask, groups=torch.arange(40) % 3, default_penalty=0.05).errors) == [0.05]
+
+
+def test_without_a_bias_zero_decodes_to_zero():
+    latent, action = make_data()
+    result = fit(latent, action, bias=False)
+    assert (result.predict(torch.zeros(6, dtype=torch.float64)) == 0).all()
+
+
+def test_one_label_fits_the_mean_and_claims_nothing():
+    latent, action = make_data(1)
+    result = fit(latent, action)
+    np.testing.assert_allclose(result.predict(torch.from_numpy(latent)), action)
+    assert result.num_labels == 1 and result.error == np.inf
+
+
+def test_constant_latent_actions_fit_the_mean():
+    _, action = make_data()
+    result = fit(np.ones((40, 6)), action)
+    np.testing.assert_allclose(result.bias, action.mean(0))
+    assert (result.weight == 0).all()
+    assert min(result.errors.values()) == pytest.approx(np.sqrt(((action - action.mean(0)) ** 2).mean()) * 40 / 39)
+
+
+def test_a_ridge_around_a_prior_is_a_ridge_around_zero_on_the_rest():
+    generator = torch.Generator().manual_seed(1)
+    latent, action = torch.randn(40, 5, generator=generator), torch.randn(40, 2, generator=generator)
+    prior = torch.randn(2, 5, generator=generator)
+    around = ridge(latent, action, prior=prior, bias=False)
+    rest = ridge(latent, action - latent @ prior.T, bias=False)
+    torch.testing.assert_close(around.weight, rest.weight + prior, rtol=1e-5, atol=1e-6)
+    assert around.penalty == rest.penalty
+    around = ridge(latent, action, prior=prior, bias=False, penalties=(1e9,))
+    torch.testing.assert_close(around.weight.float(), prior, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="prior"):
+        ridge(latent, action, prior=prior.T)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"inputs": torch.zeros(0, 6), "targets": torch.zeros(0, 2)}, "at least one labelled step"),
+        ({"inputs": torch.zeros(5, 8, 6)}, r"inputs must be \[n, m\]"),
+        ({"targets": torch.full((40, 2), torch.nan)}, "a labelled action is not finite"),
+        ({"inputs": torch.full((40, 6), torch.nan)}, "a labelled input is not finite"),
+        ({"targets": torch.zeros(39, 2)}, r"targets \[n, act\]"),
+        ({"groups": torch.zeros(39, dtype=torch.int64)}, r"groups must be \[40\], got \[39\]"),
+        ({"penalties": (1.0, 0.0)}, "penalties must be positive and finite"),
+        ({"penalties": ()}, "penalties must be positive and finite"),
+        ({"default_penalty": -1.0}, "penalties must be positive and finite"),
+    ],
+)
+def test_bad_input_is_explained(change, message):
+    inputs, targets = (torch.from_numpy(value) for value in make_data())
+    with pytest.raises(ValueError, match=message):
+        ridge(**({"inputs": inputs, "targets": targets} | change))
+
+
+# a filter that all axes share
+
+
+def test_the_filter_solves_the_ridge_equations():
+    generator = torch.Generator().manual_seed(0)
+    steps = torch.randn(30, 4, 2, generator=generator).double()
+    action = torch.randn(30, 2, generator=generator).double()
+    rows = np.concatenate([steps[..., 0].numpy(), steps[..., 1].numpy()])
+    target = np.concatenate([action[:, 0].numpy(), action[:, 1].numpy()])
+    weight = 0.3 * (rows**2).sum(1).mean()
+    expected = np.linalg.solve(rows.T @ rows + weight * np.eye(4), rows.T @ target)
+    np.testing.assert_allclose(shared_filter(steps, action, penalty=0.3).numpy(), expected, rtol=1e-9)
+
+
+def test_axes_that_differ_are_refused():
+    with pytest.raises(ValueError, match=r"\[N, S, act\]"):
+        shared_filter(torch.zeros(5, 3, 2), torch.zeros(5, 3))
+
+
+# held-out errors by themselves
+
+SIZES = (1, 3, 30, 9)  # single rows, fewer and more rows than directions
+
+
+def refit(matrix, target, groups, penalty, centred):
+    """Mean squared errors of groups by ridge regressions on all other rows."""
+    if centred:
+        matrix = torch.cat([matrix, torch.ones(len(matrix), 1, dtype=matrix.dtype)], -1)
+    free = torch.full((matrix.shape[1],), penalty, dtype=matrix.dtype)
+    if centred:
+        free[-1] = 0.0
+    errors = torch.empty_like(target)
+    for group in groups.unique():
+        out = groups == group
+        kept = matrix[~out]
+        weight = torch.linalg.solve(kept.mT @ kept + free.diag(), kept.mT @ target[~out])
+        errors[out] = target[out] - matrix[out] @ weight
+    return errors.square().mean(0)
+
+
+@pytest.mark.parametrize("centred", [True, False])
+@pytest.mark.parametrize("directions", [4, 12, 50])
+def test_groups_of_any_size_in_any_order_against_refits(directions, centred):
+    torch.manual_seed(0)
+    groups = torch.arange(len(SIZES)).repeat_interleave(torch.tensor(SIZES))
+    groups = groups[torch.randperm(len(groups))]
+    matrix = torch.randn(len(groups), directions, dtype=torch.float64) @ torch.randn(directions, directions).double()
+    target = torch.randn(len(groups), 2, dtype=torch.float64)
+    mean = matrix.mean(0) if centred else torch.zeros(directions).double()
+    shift = target.mean(0) if centred else torch.zeros(2).double()
+    left, singular, _ = thin_svd(matrix - mean, wide=2048)
+    penalties = (0.3, 5.0)
+    shrinks = torch.stack([singular.square() / (singular.square() + penalty) for penalty in penalties])
+    found = held_out_errors(left, shrinks, target - shift, groups, centred=centred)
+    expected = torch.stack([refit(matrix, target, groups, penalty, centred) for penalty in penalties])
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
+
+
+def test_a_group_that_alone_knows_a_direction_still_has_an_error():
+    left = torch.zeros(6, 2, dtype=torch.float64)
+    left[:5, 0], left[5, 1] = 5**-0.5, 1.0
+    groups, shrinks = torch.tensor([0, 0, 1, 1, 1, 2]), torch.tensor([[1.0, 1.0 - 1e-12]], dtype=torch.float64)
+    target = torch.ones(6, 1, dtype=torch.float64)
+    found = held_out_errors(left, shrinks, target, groups, centred=False)
+    assert found.item() == pytest.approx(1 / 6, rel=1e-3)  # predicted as 0 without its own row; the others are exact
+
+
+def test_systems_that_rounding_makes_indefinite_are_solved_all_the_same():
+    left = torch.eye(4, dtype=torch.float64) * (1 + 1e-9)
+    shrinks = torch.ones(1, 4, dtype=torch.float64)
+    found = held_out_errors(left, shrinks, torch.ones(4, 1).double(), torch.tensor([0, 0, 1, 1]), centred=False)
+    assert found.isfinite().all()
+
+
+@pytest.mark.parametrize("centred", [True, False])
+@pytest.mark.parametrize("size", [1, 5])
+def test_features_that_never_move_leave_the_mean(size, centred):
+    groups, target = torch.arange(20) // size, torch.randn(20, 3, dtype=torch.float64)
+    left, singular, _ = thin_svd(torch.zeros(20, 2).double(), wide=2048)
+    target = target - target.mean(0) if centred else target
+    found = held_out_errors(left, singular.expand(2, -1), target, groups, centred=centred)
+    factor = torch.stack([target[groups != group].mean(0) for group in groups]) if centred else 0.0
+    torch.testing.assert_close(found, (target - factor).square().mean(0).expand(2, -1))
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(90, 4), (9, 4), (4, 9), (3, 50)])
+def test_decomposition_is_one(rows, columns):
+    torch.manual_seed(0)
+    matrix = torch.randn(rows, columns, dtype=torch.float64)
+    left, singular, right = thin_svd(matrix, wide=20)
+    torch.testing.assert_close((left * singular) @ right, matrix)
+    torch.testing.assert_close(left.mT @ left, torch.eye(len(singular)).double())
+    torch.testing.assert_close(singular, torch.linalg.svdvals(matrix)[: len(singular)])
+
+
+def test_directions_that_are_lost_in_rounding_are_left_out():
+    matrix = torch.randn(60, 3, dtype=torch.float64)
+    matrix = torch.cat([matrix, torch.zeros(60, 2).double(), matrix[:, :1]], -1)  # nothing, and one column twice
+    left, singular, right = thin_svd(matrix, wide=2048)
+    assert len(singular) == 3
+    torch.testing.assert_close((left * singular) @ right, matrix)
+    assert thin_svd(torch.zeros(60, 2).double(), wide=2048)[1].numel() == 0

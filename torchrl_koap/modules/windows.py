@@ -1,0 +1,165 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Which frames of a window a controller reads for each frame, and which of them count in a loss.
+
+With ``num_past = 1`` frame before the present one, look-ahead ``k = 8`` and a window of ``T = 16`` frames::
+
+    frame t            1         2        ...  7         8         ...  13        14          15
+    f reads            x_0,x_1   x_1,x_2       x_6,x_7   x_7,x_8        x_12,x_13 x_13,x_14   x_14,x_15
+    and x_{t+k}        x_9       x_10          x_15      x_15 (clamped) x_15      x_15        x_15
+    full look-ahead    yes       yes           yes       no             no        no          no
+    transition known   yes       yes           yes       yes            yes       no (leak)   no (no x_{t+1})
+
+At ``t = T - 2`` the clamped look-ahead *is* ``x_{t+1}``, the answer: such a frame never counts. An inverse model that
+is *given* the successor (``min_offset=1``) may count it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+class WindowReader(nn.Module):
+    r"""Reads for every frame of a window the present state and the steps between the frames around it.
+
+    With ``num_past = 1`` and ``look_ahead = (2, 5)``, frame ``t = 3`` of a window reads::
+
+        frame       0      1      2      3      4      5      6      7      8
+                                  x_2    x_3           x_5                  x_8
+        relative          (x_3 - x_2) / s_0, x_3, (x_5 - x_3) / s_2, (x_8 - x_5) / s_3
+
+    Each step is divided by its own spread ``s`` (:meth:`fit`): steps of a few millimetres then reach a network at unit
+    scale, not as differences of numbers of order one, and a decoder that weighs them all alike is a local mean
+    velocity. The present frame stays in the normaliser's units.
+
+    Args:
+        state_dim (int): size ``d`` of a state.
+
+    Keyword Args:
+        num_past (int): number ``n`` of frames before the present one. Defaults to ``4``.
+        look_ahead (int or sequence of int): offset ``k``, or several. Defaults to ``(2, 3, 4, 5)``.
+        min_offset (int): smallest offset allowed. ``2`` (default) where the successor ``x_{t+1}`` is to be predicted
+            and so never an input; ``1`` for inverse models that are given it.
+        relative (bool): read steps, as drawn. ``False``: the frames themselves. Defaults to ``True``.
+        clamped (bool): a frame whose look-ahead is cut at the window's end counts too, except where it would be
+            ``x_{t+1}`` (with ``min_offset=2``) or ``x_t``. Defaults to ``False``.
+
+    Raises:
+        ValueError: for a negative ``num_past`` or an offset below ``min_offset``; at the call for states of another
+            size.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import WindowReader
+        >>> reader = WindowReader(1, num_past=1, look_ahead=(1, 3), min_offset=1)
+        >>> reader(torch.arange(6.0).square()[:, None])[2].tolist()  # 4 - 1, 4, 9 - 4, 25 - 9
+        [3.0, 4.0, 5.0, 16.0]
+        >>> reader.valid_frames(6)
+        range(1, 3)
+    """
+
+    scales: Tensor | None
+
+    def __init__(
+        self,
+        state_dim: int,
+        *,
+        num_past: int = 4,
+        look_ahead: int | Sequence[int] = (2, 3, 4, 5),
+        min_offset: int = 2,
+        relative: bool = True,
+        clamped: bool = False,
+    ):
+        super().__init__()
+        offsets = (look_ahead,) if isinstance(look_ahead, int) else tuple(sorted(look_ahead))
+        if num_past < 0:
+            raise ValueError(f"num_past must be >= 0 frames, got {num_past}")
+        if not offsets or min(offsets) < min_offset:
+            why = " (x_(t+1) is never an input)" if min_offset == 2 else ""
+            raise ValueError(f"look_ahead offsets must be >= {min_offset}{why}, got {offsets}")
+        self.state_dim, self.num_past, self.look_ahead = state_dim, num_past, offsets
+        self.min_offset, self.clamped = min_offset, clamped
+        self.num_frames = num_past + 1 + len(offsets)
+        self.register_buffer("scales", torch.ones(self.num_frames, state_dim) if relative else None)
+
+    @property
+    def num_features(self) -> int:
+        """Size ``F * d`` of what is read for one frame."""
+        return self.num_frames * self.state_dim
+
+    @property
+    def num_window_frames(self) -> int:
+        """Frames of the shortest window in which a frame (number ``num_past``) has all it reads and its successor."""
+        return self.num_past + 1 + self.look_ahead[-1]
+
+    def valid_frames(self, num_frames: int) -> range:
+        """Returns the frames that count in the losses: past, successor and look-ahead lie in the window.
+
+        Args:
+            num_frames (int): frames ``T`` of the window.
+
+        Raises:
+            ValueError: if no frame of so short a window counts.
+        """
+        ahead = self.min_offset if self.clamped else self.look_ahead[-1]
+        frames = range(self.num_past, num_frames - ahead)
+        if not frames:
+            raise ValueError(
+                f"a window of {num_frames} frames is too short for {self.num_past} past frames and look-ahead"
+                f" {self.look_ahead}: at least {self.num_past + 1 + ahead} frames are needed"
+            )
+        return frames
+
+    def index(self, num_frames: int, frames: range | None = None, device: torch.device | None = None) -> Tensor:
+        """Returns which frames are read for each of ``frames``, clamped to the window.
+
+        Args:
+            num_frames (int): frames ``T`` of the window.
+            frames (range, optional): frames to read for. Default: all.
+            device (torch.device, optional): of the index.
+
+        Returns:
+            Tensor: int64 ``[len(frames), F]`` with ``F = num_past + 1 + len(look_ahead)``.
+        """
+        frames = range(num_frames) if frames is None else frames
+        offsets = torch.tensor([*range(-self.num_past, 1), *self.look_ahead], device=device)
+        return (torch.arange(frames.start, frames.stop, device=device)[:, None] + offsets).clamp(0, num_frames - 1)
+
+    def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Reads a window for all or some of its frames.
+
+        Args:
+            state (Tensor): states ``[*B, T, d]`` in the networks' units.
+            frames (range, optional): frames to read for. Default: all; offsets beyond the window are clamped to it.
+
+        Returns:
+            Tensor: ``[*B, len(frames), F, d]``.
+
+        Raises:
+            ValueError: if the states have another number of columns.
+        """
+        if state.shape[-1] != self.state_dim:
+            raise ValueError(f"expected states with {self.state_dim} columns, got shape {list(state.shape)}")
+        read = state[..., self.index(state.shape[-2], frames, state.device), :]  # [*B, T, F, d]
+        return read if self.scales is None else self.steps(read) / self.scales
+
+    def steps(self, read: Tensor) -> Tensor:
+        """Turns frames ``[*B, F, d]`` into the steps to and from the present one, which stays, without scales."""
+        n, steps = self.num_past, read.diff(dim=-2)
+        return torch.cat([steps[..., :n, :], read[..., n : n + 1, :], steps[..., n:, :]], -2)
+
+    def forward(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Reads as :meth:`gather` does, in one row ``[*B, len(frames), num_features]`` per frame."""
+        return self.gather(state, frames).flatten(-2)
+
+    @torch.no_grad()
+    def fit(self, windows: Tensor) -> None:
+        """Sets the spread (root mean square) of every step from windows ``[*B, T, d]``; no label is read."""
+        if self.scales is None:
+            return
+        read = self.gather(windows, self.valid_frames(windows.shape[-2])).flatten(0, -3)
+        spread = read.square().mean(0).sqrt() * self.scales
+        spread[self.num_past] = 1.0  # the present frame stays in the normaliser's units
+        self.scales.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))

@@ -1,0 +1,164 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+r"""Losses of the Koopman inverse dynamics model.
+
+.. math::
+    L = L_{recon} + \lambda_1 L_{kpm} + \lambda_2 L_a, \quad
+    L_{recon} = \overline{|g_\psi(g_\theta(x_t)) - x_t|^2}, \quad
+    L_{kpm} = \overline{|K g(x_t) + u_t - g(x_{t+1})|^2}, \quad
+    L_a = \overline{|D u_t + b - a_t|^2}
+
+All residuals are in normalised units. ``L_a`` averages over the labelled frames alone; a batch
+without labels gives exactly 0, and an unlabelled (NaN) action reaches neither value nor gradient.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams, dispatch
+from torch import Tensor
+
+from torchrl_koap.modules.baselines.nonlinear import NonlinearInverseDynamics
+from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
+from torchrl_koap.objectives.base import WindowLoss
+
+RECONSTRUCTION, KOOPMAN, ACTION = "loss_reconstruction", "loss_koopman", "loss_action"
+
+
+class _KoopmanLoss(WindowLoss):
+    """Computes those of the three terms that :attr:`terms` names, from one pass through the networks."""
+
+    terms: tuple[str, ...]
+
+    network: KoopmanInverseDynamics | NonlinearInverseDynamics
+    network_params: TensorDictParams
+    target_network_params: TensorDictParams
+
+    def __init__(self, network: KoopmanInverseDynamics | NonlinearInverseDynamics, *, reduction: str = "mean"):
+        super().__init__(network, reduction=reduction)
+
+    def _terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        network, wanted = self.network, self.terms
+        state, recorded = self._inputs(tensordict)
+        found = {}
+        with self.network_params.to_module(network, preserve_module_state=False):
+            if {RECONSTRUCTION, KOOPMAN} & set(wanted):
+                lifted = network.lift(state)
+            if {KOOPMAN, ACTION} & set(wanted):
+                span = network.valid_frames(state.shape[-2])
+                latent = network.infer(state, span)
+            if RECONSTRUCTION in wanted:
+                error = network.lifting.reconstruction_error(lifted, network.normalize_state(state))
+                found[RECONSTRUCTION] = self._reduce(error, torch.ones_like(error, dtype=torch.bool))
+            if KOOPMAN in wanted:
+                predicted = network.predict_next(lifted[..., span.start : span.stop, :], latent)
+                error = (predicted - lifted[..., span.start + 1 : span.stop + 1, :]).square().mean(-1)
+                found[KOOPMAN] = self._reduce(error, recorded[..., span.start : span.stop])
+            if ACTION in wanted:
+                target, counts = self._targets(tensordict, state, recorded, span)
+                found[ACTION] = self._reduce(self._action_error(network.decode(latent), target), counts)
+        return found
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Computes the loss from ``state`` and, for the action term, ``action`` and ``has_action``."""
+        return TensorDict(self._terms(tensordict))
+
+
+class KoopmanReconstructionLoss(_KoopmanLoss):
+    """Computes the error of lifting and mapping back, ``loss_reconstruction``, over all frames of the window.
+
+    Args:
+        network (KoopmanInverseDynamics or NonlinearInverseDynamics): the model.
+
+    Keyword Args:
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, T]``).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KoopmanReconstructionLoss
+        >>> loss = KoopmanReconstructionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4]))["loss_reconstruction"].shape
+        torch.Size([])
+    """
+
+    terms = (RECONSTRUCTION,)
+    out_keys = [RECONSTRUCTION]
+
+
+class KoopmanDynamicsLoss(_KoopmanLoss):
+    """Computes the one-step error of the latent dynamics, ``loss_koopman``, over the frames that count.
+
+    Args and keywords as of :class:`KoopmanReconstructionLoss`; with ``"none"`` the loss is ``[*B, frames]``, 0 where
+    masked.
+    """
+
+    terms = (KOOPMAN,)
+    out_keys = [KOOPMAN]
+
+
+class LatentActionLoss(_KoopmanLoss):
+    """Computes the error of the decoded actions, ``loss_action``, over the labelled frames that count.
+
+    Args and keywords as of :class:`KoopmanReconstructionLoss`. A batch without labels gives exactly 0, and exactly zero
+    gradients.
+    """
+
+    terms = (ACTION,)
+    out_keys = [ACTION]
+    uses_labels = True
+
+
+class KOAPLoss(_KoopmanLoss):
+    """Computes the weighted sum of the three terms, from one pass through the networks.
+
+    The coefficients are already applied to the returned terms, so their sum is the total. The reconstruction averages
+    over all frames, the dynamics over those of :meth:`InverseDynamics.valid_frames`, the actions over the labelled ones
+    of these.
+
+    Args:
+        network (KoopmanInverseDynamics or NonlinearInverseDynamics): the model.
+
+    Keyword Args:
+        koopman_coeff (float): ``lambda_1``. Defaults to ``1``. Assigning to it later is an in-place buffer write.
+        action_coeff (float): ``lambda_2``. Defaults to ``1``.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, T]``, then twice ``[*B, frames]``).
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KOAPLoss
+        >>> loss = KOAPLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> batch = TensorDict({"state": torch.randn(4, 16, 2), "action": torch.full((4, 16, 2), torch.nan),
+        ...                     "has_action": torch.zeros(4, 16, 1, dtype=torch.bool)}, [4])
+        >>> loss(batch)["loss_action"].item()
+        0.0
+    """
+
+    terms = (RECONSTRUCTION, KOOPMAN, ACTION)
+    out_keys = [RECONSTRUCTION, KOOPMAN, ACTION]
+    uses_labels = True
+    _schedulable_buffers = frozenset({"koopman_coeff", "action_coeff"})
+
+    def __init__(
+        self,
+        network: KoopmanInverseDynamics | NonlinearInverseDynamics,
+        *,
+        koopman_coeff: float = 1.0,
+        action_coeff: float = 1.0,
+        reduction: str = "mean",
+    ):
+        super().__init__(network, reduction=reduction)
+        self.register_coeff_buffer("koopman_coeff", koopman_coeff)
+        self.register_coeff_buffer("action_coeff", action_coeff)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Computes the three terms from ``state``, ``action`` and ``has_action``."""
+        terms = self._terms(tensordict)
+        terms[KOOPMAN] = self.koopman_coeff * terms[KOOPMAN]
+        terms[ACTION] = self.action_coeff * terms[ACTION]
+        return TensorDict(terms)
