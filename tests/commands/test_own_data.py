@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import json
-import re
 
 import numpy as np
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap.data import load_ted, save_demonstrations, stored_task
+from torchrl_koap.data import load_ted, stored_task
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
 from torchrl_koap.tasks import Action
@@ -53,13 +52,6 @@ def test_the_task_comes_with_the_data(run):
     assert summary["labels"]["labelled_transitions"] == 58 and summary["labels"]["selected_units"] == 2
 
 
-def test_data_of_an_own_task_are_validated_without_naming_it(run, capsys):
-    assert koap("validate", run.parent / "arm") == 0
-    assert "no problem found" in capsys.readouterr().out
-    assert koap("validate", run.parent / "arm", "--task", "sorting") == 1
-    assert "holds its own task 'arm'; --task sorting does not fit it" in capsys.readouterr().err
-
-
 def test_a_policy_acts_on_the_users_observations(run):
     agent = Agent(load_policy(run))
     agent.reset()
@@ -97,37 +89,6 @@ def test_absolute_targets(arrays, tmp_path):
     assert np.abs(moved - near).min() > 2
 
 
-def test_a_data_set_in_another_format(arrays, run, tmp_path, capsys):
-    assert koap("convert", run.parent / "arm", "--out", tmp_path / "plain", "--to", "npz") == 0
-    assert "labelled steps" in capsys.readouterr().out
-    assert koap("convert", tmp_path / "plain", "--out", tmp_path / "again", "--robot", "q1", "q2") == 0
-    one, other = (load_ted(folder / "ted")[0] for folder in (run.parent / "arm", tmp_path / "again"))
-    assert (one["observation"] == other["observation"]).all() and (one["has_action"] == other["has_action"]).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ((), "arm is a data set of this library already: name another format with --to"),
-        (("--to", "npz", "--control-hz", 5), "control_hz: not an option for a data set of this library"),
-        (("--to", "npz", "--observations", "q1"), "observations: not an option"),
-        (("--to", "npz", "--robot", "q1"), "--robot was given, but format 'npz' does not hold it"),
-        (("--to", "npz", "--action-kind", "delta"), "--action-kind was given"),
-    ],
-)
-def test_options_of_which_nothing_would_be_kept_are_refused(run, tmp_path, options, message, capsys):
-    assert koap("convert", run.parent / "arm", "--out", tmp_path / "x", *options) == 1
-    assert re.search(message, capsys.readouterr().err) and not (tmp_path / "x").exists()
-
-
-def test_validation_says_how_many_labels_there_are(run, tmp_path, capsys):
-    assert koap("validate", run.parent / "arm") == 0
-    assert re.search(r"labelled steps +58\b", capsys.readouterr().out)
-    save_demonstrations(tmp_path / "bare", [np.random.default_rng(0).normal(size=(9, 2))], control_hz=9, action_dim=1)
-    assert koap("validate", tmp_path / "bare") == 0
-    assert re.search(r"labelled steps +none: `koap train` needs a few", capsys.readouterr().out)
-
-
 def test_a_missing_data_set_is_named(run, tmp_path, capsys):
     assert koap("train", "--dataset", "nowhere", "--out", tmp_path / "run") == 1
     assert "dataset 'nowhere' is neither 'scripted' nor a folder" in capsys.readouterr().err
@@ -159,11 +120,6 @@ def test_export_and_latency(run, tmp_path, capsys):
 def test_faults_are_one_line(command, message, capsys):
     assert koap(*command) == 1
     assert message in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_nothing_is_overwritten(arrays, run, capsys):
-    assert koap("convert", arrays, "--out", run.parent / "arm") == 1
-    assert "exists already; choose another --out" in capsys.readouterr().err
 
 
 def test_the_task_of_the_data_is_not_another(run, capsys, tmp_path):

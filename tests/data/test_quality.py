@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import shutil
-
 import torch
-from tiny_runs import koap, write_demonstrations
 
 from torchrl_koap.data import flatten_trajectories
 from torchrl_koap.data.quality import find_warnings
@@ -38,16 +35,6 @@ def test_each_warning_is_said_once_and_names_its_trajectory():
 def test_columns_without_a_unit_are_not_looked_at():
     data = flatten_trajectories([PATH * 1e6, PATH], [ACTIONS, ACTIONS])
     assert find_warnings(data) == [] and len(find_warnings(data, units=["", "rad"])) == 1
-
-
-def test_validate_names_the_files(tmp_path, capsys):
-    folder = write_demonstrations(tmp_path / "data")
-    assert koap("validate", folder) == 0
-    assert "no problem found\n" in capsys.readouterr().out
-    shutil.copy(folder / "env_000_00.pkl", folder / "env_900_00.pkl")
-    assert koap("validate", folder) == 0
-    said = capsys.readouterr().out
-    assert "env_900_00.pkl repeats" in said and "no problem found, 1 warning(s)" in said
 
 
 def test_columns_that_say_nothing_are_named():

@@ -14,6 +14,7 @@ import tyro
 from torchrl_koap.commands.command import Command
 from torchrl_koap.data import open_dataset, read_about, read_recordings, save_demonstrations, write_recordings
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
+from torchrl_koap.data.formats import FORMATS, Recordings
 from torchrl_koap.data.quality import find_warnings
 from torchrl_koap.data.ted import stored_folder
 from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
@@ -149,31 +150,36 @@ class Convert(Command):
         """Reads, checks and writes."""
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"max_steps must be >= 1, got {self.max_steps}")
-        described = self._given(_DESCRIBING)
-        if self.to is not None and described:
-            raise ValueError(f"{_option(next(iter(described)))} was given, but format {self.to!r} does not hold it")
-        if self.to is None and stored_folder(self.source) is not None:
+        return self._bring_in() if self.to is None else self._take_out(self.to)
+
+    def _bring_in(self) -> dict[str, Any]:
+        """Recordings become a data set of this library."""
+        if stored_folder(self.source) is not None:
             raise ValueError(f"{self.source} is a data set of this library already: name another format with --to")
-        if self.to is None and (self.out / "ted").exists():
+        if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
+        recordings, described = read_recordings(self.source, **self._given(_READING)), self._given(_DESCRIBING)
+        for name in ("action_units", "state_units"):
+            if len(described.get(name, ())) == 1:  # one for all
+                described[name] = described[name][0]
+        folder = save_demonstrations(self.out, recordings, **described)
+        about = read_about(folder / "ted")
+        return {
+            "data set": str(folder),
+            "task": about["task"],
+            "steps": about["steps"],
+            **_contents(recordings),
+            "skipped": ", ".join(recordings.skipped) or "nothing",
+            "next": f"koap train --dataset {shlex.quote(str(folder))} --out runs/{about['task']}",
+        }
+
+    def _take_out(self, kind: str) -> dict[str, Any]:
+        """Recordings become a folder in another format."""
+        lookup([name for name, form in FORMATS.items() if form.write is not None], kind, "format")
+        for name in self._given(_DESCRIBING):
+            raise ValueError(f"--{name.replace('_', '-')} was given, but format {kind!r} does not hold it")
         recordings = read_recordings(self.source, **self._given(_READING))
-        if self.to is not None:
-            said = {"written": str(write_recordings(recordings, self.out, self.to)), "format": self.to}
-            said |= {"trajectories": len(recordings.states), "labelled steps": recordings.num_labels}
-        else:
-            for name in ("action_units", "state_units"):
-                if len(described.get(name, ())) == 1:  # one for all
-                    described[name] = described[name][0]
-            folder = save_demonstrations(self.out, recordings, **described)
-            about = read_about(folder / "ted")
-            said = {"data set": str(folder)} | {name: about[name] for name in ("task", "trajectories", "steps")}
-            said["labelled steps"] = about["labelled_steps"]
-        said["states"], said["actions"] = ", ".join(recordings.state_names), ", ".join(recordings.action_names)
-        said["frames per second"] = recordings.control_hz
-        if self.to is None:
-            said["skipped"] = ", ".join(recordings.skipped) or "nothing"
-            said["next"] = f"koap train --dataset {shlex.quote(str(folder))} --out runs/{about['task']}"
-        return said
+        return {"written": str(write_recordings(recordings, self.out, kind)), "format": kind, **_contents(recordings)}
 
     def _given(self, options: Sequence[str]) -> dict[str, Any]:
         """Those of the options that were given."""
@@ -222,8 +228,14 @@ class Validate(Command):
         }
 
 
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+def _contents(recordings: Recordings) -> dict[str, Any]:
+    return {
+        "trajectories": len(recordings.states),
+        "labelled steps": recordings.num_labels,
+        "states": ", ".join(recordings.state_names),
+        "actions": ", ".join(recordings.action_names),
+        "frames per second": recordings.control_hz,
+    }
 
 
 def _metres(task: Task) -> list[str]:

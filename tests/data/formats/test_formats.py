@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchrl_koap.data import make_recordings, read_recordings, save_demonstrations, write_recordings
+from torchrl_koap.data import make_recordings, read_recordings, write_recordings
 from torchrl_koap.data.formats import FORMATS
 from torchrl_koap.files import DataError
 
@@ -56,17 +56,6 @@ def test_round_trip(kind, recordings, tmp_path):
         np.testing.assert_allclose(again.states[index], recordings.states[index], rtol=tolerance, atol=tolerance)
         np.testing.assert_allclose(again.actions[index], recordings.actions[index], rtol=tolerance, atol=tolerance)
     assert again.state_names == STATES and again.action_names == ACTIONS
-
-
-@pytest.mark.parametrize("below", ["", "ted"])
-def test_a_data_set_of_this_library(below, recordings, tmp_path):
-    save_demonstrations(tmp_path / "arm", recordings, robot=("x",))
-    again = read_recordings(tmp_path / "arm" / below)
-    assert (again.state_names, again.control_hz, again.num_labels) == (STATES, 20.0, 9)
-    np.testing.assert_allclose(again.states[2], recordings.states[2], rtol=1e-6)
-    np.testing.assert_allclose(again.actions[2], recordings.actions[2], rtol=1e-6)
-    with pytest.raises(ValueError, match="control_hz: not an option for a data set of this library"):
-        read_recordings(tmp_path / "arm", control_hz=3)
 
 
 def test_refusals_of_writing(recordings, tmp_path):

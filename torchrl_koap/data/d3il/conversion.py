@@ -156,7 +156,8 @@ def read_raw(
         FileNotFoundError: if there are none.
     """
     problems: list[str] = []
-    frames, actions = [], []
+    frames: list[torch.Tensor] = []
+    actions: list[torch.Tensor] = []
     files = find_raw_files(converter, root)
     for index, file in enumerate(files):
         if progress is not None and index:

@@ -185,7 +185,8 @@ def read_rows(root: str | Path, features: Sequence[str], *, pictures: Sequence[s
 def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
     """The rows of all files, sorted: the columns that are asked for, the actions, and ``__filename``."""
     pyarrow = import_pyarrow()
-    files, problems, kinds = sorted((root / "data").rglob("*.parquet")), [], {}
+    files, problems = sorted((root / "data").rglob("*.parquet")), []
+    kinds: dict[str, Any] = {}
     if not files:
         raise FileNotFoundError(f"no *.parquet below {root / 'data'}")
     for file in files:

@@ -150,7 +150,7 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
     rate = float(entries["control_hz"]) if "control_hz" in entries else None
     read = {key, acting, "state_names", "action_names", "control_hz"}
     steps = None if acting is None else entries[acting]
-    return _Table([(entries[key], steps)], *names, rate, [name for name in entries if name not in read])
+    return _Table([(entries[key], steps)], names[0], names[1], rate, [name for name in entries if name not in read])
 
 
 def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:

@@ -51,10 +51,10 @@ def write_lerobot(recordings: Recordings, out: Path) -> None:
     """
     if recordings.control_hz is None:
         raise DataError(out, "the rate is not known: pass control_hz")
-    names = {"state_names": recordings.state_names, "action_names": recordings.action_names}
-    writer = LeRobotWriter(out, fps=recordings.control_hz, **names)
-    for states, actions in zip(recordings.states, recordings.actions, strict=True):
-        writer.add(states, actions)
+    states, actions = recordings.state_names, recordings.action_names
+    writer = LeRobotWriter(out, fps=recordings.control_hz, state_names=states, action_names=actions)
+    for frames, steps in zip(recordings.states, recordings.actions, strict=True):
+        writer.add(frames, steps)
     writer.close()
 
 

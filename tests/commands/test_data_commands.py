@@ -1,0 +1,90 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""``koap convert`` and ``koap validate``: what is written, what is said of it, what is refused."""
+
+from __future__ import annotations
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+from tiny_runs import koap, write_demonstrations
+
+from torchrl_koap.data import load_ted, save_demonstrations
+
+
+@pytest.fixture(scope="module")
+def arrays(tmp_path_factory):
+    """Six trajectories of a robot; two have actions."""
+    folder, generator = tmp_path_factory.mktemp("arrays"), np.random.default_rng(0)
+    for index in range(6):
+        content = {"states": generator.normal(size=(30, 4)).cumsum(0), "state_names": ["q1", "q2", "goal1", "goal2"]}
+        if index < 2:
+            content |= {"actions": generator.normal(size=(30, 2)), "action_names": ["dq1", "dq2"]}
+        np.savez(folder / f"run_{index}.npz", control_hz=20.0, **content)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def arm(arrays, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("own") / "arm"
+    assert koap("convert", arrays, "--out", folder, "--robot", "q1", "q2", "--action-units", "rad") == 0
+    return folder
+
+
+def test_data_of_an_own_task_are_validated_without_naming_it(arm, capsys):
+    assert koap("validate", arm) == 0
+    assert "no problem found" in capsys.readouterr().out
+    assert koap("validate", arm, "--task", "sorting") == 1
+    assert "holds its own task 'arm'; --task sorting does not fit it" in capsys.readouterr().err
+
+
+def test_a_data_set_in_another_format(arrays, arm, tmp_path, capsys):
+    assert koap("convert", arm, "--out", tmp_path / "plain", "--to", "npz") == 0
+    assert "labelled steps" in capsys.readouterr().out
+    assert koap("convert", tmp_path / "plain", "--out", tmp_path / "again", "--robot", "q1", "q2") == 0
+    one, other = (load_ted(folder / "ted")[0] for folder in (arm, tmp_path / "again"))
+    assert (one["observation"] == other["observation"]).all() and (one["has_action"] == other["has_action"]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((), "arm is a data set of this library already: name another format with --to"),
+        (("--to", "npz", "--control-hz", 5), "control_hz: not an option for a data set of this library"),
+        (("--to", "npz", "--observations", "q1"), "observations: not an option"),
+        (("--to", "npz", "--robot", "q1"), "--robot was given, but format 'npz' does not hold it"),
+        (("--to", "npz", "--action-kind", "delta"), "--action-kind was given"),
+    ],
+)
+def test_options_of_which_nothing_would_be_kept_are_refused(arm, tmp_path, options, message, capsys):
+    assert koap("convert", arm, "--out", tmp_path / "x", *options) == 1
+    assert re.search(message, capsys.readouterr().err) and not (tmp_path / "x").exists()
+
+
+def test_validation_says_how_many_labels_there_are(arm, tmp_path, capsys):
+    assert koap("validate", arm) == 0
+    assert re.search(r"labelled steps +58\b", capsys.readouterr().out)
+    save_demonstrations(tmp_path / "bare", [np.random.default_rng(0).normal(size=(9, 2))], control_hz=9, action_dim=1)
+    assert koap("validate", tmp_path / "bare") == 0
+    assert re.search(r"labelled steps +none: `koap train` needs a few", capsys.readouterr().out)
+
+
+def test_nothing_is_overwritten(arrays, arm, capsys):
+    assert koap("convert", arrays, "--out", arm) == 1
+    assert "exists already; choose another --out" in capsys.readouterr().err
+
+
+def test_an_unknown_format_is_told_before_anything_is_read(arm, tmp_path, capsys):
+    assert koap("convert", arm, "--out", tmp_path / "x", "--to", "lerobt") == 1
+    assert "unknown format 'lerobt'; did you mean 'lerobot'" in capsys.readouterr().err
+
+
+def test_validate_names_the_files(tmp_path, capsys):
+    folder = write_demonstrations(tmp_path / "data")
+    assert koap("validate", folder) == 0
+    assert "no problem found\n" in capsys.readouterr().out
+    shutil.copy(folder / "env_000_00.pkl", folder / "env_900_00.pkl")
+    assert koap("validate", folder) == 0
+    said = capsys.readouterr().out
+    assert "env_900_00.pkl repeats" in said and "no problem found, 1 warning(s)" in said

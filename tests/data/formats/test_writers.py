@@ -1,0 +1,41 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a LeRobot data set looks like on disk; reading it back is tested with the readers."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pq = pytest.importorskip("pyarrow.parquet")
+
+from torchrl_koap.data.formats.writers import LeRobotWriter  # noqa: E402
+
+
+def test_a_data_set_of_format_3(tmp_path):
+    writer = LeRobotWriter(
+        tmp_path, fps=12.5, state_names=["x", "y"], action_names=["dx"], embodiment="robot", task="go"
+    )
+    for length in (4, 6):
+        writer.add(np.ones((length, 2)), np.arange(length - 1.0)[:, None])
+    writer.close()
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    assert info["codebase_version"] == "v3.0" and info["fps"] == 12.5 and info["embodiment"] == "robot"
+    assert info["total_episodes"] == 2 and info["total_frames"] == 10 and info["splits"] == {"train": "0:2"}
+    assert info["features"]["observation.state"] == {"dtype": "float32", "shape": [2], "names": ["x", "y"]}
+    listed = pq.read_table(tmp_path / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
+    assert listed["length"] == [4, 6] and listed["dataset_to_index"] == [4, 10] and listed["tasks"] == [["go"]] * 2
+    for number, file in enumerate(listed["data/file_index"]):
+        place = info["data_path"].format(chunk_index=listed["data/chunk_index"][number], file_index=file)
+        rows = pq.read_table(tmp_path / place).to_pydict()
+        assert rows["episode_index"] == [number] * listed["length"][number]
+        assert rows["index"][0] == listed["dataset_from_index"][number]
+        assert rows["action"][-1] == rows["action"][-2]  # nothing was done behind the last frame
+    assert rows["timestamp"][:3] == pytest.approx([0.0, 0.08, 0.16])
+
+
+def test_nothing_is_overwritten(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(FileExistsError, match="is not empty; choose another folder"):
+        LeRobotWriter(tmp_path, fps=10, state_names="x")
