@@ -95,10 +95,10 @@ class ConditionEncoder(nn.Module):
 
 
 class MLPDenoiser(nn.Module):
-    """Residual network on the flattened plan: the cheapest denoiser, for one fixed horizon.
+    """Residual network on the flattened sequence, for one fixed horizon: what planners of tasks with objects have.
 
     On Avoiding its plans touch obstacles more often than those of
-    :class:`~torchrl_koap.modules.planning.unet.TemporalUnet`; it serves comparisons and toy problems.
+    :class:`~torchrl_koap.modules.planning.unet.TemporalUnet`.
 
     Args:
         state_dim (int): number ``d`` of state columns.

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The planner's loss: closed forms, keys, reductions, the averaged copy of the weights, compilation."""
+"""The planner's loss, and all that is a denoising loss's: closed forms, keys, reductions, averages, compilation."""
 
 from __future__ import annotations
 

@@ -1,0 +1,58 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The U-Net: any horizon, padding, conditions with edges, impossible sizes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_koap.modules import TemporalUnet
+
+
+def inputs(batch, horizon=14):
+    return torch.randn(batch, horizon, 3), 50 * torch.rand(batch), torch.randn(batch, 6)
+
+
+@pytest.mark.parametrize("horizon", [1, 7, 8, 13, 14, 40])
+@pytest.mark.parametrize("channels", [(16,), (16, 32), (16, 16, 32)])
+def test_unet_takes_any_horizon(horizon, channels):
+    unet = TemporalUnet(3, 6, channels=channels)
+    x, time, condition = inputs(2, horizon=horizon)
+    assert unet(x, time, condition).shape == x.shape
+
+
+def test_unet_pads_by_repeating_the_last_step():
+    unet = TemporalUnet(3, 6, channels=(16, 32))
+    x, time, condition = inputs(2)
+    padded = torch.cat([x, x[:, -1:].expand(2, 2, 3)], 1)
+    torch.testing.assert_close(unet(x, time, condition), unet(padded, time, condition)[:, :14])
+
+
+def test_unet_learns_a_condition_that_changes_within_centimetres():
+    torch.manual_seed(0)
+    unet = TemporalUnet(1, 1, channels=(16,), condition_width=32)
+    optimizer = torch.optim.Adam(unet.parameters(), lr=5e-3)
+    losses = []
+    for _ in range(150):
+        condition = 2 * torch.rand(128, 1) - 1
+        target = torch.sign(torch.sin(9 * condition))[:, :, None].expand(-1, 8, 1)
+        loss = (unet(torch.zeros(128, 8, 1), torch.zeros(128), condition) - target).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss))
+    assert sum(losses[-10:]) / 10 < 0.25 < losses[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"channels": (30,)}, r"channels must be multiples of groups \(8\), got \(30,\)"),
+        ({"kernel_size": 4}, "kernel_size must be odd, got 4"),
+        ({"blocks_per_level": 0}, "blocks_per_level must be at least 1"),
+        ({"embedding_dim": 5}, "embedding_dim must be even"),
+    ],
+)
+def test_impossible_sizes_are_explained(options, message):
+    with pytest.raises(ValueError, match=message):
+        TemporalUnet(3, 6, **options)
