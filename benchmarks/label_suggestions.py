@@ -20,9 +20,10 @@ import time
 import torch
 from scipy.stats import t as student
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_koap.data import controller_view, cut_windows, make_window_buffer
-from torchrl_koap.evaluation.active_labelling import CRITERIA, rank_trajectories
+from torchrl_koap.evaluation.active_labelling import rank_trajectories, variance_reduction
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.modules import PRESETS, KoopmanInverseDynamics, Normalizer
 from torchrl_koap.objectives import KOAPLoss
@@ -34,7 +35,7 @@ from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.loop import train_phase
 
-CHOICES = (*CRITERIA, "longest")
+CHOICES = ("a_optimal", "uncertainty", "random", "longest")
 
 
 def within(data: TensorDictBase, episodes: list[int]) -> TensorDictBase:
@@ -72,9 +73,18 @@ def error_of(
         return rmse_mm(decoded, test["action"])
 
 
+def uncertainty(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
+    """Mean leverage of the steps of a demonstration: where the decoder is least certain."""
+    return ((latent @ covariance) * latent).sum(-1).mean().item()
+
+
 def chosen_by(criterion: str, steps: TensorDictBase, first: int, count: int, seed: int) -> list[int]:
     """The first trajectory and those that a criterion adds."""
     labelled = steps["episode"] == first
+    if criterion == "random":
+        names = steps["episode"][~labelled].unique()
+        drawn = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))[: count - 1]
+        return [first, *names[drawn].tolist()]
     if criterion == "longest":
         names, lengths = steps["episode"][~labelled].unique(return_counts=True)
         return [first, *names[lengths.argsort(descending=True)][: count - 1].tolist()]
@@ -83,9 +93,8 @@ def chosen_by(criterion: str, steps: TensorDictBase, first: int, count: int, see
         steps["episode"],
         labelled,
         penalty=PRESETS["default"]["penalty"],
-        criterion=criterion,
         count=count - 1,
-        seed=seed,
+        score=uncertainty if criterion == "uncertainty" else variance_reduction,
     )
     return [first, *(choice.episode for choice in ranked)]
 

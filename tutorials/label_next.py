@@ -47,21 +47,22 @@ def fit(episodes):
 # The choice reads no label
 # -------------------------
 # The covariance of a ridge does not depend on the *values* of labels, only on where they are. ``a_optimal`` takes the
-# demonstration that lowers the decoder's mean uncertainty over all steps the most, ``uncertainty`` the one about which
-# the decoder is least certain. They are greedy: each choice takes those before it into account.
+# demonstration that lowers the decoder's mean uncertainty over all steps the most, greedily: each choice takes those
+# before it into account. ``random`` takes any.
 
 
 def choose(criterion, first, count):
     controller, data = fit([first])
     steps = infer_steps(controller, data)
+    if criterion == "random":
+        names = steps["episode"][steps["episode"] != first].unique()
+        return names[torch.randperm(len(names), generator=torch.Generator().manual_seed(first))[:count]].tolist()
     chosen = rank_trajectories(
         steps["latent_action"],
         steps["episode"],
         steps["has_action"],
         penalty=controller.recipe.results["penalty"],
-        criterion=criterion,
         count=count,
-        seed=first,
     )
     return [choice.episode for choice in chosen]
 
@@ -76,7 +77,7 @@ judged = every[-12:]
 pool = torch.isin(demonstrations["episode"], torch.tensor(every[:-12]))
 held_out, demonstrations = demonstrations[~pool], demonstrations[pool]
 firsts, counts = every[:36:6], (1, 2, 3, 5)
-errors = {name: {count: [] for count in counts} for name in ("random", "uncertainty", "a_optimal")}
+errors = {name: {count: [] for count in counts} for name in ("random", "a_optimal")}
 for first in firsts:
     order = {name: [first, *choose(name, first, max(counts) - 1)] for name in errors}
     for name, episodes in order.items():
@@ -96,7 +97,7 @@ print(f"\nwith 5 labels a_optimal beats random from {better} of {len(firsts)} st
 # %%
 figure = Figure(figsize=(6, 3.6), layout="constrained")
 axes = figure.add_subplot(xlabel=f"labelled demonstrations of {len(every) - 12}", ylabel="action error (mm)")
-for name, color in {"random": "#8a929e", "uncertainty": "#d9730d", "a_optimal": "#1f6feb"}.items():
+for name, color in {"random": "#8a929e", "a_optimal": "#1f6feb"}.items():
     for values in zip(*errors[name].values(), strict=True):
         axes.plot(counts, values, color=color, alpha=0.2, linewidth=1)
     axes.plot(counts, [statistics.median(errors[name][c]) for c in counts], color=color, marker="o", label=name)

@@ -10,6 +10,7 @@ known before it is labelled.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,6 @@ from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.evaluation.training_data import hide_labels_again, load_training_data
 from torchrl_koap.keys import EPISODE, HAS_ACTION
-from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins, load_plugins
@@ -37,7 +37,7 @@ class Suggestion:
 
     Args:
         episode (int): its number.
-        score (float, optional): what the criterion gives it when its turn comes, in units of the noise variance.
+        score (float): what it is chosen by when its turn comes, in units of the noise variance.
 
     Examples:
         >>> from torchrl_koap.evaluation.active_labelling import Suggestion
@@ -46,16 +46,17 @@ class Suggestion:
     """
 
     episode: int
-    score: float | None
+    score: float
 
 
-def _uncertainty(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
-    """Mean leverage of the steps of a demonstration."""
-    return ((latent @ covariance) * latent).sum(-1).mean().item()
+def variance_reduction(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
+    """Returns by how much the mean leverage over all steps falls if these steps are labelled (A-optimal design).
 
-
-def _a_optimal(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
-    """By how much the mean leverage over all steps falls if these steps are labelled."""
+    Args:
+        latent (Tensor): latent actions of a trajectory ``[T, m]``.
+        covariance (Tensor): of the decoder, without the noise variance ``[m, m]``.
+        moment (Tensor): second moment of the latent actions of all steps ``[m, m]``.
+    """
     part = _explained_part(latent, covariance)
     return ((part @ moment) * part).sum().item()
 
@@ -67,9 +68,6 @@ def _explained_part(latent: Tensor, covariance: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(torch.linalg.cholesky(inner), projected, upper=False)
 
 
-CRITERIA = {"a_optimal": _a_optimal, "uncertainty": _uncertainty, "random": None}
-
-
 @torch.no_grad()
 def rank_trajectories(
     latent: Tensor,
@@ -77,18 +75,15 @@ def rank_trajectories(
     labelled: Tensor,
     *,
     penalty: float,
-    criterion: str = "a_optimal",
     count: int = 5,
     bias: bool = False,
-    seed: int = 0,
+    score: Callable[[Tensor, Tensor, Tensor], float] = variance_reduction,
 ) -> list[Suggestion]:
     r"""Chooses trajectories to label, one after the other, each as if those before it were labelled already.
 
-    * ``"a_optimal"``: the one whose labels lower the mean predictive variance over *all* steps the most (Bayesian
-      A-optimal design, weighted by the second moment of the latent actions, greedy). It prefers long demonstrations
-      that resemble many others.
-    * ``"uncertainty"``: the one along which the decoder is least certain on average. It prefers outliers.
-    * ``"random"``: any.
+    Taken is the one whose labels lower the mean predictive variance over *all* steps the most (Bayesian A-optimal
+    design, weighted by the second moment of the latent actions, greedy). It prefers long demonstrations that resemble
+    many others.
 
     The covariance is that of the plain ridge, also where the decoder is shrunk towards a prior of its own: what it is
     shrunk towards has no part in it.
@@ -102,16 +97,15 @@ def rank_trajectories(
     Keyword Args:
         penalty (float): the ridge, in units of the mean square norm of the labelled latent actions (of all, where none
             is labelled), as in :class:`~torchrl_koap.modules.RidgeFit`.
-        criterion (str): ``"a_optimal"``, ``"uncertainty"`` or ``"random"``.
         count (int): trajectories to choose.
         bias (bool): the decoder has a fitted mean.
-        seed (int): seed of ``"random"``.
+        score (callable): what a trajectory is chosen by, with the arguments of :func:`variance_reduction`.
 
     Returns:
         list of Suggestion: in the order of choice.
 
     Raises:
-        ValueError: for an unknown criterion, shapes that disagree, latent actions that are not finite, a penalty that
+        ValueError: for shapes that disagree, latent actions that are not finite, a penalty that
             is not positive, a count out of range, or if every step is labelled.
 
     Examples:
@@ -122,7 +116,6 @@ def rank_trajectories(
         >>> [choice.episode for choice in rank_trajectories(latent, torch.arange(3), known, penalty=0.1, count=2)]
         [2, 1]
     """
-    lookup(CRITERIA, criterion, "criterion")
     if latent.ndim != 2 or episode.shape != latent.shape[:1] or labelled.shape != latent.shape[:1]:
         raise ValueError(
             "wanted latent [N, m], episode [N] and labelled [N],"
@@ -139,11 +132,6 @@ def rank_trajectories(
         raise ValueError("nothing is left to suggest: every step is labelled")
     if not 1 <= count <= len(names):
         raise ValueError(f"count must be in 1..{len(names)}, the trajectories that are not labelled yet, got {count}")
-    score = CRITERIA[criterion]
-    if score is None:
-        drawn = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed))[:count].tolist()
-        return [Suggestion(names[index], None) for index in drawn]
-
     rows, scale = _rows(latent.double(), labelled, penalty, bias)
     known = rows[labelled]
     precision = known.mT @ known + scale * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
@@ -178,9 +166,6 @@ class SuggestConfig:
 
     Attributes:
         count: demonstrations to suggest (default: 5, or all that are left).
-        criterion: "a_optimal" (lowers the decoder's mean uncertainty the most), "uncertainty" (the decoder is least
-            certain about it) or "random".
-        seed: seed of "random".
         dataset: where the data set of the training is now (default: where it was).
         threads: torch threads.
         plugins: modules that register tasks or methods, besides those that the run was trained with.
@@ -191,8 +176,6 @@ class SuggestConfig:
     """
 
     count: int | None = None
-    criterion: str = "a_optimal"
-    seed: int = 0
     dataset: str | None = None
     threads: int = 1
     plugins: Plugins = ()
@@ -203,7 +186,6 @@ class SuggestedLabels:
     """What ``suggestions.json`` holds; printed as a table.
 
     Args:
-        criterion (str): how they were chosen.
         penalty (float): ridge of the run's decoder.
         labelled_steps (int): labels of the run that the choice builds on.
         labelled_episodes (list of int): trajectories with a label in the run.
@@ -213,11 +195,10 @@ class SuggestedLabels:
     Examples:
         >>> from torchrl_koap.evaluation.active_labelling import SuggestedLabels
         >>> row = {"rank": 1, "episode": 57, "steps": 120, "score": 0.31}
-        >>> print(str(SuggestedLabels("a_optimal", 0.1, 80, [3], [row])).splitlines()[-1])
+        >>> print(str(SuggestedLabels(0.1, 80, [3], [row])).splitlines()[-1])
         with these labelled: koap train --label-episodes 3 57 ...
     """
 
-    criterion: str
     penalty: float
     labelled_steps: int
     labelled_episodes: list[int]
@@ -225,10 +206,9 @@ class SuggestedLabels:
     data: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
-        lines = [f"{'rank':>4}  {'episode':>7}  {'steps':>5}  {self.criterion:>10}"]
+        lines = [f"{'rank':>4}  {'episode':>7}  {'steps':>5}  {'score':>10}"]
         for row in self.suggestions:
-            score = "-" if row["score"] is None else f"{row['score']:.4g}"
-            lines.append(f"{row['rank']:>4}  {row['episode']:>7}  {row['steps']:>5}  {score:>10}")
+            lines.append(f"{row['rank']:>4}  {row['episode']:>7}  {row['steps']:>5}  {row['score']:>10.4g}")
         every = [*self.labelled_episodes, *(row["episode"] for row in self.suggestions)]
         words = ["koap", "train", *self.data, "--label-episodes", *map(str, every)]
         lines.append(f"with these labelled: {shlex.join(words)} ...")
@@ -240,13 +220,13 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
 
     Args:
         run (str or Path): a run directory.
-        config (SuggestConfig, optional): how many, and by which criterion.
+        config (SuggestConfig, optional): how many.
 
     Returns:
         SuggestedLabels: the trajectories to label next, in order.
 
     Raises:
-        ValueError: for an unknown criterion, a count out of range, a run without latent actions or whose decoder was
+        ValueError: for a count out of range, a run without latent actions or whose decoder was
             was not fitted in closed form.
         RunDirectoryError: if the folder is no finished run, or its demonstrations are not there or others.
 
@@ -267,9 +247,6 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
         ([0, 1], [True, True])
     """
     config = SuggestConfig() if config is None else config
-    lookup(CRITERIA, config.criterion, "criterion")
-    if config.seed < 0:
-        raise ValueError(f"seed must be >= 0, got {config.seed}")
     set_up_torch(config.threads, "cpu")
     load_plugins(config.plugins)
     trained = load_run(run)
@@ -295,10 +272,8 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
         steps[EPISODE],
         steps[HAS_ACTION],
         penalty=penalty,
-        criterion=config.criterion,
         count=count,
         bias=bool(controller.action_decoder.linear.bias.any()),
-        seed=config.seed,
     )
     unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]
     rows = [
@@ -312,4 +287,4 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
     again = ["--task", task.name, "--dataset", config.dataset or trained.config["dataset"]]
-    return SuggestedLabels(config.criterion, penalty, report.labelled_transitions, labelled, rows, again)
+    return SuggestedLabels(penalty, report.labelled_transitions, labelled, rows, again)
