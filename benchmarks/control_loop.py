@@ -16,10 +16,10 @@ from torchrl_koap.evaluation.latency import run_control_loop
 from torchrl_koap.modules import (
     Agent,
     AsynchronousAgent,
-    PlanThenControl,
     StatePlanner,
     TemporalUnet,
     make_koopman_inverse_dynamics,
+    make_policy,
 )
 
 
@@ -45,7 +45,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     planner = SlowPlanner(TemporalUnet(7, 14, channels=(16, 32)), state_dim=7, num_steps=4)
-    policy = PlanThenControl(planner, make_koopman_inverse_dynamics(7, 7), state_columns=range(7), history=5).eval()
+    policy = make_policy(planner, make_koopman_inverse_dynamics(7, 7), state_of=range(7))
     observations = np.random.default_rng(0).normal(size=(options.steps, 7)).cumsum(0) / 100
     print("between steps", run_control_loop(Agent(policy), observations, control_hz=options.control_hz))
     with AsynchronousAgent(policy, control_hz=options.control_hz) as agent:

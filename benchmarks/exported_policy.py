@@ -23,20 +23,19 @@ from torch import Tensor
 
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.evaluation.latency import time_calls
-from torchrl_koap.modules import PlanThenControl, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+from torchrl_koap.modules import PlanningPolicy, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics, make_policy
 from torchrl_koap.modules.execution.export import SUFFIXES, Exportable, ExportError, export_part, exportable
 
 RESULTS = Path(__file__).resolve().parent / "results" / "exported_policy.csv"
 TOLERANCE = 1e-5
 
 
-def default_policy() -> tuple[PlanThenControl, int]:
+def default_policy() -> tuple[PlanningPolicy, int]:
     """A policy for seven joints and their goals, of the size that ``koap train`` gives it, and its observation."""
     torch.manual_seed(0)
     planner = StatePlanner(TemporalUnet(14, 28, channels=(64, 128)), state_dim=14, forecast=True, clip=1.2)
     controller = make_koopman_inverse_dynamics(7, 7)
-    options = {"state_columns": range(14), "controller_columns": range(7), "history": 5}
-    return PlanThenControl(planner, controller, **options).eval(), 14
+    return make_policy(planner, controller, state_of=range(14), columns=range(7)), 14
 
 
 def compiled(what: Exportable, expected: Tensor) -> Callable:

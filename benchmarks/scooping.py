@@ -25,7 +25,7 @@ from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
+from torchrl_koap.modules.execution.execution import STRATEGIES, ExecutionConfig
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS
 from torchrl_koap.training import METHODS as KNOWN
 from torchrl_koap.training import TrainConfig, train
@@ -89,10 +89,10 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
         settings["resume"] = run.exists()
         settings |= {"controller_steps": options.controller_steps, "analysis": unlabelled not in FEW_ROBOTS}
         train(_config(run, folder, unlabelled, labels, options.task, **settings))
-    ways = {name: getattr(options, name) for name in ("execution", "replan_interval", "blend_decay")}
-    if method.startswith("dp"):  # it has no plans to follow: its chunks of actions are executed as they are
-        ways["execution"] = None
-    result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1, **ways))
+    # dp has no plans to follow: its chunks of actions are executed as they are
+    strategy = None if method.startswith("dp") else options.execution
+    execution = ExecutionConfig(strategy, replan_interval=options.replan_interval, blend=options.blend_decay)
+    result = evaluate(run, EvalConfig(episodes=options.episodes, threads=1, execution=execution))
     summary = json.loads((run / "summary.json").read_text())
     n = options.episodes
     successes, rims = round(result["success_rate"] * n), round(result["rates"]["spoon over the bowl"]["rate"] * n)
@@ -135,7 +135,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=2000, help="planner updates")
     parser.add_argument("--controller-steps", type=int, default=200)
     parser.add_argument("--replan-interval", type=int, default=8, help="frames of each plan that are executed")
-    parser.add_argument("--execution", choices=EXECUTIONS, default="open_loop", help="of plans")
+    parser.add_argument("--execution", choices=STRATEGIES[:2], default="open_loop", help="of plans")
     parser.add_argument("--blend-decay", type=float, default=0.0, help="of plans; 0 leaves them as they are")
     parser.add_argument("--fit-projection", action="store_true", help="make the package's projection anew and stop")
     options = parser.parse_args(arguments)

@@ -38,8 +38,7 @@ from unlabelled_data import (
 )
 
 from torchrl_koap.envs.registry import make_env
-from torchrl_koap.evaluation.policy_files import BLEND_DECAY
-from torchrl_koap.modules import InverseDynamics, blend_plan
+from torchrl_koap.modules import Execution, InverseDynamics, blend_plan
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.datasets import find_task_of
@@ -192,7 +191,7 @@ def main() -> None:
     parser.add_argument("--labels-from", default="demonstrations", choices=["demonstrations", "play"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
     parser.add_argument("--judged", type=int, default=60, help="demonstrations followed per seed")
-    parser.add_argument("--blend-decay", type=float, default=BLEND_DECAY)
+    parser.add_argument("--blend-decay", type=float, default=Execution().blend)
     parser.add_argument("--table", type=Path, default=TABLE)
     errors = unlabelled_data.TABLE
     parser.add_argument("--errors", type=Path, nargs="?", const=errors, help="write rows of unlabelled_data.py as well")

@@ -36,7 +36,7 @@ EVALUATION = {
     "plan_ms": 8.5,
     "control_ms": 0.5,
     "control_hz": 400.0,
-    "execution": "feedback",
+    "execution": {"strategy": "feedback", "replan_interval": 4},
     "episode": [{"seed": 100 + e, "outcome": "success", "mode": e, "steps": 20} for e in range(4)],
 }
 

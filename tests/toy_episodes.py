@@ -14,7 +14,7 @@ def episode_of(steps, *, success=False, collision=False, mode=3, start=0.0, plan
     nested = {key: torch.zeros(steps, 1, dtype=torch.bool) for key in flags}
     for key, value in flags.items():
         nested[key][-1] = value
-    chunk = {"remaining_plan_chunk": count[:-1, None, None, :2].expand(-1, 4, 14, 2)} if plans else {}
+    chunk = {"plan": count[:-1, None, :2].expand(-1, 14, 2)} if plans else {}
     return TensorDict(
         {
             "observation": count[:-1],

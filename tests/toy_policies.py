@@ -33,6 +33,19 @@ class CountingPlanner(nn.Module):
         return torch.stack([now + ahead, now.expand(*now.shape[:-1], self.horizon)], -1)
 
 
+class CountingSampler(CountingPlanner):
+    """Entry ``k`` of a chunk sampled at state ``x`` is ``(k, x, x of the frame before, second column of x)``."""
+
+    sample_shape = noise_shape = (6, 4)
+
+    def sample(self, history, noise=None):
+        assert history.shape[-2:] == (2, 2)
+        self.calls.append(history[..., -1, 0].flatten().tolist())
+        steps = torch.arange(6.0).expand(*history.shape[:-2], 6)
+        seen = torch.stack([history[..., -1, 0], history[..., 0, 0], history[..., -1, 1]], -1)
+        return torch.cat([steps.unsqueeze(-1), seen.unsqueeze(-2).expand(*steps.shape, 3)], -1)
+
+
 class EchoController(TensorDictModuleBase):
     """The action of frame ``t`` is what the window holds: ``x_{t-1}``, ``x_t`` and both columns of ``x_{t+1}``."""
 

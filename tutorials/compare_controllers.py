@@ -43,7 +43,7 @@ def budget(count, seed):
 # %%
 # A controller of your own
 # ------------------------
-# Any module with these four attributes is a controller: it works in ``PlanThenControl`` and below. This one says that
+# Any module with these four attributes is a controller: it works in ``make_policy`` and below. This one says that
 # the command moves as fast as the arm will, times one number that it fits to the labels.
 
 

@@ -34,9 +34,9 @@ from torchrl_koap.data import (
 )
 from torchrl_koap.envs import AvoidingEnv, mode_index_of
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-from torchrl_koap.evaluation.rollouts import make_policy, roll_out, rollouts_to_tensors
+from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
-from torchrl_koap.modules import Normalizer, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+from torchrl_koap.modules import Normalizer, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics, make_policy
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.reports.rollout_plots import draw_rollouts
 from torchrl_koap.reports.run_facts import RunFacts
@@ -104,7 +104,7 @@ planner_loss.target_network_params.to_module(planner)
 # One episode per environment, all in one batch, each with its own seed. A thousand updates make a planner that is far
 # from finished: compare the picture with the one that ``make demo`` draws.
 
-policy = make_policy(planner, inverse_dynamics, state_columns=task.state_columns)
+policy = make_policy(planner, inverse_dynamics, state_of=task.state_columns)
 seeds = list(range(24))
 episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
 mode_index = mode_index_of(task)

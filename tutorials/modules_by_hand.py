@@ -26,7 +26,6 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl_koap.data import LabelBudget, cut_windows, select_state
 from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-from torchrl_koap.evaluation.rollouts import make_policy
 from torchrl_koap.modules import (
     KoopmanInverseDynamics,
     KoopmanLifting,
@@ -35,6 +34,7 @@ from torchrl_koap.modules import (
     LinearActionDecoder,
     Normalizer,
     PolicyEnv,
+    make_policy,
 )
 from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.tasks import get_task
@@ -101,7 +101,7 @@ print("largest eigenvalues of K:", [round(value, 3) for value in radii[:4].tolis
 # collector are ordinary TorchRL batches.
 
 planner = fit_planner(data, task, steps=600, progress=False)
-policy = make_policy(planner, model.eval(), state_columns=task.state_columns)
+policy = make_policy(planner, model.eval(), state_of=task.state_columns)
 env = PolicyEnv(AvoidingEnv(num_envs=8, max_steps=task.max_steps), policy)
 collector = Collector(env, policy, frames_per_batch=8 * 100, total_frames=8 * 100)
 collector.set_seed(0)

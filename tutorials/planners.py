@@ -23,7 +23,7 @@ import time
 import torch
 from matplotlib.figure import Figure
 
-from torchrl_koap import EvalConfig, get_task, load_policy
+from torchrl_koap import get_task, load_policy
 from torchrl_koap.envs import AvoidingEnv, mode_index_of
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import score
@@ -71,7 +71,7 @@ seeds = list(range(24))
 
 
 def closed_loop(steps, candidates=1):
-    policy = load_policy(run, EvalConfig(candidates=candidates))
+    policy = load_policy(run, candidates=candidates)
     policy.planner.num_steps = steps
     episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=task.max_steps)
     return score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index_of(task)), episodes

@@ -199,7 +199,7 @@ def measured_blocks(task: Task) -> list[str]:
     head = ("method", "demonstrations", "labelled", "success (95 %)", "entropy")
     followed = [
         (row["demonstrations"], row["labels"], execution(row), success(row["successes"], row["n"]), row["entropy"])
-        for row in planner_rows(task=task.name, method="koap_mpc")
+        for row in planner_rows(task=task.name, method="mpc")
     ]
     if not rows and not followed:
         return [heading("Measured", 1), "See :doc:`/results/planners`."]
@@ -207,7 +207,7 @@ def measured_blocks(task: Task) -> list[str]:
     return [
         heading("Measured", 1),
         table(head, rows),
-        "Plans followed by predicting the robot's answer to its commands, :doc:`/generated/methods/koap_mpc`:"
+        "Plans followed by predicting the robot's answer to its commands, :doc:`/generated/methods/mpc`:"
         if followed
         else "",
         table(tracked, followed),

@@ -71,11 +71,14 @@ def test_a_cell_is_trained_rolled_out_and_written_once(study, tmp_path):
     assert float(row["success_low"]) < 0.4 < float(row["success_high"])
     planner, cell, (rolled, how) = study.asked
     assert planner.method == "linear" and cell.planner_from == planner.out and rolled == cell.out
-    assert cell.label_episodes == (0, 1, 2, 3, 4) and (how.execution, how.blend_decay) == ("open_loop", 0.0)
+    assert cell.label_episodes == (0, 1, 2, 3, 4) and (how.execution.strategy, how.execution.blend) == (
+        "open_loop",
+        0.0,
+    )
     assert run(study, tmp_path, "--unlabelled", "both") == [row] and len(study.asked) == 3  # it is there already
     again = run(study, tmp_path, "--unlabelled", "both", "--execution", "feedback", "--blend-decay", "0.8")
     assert [(r["execution"], r["blend_decay"]) for r in again] == [("open_loop", "0.0"), ("feedback", "0.8")]
-    assert len(study.asked) == 4 and study.asked[3][1].blend_decay == 0.8  # nothing is trained anew
+    assert len(study.asked) == 4 and study.asked[3][1].execution.blend == 0.8  # nothing is trained anew
 
 
 def test_where_every_robot_demonstration_is_labelled_there_is_no_action_error(study, tmp_path, monkeypatch):

@@ -26,7 +26,7 @@ def test_what_an_evaluation_writes(copied_run, capsys):
     assert result["mean_steps"] == pytest.approx(sum(row["steps"] for row in rows) / 3)
     assert all(-1 <= row["mode"] < 24 for row in rows) and 0 <= result["mode_entropy"] <= 1
     assert result["control_hz"] > 0 and result["plan_ms"] >= 0 and result["control_ms"] > 0
-    assert (result["execution"], result["replan_interval"]) == ("feedback", 4)
+    assert (result["execution"]["strategy"], result["execution"]["replan_interval"]) == ("feedback", 4)
     tensors, about = load_tensors(copied_run / "rollouts.safetensors")
     assert tensors["length"].tolist() == [row["steps"] for row in rows] and about["task"] == "avoiding"
     assert (copied_run / "index.html").stat().st_size > 1000
@@ -46,11 +46,12 @@ def test_an_evaluation_does_not_depend_on_the_batch_size(copied_run, no_report):
 @pytest.mark.parametrize(
     ("options", "wanted"),
     [
-        (("--execution", "open_loop"), {"execution": "open_loop"}),
+        (("--strategy", "open_loop", "--blend", "0"), {"strategy": "open_loop", "blend": 0.0}),
+        (("--candidates", "2", "--gain", "1.5"), {"candidates": 2, "gain": 1.5}),
         (("--replan-interval", "2"), {"replan_interval": 2}),
     ],
 )
 def test_options_of_an_evaluation(copied_run, no_report, options, wanted):
     assert koap("eval", copied_run, "--episodes", 1, "--threads", 1, *options) == 0
     result = json.loads((copied_run / "eval.json").read_text())
-    assert {key: result[key] for key in wanted} == wanted and result["episodes"] == 1
+    assert {key: result["execution"][key] for key in wanted} == wanted and result["episodes"] == 1

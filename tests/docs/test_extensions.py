@@ -139,10 +139,10 @@ def test_every_command_is_a_page_of_its_options(generated):
 
 def test_success_never_stands_without_its_interval():
     assert pages.success("164", "180") == "91.1 % (86-94) of 180" and pages.success("", "180") == ""
-    for name in ("koap", "koap_mpc"):
+    for name in ("koap", "mpc"):
         cells = [line for line in method_pages.measured(method_pages.METHODS[name]).splitlines() if " of 180" in line]
         assert cells and all(re.search(r"\d % \(\d+-\d+\) of 180", cell) for cell in cells)
-    assert "koap_mpc" in "".join(task_pages.measured_blocks(task_pages.TASKS["avoiding"]))
+    assert "mpc" in "".join(task_pages.measured_blocks(task_pages.TASKS["avoiding"]))
 
 
 def test_tables_keep_several_lines_in_a_cell():

@@ -12,12 +12,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tiny_runs import koap
+from toy_policies import EchoController
 
 from torchrl_koap.data import flatten_trajectories
 from torchrl_koap.envs.contexts import evaluation_contexts
 from torchrl_koap.envs.registry import make_env
 from torchrl_koap.evaluation import diagnosis, inspection
 from torchrl_koap.evaluation.diagnosis import (
+    RecordedFutures,
+    RecordedPlanner,
     contexts_of,
     coverage,
     executed_success,
@@ -30,6 +33,7 @@ from torchrl_koap.evaluation.diagnosis import (
 )
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.evaluation.trained_run import load_run
+from torchrl_koap.modules import Execution, ExecutionConfig, MLPDenoiser, StatePlanner, make_policy
 from torchrl_koap.reports.inspection_plots import draw_experiments
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
@@ -84,19 +88,19 @@ def episode(offset, steps=8, success=True):
     ahead = frames[:steps, None, 2:] + torch.arange(1, 15)[:, None] * torch.tensor([1.0, 0.0])
     flags = torch.zeros(steps, 1, dtype=torch.bool)
     flags[-1] = success
-    chunk = (ahead + torch.tensor([0.0, offset]))[:, None]
+    plan = ahead + torch.tensor([0.0, offset])
     nested = {"observation": frames[1:], "success": flags}
-    return TensorDict({"observation": frames[:-1], "remaining_plan_chunk": chunk, "next": nested}, [steps])
+    return TensorDict({"observation": frames[:-1], "plan": plan, "next": nested}, [steps])
 
 
 def test_distance_from_plan_to_execution_by_hand():
     errors = tracking_errors(AVOIDING, [episode(0.3), episode(0.4)], 4)
     assert list(errors) == ["measured_xy"]
     assert errors["measured_xy"] == pytest.approx([math.sqrt((0.09 + 0.16) / 2)] * 4)
-    assert tracking_errors(AVOIDING, [episode(0.3).exclude("remaining_plan_chunk")], 4) == {}
+    assert tracking_errors(AVOIDING, [episode(0.3).exclude("plan")], 4) == {}
     assert executed_success([episode(0), episode(0, success=False)]) == [True, False]
     stands = episode(0.3, steps=16)
-    stands["remaining_plan_chunk"][8:] += 9.0
+    stands["plan"][8:] += 9.0
     stands["recorded"] = torch.arange(16)[:, None] < 8  # what comes after the recording's end is not held against it
     assert tracking_errors(AVOIDING, [stands], 4)["measured_xy"] == pytest.approx([0.3] * 4)
     brief = episode(9.0, steps=2)  # shorter than the interval between plans: there is nothing to judge
@@ -130,33 +134,43 @@ def test_inspect_from_the_shell(trained_run, tmp_path, capsys):
 
 def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_goal(trained_run, monkeypatch, tmp_path):
     trained = load_run(trained_run)
-    plans = {"execution": "open_loop", "replan_interval": 8, "blend_decay": 0.0}
-    own = plans | {"action_gain": 1.2, "command_lead": 0.05}
+    own = {"strategy": "open_loop", "replan_interval": 8, "blend": 0.0, "gain": 1.2, "lead": 0.05}
     task = replace(trained.task, goal=None, defaults=replace(trained.task.defaults, execution=own))
-    made, policies, make_policy = [], [], inspection.make_policy
+    policies, roll_out = [], diagnosis.roll_out
 
-    def noted(planner, controller, **options):
-        made.append(options)
-        policies.append(make_policy(planner, controller, **options))
-        return policies[-1]
+    def noted(policy, *arguments, **options):
+        policies.append(policy)
+        return roll_out(policy, *arguments, **options)
 
     monkeypatch.setattr(inspection, "load_run", lambda run: replace(trained, task=task))
     for module in (inspection, diagnosis):
-        monkeypatch.setattr(module, "make_policy", noted)
+        monkeypatch.setattr(module, "roll_out", noted)
     config = inspection.InspectConfig(episodes=2, threads=1)
     result = inspection.inspect(trained_run, config).result
-    assert [{name: options[name] for name in plans} for options in made] == [plans, plans]
     for policy in policies:  # recordings are followed by the same actions as plans
-        assert policy.action_gain.tolist() == pytest.approx([1.2, 1.2]) and policy.leash.lead == 0.05
+        assert policy.execution == Execution(**own)
+        assert policy.limits.gain == 1.2 and policy.limits.lead == 0.05
+    assert len(policies) == 2 and policies[1].follower is policies[0].follower
     assert "planner_alone" not in result and result["both"]["episodes"] == 2
     assert result["plan_to_execution"] == {}  # actions are kept, not plans
     assert len(draw_experiments(result, RunFacts(tmp_path, task)).axes) == 2
-    inspection.inspect(trained_run, replace(config, replan_interval=4))
-    assert made[-1]["replan_interval"] == 4 and made[-1]["execution"] == "open_loop"
+    inspection.inspect(trained_run, replace(config, execution=ExecutionConfig(replan_interval=4)))
+    assert policies[-1].execution == Execution(**own | {"replan_interval": 4})
     several = replace(trained, config=trained.config | {"candidates": 3})
     monkeypatch.setattr(inspection, "load_run", lambda run: several)
     inspection.inspect(trained_run, config)
-    assert policies[-2].candidates == 3  # the closed loop; a recording is one plan
+    assert [policy.execution.candidates for policy in policies[-2:]] == [3, 1]  # a recording is one plan
+
+
+def test_recorded_futures_travel_in_an_entry_of_their_own():
+    recorded = RecordedFutures(torch.arange(2 * 3 * 14 * 2.0).reshape(2, 3, 14, 2))
+    planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2))
+    policy = make_policy(planner, EchoController(), state_of=(0, 1), execution=Execution(replan_interval=1, blend=0.0))
+    observed, init = torch.zeros(2, 2, 2), torch.ones(2, 1, dtype=torch.bool)
+    for step in (0, 1, 2, 2):
+        td = TensorDict({"observation_history": observed, "is_init": init, "noise": torch.full((2, 1), torch.nan)}, [2])
+        td = policy(recorded(td))
+        assert torch.equal(td["action"][:, 2:], recorded.futures[:, step, 0])
 
 
 def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
@@ -164,14 +178,15 @@ def test_recordings_of_another_embodiment_are_not_followed(monkeypatch):
     actions = [torch.full((19, 2), float("nan") if number < 4 else 0.1) for number in range(6)]
     data = flatten_trajectories(states, actions)
     data["state"] = data["observation"][:, :2].clone()
-    monkeypatch.setattr(diagnosis, "make_policy", lambda *_, **__: None)
     plans = []
 
-    def noted(*_, futures, **__):
-        plans.append(futures)
-        return [episode(0.0, steps=24) for _ in futures]
+    def noted(policy, make_env, seeds, *, given, **_):
+        plans.extend(given(slice(index, index + 1)).futures for index in seeds)
+        return [episode(0.0, steps=24) for _ in seeds]
 
     monkeypatch.setattr(diagnosis, "roll_out", noted)
-    followed = follow_recordings(Straight(), None, AVOIDING, data, None, episodes=5)
-    assert plans[0][:, 0, 0, 0].tolist() == [4.0, 5.0]
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2)
+    policy = make_policy(planner, EchoController(), state_of=(0, 1))
+    followed = follow_recordings(policy, AVOIDING, data, None, episodes=5)
+    assert [futures[0, 0, 0, 0].item() for futures in plans] == [4.0, 5.0]
     assert [part["recorded"].sum().item() for part in followed] == [18, 18]  # frames of a path but its first

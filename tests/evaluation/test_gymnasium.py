@@ -13,7 +13,6 @@ from toy_gym import NAMES, demonstrations
 
 from torchrl_koap import Agent, EvalConfig, TrainConfig, evaluate, load_policy, save_demonstrations, train
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.modules import EpisodeNoise
 from torchrl_koap.runs.weights import load_tensors
 
 
@@ -54,8 +53,7 @@ def test_results_depend_on_the_seed_alone(arm_run):
 def test_the_actions_are_those_of_an_agent(arm_run):
     evaluate(arm_run, EvalConfig(episodes=1, seed=7, env="toy_gym:ToyReach-v0", threads=1))
     policy = load_policy(arm_run)
-    noise = EpisodeNoise([7], policy.planner.noise_shape, num_steps=6)
-    env, agent = gymnasium.make("ToyReach-v0"), Agent(policy, noise=noise)
+    env, agent = gymnasium.make("ToyReach-v0"), Agent(policy, seed=7)
     observation, _ = env.reset(seed=7)
     agent.reset()
     taken = []

@@ -4,15 +4,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
 from tiny_runs import TINY, koap, write_demonstrations
 
 from torchrl_koap.envs import AvoidingEnv
-from torchrl_koap.evaluation.oracle import OracleControl
+from torchrl_koap.evaluation.diagnosis import RecordedFutures, RecordedPlanner
+from torchrl_koap.evaluation.oracle import OracleFollower
 from torchrl_koap.evaluation.rollouts import roll_out
-from torchrl_koap.modules import MLPDenoiser, RecordedPlanner, StatePlanner
+from torchrl_koap.modules import Execution, MLPDenoiser, StatePlanner, make_policy
 from torchrl_koap.tasks import get_task
 
 TASK = get_task("avoiding")
@@ -30,12 +32,19 @@ def futures_of(start, speed, horizon=14):
     return torch.stack([path[step + 1 : step + 1 + horizon] for step in range(STEPS)])
 
 
+def policy_of(planner=None, **options):
+    planner = planner or StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2)
+    follower = OracleFollower(TASK, blend=0.0, **options)
+    return make_policy(planner, state_of=TASK.state_of, follower=follower, execution=Execution(replan_interval=1))
+
+
 def follow(speeds, **options):
     planner = Straight(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2))
-    policy = OracleControl(planner, TASK, history=2, replan_interval=1, blend_decay=0.0, **options)
+    policy = policy_of(planner, **options)
     start = AvoidingEnv(1).reset()["observation"][0, 2:]
     futures = torch.stack([futures_of(start, speed) for speed in speeds])
-    episodes = roll_out(policy, AvoidingEnv, list(range(len(speeds))), max_steps=STEPS, futures=futures)
+    seeds, given = list(range(len(speeds))), lambda part: RecordedFutures(futures[part])
+    episodes = roll_out(policy, AvoidingEnv, seeds, max_steps=STEPS, given=given)
     return futures, episodes
 
 
@@ -62,15 +71,23 @@ def test_smoothness_is_paid_for_by_tracking():
     assert errors[0] < 0.3 * errors[1]
 
 
+@torch.no_grad()
 def test_wrong_uses():
-    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2)
-    with pytest.raises(ValueError, match="look_ahead must be 1 to 13, below the plan's, got 14"):
-        OracleControl(planner, TASK, history=2, look_ahead=14)
-    with pytest.raises(ValueError, match="execution must be 'feedback'"):
-        OracleControl(planner, TASK, history=2, execution="open_loop")
-    policy = OracleControl(planner, TASK, history=2)
-    with pytest.raises(RuntimeError, match="call attach"):
-        policy.act(torch.zeros(1, 2, 2), torch.zeros(1, 14, 2))
+    observed, plan = torch.zeros(1, 2, 4), torch.zeros(1, 14, 2)
+    with pytest.raises(ValueError, match="look_ahead must be at least 1, got 0"):
+        policy_of(look_ahead=0)
+    with pytest.raises(RuntimeError, match=r"call policy.attach\(env\)"):
+        policy_of().act(observed, plan, 0)
+    long = policy_of(look_ahead=14)
+    long.attach(AvoidingEnv(1))
+    with pytest.raises(ValueError, match="look_ahead must be below the plan's 14 states, got 14"):
+        long.act(observed, plan, 0)
+    long.follower.look_ahead = 4
+    with pytest.raises(RuntimeError, match="decodes nothing ahead"):
+        long.follower(observed, observed[..., 2:], plan, 2)
+    with pytest.raises(ValueError, match="task 'avoiding' has no environment"):
+        OracleFollower(replace(TASK, env=None))
+    policy = policy_of()
     with pytest.raises(ValueError, match="needs an environment that simulates actions, object does not"):
         policy.attach(object())
 
@@ -86,26 +103,26 @@ def runs(tmp_path_factory):
 
 
 def test_the_command(runs):
-    options = ("--episodes", 1, "--threads", 1, "--no-report", "--controller", "oracle", "--out", runs / "out")
+    options = ("--episodes", 1, "--threads", 1, "--no-report", "--strategy", "oracle", "--out", runs / "out")
     assert koap("eval", runs / "koap", *options) == 0
     result = json.loads((runs / "out" / "eval.json").read_text())
-    assert result["controller"] == "oracle" and result["blend_decay"] == 0.8 and result["plan_ms"] > 0
+    execution = result["execution"]
+    assert execution["strategy"] == "oracle" and execution["blend"] == 0.8 and result["plan_ms"] > 0
 
 
 @pytest.mark.parametrize(
     ("run", "option", "message"),
     [
-        ("dp", (), "trained with method 'dp', which has no planner"),
-        ("koap", ("--execution", "open_loop"), "execution must be 'feedback'"),
+        ("dp", (), "strategy 'oracle' was asked of method 'dp', which samples actions"),
         ("koap", ("--env", "CartPole-v1"), "reads the task's own simulation; it cannot be combined with env"),
     ],
 )
 def test_where_there_is_nothing_to_follow(runs, capsys, run, option, message):
-    assert koap("eval", runs / run, "--controller", "oracle", *option) == 1
+    assert koap("eval", runs / run, "--strategy", "oracle", *option) == 1
     assert message in capsys.readouterr().err
     assert not (runs / run / "eval.json").exists()
 
 
-def test_an_unknown_controller(runs, capsys):
-    assert koap("eval", runs / "koap", "--controller", "oracel") == 1
-    assert "unknown controller 'oracel'; did you mean 'oracle'" in capsys.readouterr().err
+def test_an_unknown_strategy(runs, capsys):
+    assert koap("eval", runs / "koap", "--strategy", "oracel") == 1
+    assert "unknown strategy 'oracel'; did you mean 'oracle'" in capsys.readouterr().err

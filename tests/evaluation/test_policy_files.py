@@ -11,13 +11,13 @@ import pytest
 import torch
 from tiny_runs import TINY, koap
 
-from torchrl_koap import Agent, EvalConfig, build_policy, fit_controller, fit_planner, load_policy, save_policy
+from torchrl_koap import Agent, build_policy, fit_controller, fit_planner, load_policy, save_policy
 from torchrl_koap.data import make_demonstrations
 from torchrl_koap.evaluation.policy_files import PolicyDescription
 from torchrl_koap.evaluation.trained_run import load_run
-from torchrl_koap.modules import ChunkedPolicy, PlanThenControl
+from torchrl_koap.modules import Execution, make_policy
 from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
-from torchrl_koap.tasks import REPLAN_INTERVAL, get_task
+from torchrl_koap.tasks import get_task
 
 PATH = np.random.default_rng(0).normal(size=(9, 4)) / 100 + np.array([0.5, -0.2, 0.5, -0.2])
 
@@ -37,60 +37,60 @@ def own_policy():
     )
     planner = fit_planner(data, task, steps=2, channels=(8, 16), progress=False)
     controller = fit_controller(data, task, method="linear", progress=False)
-    return build_policy(planner, controller, replan_interval=3, blend_decay=0.5)
+    return build_policy(planner, controller, replan_interval=3, blend=0.5)
 
 
 def test_a_run_as_one_file(trained_run, tmp_path):
     shutil.copytree(trained_run, tmp_path / "run")
-    config = EvalConfig(execution="open_loop", replan_interval=2)
-    policy = load_policy(tmp_path / "run", config)
+    policy = load_policy(tmp_path / "run", strategy="open_loop", replan_interval=2)
     expected = actions(policy)
     path = save_policy(policy, tmp_path / "elsewhere" / "policy.safetensors")
     shutil.rmtree(tmp_path / "run")
     loaded = load_policy(path)
-    assert isinstance(loaded, PlanThenControl) and not loaded.training
-    assert (loaded.execution, loaded.replan_interval, loaded.blend_decay) == ("open_loop", 2, 0.8)
+    assert loaded.execution == Execution("open_loop", replan_interval=2) and not loaded.training
     np.testing.assert_array_equal(actions(loaded), expected)
-    other = load_policy(str(path), EvalConfig(replan_interval=4))
-    assert (other.execution, other.replan_interval) == ("open_loop", 4)
+    assert load_policy(str(path), replan_interval=4).execution == Execution("open_loop")
 
 
 def test_a_policy_that_is_built_follows_plans_as_its_task_says(own_policy):
-    planner, controller, task = own_policy.planner, own_policy.controller, own_policy.description.task
-    task = replace(task, defaults=replace(task.defaults, execution={"execution": "open_loop", "blend_decay": 0.0}))
-    built = build_policy(planner, controller, task)
-    assert (built.execution, built.replan_interval, built.blend_decay) == ("open_loop", REPLAN_INTERVAL, 0.0)
-    asked = build_policy(planner, controller, task, execution="feedback", replan_interval=2)
-    assert (asked.execution, asked.replan_interval, asked.blend_decay) == ("feedback", 2, 0.0)
+    planner, controller, task = own_policy.planner, own_policy.follower.controller, own_policy.description.task
+    task = replace(task, defaults=replace(task.defaults, execution={"strategy": "open_loop", "blend": 0.0}))
+    assert build_policy(planner, controller, task).execution == Execution("open_loop", blend=0.0)
+    asked = build_policy(planner, controller, task, strategy="feedback", replan_interval=2)
+    assert asked.execution == Execution(replan_interval=2, blend=0.0)
 
 
-def test_a_task_says_how_plans_are_followed_where_nobody_else_does(trained_run):
+def test_asked_goes_before_the_run_the_method_the_task_and_the_library(trained_run):
     trained = load_run(trained_run)
-    own = {"execution": "open_loop", "replan_interval": 8, "blend_decay": 0.0}
-    task = replace(trained.task, defaults=replace(trained.task.defaults, execution=own))
-    policy = load_policy(replace(trained, task=task))
-    assert {name: getattr(policy, name) for name in own} == own
-    policy = load_policy(replace(trained, task=task), EvalConfig(execution="feedback", replan_interval=2))
-    assert (policy.execution, policy.replan_interval, policy.blend_decay) == ("feedback", 2, 0.0)
-    policy = load_policy(trained)
-    assert (policy.execution, policy.replan_interval, policy.blend_decay) == ("feedback", 4, 0.8)
+    assert load_policy(trained).execution == Execution()
+    own = {"strategy": "open_loop", "replan_interval": 8, "blend": 0.0}
+    trained = replace(trained, task=replace(trained.task, defaults=replace(trained.task.defaults, execution=own)))
+    assert load_policy(trained).execution == Execution(**own)
+    method = replace(trained.method, execution={"strategy": "feedback", "blend": 0.5})
+    trained = replace(trained, method=method)
+    assert load_policy(trained).execution == Execution(replan_interval=8, blend=0.5)
+    several = replace(trained, config=trained.config | {"candidates": 3})
+    assert load_policy(several).execution.candidates == 3
+    assert load_policy(several, blend=0.0, candidates=2).execution == Execution(
+        replan_interval=8, blend=0.0, candidates=2
+    )
     assert get_task("scooping").defaults.execution == own
 
 
 def test_a_policy_of_its_own(demonstrations, tmp_path):
     assert koap("train", "--out", tmp_path / "dp", "--dataset", demonstrations, "--method", "dp", *TINY) == 0
-    with pytest.raises(ValueError, match="'open_loop' was asked of .*dp, but method 'dp' is a policy of its own"):
-        load_policy(tmp_path / "dp", EvalConfig(execution="open_loop"))
-    policy = load_policy(tmp_path / "dp", EvalConfig(replan_interval=3))
+    with pytest.raises(ValueError, match="strategy 'feedback' was asked of method 'dp', which samples actions"):
+        load_policy(tmp_path / "dp", strategy="feedback")
+    policy = load_policy(tmp_path / "dp", replan_interval=3)
     loaded = load_policy(save_policy(policy, tmp_path / "dp.safetensors"))
-    assert isinstance(loaded, ChunkedPolicy) and loaded.replan_interval == 3
+    assert loaded.follower is None and loaded.execution == Execution("open_loop", replan_interval=3)
     np.testing.assert_array_equal(actions(loaded), actions(policy))
 
 
 def test_a_robot_that_nobody_registered(own_policy, tmp_path):
     loaded = load_policy(save_policy(own_policy, tmp_path / "arm.safetensors"))
     assert loaded.description.task.name == "my_arm" and loaded.description.columns == (0, 1)
-    assert (loaded.replan_interval, loaded.blend_decay) == (3, 0.5)
+    assert loaded.execution == Execution(replan_interval=3, blend=0.5)
     np.testing.assert_array_equal(actions(loaded, PATH[:, :3]), actions(own_policy, PATH[:, :3]))
     again = load_policy(save_policy(loaded, tmp_path / "again.safetensors"))
     np.testing.assert_array_equal(actions(again, PATH[:, :3]), actions(own_policy, PATH[:, :3]))
@@ -138,15 +138,13 @@ def test_files_that_cannot_be_used_are_named(own_policy, trained_run, tmp_path):
     for path, message in wrong.items():
         with pytest.raises(CheckpointError, match=message):
             load_policy(path)
-    with pytest.raises(CheckpointError, match="good.safetensors was trained on task 'my_arm', not on 'avoiding'"):
-        load_policy(good, EvalConfig(task="avoiding"))
 
 
 def test_what_cannot_be_saved(own_policy, trained_run, tmp_path):
     with pytest.raises(IsADirectoryError, match="is a folder; a policy is one file, such as"):
         save_policy(own_policy, tmp_path)
-    bare = PlanThenControl(own_policy.planner, own_policy.controller, state_columns=(0, 1, 2), history=5)
-    with pytest.raises(TypeError, match="wanted a policy of load_policy.. or build_policy.., got another PlanThenCon"):
+    bare = make_policy(own_policy.planner, own_policy.follower.controller, state_of=(0, 1, 2), columns=(0, 1))
+    with pytest.raises(TypeError, match="wanted a policy of load_policy.. or build_policy.., got another PlanningPol"):
         save_policy(bare, tmp_path / "bare.safetensors")
     assert not list(tmp_path.iterdir())
 

@@ -13,20 +13,15 @@ from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength
 
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.transforms import EndEffectorNoise
-from torchrl_koap.evaluation.rollouts import (
-    make_policy,
-    measure_latency,
-    roll_out,
-    rollouts_to_tensors,
-)
+from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
-from torchrl_koap.modules import StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+from torchrl_koap.modules import Execution, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics, make_policy
 
 SEEDS = [100, 101, 102, 103, 104, 105, 106, 107]
 
 
-def toy_rollouts(seeds, execution="feedback", batch_size=None, **options):
-    policy = make_policy(wandering_planner(), PlannedStep(), state_columns=(2, 3), execution=execution)
+def toy_rollouts(seeds, batch_size=None, **options):
+    policy = make_policy(wandering_planner(), PlannedStep(), state_of=(2, 3))
     return roll_out(policy, AvoidingEnv, seeds, max_steps=90, batch_size=batch_size, **options)
 
 
@@ -58,14 +53,14 @@ def test_results_do_not_depend_on_the_batch_size(together, batch_size):
     assert finished == [min(done, 8) for done in range(batch_size, 8 + batch_size, batch_size)]
 
 
-@pytest.mark.parametrize("execution", ["feedback", "open_loop"])
-def test_real_networks_do_not_depend_on_it_either(execution):
+@pytest.mark.parametrize("strategy", ["feedback", "open_loop"])
+def test_real_networks_do_not_depend_on_it_either(strategy):
     torch.manual_seed(0)
     planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=3, clip=1.0)
     planner.fit_normalizers(0.01 * torch.randn(50, 16, 2).cumsum(1))
     controller = make_koopman_inverse_dynamics(2, 2)
     torch.nn.init.normal_(controller.action_decoder.linear.weight, std=1e-3)
-    policy = make_policy(planner.eval(), controller.eval(), state_columns=(2, 3), execution=execution)
+    policy = make_policy(planner.eval(), controller.eval(), state_of=(2, 3), execution=Execution(strategy))
     together, apart = (roll_out(policy, AvoidingEnv, SEEDS[:3], max_steps=9, batch_size=size) for size in (None, 1))
     for one, other in zip(apart, together, strict=True):
         assert (one["next", "observation"] - other["next", "observation"]).abs().max() < 1e-4
@@ -77,7 +72,7 @@ def test_observation_noise_of_an_episode_depends_on_its_seed_alone():
     def noisy(num_envs):
         return TransformedEnv(AvoidingEnv(num_envs), EndEffectorNoise("avoiding", sigma=0.003))
 
-    policy = make_policy(wandering_planner(), PlannedStep(), state_columns=(2, 3))
+    policy = make_policy(wandering_planner(), PlannedStep(), state_of=(2, 3))
     paths = [
         roll_out(policy, noisy, SEEDS[:3], max_steps=12, batch_size=size)[2]["observation"] for size in (None, 2, 1)
     ]
@@ -110,7 +105,7 @@ def test_episodes_are_cut_at_their_own_end(together):
 def test_one_episode_per_environment_even_if_some_end_early():
     """The first to finish are not over-represented: short and long episodes count once each."""
     lengths = ((3, 3, 3, 3), (9,), (1,), (30,))
-    policy = make_policy(CountingPlanner(), EchoController(), state_columns=(1, 2))
+    policy = make_policy(CountingPlanner(), EchoController(), state_of=(1, 2))
     episodes = roll_out(policy, lambda n: EpisodesOfRandomLength(n, lengths), [0, 1, 2, 3], max_steps=12)
     assert [len(episode) for episode in episodes] == [3, 9, 1, 12]
     assert not episodes[3]["next", "done"].any()
@@ -123,8 +118,8 @@ def test_nothing_to_roll_out_is_refused(seeds, size):
 
 
 def test_history_is_that_of_the_longer_sighted():
-    short = make_policy(CountingPlanner(), EchoController(num_past=0), state_columns=(1, 2))
-    long = make_policy(CountingPlanner(), EchoController(num_past=4), state_columns=(1, 2))
+    short = make_policy(CountingPlanner(), EchoController(num_past=0), state_of=(1, 2))
+    long = make_policy(CountingPlanner(), EchoController(num_past=4), state_of=(1, 2))
     assert (short.history, long.history) == (2, 5)
 
 
@@ -160,7 +155,7 @@ def test_latency_is_measured_per_plan_and_per_step():
             return super().sample(history, noise)
 
     planner = Slow()
-    policy = make_policy(planner, EchoController(), state_columns=(1, 2), replan_interval=4)
+    policy = make_policy(planner, EchoController(), state_of=(1, 2))
     result = measure_latency(policy, 3, repeats=5)
     assert len(planner.calls) == 5 + 3  # one plan for two steps
     assert result["plan_ms"] > 0 and result["control_ms"] > 0

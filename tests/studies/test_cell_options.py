@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchrl_koap.data import flatten_trajectories
+from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.studies.cell_options import (
     CellOptions,
     check_cell_options,
@@ -21,15 +22,15 @@ from torchrl_koap.training.methods import get_method
 
 def test_koap_paper_is_measured_as_published_unless_told_otherwise():
     assert training_options(CellOptions(), "koap_paper") == {"controller_state": "all"}
-    published = {"execution": "open_loop", "blend_decay": 0.0, "candidates": 1}
-    assert evaluation_options(CellOptions(), "koap_paper") == published
-    asked = CellOptions(execution="feedback", joining=0.8, controller_state="robot", candidates=4)
+    assert evaluation_options(CellOptions(), "koap_paper") == {"execution": ExecutionConfig()}
+    assert get_method("koap_paper").execution == {"strategy": "open_loop", "blend": 0.0, "candidates": 1}
+    asked = CellOptions(strategy="feedback", blend=0.8, controller_state="robot", candidates=4)
     assert training_options(asked, "koap_paper") == {"controller_state": "robot"}
-    told = {"execution": "feedback", "blend_decay": 0.8, "candidates": 4}
+    told = {"execution": ExecutionConfig("feedback", blend=0.8, candidates=4)}
     assert evaluation_options(asked, "koap_paper") == told == evaluation_options(asked, "dd")
-    assert evaluation_options(asked, "dp") == {"candidates": 4}
-    assert evaluation_options(CellOptions(candidates=4), "koap_paper") == published
-    assert evaluation_options(CellOptions(), "koap") == training_options(CellOptions(), "koap") == {}
+    assert evaluation_options(asked, "dp") == {"execution": ExecutionConfig(candidates=4)}
+    assert evaluation_options(CellOptions(candidates=4), "koap_paper") == {"execution": ExecutionConfig()}
+    assert training_options(CellOptions(), "koap") == {}
 
 
 def test_coefficients_reach_those_whose_loss_has_them():
@@ -49,10 +50,10 @@ def test_what_is_said_of_policies_reaches_those_that_have_no_planner():
 @pytest.mark.parametrize(
     ("options", "methods", "message"),
     [
-        ({"execution": "open_loop"}, "koap,dp", "'open_loop' was asked of dp: a policy of its own executes chunks"),
-        ({"execution": "open"}, "koap", "unknown execution 'open'"),
-        ({"execution": "open_loop", "candidates": 4}, "koap", "'open_loop' goes with 1 candidate, got 4"),
-        ({"joining": 1.0}, "koap", r"joining must be in \[0, 1\), got 1.0"),
+        ({"strategy": "open_loop"}, "koap,dp", "'open_loop' was asked of dp: a policy of its own executes chunks"),
+        ({"strategy": "open"}, "koap", "unknown strategy 'open'"),
+        ({"strategy": "open_loop", "candidates": 4}, "koap", "'open_loop' goes with 1 candidate, got 4"),
+        ({"blend": 1.0}, "koap", r"blend must be in \[0, 1\), got 1.0"),
         ({"koopman_coeff": 1.0}, "dd,dp", "koopman_coeff was given, but no loss of dd, dp has it"),
         ({"action_coeff": -1.0}, "koap_paper", "action_coeff must be >= 0, got -1.0"),
         ({"controller_state": "arm"}, "koap", "unknown part of the state 'arm'"),

@@ -69,7 +69,7 @@ def test_what_is_written(tmp_path):
 
 def test_default_methods_are_one_line_where_tasks_differ(tmp_path, monkeypatch):
     here = "stacking_unobserved_joints"
-    rows = [cell("avoiding", "koap", 0.02, 54), cell(here, "koap", 0.01, 0), cell(here, "koap_posture", 0.01, 30)]
+    rows = [cell("avoiding", "koap", 0.02, 54), cell(here, "koap", 0.01, 0), cell(here, "command_regression", 0.01, 30)]
     entries = paper_entries(rows)
     assert {(entry.task, entry.success) for entry in default_entries(entries)} == {("avoiding", 0.9), (here, 0.5)}
     ((level, mean, *_),) = average_over_tasks(default_entries(entries))[DEFAULT]

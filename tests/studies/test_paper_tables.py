@@ -116,7 +116,7 @@ def test_dp_is_trained_no_longer_than_planners_unless_an_option_says_how(asked_f
 def test_a_table_has_the_method_that_a_task_is_trained_with(asked, tmp_path):
     run_bench(BenchConfig(tmp_path / "t", table=1, tasks="aligning,stacking_unobserved_joints"))
     aligning, stacking = (options.methods.split(",") for options in asked)
-    assert "koap_posture" not in aligning and stacking == [*aligning, "koap_posture"]
+    assert "command_regression" not in aligning and stacking == [*aligning, "command_regression"]
     run_bench(BenchConfig(tmp_path / "u", table=1, tasks="stacking_unobserved_joints", methods="koap,dd"))
     assert asked[-1].methods == "koap,dd"
 

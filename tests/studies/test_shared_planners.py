@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from tiny_runs import TINY, koap
 
+from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.studies import label_efficiency
 from torchrl_koap.studies.label_efficiency import CurveConfig, run_curve
@@ -60,11 +61,7 @@ def test_a_planner_that_does_not_grow_with_the_controllers_data(jobs):
 def test_koap_paper_is_told_what_was_published(jobs):
     told = jobs(methods="koap_paper,koap")["cells/koap_paper-0.5-1-seed0"].arguments
     assert told["settings"]["controller_state"] == "all"
-    assert told["evaluation"] == {"episodes": 60, "threads": 1} | {
-        "execution": "open_loop",
-        "blend_decay": 0.0,
-        "candidates": 1,
-    }
+    assert told["evaluation"] == {"episodes": 60, "threads": 1, "execution": ExecutionConfig()}
 
 
 def test_a_share_of_the_data_leaves_labels_shares_of_the_whole(jobs, tmp_path):

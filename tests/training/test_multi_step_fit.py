@@ -7,17 +7,17 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.modules import CommandResponse
+from torchrl_koap.modules import ResponseModel
 from torchrl_koap.training import multi_step_fit
 from torchrl_koap.training.multi_step_fit import Stretches, fit_predictions, prediction_errors
 from torchrl_koap.training.response import fit_response
 
 
-def a_response() -> CommandResponse:
-    return CommandResponse([0, 1], [0, 1], [0, 1]).double()
+def a_response() -> ResponseModel:
+    return ResponseModel([0, 1], [0, 1], [0, 1]).double()
 
 
-def a_system() -> CommandResponse:
+def a_system() -> ResponseModel:
     system = a_response()
     system.weight[[0, 1], [0, 1], 0] = torch.tensor([0.7, 0.5], dtype=torch.float64)
     system.weight[[0, 1], [0, 1], 2] = torch.tensor([0.1, 0.2], dtype=torch.float64)

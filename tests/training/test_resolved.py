@@ -16,15 +16,15 @@ class TestTheTasksMethod:
         "task, method",
         [
             ("avoiding", "koap"),
-            ("stacking", "koap_mpc"),
-            ("stacking_1", "koap_mpc"),
-            ("stacking_unobserved_joints", "koap_posture"),
+            ("stacking", "mpc"),
+            ("stacking_1", "mpc"),
+            ("stacking_unobserved_joints", "command_regression"),
         ],
     )
     def test_is_trained_unless_another_is_asked_for(self, task, method):
         resolved = resolve(TrainConfig(out=Path("run"), task=task))
         assert resolved.options.method == resolved.method.name == resolved.controller["method"] == method
-        assert ("tracking" in resolved.controller) == (method == "koap_mpc")
+        assert ("columns" in resolved.controller) == (method != "koap")
         assert resolve(TrainConfig(out=Path("run"), task=task, method="linear")).options.method == "linear"
 
 

@@ -7,17 +7,17 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.modules import CommandResponse
+from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Action, Task, get_task
 from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.response import fit_response, labelled_steps, tracked_columns
 
 
-def columns(**options) -> CommandResponse:
-    return CommandResponse([0, 1], [0, 1], [0, 1], **options)
+def columns(**options) -> ResponseModel:
+    return ResponseModel([0, 1], [0, 1], [0, 1], **options)
 
 
-def a_system() -> CommandResponse:
+def a_system() -> ResponseModel:
     system = columns()
     system.weight[[0, 1], [0, 1], 0] = torch.tensor([0.7, 0.5])
     system.weight[[0, 1], [0, 1], 2] = torch.tensor([0.1, 0.2])
@@ -127,4 +127,4 @@ def test_a_task_without_commands_is_refused_before_any_work():
         name="arm", observation_parts={"joints": 2}, actions={"a": Action("rad"), "b": Action("rad")}, position="joints"
     )
     with pytest.raises(ValueError, match=r"task 'arm' .* repeats the last command \(Task.command\)"):
-        resolve(TrainConfig(out="", method="koap_mpc"), task)
+        resolve(TrainConfig(out="", method="mpc"), task)

@@ -113,7 +113,7 @@ def settled(summary):
 LONGER = {"steps": 12, "controller_steps": 12}
 KILLED = {
     "koap": ["controller"],
-    "koap_posture": ["controller"],
+    "command_regression": ["controller"],
     "pretrain": ["controller", "finetune"],
     "vae": ["controller", "decoder"],
     "lapo": ["controller", "decoder"],
@@ -190,7 +190,7 @@ def test_a_policy_is_evaluated_without_a_planner(policy_run, tmp_path, capsys):
     assert not (out / "planner.safetensors").exists()
     assert koap("eval", out, "--episodes", 2, "--threads", 1, "--no-report") == 0
     result = json.loads((out / "eval.json").read_text())
-    assert result["execution"] == "chunks"
+    assert result["execution"]["strategy"] == "open_loop"
     assert [row["seed"] for row in result["episode"]] == [100, 101]
     assert result["success_rate"] == sum(row["outcome"] == "success" for row in result["episode"]) / 2
     rollouts = load_tensors(out / "rollouts.safetensors")[0]

@@ -13,7 +13,7 @@ from torchrl_koap.commands.command import Command
 from torchrl_koap.evaluation import load_policy, load_run
 from torchrl_koap.evaluation.latency import time_calls
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import PlanThenControl
+from torchrl_koap.modules import InverseDynamicsFollower
 from torchrl_koap.modules.execution.export import PARTS, SUFFIXES, export_part, exportable
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.pretrained import writable_folder
@@ -46,7 +46,7 @@ class Export(Command):
         policy = load_policy(trained)
         out = writable_folder(self.run) / "exported" if self.out is None else self.out
         out.mkdir(parents=True, exist_ok=True)
-        parts = [part for part in PARTS if part != "controller" or isinstance(policy, PlanThenControl)]
+        parts = [part for part in PARTS if part != "controller" or isinstance(policy.follower, InverseDynamicsFollower)]
         result: dict[str, Any] = {}
         with progress_bar(len(parts), "export", unit="part") as bar:
             for part in parts:

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
+import tyro
+
+from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.plugins import Plugins
 
-CONTROLLERS = ("learned", "oracle")
 MOST_EPISODES = 100_000  # kept in memory
 
 
@@ -22,19 +23,7 @@ class EvalConfig:
         episodes: number of rollouts; tasks with contexts take the fixed ones of the evaluation table in turn.
         rollouts_per_context: rollouts in each context; from 2 on the entropy of the modes per context is known.
         seed: seed of the first rollout; the others count on from it.
-        controller: "learned", or "oracle": the simulator's own inverse map, which takes the tool where the plan says:
-            what fails then is not a question of labels.
-        execution: "feedback" (decode at every step) or "open_loop" (decode once per plan) (default: feedback, or the
-            task's).
-        replan_interval: control steps per plan (default: 4, or the task's).
-        blend_decay: share of the distance between state and plan that is left after each step; 0: plans as they are
-            (default: 0.8, or the task's).
-        command_lead: farthest that the command may be ahead of the robot along each axis, in the units of the
-            actions; 0: any distance (default: the task's, else 0).
-        action_gain: what actions that are changes of a command are multiplied by: above 1 the robot is quicker than
-            planned (default: the task's, else 1).
-        candidates: plans (of dp: action chunks) sampled whenever one is due, one of which is taken that goes on with
-            the one in force (default: as the run says, else 1).
+        execution: how plans become actions; what is not asked for is the run's, the method's, the task's.
         out: folder to evaluate in instead of the run's own; what the run is made of is copied there.
         batch_size: episodes at a time; results do not depend on it.
         contexts_file: a context file of D3IL to take instead of the table.
@@ -50,19 +39,13 @@ class EvalConfig:
 
     Examples:
         >>> from torchrl_koap.evaluation import EvalConfig, evaluate
-        >>> evaluate("runs/koap", EvalConfig(episodes=20, execution="open_loop"))["success_rate"]  # doctest: +SKIP
+        >>> evaluate("runs/koap", EvalConfig(episodes=20))["success_rate"]  # doctest: +SKIP
     """
 
     episodes: int = 60
     rollouts_per_context: int = 1
     seed: int = 100
-    controller: str = "learned"
-    execution: str | None = None
-    replan_interval: int | None = None
-    blend_decay: float | None = None
-    command_lead: float | None = None
-    action_gain: float | None = None
-    candidates: int | None = None
+    execution: Annotated[ExecutionConfig, tyro.conf.arg(name="")] = ExecutionConfig()
     out: Path | None = None
     batch_size: int | None = None
     contexts_file: Path | None = None
@@ -74,20 +57,6 @@ class EvalConfig:
     threads: int = 2
     device: str = "cpu"
     plugins: Plugins = ()
-
-
-def check_ways(config: EvalConfig) -> None:
-    """Refuses ways to follow plans and controllers that there are not.
-
-    Args:
-        config (EvalConfig): what was asked for.
-
-    Raises:
-        ValueError: naming the option and the nearest one.
-    """
-    lookup(CONTROLLERS, config.controller, "controller")
-    if config.execution is not None:
-        lookup(EXECUTIONS, config.execution, "execution")
 
 
 def check_options(config: EvalConfig) -> None:
@@ -114,4 +83,3 @@ def check_options(config: EvalConfig) -> None:
             f"success_key was given, but no env that could report {config.success_key!r}: name an environment of"
             " Gymnasium with --env"
         )
-    check_ways(config)

@@ -14,17 +14,72 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
 
 from torchrl_koap.data import trajectory_lengths
-from torchrl_koap.evaluation.rollouts import make_policy, roll_out
+from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.scores import outcome_of
-from torchrl_koap.keys import HAS_ACTION, OBSERVATION
-from torchrl_koap.modules import StatePlanner
-from torchrl_koap.modules.execution.replay import RecordedPlanner
+from torchrl_koap.keys import HAS_ACTION, OBSERVATION, PLAN
+from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
 
+RECORDED_FUTURE = "recorded_future"
 RECORDED = "recorded"  # steps whose next state the recording that is followed has, not the standing at its end
+
+
+class RecordedFutures(TensorDictModuleBase):
+    """Writes the recorded states that follow the current step, for a :class:`RecordedPlanner` to hand on.
+
+    Args:
+        futures (Tensor): for every environment and control step the states that follow ``[E, steps, H, d]``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.evaluation.diagnosis import RecordedFutures
+        >>> futures = RecordedFutures(torch.arange(6.0).reshape(1, 2, 3, 1))
+        >>> [futures(TensorDict(batch_size=[1]))["recorded_future"].flatten().tolist() for _ in range(2)]
+        [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
+    """
+
+    def __init__(self, futures: Tensor):
+        super().__init__()
+        self.in_keys, self.out_keys = [], [RECORDED_FUTURE]
+        self.register_buffer("futures", futures, persistent=False)
+        self.step = 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the futures of the current step (the last ones when the record is over) and moves on."""
+        tensordict.set(RECORDED_FUTURE, self.futures[:, min(self.step, self.futures.shape[1] - 1)])
+        self.step += 1
+        return tensordict
+
+
+class RecordedPlanner(nn.Module):
+    """A planner that knows the recorded future: what a controller does under it is its own doing.
+
+    Args:
+        planner (StatePlanner): the planner whose history and horizon it has.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.evaluation.diagnosis import RecordedPlanner
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
+        >>> planner = RecordedPlanner(StatePlanner(TemporalUnet(2, 4), state_dim=2))
+        >>> planner.sample(torch.zeros(3, 2, 2), torch.ones(3, 14, 2)).shape
+        torch.Size([3, 14, 2])
+    """
+
+    noise_key = RECORDED_FUTURE  # what a policy hands over is no noise here
+
+    def __init__(self, planner: StatePlanner):
+        super().__init__()
+        self.history, self.horizon = planner.history, planner.horizon
+
+    def sample(self, history: Tensor, future: Tensor) -> Tensor:
+        """The futures ``[*B, H, d]`` that :class:`RecordedFutures` wrote, of histories ``[*B, h, d]``."""
+        return future.expand(*history.shape[:-2], -1, -1)
 
 
 @torch.no_grad()
@@ -95,20 +150,12 @@ def recorded_futures(states: Sequence[Tensor], horizon: int) -> Tensor:
 
 
 def follow_recordings(
-    planner: StatePlanner,
-    controller,
-    task: Task,
-    data: TensorDictBase,
-    make_env: Callable[[int], Any],
-    *,
-    episodes: int,
-    **options,
+    policy: PlanningPolicy, task: Task, data: TensorDictBase, make_env: Callable[[int], Any], *, episodes: int
 ) -> list[TensorDict]:
     """Closed-loop episodes in which recorded states take the place of plans.
 
     Args:
-        planner (StatePlanner): for its history and horizon alone.
-        controller (nn.Module): the controller under test.
+        policy (PlanningPolicy): the policy under test; of its planner history and horizon alone are used.
         task (Task): the task.
         data (TensorDictBase): flat demonstrations with ``state``. Where ``has_action`` says that some of them were
             recorded without any action, by another embodiment, those are not followed.
@@ -116,7 +163,6 @@ def follow_recordings(
 
     Keyword Args:
         episodes (int): demonstrations to follow, spread evenly over the data.
-        **options: of :func:`~torchrl_koap.evaluation.rollouts.make_policy`.
 
     Returns:
         list: an episode each, with :data:`RECORDED` ``[T, 1]``.
@@ -129,14 +175,22 @@ def follow_recordings(
     chosen = own[torch.linspace(0, len(own) - 1, min(episodes, len(own))).long().unique()].tolist()
     paths = data["state"].split(lengths)
     starts = torch.stack([data[OBSERVATION].split(lengths)[index][0] for index in chosen])
-    policy = make_policy(RecordedPlanner(planner), controller, state_columns=task.state_of, **options)
+    planner = RecordedPlanner(policy.planner)
+    perfect = PlanningPolicy(
+        planner,
+        policy.follower,
+        state_of=policy.state_of,
+        execution=policy.execution.replaced(candidates=1),
+        limits=policy.limits,
+    )
+    futures = recorded_futures([paths[index] for index in chosen], planner.horizon)
     followed = roll_out(
-        policy,
+        perfect,
         make_env,
         list(range(len(chosen))),
         max_steps=task.max_steps,
         contexts=contexts_of(task, starts.double()).numpy() if task.objects else None,
-        futures=recorded_futures([paths[index] for index in chosen], planner.horizon),
+        given=lambda part: RecordedFutures(futures[part]),
     )
     for episode, index in zip(followed, chosen, strict=True):
         episode[RECORDED] = (torch.arange(len(episode)) < len(paths[index]) - 1).unsqueeze(-1)
@@ -144,11 +198,11 @@ def follow_recordings(
 
 
 def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -> dict[str, list[float]]:
-    """How far executed states lie from the plan in force, per part of the state.
+    """How far executed states lie from the current plan, per part of the state.
 
     Args:
         task (Task): tells the parts of the state.
-        episodes (sequence of TensorDict): rollouts ``[T]`` with the entry ``remaining_plan_chunk``; of those that
+        episodes (sequence of TensorDict): rollouts ``[T]`` with the entry ``plan``; of those that
             follow a recording the steps count that it has, not the standing at its end.
         interval (int): control steps per plan.
 
@@ -157,15 +211,14 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
     """
     errors: dict[str, list[Tensor]] = {name: [] for name in task.state_slices}
     for episode in episodes:
-        if "remaining_plan_chunk" not in episode.keys():
+        if PLAN not in episode.keys():
             return {}
         if RECORDED in episode.keys():
             episode = episode[episode[RECORDED].squeeze(-1)]
         states = task.state_of(torch.cat([episode[OBSERVATION], episode[-1:]["next", OBSERVATION]]))
-        chunk = episode["remaining_plan_chunk"]
         made = torch.arange(0, max(len(episode) - interval + 1, 0), interval)
         steps = torch.arange(1, interval + 1)
-        gap = states[made[:, None] + steps] - chunk[made, 0, :interval]
+        gap = states[made[:, None] + steps] - episode[PLAN][made, :interval]
         for name, columns in task.state_slices.items():
             errors[name].append(gap[..., columns].square().sum(-1))
     return {name: torch.cat(parts).mean(0).sqrt().tolist() for name, parts in errors.items() if parts}

@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+import tyro
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import controller_view, trajectory_lengths
-from torchrl_koap.evaluation.config import EvalConfig
 from torchrl_koap.evaluation.diagnosis import (
     coverage,
     executed_success,
@@ -25,11 +25,11 @@ from torchrl_koap.evaluation.diagnosis import (
 from torchrl_koap.evaluation.environments import choose_contexts
 from torchrl_koap.evaluation.findings import NEAR, describe_inspection
 from torchrl_koap.evaluation.latent_space import analyse_latent
-from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy, roll_out
+from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.statistics import rate
-from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_run
+from torchrl_koap.evaluation.trained_run import TrainedRun, load_run, trained_policy
 from torchrl_koap.evaluation.training_data import load_training_data
-from torchrl_koap.modules import KoopmanInverseDynamics
+from torchrl_koap.modules import ExecutionConfig, KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.runs.pretrained import writable_folder
@@ -47,8 +47,7 @@ class InspectConfig:
         dataset: demonstrations to compare with (default: those the run was trained on).
         out: folder to write to instead of the run's own; what the run is made of is copied there.
         seed: seed of the planner's noise.
-        replan_interval: control steps per plan (default: as `koap eval` has it, and likewise the next).
-        blend_decay: share of the distance between state and plan that is left after each step.
+        execution: how plans become actions (default: as `koap eval` has it).
         latent_only: look into the latent space alone: seconds, without the experiments in the simulator.
         latent_steps: control steps that the latent dynamics predict (fewer where demonstrations are short).
         threads: torch and simulator threads.
@@ -64,8 +63,7 @@ class InspectConfig:
     dataset: str | None = None
     out: Path | None = None
     seed: int = 500
-    replan_interval: int | None = None
-    blend_decay: float | None = None
+    execution: Annotated[ExecutionConfig, tyro.conf.arg(name="")] = ExecutionConfig()
     latent_only: bool = False
     latent_steps: int = 10
     threads: int = 2
@@ -168,24 +166,18 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
 
 def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBase) -> dict[str, Any]:
     task = trained.task
-    planner, controller = trained.planner.to(config.device), trained.controller.to(config.device)
-    asked = EvalConfig(replan_interval=config.replan_interval, blend_decay=config.blend_decay)
-    settings = execution_of(trained, asked)
-    interval = settings["replan_interval"]
-    settings |= {"controller_columns": trained.columns, "action_rule": task.action_rule}
-    settings["leash"] = make_leash(task, settings.pop("command_lead"))
-    settings["action_gain"] = make_gain(task, settings["action_gain"])
+    planner = trained.planner.to(config.device)
+    policy = trained_policy(trained, config.execution).to(config.device)
+    interval = policy.execution.replan_interval
     seeds = list(range(config.seed, config.seed + config.episodes))
     from torchrl_koap.envs.registry import make_env_of  # takes seconds
 
     make_env = make_env_of(task, num_threads=config.threads)
     _, contexts = choose_contexts(task, config.episodes)
     with progress_bar(3, "experiments", unit="experiment") as bar:
-        several = trained.candidates
-        policy = make_policy(planner, controller, state_columns=task.state_of, candidates=several, **settings)
         closed = roll_out(policy, make_env, seeds, max_steps=task.max_steps, contexts=contexts)
         bar.update()
-        followed = follow_recordings(planner, controller, task, data, make_env, episodes=config.episodes, **settings)
+        followed = follow_recordings(policy, task, data, make_env, episodes=config.episodes)
         bar.update()
         found = {}
         if task.goal is not None:

@@ -12,72 +12,63 @@ and Ramaker, 1980), of which the first one is executed::
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from torchrl_koap.modules.execution.plan_then_control import PlanThenControl, blend_plan
-from torchrl_koap.modules.planning.planner import StatePlanner
+from torchrl_koap.modules import Follower, blend_plan
+from torchrl_koap.modules.execution.followers import command_rest
 from torchrl_koap.tasks import Task
 
 LOOK_AHEAD = 4  # control steps over which the plan is followed; the arm needs about three to follow a command
 SMOOTHNESS = 0.02  # weight of a change of the action against a distance from the plan
-_REFRESH = 8  # control steps after which the response, which changes with the arm's posture, is tried again
+_REFRESH = 8  # control steps after which the response, which changes with the arm's joints, is tried again
 _PUSH = {"m": 0.004, "rad": 0.01}  # change of a command by which its effect is measured
 
 
-class OracleControl(PlanThenControl):
-    """Plans states, and executes the commands that take the simulated robot there.
+class OracleFollower(Follower):
+    """Executes the commands that take the simulated robot where plans say.
 
     It reads the simulation, not the observation: nothing that a robot could have. How exactly the tool follows
     its plan is beyond any learned controller; whether the task succeeds is not, where the tool pushes something.
 
     Args:
-        planner (StatePlanner): plans states from the last observed ones.
         task (Task): the task; its environment must be one of :class:`~torchrl_koap.envs.ManipulationEnv`.
 
     Keyword Args:
-        history (int): observed frames handed over.
-        look_ahead (int): control steps over which the plan is followed.
+        blend (float): share of the distance to the plan that remains after each frame.
+        look_ahead (int): control steps over which the plan is followed, below the plan's.
         smoothness (float): weight of changes of the action.
-        **options: as for :class:`~torchrl_koap.modules.PlanThenControl`.
 
     Raises:
-        ValueError: if the plan is too short, or the execution is not ``"feedback"``.
+        ValueError: if the task has no environment, or does not say which state columns its actions move.
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.evaluation.oracle import OracleControl
+        >>> from torchrl_koap.evaluation.oracle import OracleFollower
         >>> from torchrl_koap.evaluation.rollouts import roll_out
         >>> from torchrl_koap.envs import AvoidingEnv
-        >>> from torchrl_koap.modules import MLPDenoiser, StatePlanner
+        >>> from torchrl_koap.modules import MLPDenoiser, StatePlanner, make_policy
         >>> from torchrl_koap.tasks import get_task
         >>> _ = torch.manual_seed(0)
-        >>> planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2, num_steps=2)
-        >>> policy = OracleControl(planner, get_task("avoiding"), history=2)
+        >>> planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2)
+        >>> task = get_task("avoiding")
+        >>> policy = make_policy(planner, state_of=task.state_of, follower=OracleFollower(task))
         >>> roll_out(policy, AvoidingEnv, [0], max_steps=3)[0]["action"].shape
         torch.Size([3, 2])
     """
 
-    def __init__(
-        self,
-        planner: StatePlanner,
-        task: Task,
-        *,
-        history: int,
-        look_ahead: int = LOOK_AHEAD,
-        smoothness: float = SMOOTHNESS,
-        **options: Any,
-    ):
-        if options.get("execution", "feedback") != "feedback":
-            raise ValueError(f"the oracle controller looks at every step: execution must be 'feedback', got {options}")
-        if not 1 <= look_ahead < planner.horizon:
-            raise ValueError(f"look_ahead must be 1 to {planner.horizon - 1}, below the plan's, got {look_ahead}")
-        super().__init__(planner, nn.Identity(), state_columns=task.state_of, history=history, **options)
-        self.task, self.look_ahead, self.smoothness = task, look_ahead, smoothness
+    knows_command = True
+
+    def __init__(self, task: Task, *, blend: float = 0.8, look_ahead: int = LOOK_AHEAD, smoothness: float = SMOOTHNESS):
+        super().__init__()
+        if task.env is None:
+            raise ValueError(f"task {task.name!r} has no environment, whose simulation the strategy 'oracle' reads")
+        if look_ahead < 1:
+            raise ValueError(f"look_ahead must be at least 1, got {look_ahead}")
+        self.task, self.blend, self.look_ahead, self.smoothness = task, blend, look_ahead, smoothness
+        self._rule = task.action_rule if task.gripper is not None else None
         self._changes, self._moved = list(task.delta_actions), list(task.moved_columns(or_robot=True))
         if not self._changes or len(self._moved) != len(self._changes):
             raise ValueError(f"task {task.name!r} does not say which state columns its actions move (Action.column)")
@@ -103,32 +94,30 @@ class OracleControl(PlanThenControl):
         self._env, self._time, self._last = base, 0, np.zeros((count, size))
         self._matrix = np.zeros((count, self.look_ahead * size, self.look_ahead * size))
 
-    def act(self, history: Tensor, cached: Tensor) -> Tensor:
-        """The action whose effect is nearest to the plan.
+    def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
+        """The action ``[n, 1, act]`` whose effect is nearest to the plan; arguments as for the base class.
 
-        Args:
-            history (Tensor): observed states ``[n, history, d]``, raw units.
-            cached (Tensor): what remains of the plan ``[n, H, d]``; its first state is the present one, which is
-                observed a step late.
+        The first planned state is the present one, which is observed a step late.
 
         Raises:
-            RuntimeError: before :meth:`attach`.
+            RuntimeError: before :meth:`attach`, or if it is asked for actions ahead.
         """
         if self._env is None:
-            raise RuntimeError("the oracle controller does not know its environment: call attach(env) first")
-        plan = blend_plan(history, cached, self.blend_decay)
-        action = np.zeros((len(plan), self.task.action_dim))
-        states = torch.cat([history, cached], -2)
-        if self.action_rule is not None:
-            zeros = states.new_zeros(*states.shape[:-1], self.task.action_dim)
-            action = self.action_rule(states, zeros)[:, self.history - 1].double().cpu().numpy()
-            action[:, self._changes] = 0.0
+            raise RuntimeError("the strategy 'oracle' does not know its environment: call policy.attach(env) first")
+        if steps != 1:
+            raise RuntimeError("the strategy 'oracle' reads the simulation at every step: it decodes nothing ahead")
+        if plan.shape[-2] <= self.look_ahead:
+            raise ValueError(f"look_ahead must be below the plan's {plan.shape[-2]} states, got {self.look_ahead}")
+        bent = blend_plan(states, plan, self.blend)
+        rest = command_rest(self._rule, states, plan, self.task.action_dim, 1)
+        action = rest[:, 0].double().cpu().numpy()
+        action[:, self._changes] = 0.0
         rows = np.flatnonzero(~self._env.over)
         if not len(rows):
-            return torch.as_tensor(action, dtype=cached.dtype, device=cached.device)
-        wanted = plan[rows, 1 : self.look_ahead + 1][..., self._moved].double().cpu().numpy()
+            return torch.as_tensor(action, dtype=plan.dtype, device=plan.device).unsqueeze(1)
+        wanted = bent[rows, 1 : self.look_ahead + 1][..., self._moved].double().cpu().numpy()
         action[np.ix_(rows, self._changes)] = self._last[rows] = self._solve(rows, action[rows], wanted)
-        return torch.as_tensor(action, dtype=cached.dtype, device=cached.device)
+        return torch.as_tensor(action, dtype=plan.dtype, device=plan.device).unsqueeze(1)
 
     def _solve(self, rows: np.ndarray, held: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         """First actions ``[n, a]`` of those that lead along ``wanted [n, k, a]``; ``held [n, act]`` leave commands."""

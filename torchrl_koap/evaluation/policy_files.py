@@ -7,30 +7,25 @@ The file is safetensors with a JSON header; reading one runs no code that it bri
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
-from torchrl_koap.evaluation.rollouts import make_gain, make_leash, make_policy
-from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import ChunkedPolicy, RecedingHorizonPolicy, StatePlanner
-from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
+from torchrl_koap.modules import Execution, ExecutionConfig, Follower, PlanningPolicy, StatePlanner, make_policy
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.weights import CheckpointError, check_weights, load_tensors, save_tensors
-from torchrl_koap.tasks import REPLAN_INTERVAL, Task, get_task
+from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.tasks.registry import plain_task
 from torchrl_koap.training.builders import build_controller, method_named
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.fit import Recipe
 from torchrl_koap.training.method import Method
+from torchrl_koap.training.policy_facts import policy_facts
 from torchrl_koap.training.provenance import versions
 
 FORMAT, VERSION = "torchrl_koap policy", 1
-BLEND_DECAY = 0.8
-_OPTIONS = ("execution", "replan_interval", "blend_decay", "candidates", "command_lead", "action_gain")
 
 
 @dataclass(frozen=True)
@@ -82,78 +77,71 @@ def build_networks(
     return plans.eval(), acts.eval(), columns
 
 
-def assemble_policy(
+def policy_of(
     planner: StatePlanner | None,
     controller: nn.Module,
     description: PolicyDescription,
-    *,
-    execution: str = "feedback",
-    replan_interval: int = REPLAN_INTERVAL,
-    blend_decay: float = BLEND_DECAY,
-    candidates: int = 1,
-    command_lead: float = 0.0,
-    action_gain: float = 1.0,
-) -> RecedingHorizonPolicy:
+    execution: Execution,
+    follower: Follower | None = None,
+) -> PlanningPolicy:
     """Networks as a policy that knows how it was built.
 
     Args:
-        planner (StatePlanner, optional): the planner, None for a policy of its own.
-        controller (nn.Module): the controller, or the policy.
+        planner (StatePlanner, optional): the planner, None for a sampler of actions.
+        controller (nn.Module): the controller, or the sampler.
         description (PolicyDescription): how they were built.
-
-    Keyword Args:
-        execution (str): ``"feedback"`` or ``"open_loop"``; not looked at without a planner.
-        replan_interval (int): control steps per plan.
-        blend_decay (float): share of the distance between state and plan that is left after each step.
-        candidates (int): plans, or action chunks, sampled whenever one is due.
-        command_lead (float): farthest that the command may be ahead of the robot
-            (:class:`~torchrl_koap.modules.CommandLeash`); 0: any distance.
-        action_gain (float): what actions that are changes of a command are multiplied by.
+        execution (Execution): how plans become actions.
+        follower (Follower, optional): follows plans in place of the controller.
 
     Raises:
-        ValueError: for an unknown execution or rule, a number out of range, or a lead or gain in a task whose actions
-            are no changes of a command (that it observes).
+        ValueError: as :func:`~torchrl_koap.modules.make_policy`.
     """
-    lookup(EXECUTIONS, execution, "execution")
-    task = description.task
-    if planner is None:
-        policy = ChunkedPolicy(
-            controller,
-            state_columns=task.state_of,
-            history=controller.history,
-            replan_interval=replan_interval,
-            candidates=candidates,
-        )
-    else:
-        policy = make_policy(
-            planner,
-            controller,
-            state_columns=task.state_of,
-            execution=execution,
-            replan_interval=replan_interval,
-            blend_decay=blend_decay,
-            controller_columns=description.columns,
-            action_rule=task.action_rule,
-            candidates=candidates,
-        )
+    gripper = description.controller.get("columns", {}).get("gripper")
+    facts = policy_facts(description.task, columns=description.columns, gripper=gripper)
+    networks = (controller,) if planner is None else (planner, controller)
+    policy = make_policy(*networks, **facts, execution=execution, follower=follower)
     policy.description = description
-    policy.leash, policy.action_gain = make_leash(task, command_lead), make_gain(task, action_gain)
-    return policy.eval()
+    return policy
 
 
-def build_policy(planner: StatePlanner, controller: nn.Module, task: Task | None = None, **options: Any):
+def default_execution(task: Task, method: Method, asked: ExecutionConfig) -> Execution:
+    """How plans become actions: as asked for, else as the method, the task or the library has it.
+
+    Args:
+        task (Task): the task.
+        method (Method): the method.
+        asked (ExecutionConfig): what is asked for.
+
+    Raises:
+        ValueError: for another strategy than a sampler of actions has.
+    """
+    own = Execution().replaced(**task.defaults.execution).replaced(**method.execution)
+    if not method.has_planner:
+        if asked.strategy not in (None, "open_loop"):
+            raise ValueError(
+                f"strategy {asked.strategy!r} was asked of method {method.name!r}, which samples actions and executes"
+                " chunks of them: there is no plan to follow"
+            )
+        own = own.replaced(strategy="open_loop")
+    elif asked.strategy == "oracle":  # it knows how commands are answered
+        own = own.replaced(gain=1.0)
+    return asked.on(own)
+
+
+def build_policy(
+    planner: StatePlanner, controller: nn.Module, task: Task | None = None, **asked: Any
+) -> PlanningPolicy:
     """A fitted planner and controller as a policy: observations in, an action per control step out.
 
     Args:
         planner (StatePlanner): from :func:`~torchrl_koap.training.fit_planner`.
-        controller (InverseDynamics): from :func:`~torchrl_koap.training.fit_controller`.
+        controller (nn.Module): from :func:`~torchrl_koap.training.fit_controller`.
         task (Task, optional): the task. Default: the one they were fitted for.
-        **options: ``execution``, ``replan_interval`` and ``blend_decay``, see
-            :class:`~torchrl_koap.modules.PlanThenControl`. Default: the task's.
+        **asked: fields of :class:`~torchrl_koap.modules.Execution`. Default: the method's, else the task's.
 
     Returns:
-        PlanThenControl: for an :class:`~torchrl_koap.modules.Agent`, an environment with
-        :func:`~torchrl_koap.modules.policy_transforms`, or :func:`save_policy`.
+        PlanningPolicy: for an :class:`~torchrl_koap.modules.Agent`, a :class:`~torchrl_koap.modules.PolicyEnv`, or
+        :func:`save_policy`.
 
     Raises:
         TypeError: for networks that were not made by those functions.
@@ -185,14 +173,15 @@ def build_policy(planner: StatePlanner, controller: nn.Module, task: Task | None
     entries = {name: recipe.entry for name, recipe in made.items()}
     columns = task.controller_columns(entries["controller"]["state"])
     description = PolicyDescription(task, columns=columns, **entries)
-    return assemble_policy(planner, controller, description, **dict(task.defaults.execution) | options)
+    execution = default_execution(task, method_named(entries["controller"]), ExecutionConfig(**asked))
+    return policy_of(planner, controller, description, execution)
 
 
-def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
+def save_policy(policy: PlanningPolicy, path: str | Path) -> Path:
     """Writes a policy to one file, from which :func:`~torchrl_koap.load_policy` makes it again anywhere.
 
     Args:
-        policy (PlanThenControl or ChunkedPolicy): from :func:`~torchrl_koap.load_policy` or :func:`build_policy`.
+        policy (PlanningPolicy): from :func:`~torchrl_koap.load_policy` or :func:`build_policy`.
         path (str or Path): file to write, such as ``"policy.safetensors"``; replaced in one step.
 
     Returns:
@@ -205,14 +194,14 @@ def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
     Examples:
         >>> import tempfile
         >>> import torchrl_koap
-        >>> from torchrl_koap.evaluation.policy_files import PolicyDescription, assemble_policy, build_networks
-        >>> from torchrl_koap.modules import Normalizer
+        >>> from torchrl_koap.evaluation.policy_files import PolicyDescription, build_networks, policy_of
+        >>> from torchrl_koap.modules import Execution
         >>> from torchrl_koap.tasks import get_task
         >>> from torchrl_koap.training import TrainConfig, resolve
         >>> entries = resolve(TrainConfig(out="", task="avoiding", method="linear", channels=(8, 16)))
         >>> networks = build_networks(get_task("avoiding"), entries.method, entries.planner, entries.controller)
         >>> description = PolicyDescription(get_task("avoiding"), entries.planner, entries.controller, networks[2])
-        >>> policy = assemble_policy(*networks[:2], description)
+        >>> policy = policy_of(*networks[:2], description, Execution())
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = torchrl_koap.save_policy(policy, f"{folder}/policy.safetensors")
         ...     path.name
@@ -223,9 +212,8 @@ def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
         raise TypeError(f"wanted a policy of load_policy() or build_policy(), got another {type(policy).__name__}")
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; a policy is one file, such as {path / 'policy.safetensors'}")
-    planned = not isinstance(policy, ChunkedPolicy)
-    networks = {"controller": policy.controller if planned else policy.planner}
-    networks |= {"planner": policy.planner} if planned else {}
+    networks = {"controller": policy.planner if policy.follower is None else policy.follower.controller}
+    networks |= {} if policy.follower is None else {"planner": policy.planner}
     tensors = {f"{name}.{key}": value for name, part in networks.items() for key, value in part.state_dict().items()}
     about = {
         "format": FORMAT,
@@ -236,39 +224,24 @@ def save_policy(policy: RecedingHorizonPolicy, path: str | Path) -> Path:
         "controller": made.controller,
         "columns": list(made.columns),
         "plugins": list(made.plugins),
-        "replan_interval": policy.replan_interval,
-        "candidates": policy.candidates,
+        "execution": asdict(policy.execution),
         "versions": versions(),
     }
-    if policy.leash is not None:
-        about["command_lead"] = policy.leash.lead
-    if policy.action_gain is not None:
-        about["action_gain"] = _one_gain(policy.action_gain, made.task)
-    if planned:
-        about |= {"execution": policy.execution, "blend_decay": policy.blend_decay}
     save_tensors(path, tensors, about)
     return path
 
 
-def _one_gain(gain: Tensor, task: Task) -> float:
-    """The factor that all changes of a command have in common."""
-    factor = float(gain[0])
-    whole = torch.ones_like(gain)
-    whole[list(task.delta_actions)] = factor
-    if not torch.equal(gain, whole):
-        raise ValueError(f"a file holds one action_gain for all changes of a command, the policy has {gain.tolist()}")
-    return factor
-
-
-def read_policy(path: str | Path, *, plugins: Sequence[str] = (), **options: Any) -> RecedingHorizonPolicy:
+def read_policy(
+    path: str | Path, asked: ExecutionConfig | None = None, *, plugins: Sequence[str] = ()
+) -> PlanningPolicy:
     """The policy that :func:`save_policy` wrote.
 
     Args:
         path (str or Path): the file.
+        asked (ExecutionConfig, optional): what is to be executed otherwise than it was saved.
 
     Keyword Args:
         plugins (sequence of str): modules that register its task or method; a file cannot have them imported itself.
-        **options: ``execution``, ``replan_interval``, ``blend_decay`` instead of those it was saved with.
 
     Raises:
         CheckpointError: if the file is missing, damaged, no policy, or one of another version, or its weights do not
@@ -289,8 +262,7 @@ def read_policy(path: str | Path, *, plugins: Sequence[str] = (), **options: Any
         )
         if columns != description.columns:
             raise ValueError(f"its controller reads state columns {description.columns}, the task has {columns}")
-        kept = {name: about[name] for name in _OPTIONS if name in about}
-        policy = assemble_policy(planner, controller, description, **kept | options)
+        execution = Execution(**about["execution"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         problem = f"entry {error} is missing" if isinstance(error, KeyError) else error
         needs = [name for name in about.get("plugins") or () if name not in plugins]
@@ -299,7 +271,7 @@ def read_policy(path: str | Path, *, plugins: Sequence[str] = (), **options: Any
     for name, network in {"planner": planner, "controller": controller}.items():
         if network is not None:
             _load_part(path, name, network, tensors)
-    return policy
+    return policy_of(planner, controller, description, execution if asked is None else asked.on(execution))
 
 
 def _description(about: dict[str, Any]) -> PolicyDescription:

@@ -4,11 +4,9 @@
 from __future__ import annotations
 
 import itertools
-import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -19,156 +17,29 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import OUTCOMES
-from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION
-from torchrl_koap.modules.execution.command_leash import CommandLeash
-from torchrl_koap.modules.execution.plan_then_control import PlanThenControl
-from torchrl_koap.modules.execution.posture_tracking import PostureTracking
-from torchrl_koap.modules.execution.predictive_tracking import PredictiveTracking
-from torchrl_koap.modules.execution.receding_horizon import policy_transforms
-from torchrl_koap.modules.execution.replay import NOISE, RECORDED_FUTURE, EpisodeNoise, RecordedFutures
-from torchrl_koap.modules.planning.planner import StatePlanner
-from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.action_rules import ActionRule
-from torchrl_koap.training.response import tracked_columns
+from torchrl_koap.keys import ACTION, CONTEXT, MODE, OBSERVATION, PLAN
+from torchrl_koap.modules import NoiseStreams, PlanningPolicy, policy_transforms
+from torchrl_koap.modules.execution.noise import NOISE, StartNoise
 
 AT_ONCE = 500  # episodes that are simulated together unless asked otherwise
 
 
-def make_policy(
-    planner: StatePlanner,
-    controller: TensorDictModuleBase,
-    *,
-    state_columns: Sequence[int] | Callable[[Tensor], Tensor],
-    execution: str = "feedback",
-    replan_interval: int = 4,
-    blend_decay: float = 0.8,
-    controller_columns: Sequence[int] | None = None,
-    action_rule: Callable[[Tensor, Tensor], Tensor] | None = None,
-    candidates: int = 1,
-    leash: CommandLeash | None = None,
-    action_gain: Tensor | None = None,
-) -> PlanThenControl:
-    """Planner and controller as a policy that observes as many frames as the longer-sighted of the two.
-
-    A controller that has a ``response`` follows plans by it (:class:`~torchrl_koap.modules.PredictiveTracking`), one
-    with a ``posture`` by that (:class:`~torchrl_koap.modules.PostureTracking`), and the number of a gripper that the
-    posture names is read off the planned widths where no other rule is given.
-
-    Args:
-        planner (StatePlanner): the planner.
-        controller (TensorDictModuleBase): the inverse dynamics.
-
-    Keyword Args:
-        state_columns (sequence of int, or callable): as for :class:`~torchrl_koap.modules.PlanThenControl`, and so are
-            all others.
-        execution (str): ``"feedback"`` or ``"open_loop"``.
-        replan_interval (int): steps per plan.
-        blend_decay (float): share of the distance to the plan that remains after each frame.
-        controller_columns (sequence of int, optional): columns of the state that the controller reads.
-        action_rule (callable, optional): has the last word on actions, such as ``task.action_rule``.
-        candidates (int): plans sampled whenever one is due.
-        leash (CommandLeash, optional): how far the command may be ahead of the robot (:func:`make_leash`).
-        action_gain (Tensor, optional): what every entry of an action is multiplied by ``[act]`` (:func:`make_gain`).
-    """
-    response, posture = getattr(controller, "response", None), getattr(controller, "posture", None)
-    frames = [planner.history, controller.num_past + 1] + ([] if response is None else [response.history])
-    kind = PlanThenControl if response is None else partial(PredictiveTracking, response=response)
-    if posture is not None:
-        kind = partial(PostureTracking, posture=posture)
-        if action_rule is None and posture.gripper is not None:
-            action_rule = ActionRule(posture.gripper)
-    policy = kind(
-        planner,
-        controller,
-        state_columns=state_columns,
-        history=max(frames),
-        execution=execution,
-        replan_interval=replan_interval,
-        blend_decay=blend_decay,
-        controller_columns=controller_columns,
-        action_rule=action_rule,
-        candidates=candidates,
-    )
-    policy.leash, policy.action_gain = leash, action_gain
-    return policy
-
-
-def make_gain(task: Task, gain: float) -> Tensor | None:
-    """What every entry of a task's actions is multiplied by, None for a gain of 1.
-
-    Args:
-        task (Task): the task.
-        gain (float): factor of the entries that are changes of a command; others are left as they are.
-
-    Raises:
-        ValueError: if the gain is no number above 0, or no action of the task is a change of a command.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.rollouts import make_gain
-        >>> from torchrl_koap.tasks import get_task
-        >>> make_gain(get_task("sorting"), 1.5).tolist(), make_gain(get_task("stacking"), 2.0).tolist()
-        ([1.5, 1.5], [2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0])
-    """
-    if not 0 < gain < math.inf:
-        raise ValueError(f"action_gain must be a number above 0, got {gain}")
-    if gain == 1:
-        return None
-    if not task.delta_actions:
-        raise ValueError(f"action_gain was given, but no action of task {task.name!r} is a change of a command")
-    return torch.tensor([gain if index in task.delta_actions else 1.0 for index in range(task.action_dim)])
-
-
-def make_leash(task: Task, lead: float) -> CommandLeash | None:
-    """The leash on a task's commands, None for a lead of 0.
-
-    Args:
-        task (Task): the task.
-        lead (float): farthest that the command may be ahead of the robot, in the units of the actions.
-
-    Raises:
-        ValueError: if the lead is negative, or the task's actions are no changes of a command that it observes.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.rollouts import make_leash
-        >>> from torchrl_koap.tasks import get_task
-        >>> make_leash(get_task("aligning"), 0.1).commands.tolist()
-        [0, 1, 2]
-    """
-    if not lead:
-        return None
-    if task.command is None or task.targets:
-        raise ValueError(
-            f"command_lead was given, but the actions of task {task.name!r} are no changes of a command that it"
-            " observes (Task.command)"
-        )
-    if not 0 < lead < math.inf:
-        raise ValueError(f"command_lead must be a number >= 0, got {lead}")
-    columns = tracked_columns(task)
-    return CommandLeash(
-        lead,
-        commands=columns["commands"],
-        positions=columns["states"],
-        actions=columns["actions"],
-        state_of=task.state_of,
-    )
-
-
 @torch.no_grad()
 def roll_out(
-    policy: PlanThenControl,
+    policy: PlanningPolicy,
     make_env: Callable[[int], EnvBase],
     seeds: Sequence[int],
     *,
     max_steps: int,
     batch_size: int | None = None,
     contexts: Any = None,
-    futures: Tensor | None = None,
+    given: Callable[[slice], TensorDictModuleBase] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[TensorDict]:
     """Runs one episode per seed.
 
     Args:
-        policy (PlanThenControl): the policy.
+        policy (PlanningPolicy): the policy.
         make_env (callable): makes an environment of a given number of parallel episodes.
         seeds (sequence of int): one per episode; the planner's noise depends on nothing else.
 
@@ -177,8 +48,8 @@ def roll_out(
         batch_size (int, optional): episodes at a time. Default: all, but for :data:`AT_ONCE` at most, so that memory is
             bounded. Outcomes do not depend on it.
         contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
-        futures (Tensor, optional): recorded futures ``[E, steps, H, d]`` for a policy whose planner is a
-            :class:`~torchrl_koap.modules.execution.replay.RecordedPlanner`.
+        given (callable, optional): ``given(episodes)`` writes what the planner reads in those episodes in place of
+            start noise.
         progress (callable, optional): called with the number of episodes finished.
 
     Returns:
@@ -199,12 +70,11 @@ def roll_out(
         _seed_episodes(env, part)
         transforms = policy_transforms(policy.history, history_key=policy.in_keys[0])
         env = env.append_transform(transforms) if isinstance(env, TransformedEnv) else TransformedEnv(env, transforms)
-        if futures is not None:
-            noise = RecordedFutures(futures[begin : begin + size])
+        if given is not None:
+            noise = given(slice(begin, begin + len(part)))
         else:
-            noise = EpisodeNoise(part, policy.noise_shape, num_steps=max_steps, noise_key=noise_key)
-        if hasattr(policy, "attach"):  # it reads the simulation
-            policy.attach(env)
+            noise = StartNoise(NoiseStreams(part, policy.noise_shape, block=policy.max_steps), noise_key=noise_key)
+        policy.attach(env)
         start = {} if contexts is None else {"contexts": contexts[begin : begin + size]}
         try:
             rollout = env.rollout(
@@ -217,9 +87,7 @@ def roll_out(
             )
         finally:
             env.close()
-        rollout = rollout.exclude(
-            noise_key, RECORDED_FUTURE, policy.in_keys[0], ("next", policy.in_keys[0]), "remaining_plan"
-        )
+        rollout = rollout.exclude(noise_key, policy.in_keys[0], ("next", policy.in_keys[0]))
         done = rollout["next", "done"].squeeze(-1)
         lengths = torch.where(done.any(-1), done.int().argmax(-1) + 1, done.shape[-1])
         episodes += [rollout[index, :length] for index, length in enumerate(lengths.tolist())]
@@ -228,7 +96,7 @@ def roll_out(
     return episodes
 
 
-def _device_of(policy: PlanThenControl) -> torch.device:
+def _device_of(policy: PlanningPolicy) -> torch.device:
     return next(itertools.chain(policy.parameters(), policy.buffers()), torch.empty(0)).device
 
 
@@ -244,11 +112,11 @@ def _seed_episodes(env: EnvBase, seeds: Sequence[int]) -> None:
 
 
 @torch.no_grad()
-def measure_latency(policy: PlanThenControl, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
+def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
     """Median times of a plan and of a control step between plans, at batch 1.
 
     Args:
-        policy (PlanThenControl): the policy, on the device to measure on.
+        policy (PlanningPolicy): the policy, on the device to measure on.
         observation_dim (int): number of observation columns.
 
     Keyword Args:
@@ -275,7 +143,7 @@ def measure_latency(policy: PlanThenControl, observation_dim: int, *, repeats: i
             td["is_init"] = torch.zeros(1, 1, dtype=torch.bool, device=device)
     control = statistics.median(between)
     plan = max(statistics.median(with_plan) - control, 0.0)
-    rate = 1e3 / (control + plan / policy.replan_interval)
+    rate = 1e3 / (control + plan / policy.execution.replan_interval)
     return {"plan_ms": plan, "control_ms": control, "control_hz": rate}
 
 
@@ -316,8 +184,8 @@ def rollouts_to_tensors(
     for index, episode in enumerate(episodes):
         frames = torch.cat([episode[OBSERVATION], last[index][OBSERVATION][None]])
         paths[index, : len(frames)] = torch.stack([frames[:, part] for part in columns], 1).float()
-        chunks = episode.get("remaining_plan_chunk", None)
-        plans.append(torch.zeros(0, 1, 2) if chunks is None or not plans_position else chunks[::interval, 0, :, :2])
+        chunks = episode.get(PLAN, None)
+        plans.append(torch.zeros(0, 1, 2) if chunks is None or not plans_position else chunks[::interval, :, :2])
         plan_steps.append(torch.arange(len(plans[-1])) * interval)
         actions.append(episode[ACTION])
     pad = torch.nn.utils.rnn.pad_sequence

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ from torchrl_koap.evaluation.environments import choose_contexts, environment_of
 from torchrl_koap.evaluation.offline import evaluate_offline
 from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
-from torchrl_koap.evaluation.trained_run import TrainedRun, execution_of, load_policy, load_run
+from torchrl_koap.evaluation.trained_run import TrainedRun, load_run, trained_policy
+from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import writable_folder
@@ -63,11 +64,11 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     directory, task = trained.directory, trained.task
     if task.env is None and config.env is None:
         return _judge_offline(trained, config)
-    if config.controller == "oracle" and config.env is not None:
-        raise ValueError("the oracle controller reads the task's own simulation; it cannot be combined with env")
+    if config.execution.strategy == "oracle" and config.env is not None:
+        raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     if config.dataset is not None:
         raise ValueError(f"dataset is for judging without an environment; task {task.name!r} is rolled out in one")
-    policy, execution = load_policy(trained, config), execution_of(trained, config)
+    policy = trained_policy(trained, config.execution).to(config.device)
     seeds = list(range(config.seed, config.seed + config.episodes))
     where = environment_of(task, config)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
@@ -92,13 +93,11 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if config.env is None:
         result = task_scores(task, result, episodes, where.numbers)
     rows = result.pop("episode")
-    timed = policy if config.controller == "learned" else load_policy(trained, replace(config, controller="learned"))
+    learned = config.execution if policy.execution.strategy != "oracle" else ExecutionConfig()
+    timed = policy if learned is config.execution else trained_policy(trained, learned).to(config.device)
     result |= measure_latency(timed, task.observation_dim)
     result |= {
-        "controller": config.controller,
-        **execution,
-        "execution": "chunks" if trained.planner is None else execution["execution"],
-        "candidates": policy.candidates,
+        "execution": asdict(policy.execution),
         "episode": rows,
     }
     if config.env is not None:
@@ -107,7 +106,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         [episode.cpu() for episode in episodes],
         position=task.observation[task.position],
         mode_index=where.mode_index,
-        interval=execution["replan_interval"],
+        interval=policy.execution.replan_interval,
         objects=[task.observation[body.position] for body in task.bodies] if config.env is None else (),
         plans_position=task.plans_position,
     )
@@ -128,7 +127,7 @@ def _folder(run: str | Path, config: EvalConfig) -> Path:
 def _judge_offline(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:
     """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
     choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
-    policy = load_policy(trained, config)
+    policy = trained_policy(trained, config.execution)
     result = evaluate_offline(trained, dataset=config.dataset, samples=config.samples, seed=config.seed)
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
     result["seed"] = config.seed

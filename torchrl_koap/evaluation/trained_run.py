@@ -3,28 +3,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
 from torchrl_koap.data import LabelBudget
-from torchrl_koap.evaluation.config import EvalConfig, check_ways
 from torchrl_koap.evaluation.policy_files import (
-    BLEND_DECAY,
     PolicyDescription,
-    assemble_policy,
     build_networks,
+    default_execution,
+    policy_of,
     read_policy,
 )
-from torchrl_koap.evaluation.rollouts import make_gain, make_leash
-from torchrl_koap.modules import RecedingHorizonPolicy, StatePlanner
+from torchrl_koap.modules import Execution, ExecutionConfig, PlanningPolicy, StatePlanner
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.runs.weights import CheckpointError, load_weights
-from torchrl_koap.tasks import REPLAN_INTERVAL, Task, task_of
+from torchrl_koap.runs.weights import load_weights
+from torchrl_koap.tasks import Task, task_of
 from torchrl_koap.training.builders import method_named
 from torchrl_koap.training.digests import check_digests
 from torchrl_koap.training.method import Method
@@ -57,11 +56,6 @@ class TrainedRun:
     planner: StatePlanner | None
     controller: nn.Module
     columns: tuple[int, ...]
-
-    @property
-    def candidates(self) -> int:
-        """Plans (of dp: action chunks) sampled whenever one is due, one of which is taken."""
-        return self.config.get("candidates") or 1  # runs of before have none
 
     @property
     def budget(self) -> LabelBudget:
@@ -119,23 +113,29 @@ def load_run(run: str | Path, *, task: str | None = None) -> TrainedRun:
     return TrainedRun(directory, config, facts, method, planner, controller, columns)
 
 
-def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) -> RecedingHorizonPolicy:
+def load_policy(
+    run: str | Path | TrainedRun, *, device: str = "cpu", plugins: Sequence[str] = (), **asked: Any
+) -> PlanningPolicy:
     """A run, or a file of :func:`~torchrl_koap.save_policy`, as a policy: observations in, an action per step out.
 
-    An environment needs :func:`~torchrl_koap.modules.policy_transforms` of ``policy.history`` for it, which hand it the
-    last observations; an :class:`~torchrl_koap.modules.Agent` keeps them itself.
+    A :class:`~torchrl_koap.modules.PolicyEnv` hands it what it reads; an :class:`~torchrl_koap.modules.Agent` keeps
+    that itself.
 
     Args:
         run (str, Path or TrainedRun): a run directory, ``"pretrained:NAME"``, what :func:`load_run` made of one, or a
             file.
-        config (EvalConfig, optional): execution, interval between plans, device and plugins; the rest is not
-            used. What is not asked for is as ``koap eval`` has it, for a file as it was saved.
+
+    Keyword Args:
+        device (str): ``"cpu"`` or ``"cuda"``.
+        plugins (sequence of str): modules that register task or method of a file, which cannot have them imported.
+        **asked: fields of :class:`~torchrl_koap.modules.Execution`. What is not asked for is as ``koap eval`` has it,
+            for a file as it was saved.
 
     Returns:
-        RecedingHorizonPolicy: in evaluation mode, on the device asked for.
+        PlanningPolicy: in evaluation mode, on the device asked for.
 
     Raises:
-        ValueError: for an unknown execution, or an interval out of range.
+        ValueError: for an unknown strategy, or a number out of range.
         RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`; a :class:`CheckpointError` names the file.
 
     Examples:
@@ -146,79 +146,40 @@ def load_policy(run: str | Path | TrainedRun, config: EvalConfig | None = None) 
         >>> agent.act(np.array([0.525, -0.28, 0.525, -0.28])).shape  # commanded and measured xy to a change of xy (m)
         (2,)
     """
-    given, config = config, EvalConfig() if config is None else config
-    check_ways(config)
-    names = ("execution", "replan_interval", "blend_decay", "candidates", "command_lead", "action_gain")
-    options = {name: getattr(config, name) for name in names if getattr(config, name) is not None}
-    if config.controller == "oracle":
-        trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
-        policy = _oracle(trained, options | execution_of(trained, config))
-    elif isinstance(run, (str, Path)) and Path(run).is_file():
-        policy = read_policy(run, plugins=config.plugins, **({} if given is None else options))
-        trained_on = policy.description.task.name
-        if config.task not in (None, trained_on):
-            raise CheckpointError(f"{run} was trained on task {trained_on!r}, not on {config.task!r}")
-    else:
-        trained = run if isinstance(run, TrainedRun) else load_run(run, task=config.task)
-        if trained.planner is None and config.execution not in (None, "feedback"):
-            raise ValueError(
-                f"execution {config.execution!r} was asked of {trained.directory.path}, but method"
-                f" {trained.method.name!r} is a policy of its own: it executes chunks of actions"
-            )
-        description = PolicyDescription(
-            trained.task,
-            trained.config["planner"],
-            trained.config["controller"],
-            trained.columns,
-            tuple(trained.config.get("plugins") or ()),
-        )
-        kept: dict[str, Any] = {"candidates": trained.candidates}
-        policy = assemble_policy(
-            trained.planner, trained.controller, description, **kept | options | execution_of(trained, config)
-        )
-    return policy.to(config.device)
+    wanted = ExecutionConfig(**asked)
+    if isinstance(run, (str, Path)) and Path(run).is_file():
+        return read_policy(run, wanted, plugins=plugins).to(device)
+    load_plugins(plugins)
+    trained = run if isinstance(run, TrainedRun) else load_run(run)
+    return trained_policy(trained, wanted).to(device)
 
 
-def execution_of(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:
-    """How plans are followed: as was asked for, else as the task has it, else in feedback.
+def execution_of(trained: TrainedRun, asked: ExecutionConfig) -> Execution:
+    """How a run's plans become actions: as asked for, else as the run, its method or its task has it.
 
     Args:
         trained (TrainedRun): the run.
-        config (EvalConfig): what was asked for.
+        asked (ExecutionConfig): what is asked for.
     """
-    options: dict[str, Any] = {
-        "execution": "feedback",
-        "replan_interval": REPLAN_INTERVAL,
-        "blend_decay": BLEND_DECAY,
-        "command_lead": 0.0,
-        "action_gain": 1.0,
-    }
-    own = dict(trained.task.defaults.execution)
-    if trained.planner is None or config.controller == "oracle":  # chunks are executed as they are; an oracle looks
-        own.pop("execution", None)
-    knows = trained.method.tracks or trained.method.keeps_posture
-    if config.controller == "oracle" or knows:  # they know what they commanded, and how it is answered
-        own.pop("action_gain", None)
-    asked = {name: getattr(config, name) for name in options if getattr(config, name) is not None}
-    return options | own | asked
+    if asked.candidates is None and (candidates := trained.config.get("candidates")):
+        asked = replace(asked, candidates=candidates)
+    return default_execution(trained.task, trained.method, asked)
 
 
-def _oracle(trained: TrainedRun, options: dict[str, Any]) -> RecedingHorizonPolicy:
-    """The run's planner with the simulator's inverse map."""
-    if trained.planner is None:
-        raise ValueError(
-            f"{trained.directory.path} was trained with method {trained.method.name!r}, which has no planner: there is"
-            " nothing that the oracle controller could follow"
-        )
-    if trained.task.env is None:
-        raise ValueError(f"task {trained.task.name!r} has no environment, whose simulation the oracle controller reads")
-    from torchrl_koap.evaluation.oracle import OracleControl
+def trained_policy(trained: TrainedRun, asked: ExecutionConfig) -> PlanningPolicy:
+    """A run as a policy.
 
-    kept = {"candidates": trained.candidates}
-    history = max(trained.planner.history, getattr(trained.controller, "num_past", 0) + 1)
-    rule = trained.task.action_rule if trained.task.gripper is not None else None
-    leash = make_leash(trained.task, options.pop("command_lead"))
-    gain = make_gain(trained.task, options.pop("action_gain"))
-    policy = OracleControl(trained.planner, trained.task, history=history, action_rule=rule, **kept | options)
-    policy.leash, policy.action_gain = leash, gain
-    return policy
+    Args:
+        trained (TrainedRun): the run.
+        asked (ExecutionConfig): how plans are to become actions.
+    """
+    execution, follower = execution_of(trained, asked), None
+    if execution.strategy == "oracle":
+        from torchrl_koap.evaluation.oracle import OracleFollower
+
+        follower = OracleFollower(trained.task, blend=execution.blend)
+    plugins = tuple(trained.config.get("plugins") or ())
+    description = PolicyDescription(
+        trained.task, trained.config["planner"], trained.config["controller"], trained.columns, plugins
+    )
+    return policy_of(trained.planner, trained.controller, description, execution, follower)

@@ -7,21 +7,20 @@ from torchrl_koap.modules.baselines.principal import PrincipalInverseDynamics
 from torchrl_koap.modules.baselines.quantized import FiniteScalarQuantizer, QuantizedInverseDynamics
 from torchrl_koap.modules.baselines.supervised import SupervisedInverseDynamics
 from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
-from torchrl_koap.modules.execution.action_chunks import ChunkedPolicy
 from torchrl_koap.modules.execution.agent import Agent
 from torchrl_koap.modules.execution.asynchronous import AsynchronousAgent
-from torchrl_koap.modules.execution.command_leash import CommandLeash
+from torchrl_koap.modules.execution.command_decoder import CommandDecoder, CommandRegression
+from torchrl_koap.modules.execution.command_limits import CommandLimits
 from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
-from torchrl_koap.modules.execution.plan_then_control import PlanThenControl, blend_plan
-from torchrl_koap.modules.execution.policy_env import PolicyEnv, SeededNoise
-from torchrl_koap.modules.execution.posture_tracking import PostureTracking
-from torchrl_koap.modules.execution.predictive_tracking import PredictiveTracking
-from torchrl_koap.modules.execution.receding_horizon import RecedingHorizonPolicy, policy_transforms
-from torchrl_koap.modules.execution.replay import EpisodeNoise, RecordedFutures, RecordedPlanner
+from torchrl_koap.modules.execution.factory import make_policy
+from torchrl_koap.modules.execution.followers import Follower, InverseDynamicsFollower, blend_plan
+from torchrl_koap.modules.execution.mpc import MPC
+from torchrl_koap.modules.execution.noise import NoiseStreams
+from torchrl_koap.modules.execution.policy import PlanningPolicy
+from torchrl_koap.modules.execution.policy_env import PolicyEnv, policy_transforms
+from torchrl_koap.modules.execution.response_model import ResponseModel
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
-from torchrl_koap.modules.koopman.command_posture import CommandPosture
-from torchrl_koap.modules.koopman.command_response import CommandResponse
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import (
     LatentActionFourier,
@@ -42,19 +41,20 @@ from torchrl_koap.modules.ridge import RidgeFit, ridge
 from torchrl_koap.modules.windows import WindowReader
 
 __all__ = [
+    "MPC",
     "PRESETS",
     "Agent",
     "AsynchronousAgent",
-    "ChunkedPolicy",
-    "CommandLeash",
-    "CommandPosture",
-    "CommandResponse",
+    "CommandDecoder",
+    "CommandLimits",
+    "CommandRegression",
     "DiffusionPolicy",
-    "EpisodeNoise",
     "Execution",
     "ExecutionConfig",
     "FiniteScalarQuantizer",
+    "Follower",
     "InverseDynamics",
+    "InverseDynamicsFollower",
     "KoopmanInverseDynamics",
     "KoopmanLifting",
     "KoopmanOperator",
@@ -67,19 +67,15 @@ __all__ = [
     "LinearInverseDynamics",
     "MLPDenoiser",
     "NoiseSchedule",
+    "NoiseStreams",
     "NonlinearInverseDynamics",
     "Normalizer",
-    "PlanThenControl",
+    "PlanningPolicy",
     "PolicyEnv",
-    "PostureTracking",
-    "PredictiveTracking",
     "PrincipalInverseDynamics",
     "QuantizedInverseDynamics",
-    "RecedingHorizonPolicy",
-    "RecordedFutures",
-    "RecordedPlanner",
+    "ResponseModel",
     "RidgeFit",
-    "SeededNoise",
     "StatePlanner",
     "SupervisedInverseDynamics",
     "TemporalUnet",
@@ -87,6 +83,7 @@ __all__ = [
     "WindowReader",
     "blend_plan",
     "make_koopman_inverse_dynamics",
+    "make_policy",
     "policy_transforms",
     "ridge",
 ]

@@ -151,8 +151,9 @@ def _eval_command(run: RunFacts) -> str:
     episode = evaluation.get("episode")
     first = episode[0] if isinstance(episode, list) and episode and isinstance(episode[0], Mapping) else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
-    options |= {key: evaluation.get(key) for key in ("execution", "env", "success_key")}
-    options["controller"] = "oracle" if evaluation.get("controller") == "oracle" else None
+    execution = evaluation.get("execution")
+    options["strategy"] = execution.get("strategy") if isinstance(execution, Mapping) else None
+    options |= {key: evaluation.get(key) for key in ("env", "success_key")}
     for key, value in options.items():
         if value is not None:
             words += [f"--{key.replace('_', '-')}", str(value)]

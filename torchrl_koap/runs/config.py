@@ -28,7 +28,7 @@ class TrainConfig:
         observation_fraction: share of the trajectories that are used at all; those with labels come first.
         validation_fraction: share of the trajectories that the planner never sees, those without labels first, for
             `koap eval` to judge its plans by (default: 0.1 for a task without an environment, else none).
-        method: "koap", "koap_mpc" (plans followed by prediction), "linear" (ridge on raw frames), "dd" (supervised
+        method: "koap", "mpc" (model predictive control), "linear" (ridge on raw frames), "dd" (supervised
             inverse dynamics), "dp" (Diffusion Policy), or another name in torchrl_koap.training.methods.METHODS, those
             that plugins register included (default: that of the task).
         preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the

@@ -1,8 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What the cells of a curve may be told besides their method and labels: planner, losses, what is read and executed.
 
-``koap_paper`` is measured as published unless an option says otherwise: its controller reads the whole state, and 4
-actions of every chunk are executed in open loop, from plans as they are.
+``koap_paper`` is measured as published unless an option says otherwise: its controller reads the whole state.
 """
 
 from __future__ import annotations
@@ -11,12 +10,12 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.execution.plan_then_control import EXECUTIONS
+from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
 from torchrl_koap.training.methods import get_method
 
 # how a method is measured where no option says otherwise; what is not named is as for any other method
-PUBLISHED = {"koap_paper": {"controller_state": "all", "execution": "open_loop", "joining": 0.0, "candidates": 1}}
+PUBLISHED = {"koap_paper": {"controller_state": "all"}}
 PLANNER = (
     "denoiser",
     "denoiser_width",
@@ -33,11 +32,11 @@ class CellOptions:
     """Options of every cell; None leaves a method as it is measured by default.
 
     Attributes:
-        execution: "feedback" (decode at every step) or "open_loop" (4 actions per plan, decoded at once), for all
-            methods with a planner (default: feedback; open_loop for koap_paper, as published).
-        joining: share of the distance between state and plan that is left after each step, `--blend-decay` of
-            `koap eval`; 0: plans as they are (default: 0.8; 0 for koap_paper).
-        candidates: plans sampled whenever one is due (default: 1; always 1 for koap_paper in open loop).
+        strategy: "feedback" (decode at every step) or "open_loop" (4 actions per plan, decoded at once), for all
+            methods with a planner (default: the method's, feedback; open_loop for koap_paper, as published).
+        blend: share of the distance between robot and plan that remains after each step; 0: plans as they are (default:
+            the method's, 0.8; 0 for koap_paper).
+        candidates: plans sampled whenever one is due (default: the method's, 1).
         controller_state: what controllers read, "robot" (the robot's own columns) or "all" (default: robot; all for
             koap_paper).
         koopman_coeff: weight of the Koopman term in the loss of every method that has one (default: 1).
@@ -58,8 +57,8 @@ class CellOptions:
         {'koopman_coeff': 0.5, 'controller_state': 'all'}
     """
 
-    execution: str | None = None
-    joining: float | None = None
+    strategy: str | None = None
+    blend: float | None = None
     candidates: int | None = None
     controller_state: str | None = None
     koopman_coeff: float | None = None
@@ -95,7 +94,7 @@ def training_options(options: CellOptions, method: str) -> dict[str, Any]:
     }
     if not get_method(method).has_planner:
         chosen |= {name: getattr(options, own) for name, own in POLICY.items() if getattr(options, own) is not None}
-    state = _chosen(options, method, "controller_state")
+    state = options.controller_state or PUBLISHED.get(method, {}).get("controller_state")
     return chosen if state is None else chosen | {"controller_state": state}
 
 
@@ -108,21 +107,15 @@ def evaluation_options(options: CellOptions, method: str) -> dict[str, Any]:
 
     Examples:
         >>> from torchrl_koap.studies.cell_options import CellOptions, evaluation_options
-        >>> evaluation_options(CellOptions(), "koap"), evaluation_options(CellOptions(), "koap_paper")
-        ({}, {'execution': 'open_loop', 'blend_decay': 0.0, 'candidates': 1})
+        >>> evaluation_options(CellOptions(strategy="open_loop", blend=0.0), "koap")["execution"].blend
+        0.0
     """
-    names = {"execution": "execution", "joining": "blend_decay", "candidates": "candidates"}
-    if not get_method(method).has_planner:
-        names = {"candidates": "candidates"}
-    chosen = {written: _chosen(options, method, name) for name, written in names.items()}
-    if chosen.get("execution") == "open_loop" and options.execution is None:
-        chosen["candidates"] = 1  # no plan is kept that several could be compared with
-    return {name: value for name, value in chosen.items() if value is not None}
-
-
-def _chosen(options: CellOptions, method: str, name: str) -> Any:
-    asked = getattr(options, name)
-    return PUBLISHED.get(method, {}).get(name) if asked is None else asked
+    own, candidates = get_method(method), options.candidates
+    if not own.has_planner:
+        return {"execution": ExecutionConfig(candidates=candidates)}
+    if options.strategy is None and own.execution.get("strategy") == "open_loop":
+        candidates = None  # no plan is kept that several could be compared with
+    return {"execution": ExecutionConfig(options.strategy, blend=options.blend, candidates=candidates)}
 
 
 def check_cell_options(options: CellOptions, methods: list[Method]) -> None:
@@ -136,23 +129,20 @@ def check_cell_options(options: CellOptions, methods: list[Method]) -> None:
         ValueError: for unknown names, numbers out of range, open loop asked of a policy that executes chunks, several
             candidates in open loop, or a coefficient that no method's loss has.
     """
-    if options.execution is not None:
-        lookup(EXECUTIONS, options.execution, "execution")
+    ExecutionConfig(options.strategy, blend=options.blend, candidates=options.candidates)
     if options.controller_state is not None:
         lookup(("robot", "all"), options.controller_state, "part of the state")
     chunked = [method.name for method in methods if not method.has_planner]
-    if options.execution == "open_loop" and chunked:
+    if options.strategy == "open_loop" and chunked:
         raise ValueError(
-            f"execution 'open_loop' was asked of {', '.join(chunked)}: a policy of its own executes chunks of actions"
-            " and has no other execution; leave it out of --methods"
+            f"strategy 'open_loop' was asked of {', '.join(chunked)}: a policy of its own executes chunks of actions"
+            " and has no other strategy; leave it out of --methods"
         )
-    if options.execution == "open_loop" and (options.candidates or 1) > 1:
+    if options.strategy == "open_loop" and (options.candidates or 1) > 1:
         raise ValueError(
-            "in open loop no plan is kept that several candidates could be compared with: execution 'open_loop' goes"
+            "in open loop no plan is kept that several candidates could be compared with: strategy 'open_loop' goes"
             f" with 1 candidate, got {options.candidates}"
         )
-    if options.joining is not None and not 0 <= options.joining < 1:
-        raise ValueError(f"joining must be in [0, 1), got {options.joining}")
     for name in ("candidates", "planner_seeds", "batch_size", *POLICY.values()):
         if getattr(options, name) is not None and getattr(options, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")

@@ -124,7 +124,7 @@ register_task(
             planner_steps=8000,
             planner=WIDE_MLP,
             view={"observed_frames": 1},
-            execution={"command_lead": COMMAND_LEAD},
+            execution={"lead": COMMAND_LEAD},
         ),
     )
 )

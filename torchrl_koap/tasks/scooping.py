@@ -93,7 +93,7 @@ _SCOOPING = register_task(
             recovery_sigma=0.0,
             view={"neighbor_recovery": 2.0},  # no column is a position that could be displaced
             # a place read off every frame with an error acts as a velocity: docs/results/scooping.md
-            execution={"execution": "open_loop", "replan_interval": 8, "blend_decay": 0.0},
+            execution={"strategy": "open_loop", "replan_interval": 8, "blend": 0.0},
         ),
     )
 )

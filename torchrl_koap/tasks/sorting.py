@@ -141,7 +141,7 @@ def _sorting(num_boxes: int) -> Task:
             planner_steps=24000,
             planner=WIDE_MLP,
             view={"observed_frames": 1},
-            execution={"command_lead": COMMAND_LEAD},
+            execution={"lead": COMMAND_LEAD},
         ),
     )
 
@@ -161,7 +161,7 @@ register_task(
             planner_steps=24000,
             planner=WIDE_MLP,
             view={"observed_frames": 1},
-            execution={"command_lead": COMMAND_LEAD, "action_gain": ACTION_GAIN},
+            execution={"lead": COMMAND_LEAD, "gain": ACTION_GAIN},
         ),
     )
 )

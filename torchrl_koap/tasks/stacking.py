@@ -94,7 +94,7 @@ _STACKING = register_task(
             " never moved and for those dropped on the way.",
             camera="front",
         ),
-        defaults=Defaults(method="koap_mpc", demonstrations=1000, planner_steps=18000, planner=WIDE_MLP),
+        defaults=Defaults(method="mpc", demonstrations=1000, planner_steps=18000, planner=WIDE_MLP),
     )
 )
 _STACKING_1 = register_task(
@@ -120,6 +120,6 @@ register_task(
         robot=tuple(range(4)),  # position of the tool, width of the gripper
         tool_kinematics=None,
         actions=_JOINTS | {"gripper": Action("m", "absolute")},
-        defaults=replace(_STACKING.defaults, method="koap_posture"),  # what the commands move is not seen
+        defaults=replace(_STACKING.defaults, method="command_regression"),  # what the commands move is not seen
     )
 )

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_koap.data import controller_view, cut_windows
-from torchrl_koap.modules import LinearInverseDynamics
+from torchrl_koap.modules import InverseDynamics, LinearInverseDynamics
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks import Task
@@ -142,9 +142,6 @@ def write_analysis(
         dict: ``controller`` and ``ridge``, root mean squared errors in mm or mrad, and ``analysis_labels_read``; a
         ``note`` alone where no hidden trajectory has labels.
     """
-    labelled = controller_view(labelled.cpu(), columns, action_targets=task.targets)
-    viewed = controller_view(data, columns, action_targets=task.targets)
-    predicted, true = hidden_action_errors(controller, viewed, labelled)
     # trajectories that the training does not use have no label
     has_action = torch.zeros(len(data), dtype=torch.bool)
     has_action[torch.isin(data["episode"], labelled["episode"])] = labelled["has_action"].squeeze(-1)
@@ -152,6 +149,11 @@ def write_analysis(
     if task.env is not None:  # otherwise nobody knows what lies in a plane
         shown |= _plotted(task, data["observation"])
     save_tensors(run.path / "demonstrations.safetensors", shown)
+    if not isinstance(controller, InverseDynamics):
+        return {"note": "the controller decodes no recorded states: it follows plans by the command that it gave"}
+    labelled = controller_view(labelled.cpu(), columns, action_targets=task.targets)
+    viewed = controller_view(data, columns, action_targets=task.targets)
+    predicted, true = hidden_action_errors(controller, viewed, labelled)
     if not len(true):
         return {"note": "no trajectory outside the budget has labels: there is nothing to measure on"}
     save_tensors(run.path / "actions.safetensors", {"predicted": predicted, "true": true})

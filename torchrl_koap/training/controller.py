@@ -25,9 +25,7 @@ from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.method import LABELLED_SHARES, Method, Phase
 from torchrl_koap.training.planner import WEIGHT_DECAY, augmentation
-from torchrl_koap.training.posture import POSTURE_SHARE, UPDATES, fit_posture
 from torchrl_koap.training.resolved import ResolvedConfig
-from torchrl_koap.training.response import fit_response
 
 _KEYS = ["state", "action", "has_action"]
 
@@ -76,14 +74,13 @@ def learn_actions(
     fit: dict[str, Any] = {}
     if resolved.teacher is not None:
         data = _relabelled(train_one, resolved, data)
-    if method.has_planner:
+    if method.fit is not None:
+        columns, width = data["state"].shape[-1], resolved.task.action_dim
+        controller = build_controller(resolved.controller, columns, width, method=method).to(resolved.options.device)
+        fit, values = method.fit(controller, data, train_one.controller_budget), dict[str, float]()
+    elif method.has_planner:
         view = resolved.controller_view(data)
         controller, fit, values = _train_network(train_one, method, resolved.controller, view)
-        if method.tracks:
-            fit = fit | {"response": fit_response(controller.response, data)}
-        if method.keeps_posture:
-            updates = min(max(POSTURE_SHARE * train_one.controller_budget, 1), UPDATES)
-            fit = fit | {"posture": fit_posture(controller.posture, data, updates=updates)}
     else:
         controller, values = _train_policy(train_one, resolved, data)
     values["updates"] = train_one.updates

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -13,6 +13,7 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import Execution
 
 KINDS = ("controller", "policy")
 # share of every batch that has labels; None: as it comes
@@ -78,12 +79,14 @@ class Method:
         teacher (str): the method whose controller labels the rest of the data first.
         other_decoder (str): the same method with the other way to get a decoder.
         presets (tuple of str): values of ``--preset`` that it can be built with; the first is its own.
-        tracks (bool): its controller has a ``response`` (:class:`~torchrl_koap.modules.CommandResponse`), which is
-            fitted to the labelled steps; plans are followed by it (:class:`~torchrl_koap.modules.PredictiveTracking`);
-            ``build`` finds its columns under ``"tracking"`` of the options.
-        keeps_posture (bool): its controller has a ``posture`` (:class:`~torchrl_koap.modules.CommandPosture`), fitted
-            to the commands of labelled steps; plans are followed by it
-            (:class:`~torchrl_koap.modules.PostureTracking`); ``build`` finds it under ``"posture"``.
+        columns (callable, optional): ``columns(task) -> dict``, for a controller that is no inverse dynamics: what
+            ``build`` finds under ``"columns"`` of the options.
+        fit (callable, optional): ``fit(controller, data, updates) -> dict`` fits such a controller to flat data after
+            the label budget was applied, in place of phases and closed form; returns numbers for the summary.
+        knows_commands (bool): it is told the last command at every labelled step, which is a recording's as the action
+            is (:func:`~torchrl_koap.training.command_model.with_label_commands`).
+        execution (dict): fields of :class:`~torchrl_koap.modules.Execution` that it is executed with unless others are
+            asked for.
 
     Raises:
         ValueError: for an unknown kind, a name that cannot be a folder's, or two phases of one name.
@@ -107,8 +110,10 @@ class Method:
     teacher: str = ""
     other_decoder: str = ""
     presets: tuple[str, ...] = ("default",)
-    tracks: bool = False
-    keeps_posture: bool = False
+    columns: Callable[[Any], dict[str, Any]] | None = None
+    fit: Callable[[Any, Any, int], dict[str, Any]] | None = None
+    knows_commands: bool = False
+    execution: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
         lookup(KINDS, self.kind, "kind of method")
@@ -117,6 +122,9 @@ class Method:
         names = [phase.name for phase in self.phases]
         if len(set(names)) < len(names):
             raise ValueError(f"phases of method {self.name!r} need names of their own, got {names}")
+        Execution().replaced(**self.execution)
+        if (self.fit is None) != (self.columns is None) or (self.fit is not None and (names or self.closed_form)):
+            raise ValueError(f"method {self.name!r}: columns and fit come together, and without phases or closed form")
         if self.kind == "policy" and len(names) != 1:
             raise ValueError(f"a policy is trained in one phase, method {self.name!r} has {len(names)}")
 

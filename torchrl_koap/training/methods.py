@@ -11,6 +11,9 @@ to 5 after the present one, but for two that are defined otherwise: Decision Dif
 ``dp`` and ``dp_relabel`` have no planner and make its number of updates instead; relabelling costs the updates of the
 teacher besides.
 
+Two controllers are no inverse dynamics and have nothing of KOAP: ``mpc`` follows plans by an identified model of how
+the robot answers commands, ``command_regression`` by the commands that belong to states.
+
 Four controls say what the Koopman model itself is worth: ``linear``, the plain ridge on ``x_{t-1}, x_t, x_{t+8}`` with
 none of KOAP's scales; ``linear_steps``, a ridge on what KOAP's latent action reads, with its scales, penalty and prior;
 ``koap_untrained``, KOAP with random features, of which nothing but the decoder is fitted;
@@ -28,11 +31,11 @@ from torchrl.objectives import LossModule
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import (
     PRESETS,
-    CommandResponse,
     LinearInverseDynamics,
     NonlinearInverseDynamics,
     PrincipalInverseDynamics,
     QuantizedInverseDynamics,
+    ResponseModel,
     SupervisedInverseDynamics,
     VariationalInverseDynamics,
     make_koopman_inverse_dynamics,
@@ -45,9 +48,10 @@ from torchrl_koap.objectives import (
     VariationalLoss,
 )
 from torchrl_koap.runs.plugins import load_entry_points
+from torchrl_koap.training.command_model import SHARE, UPDATES, build_decoder, decoder_columns, fit_decoder
 from torchrl_koap.training.diffusion_builders import build_diffusion_policy
 from torchrl_koap.training.method import Method, Phase
-from torchrl_koap.training.posture import build_posture
+from torchrl_koap.training.response import fit_response, tracked_columns
 
 LOOK_AHEAD = (1, 2, 3, 4, 5)
 GROUP = "torchrl_koap.methods"  # of entry points
@@ -57,16 +61,20 @@ def _koap(state_dim, action_dim, normalizers, options, **overrides):
     return make_koopman_inverse_dynamics(state_dim, action_dim, preset=options["preset"], **normalizers, **overrides)
 
 
-def _koap_mpc(state_dim, action_dim, normalizers, options):
-    model = _koap(state_dim, action_dim, normalizers, options)
-    model.response = CommandResponse(**options["tracking"])
-    return model
+def _response(state_dim, action_dim, normalizers, options):
+    return ResponseModel(**options["columns"], action_dim=action_dim)
 
 
-def _koap_posture(state_dim, action_dim, normalizers, options):
-    model = _koap(state_dim, action_dim, normalizers, options)
-    model.posture = build_posture(options["posture"])
-    return model
+def _fit_response(response, data, updates):
+    return fit_response(response, data)
+
+
+def _command_decoder(state_dim, action_dim, normalizers, options):
+    return build_decoder(options["columns"], action_dim)
+
+
+def _fit_command_decoder(decoder, data, updates):
+    return fit_decoder(decoder, data, updates=min(max(SHARE * updates, 1), UPDATES))
 
 
 def _linear(state_dim, action_dim, normalizers, options):
@@ -108,6 +116,7 @@ _DECODER = Phase("decoder", partial(ActionLoss, freeze_latents=True), "labelled"
 _POLICY = (Phase("policy", DiffusionPolicyLoss, "labelled"),)
 
 _ANY_PRESET = tuple(PRESETS)
+_EVERY_STEP = {"strategy": "feedback", "gain": 1.0}  # they know the command that they gave, and how it is answered
 
 METHODS: dict[str, Method] = {}
 
@@ -152,25 +161,31 @@ for _method in (
         presets=_ANY_PRESET,
     ),
     Method(
-        "koap_mpc",
-        "KOAP, plans followed by prediction",
-        _koap_mpc,
-        (_UNLABELLED,),
-        closed_form=True,
-        presets=_ANY_PRESET,
-        tracks=True,
+        "mpc",
+        "MPC with an identified response",
+        _response,
+        columns=tracked_columns,
+        fit=_fit_response,
+        execution=_EVERY_STEP,
     ),
     Method(
-        "koap_posture",
-        "KOAP, plans followed by the commands of their states",
-        _koap_posture,
-        (_UNLABELLED,),
-        closed_form=True,
-        presets=_ANY_PRESET,
-        keeps_posture=True,
+        "command_regression",
+        "regression of the command on the state",
+        _command_decoder,
+        columns=decoder_columns,
+        fit=_fit_command_decoder,
+        knows_commands=True,
+        execution=_EVERY_STEP,
     ),
     Method("koap_sgd", "KOAP, decoder trained with the rest", _koap, _JOINT, other_decoder="koap", presets=_ANY_PRESET),
-    Method("koap_paper", "KOAP as in the paper", _koap, _JOINT, presets=("paper",)),
+    Method(
+        "koap_paper",
+        "KOAP as in the paper",
+        _koap,
+        _JOINT,
+        presets=("paper",),
+        execution={"strategy": "open_loop", "blend": 0.0, "candidates": 1},
+    ),
     Method(
         "koap_labelled_only",
         "KOAP, labelled windows alone",

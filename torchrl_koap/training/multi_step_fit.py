@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_koap.modules import CommandResponse
+from torchrl_koap.modules import ResponseModel
 
 MOST = 4000  # stretches that are predicted; of more, so many are taken at equal distances
 STAY = 1e-3  # weight of a change of the coefficients, in mean steps per mean coordinate, against relative errors
@@ -39,14 +39,14 @@ class Stretches(NamedTuple):
         return Stretches(*(field[chosen] for field in self))
 
 
-def prediction_errors(response: CommandResponse, stretches: Stretches, weight: Tensor | None = None) -> Tensor:
+def prediction_errors(response: ResponseModel, stretches: Stretches, weight: Tensor | None = None) -> Tensor:
     """Errors of predicted positions ``[n, N, J]``, in the unit of the axes.
 
     A command that is counted from an unknown place is wrong by a constant. Its effect is linear: only what no constant
     explains is an error (fixed effects).
 
     Args:
-        response (CommandResponse): the model.
+        response (ResponseModel): the model.
         stretches (Stretches): ``n``, of ``N`` steps.
         weight (Tensor, optional): coefficients in place of the model's own. Gradients pass through them.
     """
@@ -63,7 +63,7 @@ def prediction_errors(response: CommandResponse, stretches: Stretches, weight: T
     return error - (best @ effect).view_as(error)
 
 
-def fit_predictions(response: CommandResponse, stretches: Stretches, *, coupled: bool) -> None:
+def fit_predictions(response: ResponseModel, stretches: Stretches, *, coupled: bool) -> None:
     """Changes the coefficients such that positions are predicted best over the whole stretches (simulation error).
 
     A fit to single steps takes what it cannot explain for a shorter memory or a weaker pull of the command; the error
@@ -71,7 +71,7 @@ def fit_predictions(response: CommandResponse, stretches: Stretches, *, coupled:
     (:data:`STAY`), where stretches tell little.
 
     Args:
-        response (CommandResponse): the model, fitted to single steps; its weights are set.
+        response (ResponseModel): the model, fitted to single steps; its weights are set.
         stretches (Stretches): to predict. Without any, nothing changes.
 
     Keyword Args:

@@ -22,8 +22,6 @@ from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.diffusion_builders import SIZES
 from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
 from torchrl_koap.training.methods import get_method
-from torchrl_koap.training.posture import posture_columns
-from torchrl_koap.training.response import tracked_columns
 from torchrl_koap.training.validation import default_fraction
 
 # defaults for data that lack labels or came without an environment, and for all others
@@ -118,10 +116,8 @@ def resolve(config: TrainConfig, task: Task | None = None) -> ResolvedConfig:
         "preset": preset,
         "state": options.controller_state if method.has_planner else "all",
     }
-    if method.tracks:
-        controller["tracking"] = tracked_columns(task)
-    if method.keeps_posture:
-        controller["posture"] = posture_columns(task)
+    if method.columns is not None:
+        controller["columns"] = method.columns(task)
     return ResolvedConfig(
         options=options,
         task=task,

@@ -9,9 +9,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from torchrl_koap.modules import CommandResponse
+from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Task
 from torchrl_koap.training.multi_step_fit import Stretches, fit_predictions, prediction_errors
+from torchrl_koap.training.policy_facts import commanded_columns
 
 AHEAD = 12  # control steps that are predicted, in the fit and where labelled steps are left out
 PENALTY = 1e-5  # relative; larger ones shrink momentum, and plans are lost
@@ -20,7 +21,7 @@ _LEAST = 9  # steps of a block, where a single stretch is cut
 
 
 def tracked_columns(task: Task) -> dict[str, Any]:
-    """What a :class:`~torchrl_koap.modules.CommandResponse` is built with: which columns a task's actions move.
+    """What a :class:`~torchrl_koap.modules.ResponseModel` is built with: which columns a task's actions move.
 
     Args:
         task (Task): the task.
@@ -34,21 +35,22 @@ def tracked_columns(task: Task) -> dict[str, Any]:
         >>> tracked_columns(get_task("avoiding"))
         {'states': [0, 1], 'commands': [0, 1], 'actions': [0, 1], 'absolute': False}
     """
-    absolute = bool(task.targets)
-    actions = list(range(task.action_dim) if absolute else task.delta_actions)
-    moved = list(task.targets or task.moved_columns(or_robot=True))
     if task.command is None:
         raise ValueError(
             f"task {task.name!r} cannot follow plans by prediction: its observation has no part that repeats the last"
             " command (Task.command)"
         )
-    commands = list(range(task.observation_dim))[task.command_columns][: len(actions)]
-    if not len(actions) == len(moved) == len(commands):
+    columns = commanded_columns(task)
+    if columns is None:
         raise ValueError(
-            f"task {task.name!r} cannot follow plans by prediction: {len(actions)} actions, {len(commands)} commands"
-            f" ({task.command!r}) and {len(moved)} state columns that they move (Action.column or Task.robot)"
+            f"task {task.name!r} cannot follow plans by prediction: its {task.action_dim} actions, the commands"
+            f" ({task.command!r}) and the state columns that they move (Action.column or Task.robot) differ in number"
         )
-    return {"states": moved, "commands": commands, "actions": actions, "absolute": absolute}
+    rest = set(range(task.action_dim)) - set(columns["actions"]) - {task.gripper[0] if task.gripper else None}
+    if rest:
+        names = ", ".join(task.action_names[column] for column in sorted(rest))
+        raise ValueError(f"task {task.name!r} cannot follow plans by prediction: nothing tells the actions {names}")
+    return columns | {"absolute": bool(task.targets)}
 
 
 class LabelledSteps(NamedTuple):
@@ -73,7 +75,7 @@ class LabelledSteps(NamedTuple):
         return LabelledSteps(*(field[chosen] for field in self))
 
 
-def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, Any]:
+def fit_response(response: ResponseModel, data: TensorDictBase) -> dict[str, Any]:
     """Fits a response to the labelled steps; axes are coupled if stretches left out are predicted better by it.
 
     A ridge regression of single steps is where the fit of predictions over up to 12 steps begins
@@ -83,7 +85,7 @@ def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, A
     such stretch then has an unknown offset of its own, which is taken out (fixed effects).
 
     Args:
-        response (CommandResponse): the model, whose weights are set.
+        response (ResponseModel): the model, whose weights are set.
         data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
 
     Returns:
@@ -121,11 +123,11 @@ def fit_response(response: CommandResponse, data: TensorDictBase) -> dict[str, A
     }
 
 
-def labelled_steps(response: CommandResponse, data: TensorDictBase) -> tuple[LabelledSteps, Tensor]:
+def labelled_steps(response: ResponseModel, data: TensorDictBase) -> tuple[LabelledSteps, Tensor]:
     """The steps that may be fitted to, and the changes of the command.
 
     Args:
-        response (CommandResponse): which columns to read.
+        response (ResponseModel): which columns to read.
         data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
 
     Returns:
@@ -170,7 +172,7 @@ def _counted(changes: Tensor, segment: Tensor) -> Tensor:
 
 
 def _fit(
-    response: CommandResponse, data: TensorDictBase, steps: LabelledSteps, changes: Tensor, *, coupled: bool
+    response: ResponseModel, data: TensorDictBase, steps: LabelledSteps, changes: Tensor, *, coupled: bool
 ) -> None:
     """A ridge after the means of the stretches with unknown commands were taken out, then predictions of many steps."""
     read, wanted = steps.coordinates, steps.steps
@@ -196,7 +198,7 @@ def _folds(steps: LabelledSteps) -> Tensor | None:
     return torch.arange(len(steps.row), device=steps.row.device) * _FOLDS // len(steps.row)
 
 
-def _stretches(response: CommandResponse, data: TensorDictBase, steps: LabelledSteps, changes: Tensor) -> Stretches:
+def _stretches(response: ResponseModel, data: TensorDictBase, steps: LabelledSteps, changes: Tensor) -> Stretches:
     """What follows every second step that has as many labelled ones after it, :data:`AHEAD` where they are in a row."""
     row, memory = steps.row, response.memory
     length = min(AHEAD, int(steps.segment.bincount().max()))

@@ -21,12 +21,12 @@ from torchrl_koap.runs.weights import load_weights
 from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training.action_errors import AFTER, BEFORE, error_entry, write_analysis
 from torchrl_koap.training.builders import build_controller
+from torchrl_koap.training.command_model import with_label_commands
 from torchrl_koap.training.controller import train_controller
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.diffusion_builders import build_planner
 from torchrl_koap.training.digests import forget_digests, write_digests
 from torchrl_koap.training.planner import train_planner
-from torchrl_koap.training.posture import with_label_commands
 from torchrl_koap.training.provenance import fingerprint, to_json
 from torchrl_koap.training.resolved import ResolvedConfig, resolve
 from torchrl_koap.training.resume import begun_by, check_data, check_resume, started_with
@@ -88,7 +88,7 @@ def train(config: TrainConfig, *, command: str | None = None) -> dict[str, Any]:
         options = resolved.options
         content["label_fraction"] = options.label_fraction
         labelled, report = resolved.budget.apply(data, command=task.command_columns)
-        if resolved.method.keeps_posture:
+        if resolved.method.knows_commands:
             labelled = with_label_commands(labelled, data, task.command_columns)
         # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
         labelled = subsample_trajectories(labelled, options.observation_fraction).to(options.device)
@@ -208,7 +208,7 @@ def check_networks(resolved: ResolvedConfig) -> None:
 
 def _check_lengths(resolved: ResolvedConfig, data: TensorDictBase) -> None:
     """Finds trajectories that are too short now rather than after the planner was trained."""
-    if not resolved.method.has_planner:
+    if not resolved.method.has_planner or resolved.method.fit is not None:
         WindowTable.build(data, WINDOW, pad_before=1)
         return
     controller = build_controller(

@@ -6,20 +6,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from tensordict.nn import TensorDictSequential
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from torchrl_koap.modules import (
     Agent,
-    ChunkedPolicy,
     DiffusionPolicy,
-    EpisodeNoise,
-    PlanThenControl,
+    Execution,
+    InverseDynamicsFollower,
+    PlanningPolicy,
+    PolicyEnv,
     StatePlanner,
     TemporalUnet,
     make_koopman_inverse_dynamics,
-    policy_transforms,
+    make_policy,
 )
 
 STEPS = 13
@@ -50,35 +50,34 @@ class Drift(EnvBase):
         pass
 
 
-def plan_then_control(execution="feedback"):
+def small_planner(**options):
     torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=3)
-    controller = make_koopman_inverse_dynamics(2, 2)
-    policy = PlanThenControl(planner, controller, state_columns=(0, 1), history=5, execution=execution)
-    return policy.eval()
+    return StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2, **options)
+
+
+def policy_of(strategy="feedback", columns=(0, 1), **options):
+    planner = small_planner(**options)
+    return make_policy(planner, make_koopman_inverse_dynamics(2, 2), state_of=columns, execution=Execution(strategy))
 
 
 def chunks():
     torch.manual_seed(0)
     diffusion = DiffusionPolicy(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, action_dim=2, num_steps=3)
-    return ChunkedPolicy(diffusion, state_columns=(0, 1), history=2).eval()
+    return make_policy(diffusion, state_of=(0, 1))
 
 
-POLICIES = [lambda: plan_then_control(), lambda: plan_then_control("open_loop"), chunks]
+POLICIES = [lambda: policy_of(), lambda: policy_of("open_loop"), chunks]
 
 
 @pytest.mark.parametrize("make", POLICIES, ids=["feedback", "open loop", "chunks"])
 @pytest.mark.parametrize("robots", [1, 3])
 def test_the_actions_of_a_rollout_bit_for_bit(make, robots):
     policy = make()
-
-    def noise():
-        return EpisodeNoise(range(7, 7 + robots), policy.planner.noise_shape, num_steps=STEPS)
-
-    env = TransformedEnv(Drift(robots), policy_transforms(policy.history))
+    env = PolicyEnv(Drift(robots), policy)
+    env.set_seed(7)
     with torch.no_grad():
-        rollout = env.rollout(STEPS, TensorDictSequential(noise(), policy))
-    agent = Agent(policy, noise=noise())
+        rollout = env.rollout(STEPS, policy)
+    agent = Agent(policy, seed=7)
     agent.reset()
     for step in range(STEPS):
         action = agent.act(rollout["observation"][:, step])
@@ -86,7 +85,7 @@ def test_the_actions_of_a_rollout_bit_for_bit(make, robots):
 
 
 def test_numpy_or_torch_one_robot_or_several():
-    agent = Agent(plan_then_control(), seed=3)
+    agent = Agent(policy_of(), seed=3)
     agent.reset()
     one = agent.act(np.array([0.1, 0.2]))
     assert isinstance(one, np.ndarray) and one.shape == (2,) and one.dtype == np.float32
@@ -98,7 +97,7 @@ def test_numpy_or_torch_one_robot_or_several():
 
 
 def test_reset_begins_anew():
-    agent, path = Agent(plan_then_control()), np.random.default_rng(0).normal(size=(6, 2))
+    agent, path = Agent(policy_of()), np.random.default_rng(0).normal(size=(6, 2))
     runs = []
     for _ in range(2):
         agent.reset()
@@ -110,20 +109,20 @@ def test_reset_begins_anew():
 def test_seeds_make_a_difference():
     actions = []
     for seed in (0, 1):
-        agent = Agent(plan_then_control(), seed=seed)
+        agent = Agent(policy_of(), seed=seed)
         agent.reset()
         actions.append(agent.act(np.zeros(2)))
     assert not np.allclose(*actions)
 
 
 def test_refusals():
-    agent = Agent(plan_then_control())
+    agent = Agent(policy_of())
     with pytest.raises(RuntimeError, match="reset.. the agent before the first act"):
         agent.act(np.zeros(2))
     with pytest.raises(RuntimeError, match="has not acted yet"):
         agent.latency()
     agent.reset()
-    with pytest.raises(ValueError, match="must have at least 2 columns .state_columns., got 1"):
+    with pytest.raises(ValueError, match="must have at least 2 columns .state_of., got 1"):
         agent.act(np.zeros(1))
     agent.reset()
     agent.act(np.zeros(2))
@@ -137,11 +136,9 @@ def test_refusals():
 
 def test_keys_of_the_policy_are_those_that_are_written_and_read():
     def acted(noise_key, **keys):
-        torch.manual_seed(0)
-        planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2, noise_key=noise_key)
-        controller = make_koopman_inverse_dynamics(2, 2)
-        policy = PlanThenControl(planner, controller, state_columns=(2, 3), history=5, **keys).eval()
-        agent = Agent(policy, noise=EpisodeNoise([7], planner.noise_shape, num_steps=3, noise_key=noise_key))
+        planner = small_planner(noise_key=noise_key)
+        follower = InverseDynamicsFollower(make_koopman_inverse_dynamics(2, 2))
+        agent = Agent(PlanningPolicy(planner, follower, state_of=(2, 3), **keys).eval(), seed=7)
         agent.reset()
         return np.stack([agent.act(np.full(4, float(step))) for step in range(3)])
 
@@ -149,15 +146,16 @@ def test_keys_of_the_policy_are_those_that_are_written_and_read():
     np.testing.assert_array_equal(acted("z", history_key="frames", action_key=("robot", "u")), usual)
 
 
-def test_noise_that_the_policy_does_not_read_is_refused():
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2, noise_key="z")
-    policy = PlanThenControl(planner, make_koopman_inverse_dynamics(2, 2), state_columns=(2, 3), history=5)
-    with pytest.raises(ValueError, match=r"reads its noise from 'z', what was given writes \['noise'\]"):
-        Agent(policy, noise=EpisodeNoise([7], planner.noise_shape, num_steps=3))
-
-
 def test_a_planner_that_draws_by_itself_is_handed_no_noise():
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2, noise_key=None)
-    agent = Agent(PlanThenControl(planner, make_koopman_inverse_dynamics(2, 2), state_columns=(2, 3), history=5))
+    agent = Agent(policy_of(columns=(2, 3), noise_key=None))
     agent.reset()
     assert np.isfinite(agent.act(np.zeros((3, 4)))).all()
+
+
+def test_latencies_do_not_grow_for_ever(monkeypatch):
+    monkeypatch.setattr("torchrl_koap.modules.execution.agent.KEPT", 3)
+    agent = Agent(policy_of())
+    agent.reset()
+    for _ in range(5):
+        agent.act(np.zeros(2))
+    assert agent.latency()["steps"] == 3

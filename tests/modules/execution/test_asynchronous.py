@@ -13,15 +13,13 @@ from toy_policies import CountingPlanner, EchoController
 from torchrl_koap.modules import (
     Agent,
     AsynchronousAgent,
-    CommandLeash,
-    CommandPosture,
-    CommandResponse,
-    PlanThenControl,
-    PostureTracking,
-    PredictiveTracking,
+    CommandDecoder,
+    Execution,
+    ResponseModel,
     StatePlanner,
     TemporalUnet,
     make_koopman_inverse_dynamics,
+    make_policy,
 )
 
 
@@ -39,12 +37,16 @@ class HeldPlanner(CountingPlanner):
         return super().sample(history, noise)
 
 
-def make_agent(interval=2, hz=30.0):
-    policy = PlanThenControl(
-        HeldPlanner(), EchoController(), state_columns=(0, 1), history=2, replan_interval=interval, blend_decay=0.0
+def policy_of(**execution):
+    execution = Execution(replan_interval=2, blend=0.0).replaced(**execution)
+    commanded = {"commands": [0], "states": [1]}
+    return make_policy(
+        HeldPlanner(), EchoController(), state_of=(0, 1), execution=execution, changes=(0,), commanded=commanded
     )
-    policy.register_parameter("device_holder", torch.nn.Parameter(torch.zeros(1)))
-    return AsynchronousAgent(policy, control_hz=hz)
+
+
+def make_agent(**execution):
+    return AsynchronousAgent(policy_of(**execution), control_hz=30.0)
 
 
 def plan_behind(action):
@@ -109,8 +111,7 @@ def test_a_plan_has_the_states_that_are_known(prediction):
 
 
 def test_the_command_is_held_back_as_in_the_policy_itself():
-    agent = make_agent()
-    agent.policy.leash = CommandLeash(0.1, commands=[0], positions=[1], actions=[0])
+    agent = make_agent(lead=0.1)
     agent.reset()
     for step in range(4):
         action = agent.act(np.array([step / 20, 0.0]))  # a command ahead of a robot that stands still
@@ -119,42 +120,37 @@ def test_the_command_is_held_back_as_in_the_policy_itself():
 
 
 def test_actions_have_the_gain_of_the_policy():
-    plain, gained = make_agent(), make_agent()
-    gained.policy.action_gain = torch.tensor([1.0, 2.0, 3.0, 4.0])
+    plain, gained = make_agent(), make_agent(gain=2.0)
     for agent in (plain, gained):
         agent.reset()
     first, second = (agent.act(np.array([7.0, 1.0])) for agent in (plain, gained))
-    assert np.any(first) and np.allclose(second, first * [1.0, 2.0, 3.0, 4.0])
+    assert np.any(first) and np.allclose(second, first * [2.0, 1.0, 1.0, 1.0])
     for agent in (plain, gained):
         agent.close()
 
 
 def test_refusals():
-    policy = make_agent().policy
     with pytest.raises(ValueError, match="control_hz must be a positive number"):
-        AsynchronousAgent(policy, control_hz=0)
-    policy.candidates = 4
-    with pytest.raises(ValueError, match="one at a time, not of 4 candidates"):
-        AsynchronousAgent(policy, control_hz=30)
-    policy.execution = "open_loop"
-    with pytest.raises(ValueError, match="execution 'feedback' only"):
-        AsynchronousAgent(policy, control_hz=30)
+        AsynchronousAgent(policy_of(), control_hz=0)
+    with pytest.raises(ValueError, match="one at a time, not of 4"):
+        AsynchronousAgent(policy_of(candidates=4), control_hz=30)
+    with pytest.raises(ValueError, match="with strategy 'feedback', not 'open_loop'"):
+        AsynchronousAgent(policy_of(strategy="open_loop"), control_hz=30)
     assert issubclass(AsynchronousAgent, Agent)
 
 
-@pytest.mark.parametrize("kind", [PredictiveTracking, PostureTracking])
+@pytest.mark.parametrize("kind", ["mpc", "command_regression"])
 def test_plans_are_followed_as_the_policy_follows_them(kind):
     torch.manual_seed(0)
     planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2)
-    if kind is PredictiveTracking:
-        law = CommandResponse([0, 1], [0, 1], [0, 1])
+    if kind == "mpc":
+        law = ResponseModel([0, 1], [0, 1], [0, 1])
         law.weight[[0, 1], [0, 1], 2] = 0.3
     else:
-        law = CommandPosture(2, [0, 1], [0, 1], width=4)
+        law = CommandDecoder(2, [0, 1], [0, 1], width=4)
         law.forward = lambda states: 2 * states
-    policy = kind(planner, make_koopman_inverse_dynamics(2, 2), law, state_columns=(2, 3), history=5).eval()
+    policy, plain = (make_policy(planner, by, state_of=(2, 3)) for by in (law, make_koopman_inverse_dynamics(2, 2)))
     observations = np.random.default_rng(0).normal(size=(3, 4))
-    plain = PlanThenControl(policy.planner, policy.controller, state_columns=(2, 3), history=5).eval()
     acted = []
     for agent in (Agent(policy), AsynchronousAgent(policy, control_hz=1.0), Agent(plain)):
         agent.reset()

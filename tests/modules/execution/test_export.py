@@ -9,27 +9,35 @@ import pytest
 import torch
 
 from torchrl_koap.modules import (
-    ChunkedPolicy,
     DiffusionPolicy,
-    PlanThenControl,
+    Execution,
     StatePlanner,
     TemporalUnet,
     make_koopman_inverse_dynamics,
+    make_policy,
 )
 from torchrl_koap.modules.execution.export import SUFFIXES, ExportError, export_part, exportable
 
 
-def policy():
+def policy(**execution):
     torch.manual_seed(0)
     planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=3)
     controller = make_koopman_inverse_dynamics(2, 3)
-    return PlanThenControl(planner, controller, state_columns=(2, 3), history=5).eval()
+    columns = {"commands": [0, 1], "states": [0, 1]}
+    return make_policy(
+        planner,
+        controller,
+        state_of=(2, 3),
+        changes=(0, 1),
+        commanded=columns,
+        execution=Execution(**execution),
+    )
 
 
 def chunks():
     torch.manual_seed(0)
     diffusion = DiffusionPolicy(TemporalUnet(3, 4, channels=(8, 16)), state_dim=2, action_dim=3, num_steps=2)
-    return ChunkedPolicy(diffusion, state_columns=(2, 3), history=2).eval()
+    return make_policy(diffusion, state_of=(2, 3))
 
 
 def test_the_stateless_policy_is_the_open_loop_one():
@@ -37,10 +45,19 @@ def test_the_stateless_policy_is_the_open_loop_one():
     what = exportable(whole, observation_dim=4)
     with torch.no_grad():
         actions = what.module(*what.inputs.values())
-        state = what.inputs["observations"][..., 2:]
-        plan = whole.planner.sample(state[:, -2:], what.inputs["noise"])
+        observed = what.inputs["observations"]
+        plan = whole.plan(observed, what.inputs["noise"])
     assert actions.shape == (1, 4, 3)
-    torch.testing.assert_close(actions[:, 0], whole.act(state, plan))
+    torch.testing.assert_close(actions[:, 0], whole.act(observed, plan, 0))
+
+
+def test_gain_and_command_limit_are_exported(tmp_path):
+    what = exportable(policy(gain=1.5, lead=0.01), observation_dim=4)
+    loaded = export_part(what, tmp_path / "policy.pt2")
+    observed, noise = what.inputs["observations"] + 0.2, what.inputs["noise"]
+    now = observed[0, -1]
+    ahead = now[:2] - now[2:] + loaded(observed, noise)[0, :, :2]
+    assert (ahead.abs() <= 0.01 + 1e-6).all() and (ahead.abs() > 0.0099).any()
 
 
 @pytest.mark.parametrize("part", ["policy", "controller", "denoiser"])
@@ -55,7 +72,7 @@ def test_every_part_comes_back_from_its_file(part, tmp_path):
 def test_a_diffusion_policy_is_exported_too(tmp_path):
     what = exportable(chunks(), observation_dim=4)
     assert export_part(what, tmp_path / "policy.pt2")(*what.inputs.values()).shape == (1, 4, 3)
-    with pytest.raises(ValueError, match="has no controller to export"):
+    with pytest.raises(ValueError, match="has no inverse dynamics to export"):
         exportable(chunks(), "controller", observation_dim=4)
 
 

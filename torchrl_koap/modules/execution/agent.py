@@ -4,45 +4,43 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_koap.modules.execution.receding_horizon import IS_INIT, RecedingHorizonPolicy
+from torchrl_koap.modules.execution.noise import NoiseStreams
+from torchrl_koap.modules.execution.policy import IS_INIT, PlanningPolicy
+
+KEPT = 10_000  # latencies of the last steps
 
 
 class Agent:
     """Acts with a policy, one robot or several at a time, without gradients.
 
-    Frames observed so far, plans in force and start noise live inside. With the same start noise the actions are bit
-    for bit those of the policy in :meth:`torchrl.envs.EnvBase.rollout`.
+    Frames observed so far, the current plans and start noise live inside. With the same seed the actions are bit for
+    bit those of a :class:`~torchrl_koap.modules.PolicyEnv`, and of the episode of that seed in ``koap eval``.
 
     Args:
-        policy (RecedingHorizonPolicy): a :class:`~torchrl_koap.modules.PlanThenControl` or
-            :class:`~torchrl_koap.modules.ChunkedPolicy`.
+        policy (PlanningPolicy): of :func:`~torchrl_koap.modules.make_policy` or :func:`~torchrl_koap.load_policy`.
 
     Keyword Args:
         seed (int): seed of the plans' start noise; robot ``i`` of a batch draws with ``seed + i``.
-        noise (TensorDictModuleBase, optional): writes the start noise instead, an
-            :class:`~torchrl_koap.modules.EpisodeNoise` for example.
 
     Raises:
         RuntimeError: if it is asked to act before :meth:`reset`.
-        ValueError: for noise under another key than the policy reads; for observations of another width, batch or
-            number of axes than before, or that are not finite.
+        ValueError: for observations of another width, batch or number of axes than before, or that are not finite.
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_koap.modules import Agent, PlanThenControl, StatePlanner, TemporalUnet
+        >>> from torchrl_koap.modules import Agent, StatePlanner, TemporalUnet, make_policy
         >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
         >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
-        >>> policy = PlanThenControl(
-        ...     planner, make_koopman_inverse_dynamics(2, 3), state_columns=(2, 3), history=5)
+        >>> policy = make_policy(planner, make_koopman_inverse_dynamics(2, 3), state_of=(2, 3))
         >>> agent = Agent(policy, seed=0)
         >>> agent.reset()
         >>> agent.act(np.zeros(4)).shape, agent.act(np.zeros(4)).shape
@@ -51,14 +49,11 @@ class Agent:
 
     _frames: Tensor | None  # [n, history, obs]
 
-    def __init__(self, policy: RecedingHorizonPolicy, *, seed: int = 0, noise: TensorDictModuleBase | None = None):
-        key = policy.planner.noise_key
-        if noise is not None and key not in noise.out_keys:
-            raise ValueError(f"the policy reads its noise from {key!r}, what was given writes {list(noise.out_keys)}")
-        self.policy, self.seed, self.noise = policy, seed, noise
+    def __init__(self, policy: PlanningPolicy, *, seed: int = 0):
+        self.policy, self.seed = policy, seed
         example = next(policy.parameters(), torch.empty(0))
         self.device, self.dtype = example.device, example.dtype
-        self.latencies: list[float] = []
+        self.latencies: deque[float] = deque(maxlen=KEPT)
         self._ready = False
         self._forget()
 
@@ -91,7 +86,7 @@ class Agent:
         return result
 
     def latency(self) -> dict[str, float]:
-        """Time per action so far in ms: ``p50``, ``p99``, ``max``, and the number of ``steps``.
+        """Time per action of the last 10,000 steps in ms: ``p50``, ``p99``, ``max``, and the number of ``steps``.
 
         Raises:
             RuntimeError: if it has not acted yet.
@@ -105,7 +100,7 @@ class Agent:
     def _forget(self) -> None:
         self._carried: TensorDict | None = None  # what the policy wrote in the last step
         self._frames = None
-        self._generators: list[torch.Generator] = []
+        self._streams: NoiseStreams | None = None
         self._shape: tuple[int, ...] | None = None  # of the observations
 
     def _decide(self) -> Tensor:
@@ -114,25 +109,18 @@ class Agent:
         td = TensorDict(batch_size=[robots], device=self.device) if self._carried is None else self._carried
         td.set(self.policy.in_keys[0], self._frames)
         td.set(IS_INIT, torch.full((robots, 1), self._carried is None, device=self.device))
-        td = self._with_noise(td)
+        if self.policy.planner.noise_key is not None:  # else the planner draws by itself
+            td.set(self.policy.planner.noise_key, self._noise(robots))
         td = self.policy(td)
         self._carried = td
         return td.get(self.policy.out_keys[0]).clone()
 
-    def _with_noise(self, td: TensorDict) -> TensorDict:
-        if self.noise is not None:
-            return self.noise(td)
-        if self.policy.planner.noise_key is None:  # the planner draws by itself
-            return td
-        return td.set(self.policy.planner.noise_key, self._noise_for(len(self._frames)))
-
-    def _noise_for(self, robots: int) -> Tensor:
+    def _noise(self, robots: int) -> Tensor:
         """Start noise of a plan ``[n, *noise_shape]``, from a stream per robot."""
-        if not self._generators:
-            self._generators = [torch.Generator().manual_seed(self.seed + robot) for robot in range(robots)]
-        shape = self.policy.noise_shape
-        draws = [torch.randn(*shape, generator=generator) for generator in self._generators]
-        return torch.stack(draws).to(self.device, self.dtype)
+        if self._streams is None:
+            seeds = range(self.seed, self.seed + robots)
+            self._streams = NoiseStreams(seeds, self.policy.noise_shape, block=self.policy.max_steps)
+        return self._streams.draw().to(self.device, self.dtype)
 
     def _checked(self, observation: Any) -> Tensor:
         """The observation as ``[n, obs]`` of the policy's type."""

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from torchrl_koap.modules.execution.agent import Agent
-from torchrl_koap.modules.execution.plan_then_control import PlanThenControl
+from torchrl_koap.modules.execution.followers import remaining_plan
+from torchrl_koap.modules.execution.policy import PlanningPolicy
 
 
 class AsynchronousAgent(Agent):
@@ -20,7 +21,7 @@ class AsynchronousAgent(Agent):
     ::
 
         step                 0     1     2     3     4     5     6     7
-        plan in force        P     P     P     P     P     P     P'    P'
+        current plan         P     P     P     P     P     P     P'    P'
         in the thread                                P'---------        P''---
         first states of P'                           P_4 = P'_1, P_5 = P'_2: executed before P' is there
 
@@ -32,36 +33,36 @@ class AsynchronousAgent(Agent):
     the clock runs.
 
     Args:
-        policy (PlanThenControl): a policy that decodes at every step.
+        policy (PlanningPolicy): one that follows plans with strategy ``"feedback"``.
 
     Keyword Args:
         control_hz (float): control steps per second, by which a plan's time becomes a number of steps.
         seed (int): as for :class:`Agent`.
 
     Raises:
-        ValueError: for another kind of policy, open-loop execution, several candidates, or a rate that is not
-            positive.
+        ValueError: for another strategy, several candidates, or a rate that is not positive.
 
     Examples:
         >>> import numpy as np
-        >>> from torchrl_koap.modules import AsynchronousAgent, PlanThenControl, StatePlanner, TemporalUnet
+        >>> from torchrl_koap.modules import AsynchronousAgent, StatePlanner, TemporalUnet, make_policy
         >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
-        >>> policy = PlanThenControl(
-        ...     StatePlanner(TemporalUnet(2, 4), state_dim=2), make_koopman_inverse_dynamics(2, 3),
-        ...     state_columns=(2, 3), history=5)
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> policy = make_policy(planner, make_koopman_inverse_dynamics(2, 3), state_of=(2, 3))
         >>> with AsynchronousAgent(policy, control_hz=30.0) as agent:
         ...     agent.reset(np.zeros(4))
         ...     agent.act(np.zeros(4)).shape
         (3,)
     """
 
-    _plan: Tensor | None  # [n, H, d], in force
+    _plan: Tensor | None  # [n, H, d], the current one
 
-    def __init__(self, policy: PlanThenControl, *, control_hz: float, seed: int = 0):
-        if not isinstance(policy, PlanThenControl) or policy.execution != "feedback":
-            raise ValueError("plans are made asynchronously for a PlanThenControl with execution 'feedback' only")
-        if policy.candidates != 1:
-            raise ValueError(f"plans are made asynchronously one at a time, not of {policy.candidates} candidates")
+    def __init__(self, policy: PlanningPolicy, *, control_hz: float, seed: int = 0):
+        if policy.execution.strategy != "feedback":
+            raise ValueError(
+                f"plans are made asynchronously with strategy 'feedback', not {policy.execution.strategy!r}"
+            )
+        if policy.execution.candidates != 1:
+            raise ValueError(f"plans are made asynchronously one at a time, not of {policy.execution.candidates}")
         if not (math.isfinite(control_hz) and control_hz > 0):
             raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz}")
         self.control_hz = control_hz
@@ -90,7 +91,7 @@ class AsynchronousAgent(Agent):
         super().reset()
         if observation is not None:
             frames = self._checked(observation).unsqueeze(-2).expand(-1, self.policy.history, -1)
-            self._plan, took = self._make(self.policy.state_of(frames), self._noise_for(len(frames)), None)
+            self._plan, took = self._make(frames, self._noise(len(frames)), None)
             self._delay = self._steps(took)
 
     def _forget(self) -> None:
@@ -104,32 +105,27 @@ class AsynchronousAgent(Agent):
 
     @torch.no_grad()
     def _decide(self) -> Tensor:
-        history = self.policy.state_of(self._frames)
+        frames, policy = self._frames, self.policy
         if self._plan is None:
-            self._plan, took = self._make(history, self._noise_for(len(history)), None)
+            self._plan, took = self._make(frames, self._noise(len(frames)), None)
             self._delay = self._steps(took)
         if self._pending is not None and self._pending.done():
             self._plan, took = self._pending.result()
             self._delay, self._age, self._pending = self._steps(took), self._begun, None
-        if self._pending is None and self._age >= self.policy.replan_interval:
-            bound = self._remaining()[..., : min(self._delay, self.policy.planner.horizon - 1), :]
-            self._pending = self._thread.submit(self._make, history, self._noise_for(len(history)), bound)
+        if self._pending is None and self._age >= policy.execution.replan_interval:
+            bound = remaining_plan(self._plan, self._age)[..., : min(self._delay, policy.planner.horizon - 1), :]
+            self._pending = self._thread.submit(self._make, frames, self._noise(len(frames)), bound)
             self._begun = 0
-        action = self.policy.scaled(self.policy.decide(self._frames, history, self._remaining()))
+        action = policy.act(frames, self._plan, self._age)
         self._age += 1
         self._begun += 1
-        return action if self.policy.leash is None else self.policy.leash.hold(self._frames, action)
-
-    def _remaining(self) -> Tensor:
-        """What is left of the plan in force, its last state repeated."""
-        steps = torch.arange(self._plan.shape[-2], device=self._plan.device) + self._age
-        return self._plan[..., steps.clamp_max(self._plan.shape[-2] - 1), :]
+        return action
 
     @torch.no_grad()
-    def _make(self, history: Tensor, noise: Tensor, known: Tensor | None) -> tuple[Tensor, float]:
+    def _make(self, frames: Tensor, noise: Tensor, prefix: Tensor | None) -> tuple[Tensor, float]:
         began = time.perf_counter()
         planner = self.policy.planner
-        plan = planner.sample(history[..., -planner.history :, :], noise, prefix=known)
+        plan = planner.sample(self.policy.state_of(frames)[..., -planner.history :, :], noise, prefix=prefix)
         return plan, time.perf_counter() - began
 
     def _steps(self, seconds: float) -> int:

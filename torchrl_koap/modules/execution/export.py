@@ -1,9 +1,9 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Policies as files that run without this library: ``torch.export``, ONNX, AOTInductor.
 
-What is exported is :meth:`~torchrl_koap.modules.execution.receding_horizon.RecedingHorizonPolicy.plan_and_decode`:
-observations and start noise in, the next actions out, the solver's loop unrolled inside. Whoever calls it keeps the
-last observations and counts steps.
+What is exported is :meth:`~torchrl_koap.modules.PlanningPolicy.decode_ahead`: observations and start noise in, the next
+actions out, gain and command limit included, the solver's loop unrolled inside. Whoever calls it keeps the last
+observations and counts steps.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules.execution.plan_then_control import PlanThenControl
-from torchrl_koap.modules.execution.receding_horizon import RecedingHorizonPolicy
+from torchrl_koap.modules.execution.followers import InverseDynamicsFollower
+from torchrl_koap.modules.execution.policy import PlanningPolicy
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 SUFFIXES = {"torch": ".pt2", "onnx": ".onnx", "aoti": ".aoti.pt2"}
 PARTS = ("policy", "controller", "denoiser")
@@ -34,24 +34,24 @@ class ExportError(RuntimeError):
 class _WholePolicy(nn.Module):
     """Observations ``[B, history, obs]`` and noise to the next actions ``[B, interval, act]``."""
 
-    def __init__(self, policy: RecedingHorizonPolicy):
+    def __init__(self, policy: PlanningPolicy):
         super().__init__()
         self.policy = policy
 
     def forward(self, observations: Tensor, noise: Tensor) -> Tensor:
-        return self.policy.plan_and_decode(observations, noise)
+        return self.policy.decode_ahead(observations, noise)
 
 
 class _Controller(nn.Module):
     """Windows of states ``[B, T, d]`` to actions ``[B, T, act]``."""
 
-    def __init__(self, controller: TensorDictModuleBase):
+    def __init__(self, controller: InverseDynamics):
         super().__init__()
         self.controller = controller
 
     def forward(self, states: Tensor) -> Tensor:
-        out = self.controller(TensorDict({self.controller.in_keys[0]: states}, batch_size=states.shape[:1]))
-        return out.get(self.controller.out_keys[-1])
+        out = self.controller(TensorDict({self.controller.in_key: states}, batch_size=states.shape[:1]))
+        return out.get(self.controller.out_key)
 
 
 @dataclass(frozen=True)
@@ -76,25 +76,24 @@ class Exportable:
     output: str
 
 
-def exportable(policy: RecedingHorizonPolicy, part: str = "policy", *, observation_dim: int) -> Exportable:
+def exportable(policy: PlanningPolicy, part: str = "policy", *, observation_dim: int) -> Exportable:
     """A part of a policy as a plain module.
 
     Args:
-        policy (RecedingHorizonPolicy): the policy.
+        policy (PlanningPolicy): the policy.
         part (str): ``"policy"``, its ``"controller"``, or the planner's ``"denoiser"``.
 
     Keyword Args:
         observation_dim (int): number of observation columns.
 
     Raises:
-        ValueError: for another part, or the controller of a policy that has none.
+        ValueError: for another part, or the controller of a policy that decodes by no inverse dynamics.
 
     Examples:
-        >>> from torchrl_koap.modules import PlanThenControl, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet, make_koopman_inverse_dynamics, make_policy
         >>> from torchrl_koap.modules.execution.export import exportable
-        >>> policy = PlanThenControl(
-        ...     StatePlanner(TemporalUnet(2, 4), state_dim=2), make_koopman_inverse_dynamics(2, 3),
-        ...     state_columns=(2, 3), history=5)
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> policy = make_policy(planner, make_koopman_inverse_dynamics(2, 3), state_of=(2, 3))
         >>> {name: list(value.shape) for name, value in exportable(policy, observation_dim=4).inputs.items()}
         {'observations': [1, 5, 4], 'noise': [1, 14, 2]}
     """
@@ -113,12 +112,12 @@ def exportable(policy: RecedingHorizonPolicy, part: str = "policy", *, observati
         }
         return Exportable(_WholePolicy(policy), inputs, "actions")
     if part == "controller":
-        if not isinstance(policy, PlanThenControl):
-            raise ValueError("this policy samples actions itself: it has no controller to export")
-        columns = policy.controller_columns
-        width = planner.state_dim if columns is None else len(columns)
+        follower = policy.follower
+        if not isinstance(follower, InverseDynamicsFollower):
+            raise ValueError("this policy has no inverse dynamics to export: its actions come from another model")
+        width = planner.state_dim if follower.columns is None else len(follower.columns)
         inputs = {"states": example(1, policy.history + planner.horizon, width)}
-        return Exportable(_Controller(policy.controller), inputs, "actions")
+        return Exportable(_Controller(follower.controller), inputs, "actions")
     condition = planner.encode_history(example(1, planner.history, planner.state_dim))
     inputs = {"sequence": example(1, *planner.noise_shape), "time": example(1).abs(), "condition": condition}
     return Exportable(planner.denoiser, inputs, "prediction")

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 MEMORY = 2  # past steps, and past changes of the command, that the model reads
 
 
-class CommandResponse(nn.Module):
+class ResponseModel(nn.Module):
     r"""Predicts measured positions from position commands by linear dynamics of delayed coordinates.
 
     An arm under its tracking law is behind its command, and how far tells where it goes next. The coordinates of the
@@ -32,6 +32,7 @@ class CommandResponse(nn.Module):
         actions (sequence of int): columns of the action that change them, or set them ``[J]``.
 
     Keyword Args:
+        action_dim (int, optional): entries of an action. Default: those that move an axis.
         absolute (bool): an action is the command itself instead of its change. Defaults to ``False``.
         memory (int): ``m``.
 
@@ -40,8 +41,8 @@ class CommandResponse(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.modules import CommandResponse
-        >>> response = CommandResponse([0], [0], [0])
+        >>> from torchrl_koap.modules import ResponseModel
+        >>> response = ResponseModel([0], [0], [0])
         >>> _ = response.weight[0, 0, 2].fill_(0.5)  # every step covers half of the distance to the command
         >>> x, none = torch.zeros(3, 1), torch.zeros(2, 1)
         >>> response.predict(x, torch.tensor([8.0]), none, torch.zeros(3, 1)).flatten().tolist()
@@ -54,6 +55,7 @@ class CommandResponse(nn.Module):
         commands: Sequence[int],
         actions: Sequence[int],
         *,
+        action_dim: int | None = None,
         absolute: bool = False,
         memory: int = MEMORY,
     ):
@@ -64,6 +66,7 @@ class CommandResponse(nn.Module):
         if memory < 1:
             raise ValueError(f"memory must be >= 1, got {memory}")
         self.states, self.commands, self.actions = list(states), list(commands), list(actions)
+        self.action_dim = len(self.actions) if action_dim is None else action_dim
         self.absolute, self.memory = absolute, memory
         self.register_buffer("weight", torch.zeros(len(states), len(states), 2 * memory + 1))
 
@@ -136,7 +139,7 @@ class CommandResponse(nn.Module):
     @torch.no_grad()
     def fit_ridge(
         self, coordinates: Tensor, steps: Tensor, *, penalty: float = 1e-5, coupled: bool = True
-    ) -> CommandResponse:
+    ) -> ResponseModel:
         """Fits the model to measured steps by ridge regression.
 
         Args:
@@ -148,7 +151,7 @@ class CommandResponse(nn.Module):
             coupled (bool): an axis may answer the commands of others; else each one is fitted by itself.
 
         Returns:
-            CommandResponse: this one.
+            ResponseModel: this one.
 
         Raises:
             ValueError: if there is no step, or the shapes do not fit.

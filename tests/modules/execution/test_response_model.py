@@ -4,14 +4,14 @@
 import pytest
 import torch
 
-from torchrl_koap.modules import CommandResponse
+from torchrl_koap.modules import ResponseModel
 
 AXES = 2
 
 
-def a_system() -> CommandResponse:
+def a_system() -> ResponseModel:
     """A stable, coupled system of two axes."""
-    system = CommandResponse([0, 1], [0, 1], [0, 1])
+    system = ResponseModel([0, 1], [0, 1], [0, 1])
     system.weight[[0, 1], [0, 1], 0] = torch.tensor([0.7, 0.5])  # momentum
     system.weight[[0, 1], [0, 1], 2] = torch.tensor([0.1, 0.2])  # pull of the command
     system.weight[[0, 1], [0, 1], 1] = torch.tensor([-0.2, 0.1])  # else its coordinates depend on each other
@@ -21,7 +21,7 @@ def a_system() -> CommandResponse:
     return system.double()
 
 
-def rollout(system: CommandResponse, changes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def rollout(system: ResponseModel, changes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Positions ``[T, J]`` and commands ``[T, J]`` (those in force at each of them) from rest at 0."""
     nothing = torch.zeros(3, AXES, dtype=torch.float64)
     moved = system.predict(nothing, nothing[0], nothing[1:], changes)
@@ -29,7 +29,7 @@ def rollout(system: CommandResponse, changes: torch.Tensor) -> tuple[torch.Tenso
     return positions, torch.cat([nothing[:1], changes[:-1].cumsum(0)])
 
 
-def steps_of(system: CommandResponse, count: int = 60) -> tuple[torch.Tensor, torch.Tensor]:
+def steps_of(system: ResponseModel, count: int = 60) -> tuple[torch.Tensor, torch.Tensor]:
     torch.manual_seed(0)
     changes = 0.01 * torch.randn(count, AXES, dtype=torch.float64)
     x, c = rollout(system, changes)
@@ -41,13 +41,13 @@ def steps_of(system: CommandResponse, count: int = 60) -> tuple[torch.Tensor, to
 
 def test_a_fit_finds_the_system():
     system = a_system()
-    fitted = CommandResponse([0, 1], [0, 1], [0, 1]).double().fit_ridge(*steps_of(system), penalty=1e-12)
+    fitted = ResponseModel([0, 1], [0, 1], [0, 1]).double().fit_ridge(*steps_of(system), penalty=1e-12)
     torch.testing.assert_close(fitted.weight, system.weight, atol=1e-5, rtol=0)
 
 
 def test_uncoupled_axes_know_nothing_of_each_other():
     fitted = (
-        CommandResponse([0, 1], [0, 1], [0, 1]).double().fit_ridge(*steps_of(a_system()), penalty=1e-12, coupled=False)
+        ResponseModel([0, 1], [0, 1], [0, 1]).double().fit_ridge(*steps_of(a_system()), penalty=1e-12, coupled=False)
     )
     assert not fitted.weight[0, 1].any() and not fitted.weight[1, 0].any()
     torch.testing.assert_close(fitted.weight[0, 0], a_system().weight[0, 0], atol=1e-2, rtol=0)
@@ -77,8 +77,8 @@ def test_any_batch(batch):
 
 def test_bad_columns_and_shapes_are_refused():
     with pytest.raises(ValueError, match="'commands': 1"):
-        CommandResponse([0, 1], [0], [0, 1])
+        ResponseModel([0, 1], [0], [0, 1])
     with pytest.raises(ValueError, match="memory must be >= 1, got 0"):
-        CommandResponse([0], [0], [0], memory=0)
+        ResponseModel([0], [0], [0], memory=0)
     with pytest.raises(ValueError, match=r"wanted coordinates \[n, 1, 5\]"):
-        CommandResponse([0], [0], [0]).fit_ridge(torch.zeros(0, 1, 5), torch.zeros(0, 1))
+        ResponseModel([0], [0], [0]).fit_ridge(torch.zeros(0, 1, 5), torch.zeros(0, 1))

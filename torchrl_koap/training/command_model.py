@@ -10,49 +10,57 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, STATE
-from torchrl_koap.modules import CommandPosture
+from torchrl_koap.modules import CommandDecoder
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
 
-LABEL_COMMAND = "label_command"  # commands in force at labelled steps [N, J], NaN elsewhere
-POSTURE_SHARE = 16  # updates of a posture for each of the controller's, up to UPDATES
+LABEL_COMMAND = "label_command"  # last commands at labelled steps [N, J], NaN elsewhere
+SHARE = 16  # updates for each of another controller's, up to UPDATES
 UPDATES, BATCH, RATE, WEIGHT_DECAY = 8000, 512, 2e-3, 1e-4
 
 
-def posture_columns(task: Task) -> dict[str, Any]:
-    """What a :class:`~torchrl_koap.modules.CommandPosture` of a task is built with (:func:`build_posture`).
-
-    The number of a gripper is read off planned widths where the task says so (``Task.gripper``), and where an absolute
-    action ``name`` has its width in the state, as the part ``name_width``.
+def decoder_columns(task: Task) -> dict[str, Any]:
+    """What a :class:`~torchrl_koap.modules.CommandDecoder` of a task is built with (:func:`build_decoder`).
 
     Args:
         task (Task): the task.
 
+    Returns:
+        dict: ``state_dim``, ``commands``, ``actions``, ``relative`` positions; and ``gripper``, action column and state
+        column of a gripper whose number is read off planned widths: ``Task.gripper``, or where an absolute action
+        ``name`` has its width in the state, as the part ``name_width``.
+
     Raises:
-        ValueError: if its observation does not repeat the last command, or no action is a change of it.
+        ValueError: if its observation does not repeat the last command, no action is a change of it, or nothing tells
+            the others.
 
     Examples:
         >>> from torchrl_koap.tasks import get_task
-        >>> from torchrl_koap.training.posture import posture_columns
-        >>> posture_columns(get_task("stacking_unobserved_joints"))["commands"]
+        >>> from torchrl_koap.training.command_model import decoder_columns
+        >>> decoder_columns(get_task("stacking_unobserved_joints"))["commands"]
         [0, 1, 2, 3, 4, 5, 6]
     """
     if task.command is None:
         raise ValueError(
-            f"task {task.name!r} cannot keep a posture: its observation has no part that repeats the last command"
-            " (Task.command)"
+            f"task {task.name!r} cannot have its commands regressed: its observation has no part that repeats the last"
+            " one (Task.command)"
         )
     actions = list(task.delta_actions)
     if not actions:
-        raise ValueError(f"task {task.name!r} needs no posture: its actions are commands, not changes of them")
+        raise ValueError(f"task {task.name!r} needs no commands regressed: its actions are commands, not their changes")
+    gripper = _gripper(task)
+    rest = set(range(task.action_dim)) - set(actions) - {gripper[0] if gripper else None}
+    if rest:
+        names = ", ".join(task.action_names[column] for column in sorted(rest))
+        raise ValueError(f"task {task.name!r} cannot have its commands regressed: nothing tells the actions {names}")
     commands = list(range(task.observation_dim))[task.command_columns]
     relative = [[_ends(part) for part in (*pair, None, None)[:4]] for pair in task.relative_columns()]
     return {
         "state_dim": task.state_dim,
         "commands": [commands[i] for i in actions],
         "actions": actions,
-        "gripper": _gripper(task),
+        "gripper": gripper,
         "relative": relative,
     }
 
@@ -64,16 +72,17 @@ def _gripper(task: Task) -> list[int] | None:
     return next(([i, part.start] for i, part in widths if part is not None), None)
 
 
-def build_posture(columns: dict[str, Any]) -> CommandPosture:
-    """The module that :func:`posture_columns` describes.
+def build_decoder(columns: dict[str, Any], action_dim: int) -> CommandDecoder:
+    """The module that :func:`decoder_columns` describes.
 
     Args:
         columns (dict): as there, or as a run's ``config.json`` has it.
+        action_dim (int): entries of an action.
     """
-    own = dict(columns)
-    pairs = [[None if part is None else slice(*part) for part in pair] for pair in own.pop("relative", ())]
+    own = {name: columns[name] for name in ("state_dim", "commands", "actions")}
+    pairs = [[None if part is None else slice(*part) for part in pair] for pair in columns.get("relative", ())]
     features = RelativePositionFeatures([RelativePosition(*pair) for pair in pairs]) if pairs else None
-    return CommandPosture(**own, features=features)
+    return CommandDecoder(**own, action_dim=action_dim, features=features)
 
 
 def _ends(part: slice | None) -> list[int] | None:
@@ -81,7 +90,7 @@ def _ends(part: slice | None) -> list[int] | None:
 
 
 def with_label_commands(labelled: TensorDictBase, data: TensorDictBase, command: slice) -> TensorDictBase:
-    """Adds the commands in force at labelled steps, which the budget has blanked where other steps are not labelled.
+    """Adds the last commands at labelled steps, which the budget has blanked where other steps are not labelled.
 
     A recording holds commands, and an action is the difference of two of them: whoever labels a step knows both. What
     is added is what labelled steps have, one command each; of the steps between nothing but the sum of their actions
@@ -99,11 +108,11 @@ def with_label_commands(labelled: TensorDictBase, data: TensorDictBase, command:
     return labelled.copy().set(LABEL_COMMAND, torch.where(labelled[HAS_ACTION], known, torch.nan))
 
 
-def fit_posture(posture: CommandPosture, data: TensorDictBase, *, updates: int = UPDATES) -> dict[str, Any]:
-    """Regresses the commands in force at labelled steps on the state.
+def fit_decoder(decoder: CommandDecoder, data: TensorDictBase, *, updates: int = UPDATES) -> dict[str, Any]:
+    """Regresses the commands at labelled steps on the state.
 
     Args:
-        posture (CommandPosture): the module, which is trained in place.
+        decoder (CommandDecoder): the module, which is trained in place.
         data (TensorDictBase): flat data ``[N]`` after the label budget was applied, with the whole ``state``. Commands
             are those of :data:`LABEL_COMMAND` where it is there (:func:`with_label_commands`), else those of the
             observation, which the budget leaves in trajectories that are labelled throughout.
@@ -119,32 +128,32 @@ def fit_posture(posture: CommandPosture, data: TensorDictBase, *, updates: int =
     Raises:
         ValueError: if no labelled step has a known command.
     """
-    states, commands, told = _labelled(data, posture)
+    states, commands, told = _labelled(data, decoder)
     if not len(states):
-        raise ValueError("keeping a posture needs labelled steps whose command is known, there are none")
-    posture.set_scales(states, commands)
-    wanted = posture.outputs(commands)
-    optimizer = torch.optim.AdamW(posture.parameters(), RATE, weight_decay=WEIGHT_DECAY)
+        raise ValueError("a regression of commands needs labelled steps whose command is known, there are none")
+    decoder.set_scales(states, commands)
+    wanted = decoder.outputs(commands)
+    optimizer = torch.optim.AdamW(decoder.parameters(), RATE, weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE, updates)
-    with progress_bar(updates, "posture", smoothing=0.05, mininterval=0.5) as bar, torch.enable_grad():
+    with progress_bar(updates, "commands", smoothing=0.05, mininterval=0.5) as bar, torch.enable_grad():
         for _ in range(updates):
             rows = torch.randint(len(states), (BATCH,), device=states.device)
-            loss = (posture.scaled(states[rows]) - wanted[rows]).square().mean()
+            loss = (decoder.scaled(states[rows]) - wanted[rows]).square().mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
             schedule.step()
             bar.update(1)
     with torch.no_grad():
-        errors = [posture(x) - c for x, c in zip(states.split(8192), commands.split(8192), strict=True)]
+        errors = [decoder(x) - c for x, c in zip(states.split(8192), commands.split(8192), strict=True)]
     error = torch.cat(errors).square().mean().sqrt().item()
     return {"labels_used": len(states), "commands_told": told, "fit_error": float(f"{error:.4g}")}
 
 
-def _labelled(data: TensorDictBase, posture: CommandPosture) -> tuple[Tensor, Tensor, int]:
+def _labelled(data: TensorDictBase, decoder: CommandDecoder) -> tuple[Tensor, Tensor, int]:
     """States ``[n, d]`` and commands ``[n, J]`` of labelled steps whose command is known, and how many were told."""
-    seen = data[OBSERVATION][:, posture.commands]
-    commands = data[LABEL_COMMAND][:, posture.actions] if LABEL_COMMAND in data.keys() else seen
+    seen = data[OBSERVATION][:, decoder.commands]
+    commands = data[LABEL_COMMAND][:, decoder.actions] if LABEL_COMMAND in data.keys() else seen
     states = data[STATE].float()
     rows = data[HAS_ACTION].reshape(-1) & ~commands.isnan().any(-1) & ~states.isnan().any(-1)
     return states[rows], commands[rows].float(), int(seen[rows].isnan().any(-1).sum())

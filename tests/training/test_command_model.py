@@ -6,14 +6,14 @@ import torch
 from tensordict import TensorDict
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories
-from torchrl_koap.modules import CommandPosture
+from torchrl_koap.modules import CommandDecoder
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import TrainConfig, resolve
-from torchrl_koap.training.posture import (
+from torchrl_koap.training.command_model import (
     LABEL_COMMAND,
-    build_posture,
-    fit_posture,
-    posture_columns,
+    build_decoder,
+    decoder_columns,
+    fit_decoder,
     with_label_commands,
 )
 
@@ -31,17 +31,17 @@ def recordings(episodes: int = 6, length: int = 60) -> TensorDict:
     return data.set("state", data["observation"][:, 2:])
 
 
-def posture() -> CommandPosture:
+def small_decoder() -> CommandDecoder:
     torch.manual_seed(0)
-    return CommandPosture(1, [0, 1], [0, 1], width=32)
+    return CommandDecoder(1, [0, 1], [0, 1], width=32)
 
 
 def test_commands_are_found_from_windows():
     data = recordings()
     labelled = LabelBudget(fraction=0.1, unit="window").apply(data, command=slice(0, 2))[0]
     assert labelled["observation"][:, :2].isnan().all()
-    module = posture()
-    found = fit_posture(module, with_label_commands(labelled, data, slice(0, 2)), updates=600)
+    module = small_decoder()
+    found = fit_decoder(module, with_label_commands(labelled, data, slice(0, 2)), updates=600)
     assert found["labels_used"] == found["commands_told"] == int(labelled["has_action"].sum())
     x = torch.linspace(0.5, 1.3, 9).unsqueeze(-1)
     torch.testing.assert_close(module(x), torch.cat([x, (3 * x).sin()], -1), atol=0.08, rtol=0)
@@ -49,7 +49,7 @@ def test_commands_are_found_from_windows():
 
 def test_trajectories_that_are_labelled_throughout_need_nothing_added():
     labelled = LabelBudget(count=2).apply(recordings(), command=slice(0, 2))[0]
-    found = fit_posture(posture(), labelled, updates=20)
+    found = fit_decoder(small_decoder(), labelled, updates=20)
     assert found["labels_used"] == int(labelled["has_action"].sum()) and found["commands_told"] == 0
 
 
@@ -64,9 +64,9 @@ def test_steps_without_label_are_not_read():
             other["action"][free] = 1e6
         labelled = with_label_commands(budget.apply(other, command=slice(0, 2))[0], other, slice(0, 2))
         assert labelled[LABEL_COMMAND][free].isnan().all() and labelled[LABEL_COMMAND][~free].isfinite().all()
-        module = posture()
+        module = small_decoder()
         torch.manual_seed(1)
-        fit_posture(module, labelled, updates=20)
+        fit_decoder(module, labelled, updates=20)
         weights.append(torch.cat([value.flatten() for value in module.state_dict().values()]))
     assert torch.equal(*weights)
 
@@ -74,30 +74,30 @@ def test_steps_without_label_are_not_read():
 def test_commands_that_nobody_hid_count_at_labelled_steps_alone():
     data = recordings()
     data["has_action"] = (data["step_count"] < 7).reshape(-1, 1)
-    assert fit_posture(posture(), data, updates=2)["labels_used"] == 6 * 7
+    assert fit_decoder(small_decoder(), data, updates=2)["labels_used"] == 6 * 7
 
 
 def test_without_a_known_command_it_says_so():
     labelled = LabelBudget(fraction=0.1, unit="window").apply(recordings(), command=slice(0, 2))[0]
     with pytest.raises(ValueError, match="labelled steps whose command is known"):
-        fit_posture(posture(), labelled)
+        fit_decoder(small_decoder(), labelled)
 
 
 def test_columns_of_tasks():
-    columns = posture_columns(get_task("stacking_unobserved_joints"))
+    columns = decoder_columns(get_task("stacking_unobserved_joints"))
     assert columns["commands"] == columns["actions"] == list(range(7))
     assert columns["gripper"] == [7, 3] and columns["state_dim"] == 19
-    assert build_posture(columns).num_axes == 7
-    assert posture_columns(get_task("avoiding"))["gripper"] is None
-    assert posture_columns(get_task("stacking"))["gripper"] == [7, 7]
+    assert build_decoder(columns, 8).num_axes == 7
+    assert decoder_columns(get_task("avoiding"))["gripper"] is None
+    assert decoder_columns(get_task("stacking"))["gripper"] == [7, 7]
 
 
 def test_tasks_whose_actions_are_commands_are_refused():
     with pytest.raises(ValueError, match="scooping"):
-        resolve(TrainConfig(out="", task="scooping", method="koap_posture"), get_task("scooping"))
+        resolve(TrainConfig(out="", task="scooping", method="command_regression"), get_task("scooping"))
 
 
-def test_a_run_says_what_its_posture_reads():
-    resolved = resolve(TrainConfig(out="", method="koap_posture"), get_task("avoiding"))
-    assert resolved.controller["posture"]["commands"] == [0, 1]
-    assert resolved.controller["posture"]["actions"] == [0, 1]
+def test_a_run_says_what_its_decoder_reads():
+    resolved = resolve(TrainConfig(out="", method="command_regression"), get_task("avoiding"))
+    assert resolved.controller["columns"]["commands"] == [0, 1]
+    assert resolved.controller["columns"]["actions"] == [0, 1]

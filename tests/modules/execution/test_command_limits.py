@@ -1,0 +1,138 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Gain and lead: a command stays near its robot, actions that keep it there are left alone, all policies agree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from toy_policies import CountingPlanner, CountingSampler, EchoController
+
+from torchrl_koap import load_policy, save_policy
+from torchrl_koap.evaluation.trained_run import execution_of, load_run
+from torchrl_koap.modules import CommandLimits, Execution, ExecutionConfig, make_policy
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training.policy_facts import policy_facts
+
+COLUMNS = {"commands": [0, 1], "positions": [2, 3]}
+
+
+def seen(command, position, batch=()):
+    return torch.tensor([*command, *position]).expand(*batch, 3, 4)
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_command_ends_within_the_lead_on_every_axis(batch, dtype):
+    observed = seen((0.50, 0.30), (0.45, 0.38), batch).to(dtype)
+    action = torch.full((*batch, 3), 0.2, dtype=dtype)
+    held = CommandLimits([0, 1], lead=0.1, **COLUMNS)(observed, action)
+    now = observed[..., -1, :]
+    torch.testing.assert_close(now[..., :2] + held[..., :2] - now[..., 2:], torch.full((*batch, 2), 0.1, dtype=dtype))
+    assert (held[..., 2] == 0.2).all() and (action == 0.2).all()  # the third is not one of the command's
+
+
+def test_actions_within_the_lead_are_left_alone():
+    action = 0.04 * torch.rand(1000, 2)
+    limits = CommandLimits([0, 1], lead=0.1, **COLUMNS)
+    assert torch.equal(limits(seen((0.5, 0.3), (0.45, 0.33), [1000]), action), action)  # bit by bit
+
+
+def test_a_blocked_robot_turns_back_as_soon_as_its_policy_does():
+    turned = {}
+    for name, limits in {"free": None, "held": CommandLimits([0, 1], lead=0.05, **COLUMNS)}.items():
+        command, place = torch.zeros(2), torch.zeros(2)
+        for step in range(60):
+            action = torch.tensor([0.01 if step < 30 else -0.01, 0.0])  # forwards for 30 steps, then backwards
+            command = command + (action if limits is None else limits(torch.cat([command, place]).expand(1, 4), action))
+            place = torch.minimum(place + 0.5 * (command - place), torch.tensor([0.02, 1.0]))  # a wall
+            if step >= 30 and place[0] < 0.019 and name not in turned:
+                turned[name] = step - 30
+    assert turned["held"] <= 6 < 20 < turned["free"]
+
+
+def test_a_gain_multiplies_changes_of_a_command_alone():
+    assert CommandLimits([0, 2], gain=1.5)(torch.zeros(1, 1), torch.ones(4, 3)).tolist() == [[1.5, 1.0, 1.5]] * 4
+    both = CommandLimits([0, 1], gain=3.0, lead=0.1, **COLUMNS)(seen((0, 0), (0, 0)), torch.tensor([0.02, 0.05]))
+    torch.testing.assert_close(both, torch.tensor([0.06, 0.1]))
+
+
+def observed(batch=(3,)):
+    frames, begin = torch.ones(*batch, 2, 2), torch.ones(*batch, 1, dtype=torch.bool)
+    return TensorDict({"observation_history": frames, "is_init": begin}, batch)
+
+
+def policy_of(kind, **execution):
+    networks = (CountingSampler(),) if kind == "chunks" else (CountingPlanner(), EchoController())
+    return make_policy(
+        *networks,
+        state_of=(0, 1),
+        changes=(2,),
+        commanded={"commands": [0], "states": [1]},
+        execution=Execution("open_loop" if kind == "chunks" else kind, 2, blend=0.0, **execution),
+    )
+
+
+@pytest.mark.parametrize("kind", ["feedback", "open_loop", "chunks"])
+@pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
+def test_every_kind_of_policy_applies_them_alike_in_rollouts_and_for_export(kind, batch):
+    plain, twice, held = policy_of(kind), policy_of(kind, gain=2.0), policy_of(kind, gain=2.0, lead=0.25)
+    td, noise = observed(batch), torch.zeros(*batch, *plain.noise_shape)
+    free, double, near = (policy(td.clone()) for policy in (plain, twice, held))
+    gains = torch.tensor([1.0, 1.0, 2.0, 1.0])
+    torch.testing.assert_close(double["action"], free["action"] * gains)
+    chunk = plain.out_keys[1]
+    assert torch.equal(double[chunk], free[chunk])  # so the gain does not count twice in open loop
+    assert torch.equal(near["action"][..., :2], free["action"][..., :2])
+    assert (near["action"][..., 2].abs() == 0.25).all() and free["action"][..., 2].abs().min() > 0.25
+    decoded = [policy.decode_ahead(td["observation_history"], noise) for policy in (plain, twice, held)]
+    torch.testing.assert_close(decoded[1], decoded[0] * gains)
+    torch.testing.assert_close(decoded[2][..., 2], decoded[1][..., 2].clamp(-0.25, 0.25))
+
+
+def policy_for(name, **execution):
+    return make_policy(
+        CountingPlanner(), EchoController(), **policy_facts(get_task(name)), execution=Execution(**execution)
+    )
+
+
+def test_a_task_says_which_columns_they_are():
+    limits = policy_for("sorting", lead=0.1).limits
+    observation = torch.zeros(1, get_task("sorting").observation_dim)
+    observation[:, :2] = 1.0  # the last command, a metre ahead
+    torch.testing.assert_close(limits(observation, torch.zeros(2)), torch.tensor([-0.9, -0.9]))
+    gain = policy_for("stacking", gain=1.5).limits
+    assert gain(torch.zeros(1, 1), torch.ones(8)).tolist() == [1.5] * 7 + [1.0]  # the gripper opens as it did
+
+
+def test_a_trained_policy_has_those_of_its_task_unless_told_otherwise(tmp_path):
+    policy = load_policy("pretrained:sorting")
+    assert policy.limits.lead == policy.execution.lead == 0.1
+    assert load_policy("pretrained:sorting", lead=0.0).limits is None
+    saved = save_policy(load_policy("pretrained:sorting", gain=1.2), tmp_path / "policy.safetensors")
+    assert load_policy(saved).execution == Execution(lead=0.1, gain=1.2)
+    assert load_policy(saved, lead=0.0, gain=1.0).limits is None
+
+
+def test_those_who_know_what_they_commanded_go_without_gain():
+    own = get_task("po_sorting").defaults.execution["gain"]
+    trained = load_run("pretrained:po_sorting")
+    assert own > 1 and execution_of(trained, ExecutionConfig()).gain == own
+    assert execution_of(trained, ExecutionConfig(gain=1.4)).gain == 1.4
+    assert execution_of(trained, ExecutionConfig(strategy="oracle")).gain == 1.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: CommandLimits([0], lead=0.1, **COLUMNS), "2, 2 and 1 columns"),
+        (lambda: CommandLimits([0], lead=0.1), "lead 0.1 was given, but the observation repeats no command"),
+        (lambda: CommandLimits([0], gain=np.nan), "gain must be a number above 0"),
+        (lambda: policy_for("scooping", lead=0.1), "lead 0.1 were given, but no action is a change of a command"),
+        (lambda: policy_for("scooping", gain=1.1), "gain 1.1 and .* but no action is a change of a command"),
+    ],
+)
+def test_what_limits_nothing_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

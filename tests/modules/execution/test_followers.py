@@ -1,0 +1,106 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A plan becomes actions: it is bent into the present state, decoded, and a rule has the last word."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from toy_policies import CountingPlanner, EchoController
+
+from torchrl_koap.modules import (
+    MPC,
+    CommandDecoder,
+    CommandRegression,
+    Execution,
+    InverseDynamicsFollower,
+    ResponseModel,
+    blend_plan,
+    make_policy,
+)
+from torchrl_koap.modules.execution.followers import command_rest, remaining_plan
+from torchrl_koap.tasks.action_rules import ActionRule
+
+
+def test_a_blended_plan_leaves_from_the_present_state_and_ends_as_planned():
+    line = torch.stack([torch.arange(1.0, 15.0), 2 * torch.arange(1.0, 15.0)], -1)  # at (0, 0) at present
+    history = torch.tensor([[9.0, 9.0], [5.0, -3.0]])
+    blended = blend_plan(history, line, 0.8)
+    for k in range(14):
+        torch.testing.assert_close(blended[k], line[k] + 0.8 ** (k + 1) * history[-1])
+    torch.testing.assert_close(blend_plan(torch.zeros(2, 2), line, 0.8), line)  # a plan that fits is left as it is
+    assert torch.equal(blend_plan(history, line, 0.0), line)
+    batched = blend_plan(history.expand(3, 4, 2, 2), line.expand(3, 4, 14, 2), 0.8)
+    torch.testing.assert_close(batched[2, 3], blended)
+    uneven = torch.tensor([[1.0], [5.0], [3.0]])  # least-squares line through (1, 1), (2, 5), (3, 3): at 0 it is 1
+    torch.testing.assert_close(blend_plan(torch.tensor([[1.0]]), uneven, 0.5), uneven)
+
+
+def test_what_is_left_of_plans_of_different_age():
+    plans = torch.arange(10.0).reshape(2, 5, 1)
+    left = remaining_plan(plans, torch.tensor([1, 4]))
+    assert left[..., 0].tolist() == [[1.0, 2.0, 3.0, 4.0, 4.0], [9.0] * 5]
+    assert torch.equal(left[0], remaining_plan(plans[0], 1))
+
+
+def test_the_last_word_on_actions_sees_the_whole_window():
+    seen = []
+
+    def rule(states, actions):
+        seen.append(states)
+        return actions + 0.5
+
+    follower = InverseDynamicsFollower(EchoController(), columns=(0, 1), action_rule=rule)
+    states, plan = (
+        torch.tensor([[[3.0, 7.0], [4.0, 7.0]]]),
+        CountingPlanner().sample(torch.tensor([[[3.0, 7], [4, 7]]])),
+    )
+    assert follower(states, states, plan)[0, 0, :2].tolist() == [3.5, 4.5]
+    assert seen[0][0, :, 0].tolist() == [3, 4] + [4 + 1000.0 * k for k in range(1, 7)]  # plans as they were made
+
+
+@torch.no_grad()
+def test_a_gripper_is_commanded_by_the_planned_widths():
+    def opened(states, plan):
+        return command_rest(ActionRule((2, 1)), states, plan, 3, 1)[0, 0]
+
+    states, plan = torch.zeros(1, 5, 2), torch.zeros(1, 14, 2)
+    plan[:, :, 1] = torch.linspace(0.01, 0.08, 14)
+    assert opened(states, plan)[2] < 0.075  # it opens much later
+    plan[:, :, 1] = torch.linspace(0.05, 0.08, 14)
+    assert opened(states, plan)[2] == pytest.approx(0.05)
+    states[..., 1], plan[:, :, 1] = 0.08, torch.linspace(0.06, 0.03, 14)
+    assert opened(states, plan).tolist() == [0, 0, plan[0, 0, 1]]
+    assert not command_rest(None, states, plan, 3, 4).any()
+
+
+CONTROLLERS = {
+    InverseDynamicsFollower: EchoController,
+    MPC: lambda: ResponseModel([0, 1], [0, 1], [0, 1]),
+    CommandRegression: lambda: CommandDecoder(2, [0, 1], [0, 1], width=4),
+}
+
+
+@pytest.mark.parametrize("kind", CONTROLLERS)
+def test_the_factory_knows_how_a_controller_is_followed(kind):
+    execution = Execution(replan_interval=2, blend=0.3)
+    policy = make_policy(CountingPlanner(), CONTROLLERS[kind](), state_of=(0, 1), execution=execution)
+    assert type(policy.follower) is kind and policy.follower.blend == 0.3 and policy.execution == execution
+    assert policy.limits is None and not policy.training
+    knows = kind is not InverseDynamicsFollower
+    assert policy.follower.knows_command is knows
+    for asked, named in {"strategy": "open_loop", "gain": 1.5}.items():
+        if knows:
+            with pytest.raises(ValueError, match=f"{kind.__name__} .*{asked}"):
+                make_policy(
+                    CountingPlanner(),
+                    CONTROLLERS[kind](),
+                    state_of=(0, 1),
+                    changes=(0, 1),
+                    execution=execution.replaced(**{asked: named}),
+                )
+
+
+def test_open_loop_and_chunks_need_no_plan_at_every_step():
+    sampled = make_policy(CountingPlanner(), state_of=(0, 1))
+    assert sampled.follower is None and sampled.execution.strategy == "open_loop"
+    assert make_policy(CountingPlanner(), EchoController(), state_of=(0, 1)).out_keys == ["action", "plan"]

@@ -1,0 +1,151 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Plans that are followed by prediction: on a robot whose response is known, and as a policy."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_koap.modules import MPC, Execution, MLPDenoiser, ResponseModel, StatePlanner, make_policy
+
+
+def sluggish() -> ResponseModel:
+    """Two axes that follow their commands late, one of them slower."""
+    response = ResponseModel([0, 1], [0, 1], [0, 1])
+    response.weight[[0, 1], [0, 1], 0] = torch.tensor([0.8, 0.6])
+    response.weight[[0, 1], [0, 1], 2] = torch.tensor([0.05, 0.1])
+    response.weight[[0, 1], [0, 1], 3] = torch.tensor([0.2, 0.1])
+    return response
+
+
+def mpc_of(response=None, look_ahead=11, **options):
+    return MPC(response or sluggish(), look_ahead=look_ahead, **options)
+
+
+def policy_of(response=None, **execution):
+    torch.manual_seed(0)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2, num_steps=2)
+    return make_policy(
+        planner, response or sluggish(), state_of=(2, 3), changes=(0, 1), execution=Execution(**execution)
+    )
+
+
+def follow(mpc: MPC, path: torch.Tensor) -> torch.Tensor:
+    """Positions of a robot that answers as ``sluggish`` while ``path [T, 2]`` is tracked: ``[steps, 2]``."""
+    robot, size = sluggish(), mpc.look_ahead
+    x, c, a = torch.zeros(5, 2), torch.zeros(5, 2), torch.zeros(2, 2)
+    been = []
+    for step in range(len(path) - size):
+        observed = torch.cat([c, x], -1)
+        change = mpc(observed, x, path[step + 1 : step + 1 + size])[0]
+        if mpc.controller.absolute:
+            change = change - c[-1]
+        moved = robot.predict(x[-3:], c[-1], a, torch.zeros(1, 2))
+        x, c = torch.cat([x[1:], moved]), torch.cat([c[1:], c[-1:] + change])
+        a = torch.cat([a[1:], change.unsqueeze(0)])
+        been.append(moved[0])
+    return torch.stack(been)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_a_known_robot_stays_on_the_path(absolute):
+    time = torch.linspace(0, 3, 80)
+    path = torch.stack([0.1 * (1 - time.cos()), 0.05 * time * time.sin()], -1)
+    response = sluggish()
+    response.absolute = absolute
+    been = follow(mpc_of(response, smoothness=0.1, blend=0.0), path)
+    error = (been - path[1 : len(been) + 1]).norm(dim=-1)
+    assert error[10:].max() < 1e-3  # m; executing the path as commands leaves most of a centimetre
+    behind = sluggish().predict(torch.zeros(3, 2), torch.zeros(2), torch.zeros(2, 2), path.diff(dim=0))
+    assert (behind[: len(been)] - path[1 : len(been) + 1]).norm(dim=-1)[10:].max() > 5e-3
+
+
+def test_smooth_commands_are_bought_with_distance():
+    time = torch.linspace(0, 3, 60)
+    path = torch.stack([0.1 * (8 * time).sin(), 0 * time], -1)
+    errors = []
+    for smoothness in (0.1, 100.0):
+        been = follow(mpc_of(smoothness=smoothness), path)
+        errors.append((been - path[1 : len(been) + 1]).pow(2).mean())
+    assert errors[0] < 0.5 * errors[1]
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_entries_that_the_response_does_not_know_are_the_rules(batch):
+    one_axis = ResponseModel([1], [1], [1], action_dim=3)
+    one_axis.weight[0, 0, 2] = 0.3
+    mpc = mpc_of(one_axis, action_rule=lambda states, actions: actions + states[..., :1])
+    observed, plan = torch.randn(*batch, 5, 4), torch.randn(*batch, 14, 2)
+    states = observed[..., 2:]
+    actions = mpc(observed, states, plan, 2)
+    assert actions.shape == (*batch, 2, 3)
+    torch.testing.assert_close(actions[..., 1:2], mpc.track(observed, states, plan)[..., :2, :])
+    for column in (0, 2):  # the states of the frames: the present one and the next planned one
+        torch.testing.assert_close(actions[..., 0, column], states[..., -1, 0])
+        torch.testing.assert_close(actions[..., 1, column], plan[..., 0, 0])
+
+
+def test_chunks_for_export_begin_with_the_action_of_the_step():
+    policy = policy_of()
+    assert policy.history == 3
+    observed, noise = torch.randn(3, 3, 4), torch.randn(3, *policy.noise_shape)
+    chunk = policy.decode_ahead(observed, noise)
+    assert chunk.shape == (3, 4, 2)
+    td = TensorDict({"observation_history": observed, "is_init": torch.ones(3, 1, dtype=torch.bool), "noise": noise}, 3)
+    torch.testing.assert_close(policy(td)["action"], chunk[:, 0])
+    states = policy.state_of(observed)
+    plan = policy.planner.sample(states[:, -policy.planner.history :], noise)
+    torch.testing.assert_close(chunk, policy.follower.track(observed, states, plan)[:, :4])
+    assert not torch.allclose(chunk[:, 0], chunk[:, 1])
+
+
+def test_options_out_of_range_are_refused():
+    with pytest.raises(ValueError, match="MPC looks at every step: strategy must not be 'open_loop'"):
+        policy_of(strategy="open_loop")
+    with pytest.raises(ValueError, match="MPC knows how commands are answered: gain must be 1"):
+        policy_of(gain=1.5)
+    with pytest.raises(ValueError, match="look_ahead must be at least 2"):
+        policy_of(replan_interval=14)
+    with pytest.raises(ValueError, match="smoothness must be > 0"):
+        mpc_of(smoothness=0.0)
+
+
+def test_actions_minimise_what_is_documented():
+    torch.manual_seed(0)
+    mpc = mpc_of(look_ahead=4, smoothness=2.0, end_speed=3.0, blend=0.0)
+    observed, plan = torch.randn(5, 4).double(), torch.randn(14, 2).double()
+    states, changes = observed[:, 2:], observed[-3:, :2].diff(dim=0)
+
+    def cost(future):
+        held = torch.cat([future, future.new_zeros(1, 2)])  # the last change is not seen
+        y = mpc.controller.predict(states[-3:], observed[-1, :2], changes, held)
+        jerk = torch.cat([changes[-1:], future]).diff(dim=0)
+        speed = (y[-1] - y[-2]) - (plan[3] - plan[2])
+        return (y - plan[:4]).pow(2).sum() + 9.0 * speed.pow(2).sum() + 2.0 * jerk.pow(2).sum()
+
+    best = mpc.track(observed, states, plan).requires_grad_()
+    assert best.shape == (3, 2)
+    (slope,) = torch.autograd.grad(cost(best), best)
+    torch.testing.assert_close(slope, torch.zeros_like(slope), atol=1e-9, rtol=0)
+
+
+def test_weights_that_are_loaded_later_count():
+    mpc, other = mpc_of(), sluggish()
+    other.weight[[0, 1], [0, 1], 2] *= 3
+    wanted, before = mpc_of(other), mpc.follow_gain.clone()
+    mpc.load_state_dict(wanted.state_dict())
+    assert torch.equal(mpc.follow_gain, wanted.follow_gain) and not torch.allclose(mpc.follow_gain, before)
+    mpc.controller.weight.copy_(sluggish().weight)
+    mpc.refresh()
+    torch.testing.assert_close(mpc.follow_gain, before)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_steps_beyond_the_look_ahead_hold_the_last_command(absolute):
+    response = sluggish()
+    response.absolute = absolute
+    mpc = mpc_of(response, look_ahead=3)  # tells two actions
+    observed = torch.randn(1, 5, 4)
+    chunk = mpc(observed, observed[..., 2:], torch.randn(1, 14, 2), 4)
+    assert chunk.shape == (1, 4, 2)
+    held = chunk[:, 1] if absolute else torch.zeros(1, 2)
+    torch.testing.assert_close(chunk[:, 2:], held.unsqueeze(1).expand(-1, 2, -1))

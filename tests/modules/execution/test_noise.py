@@ -1,0 +1,90 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The noise of an episode depends on its seed and step alone; agents, environments and evaluations draw the same."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import toy_gym  # noqa: F401 - registers
+from tensordict import TensorDict
+from torchrl.envs import DoubleToFloat, GymEnv, TransformedEnv
+
+from torchrl_koap.evaluation.rollouts import roll_out
+from torchrl_koap.modules import (
+    Agent,
+    Execution,
+    MLPDenoiser,
+    NoiseStreams,
+    PolicyEnv,
+    StatePlanner,
+    make_koopman_inverse_dynamics,
+    make_policy,
+)
+from torchrl_koap.modules.execution.noise import StartNoise
+
+
+def test_a_stream_is_that_of_its_seed_whatever_else_is_drawn():
+    together, alone = NoiseStreams([3, 9, 4], (5, 2), block=4), NoiseStreams([9], (5, 2), block=4)
+    state, draws = torch.get_rng_state(), []
+    for _ in range(9):  # more than two blocks
+        draws.append(together.draw())
+        assert torch.equal(draws[-1][1:2], alone.draw())
+    assert torch.stack(draws).flatten().unique().numel() == 9 * 3 * 10
+    assert torch.equal(torch.get_rng_state(), state)  # the global generator is left alone
+    block = torch.randn(4, 5, 2, generator=torch.Generator().manual_seed(3))
+    assert torch.equal(torch.stack(draws[:4])[:, 0], block)
+
+
+def test_any_batch_is_written():
+    td = StartNoise(NoiseStreams(range(6), (5, 2), block=1), noise_key="z")(TensorDict(batch_size=[2, 3]))
+    assert td["z"].shape == (2, 3, 5, 2)
+
+
+class Still(StatePlanner):
+    """Plans that are their own start noise, so that actions tell every bit of it."""
+
+    def sample(self, history, noise=None, generator=None):
+        return noise if noise.ndim == history.ndim else noise[..., 0, :, :]
+
+
+@pytest.mark.parametrize("horizon", [14, 16, 5])
+@pytest.mark.parametrize("candidates", [1, 3])
+def test_agent_environment_and_evaluation_act_alike_bit_for_bit(horizon, candidates):
+    """Horizons times columns that are no multiple of 16 included, in which torch fills tensors."""
+    torch.manual_seed(0)
+    planner = Still(MLPDenoiser(4, 8, horizon=horizon, width=8, depth=1), state_dim=4, horizon=horizon, num_steps=2)
+    policy = make_policy(
+        planner,
+        make_koopman_inverse_dynamics(4, 2),
+        state_of=range(4),
+        max_steps=7,
+        execution=Execution(replan_interval=2, candidates=candidates),
+    )
+
+    def bare(*_):
+        return TransformedEnv(GymEnv("ToyReach-v0"), DoubleToFloat(in_keys=["observation"]))
+
+    env = PolicyEnv(bare(), policy)
+    env.set_seed(3)
+    with torch.no_grad():
+        rollout = env.rollout(6, policy)
+    agent = Agent(policy, seed=3)
+    agent.reset()
+    streams = NoiseStreams([3], policy.noise_shape, block=7)
+    for step, row in enumerate(rollout):
+        assert torch.equal(row["noise"], streams.draw()[0])  # what roll_out hands the episode of seed 3
+        assert torch.equal(agent.act(row["observation"]), row["action"]), step
+
+
+def test_the_episode_of_a_seed_in_an_evaluation_is_that_of_an_agent():
+    from torchrl_koap.envs import AvoidingEnv
+
+    torch.manual_seed(0)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=13, width=8, depth=1), state_dim=2, horizon=13, num_steps=2)
+    planner.fit_normalizers(0.01 * torch.randn(50, 15, 2).cumsum(1))
+    policy = make_policy(planner, make_koopman_inverse_dynamics(2, 2), state_of=(2, 3), max_steps=9)
+    (episode,) = roll_out(policy, AvoidingEnv, [7], max_steps=9)
+    agent = Agent(policy, seed=7)
+    agent.reset()
+    for observation, action in zip(episode["observation"], episode["action"], strict=True):
+        assert torch.equal(agent.act(observation), action)

@@ -1,0 +1,360 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Which frame of which plan is used at which step, against a reference loop, in environments of any make."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import ExplorationType
+from toy_policies import (
+    CountingPlanner,
+    CountingSampler,
+    EchoController,
+    EpisodesOfRandomLength,
+    PlannedStep,
+    state_number,
+    wandering_planner,
+)
+
+from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
+from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
+from torchrl_koap.modules import (
+    DiffusionPolicy,
+    Execution,
+    InverseDynamicsFollower,
+    MLPDenoiser,
+    PlanningPolicy,
+    StatePlanner,
+    TemporalUnet,
+    make_koopman_inverse_dynamics,
+    make_policy,
+    policy_transforms,
+)
+
+LENGTHS = ((5, 3, 11), (9,), (1, 2, 7, 4), (12, 6), (4, 4, 8))
+KINDS = ["feedback", "open_loop", "chunks"]
+
+
+def policy_of(kind="feedback", interval=4, columns=(1, 2), num_past=1, **options):
+    """A counting policy; the reference loop decodes plans as they are."""
+    execution = Execution("open_loop" if kind == "chunks" else kind, replan_interval=interval, blend=0.0)
+    if kind == "chunks":
+        return PlanningPolicy(CountingSampler(), state_of=columns, execution=execution, **options)
+    follower = InverseDynamicsFollower(EchoController(num_past), blend=0.0)
+    return PlanningPolicy(CountingPlanner(), follower, state_of=columns, execution=execution, **options)
+
+
+def expected_action(env, episode, step, interval, kind):
+    """Written from the picture in the docstring of Execution, one step at a time."""
+
+    def x(at):
+        return state_number(env, episode % 5, at)
+
+    planned_at = step - step % interval
+    age = step - planned_at
+    if kind == "chunks":
+        return [float(age), x(planned_at), x(max(planned_at - 1, 0)), 7.0]
+    following = [x(planned_at) + 1000 * (age + 1), x(planned_at)]  # frame `age` of the plan, and where it was made
+    if kind == "feedback":
+        return [x(max(step - 1, 0)), x(step), *following]
+    if age == 0:
+        return [x(max(planned_at - 1, 0)), x(planned_at), *following]
+    before = x(planned_at) + 1000 * (age - 1) if age > 1 else x(planned_at)
+    return [before, x(planned_at) + 1000 * age, *following]
+
+
+def step_input(observed, **more):
+    batch = observed.shape[:-2]
+    init = torch.ones(*batch, 1, dtype=torch.bool)
+    return TensorDict({"observation_history": observed, "is_init": init, **more}, batch)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("interval", [1, 3, 4, 6])
+@pytest.mark.parametrize("num_envs", [1, 5])
+def test_every_action_in_a_collector_with_auto_reset(kind, interval, num_envs):
+    env = TransformedEnv(EpisodesOfRandomLength(num_envs, LENGTHS), policy_transforms(2))
+    policy = policy_of(kind, interval)
+    steps = 45
+    collector = Collector(env, policy, frames_per_batch=15 * num_envs, total_frames=steps * num_envs)
+    policy.planner.calls.clear()  # the collector tries the policy once
+    data = torch.cat([batch.clone() for batch in collector], 1)
+    collector.shutdown()
+    assert data.shape == (num_envs, steps)
+    for index in range(num_envs):
+        episode, step = 0, 0
+        while data["observation"][index, 0, 1] != state_number(index, episode, 0):
+            episode += 1  # the collector resets once more before it begins
+        plans = 0
+        for row in range(steps):
+            now, before = (state_number(index, episode % 5, max(step - back, 0)) for back in (0, 1))
+            assert data["observation"][index, row, 1] == now
+            expected = expected_action(index, episode, step, interval, kind)
+            assert data["action"][index, row].tolist() == expected, (index, episode, step)
+            assert data["observation_history"][index, row, :, 1].tolist() == [before, now]
+            plans += step % interval == 0
+            step += 1
+            if data["next", "done"][index, row]:
+                episode, step = episode + 1, 0
+        made = sum(int(number // 100) == index for call in policy.planner.calls for number in call)
+        assert made == plans  # the planner runs for rows that need a plan, and for no others
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_collectors_of_any_exploration_and_a_plain_rollout_agree(kind):
+    env = TransformedEnv(EpisodesOfRandomLength(3, LENGTHS), policy_transforms(2))
+    rollout = env.rollout(12, policy_of(kind), break_when_any_done=False)
+    for row in range(12):
+        if not rollout["is_init"][1, : row + 1].sum() == 1:
+            break
+        assert rollout["action"][1, row].tolist() == expected_action(1, 0, row, 4, kind)
+    assert row == 9
+
+
+def test_the_plan_is_kept_once_and_its_last_state_is_repeated_when_it_runs_out():
+    policy, td = policy_of(interval=6), step_input(torch.zeros(1, 2, 3))
+    for age in range(6):
+        td = policy(td)
+        assert td["plan"][0, :, 0].tolist() == [1000.0 * frame for frame in range(1, 7)]
+        assert td["planned_state"].tolist() == [[1000.0 * (age + 1), 0.0]]
+        assert td["action"][0, 2] == 1000.0 * (age + 1)
+        td["is_init"] = torch.zeros(1, 1, dtype=torch.bool)
+    seen = []
+    policy.follower.register_forward_hook(lambda module, arguments, _: seen.append(arguments[2][0, :, 0].tolist()))
+    policy.act(torch.zeros(1, 2, 3), td["plan"], torch.tensor([3]))
+    assert seen == [[4000.0, 5000.0, 6000.0, 6000.0, 6000.0, 6000.0]]
+
+
+@pytest.mark.parametrize("kind", ["feedback", "open_loop"])
+def test_longer_histories_reach_the_follower_shorter_ones_the_planner(kind):
+    policy = policy_of(kind, num_past=4)
+    assert policy.history == 5 and policy_of("chunks").history == 2
+    td = policy(step_input(torch.arange(15.0).reshape(1, 5, 3)))
+    assert policy.planner.calls == [[13.0]]
+    assert td["action"].tolist() == [[10.0, 13.0, 1013.0, 13.0]]
+
+
+def test_the_state_may_be_a_function_of_the_observation():
+    observed = torch.arange(12.0).reshape(2, 2, 3)
+    action = policy_of("chunks", columns=lambda seen: 10 * seen[..., [2, 0]])(step_input(observed))["action"]
+    assert action.tolist() == [[0, 50, 20, 30], [0, 110, 80, 90]]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_renamed_keys(kind):
+    policy = policy_of(kind, history_key=("agent", "frames"), action_key=("agent", "command"))
+    expected, observed = policy_of(kind), torch.rand(3, 2, 3)
+    renamed = TensorDict({"agent": {"frames": observed}, "is_init": torch.ones(3, 1, dtype=torch.bool)}, [3])
+    plain = step_input(observed)
+    for _ in range(6):
+        renamed, plain = policy(renamed), expected(plain)
+        assert torch.equal(renamed["agent", "command"], plain["action"])
+        assert set(policy.out_keys) <= set(renamed.keys(True))
+        for td in (renamed, plain):
+            td["is_init"] = torch.zeros(3, 1, dtype=torch.bool)
+    assert list(policy.in_keys) == [("agent", "frames"), "is_init"]
+
+
+def test_wrong_arguments_are_named():
+    with pytest.raises(ValueError, match=r"replan_interval must be in 1..6 \(the horizon\), got 7"):
+        policy_of(interval=7)
+    with pytest.raises(ValueError, match="several candidates need strategy 'feedback'"):
+        make_policy(
+            CountingPlanner(), EchoController(), state_of=(0, 1), execution=Execution("open_loop", candidates=2)
+        )
+    with pytest.raises(ValueError, match=r"must have at least 3 columns \(state_of\), got 2"):
+        policy_of()(step_input(torch.zeros(1, 2, 2)))
+
+
+def test_a_missing_transform_is_named():
+    with pytest.raises(KeyError, match="reads 'observation_history': append policy_transforms"):
+        EpisodesOfRandomLength(2, LENGTHS).rollout(2, policy_of())
+    with pytest.raises(KeyError, match="reads 'is_init': append policy_transforms"):
+        policy_of()(TensorDict({"observation_history": torch.zeros(2, 2, 3)}, [2]))
+    with pytest.raises(ValueError, match=r"must hold 2 frames on axis -2, got \[2, 4, 3\]"):
+        policy_of()(step_input(torch.zeros(2, 4, 3)))
+
+
+# ---- environments of any make
+
+
+class Counting(EnvBase):
+    """One environment, batch ``[]``: observes ``100 episode + step``; an episode has six steps."""
+
+    LENGTH = 6
+
+    def __init__(self):
+        super().__init__()
+        self.observation_spec = Composite({"observation": Unbounded((2,))})
+        self.action_spec, self.reward_spec = Unbounded((4,)), Unbounded((1,))
+        self.episode, self.step_number = -1, 0
+
+    def _seen(self, **more):
+        now = float(100 * max(self.episode, 0) + self.step_number)
+        done = torch.tensor([self.step_number >= self.LENGTH])
+        return TensorDict({"observation": torch.tensor([now, 7.0]), "done": done, "terminated": done.clone(), **more})
+
+    def _reset(self, tensordict):
+        self.episode, self.step_number = self.episode + 1, 0
+        return self._seen()
+
+    def _step(self, tensordict):
+        self.step_number += 1
+        return self._seen(reward=torch.zeros(1))
+
+    def _set_seed(self, seed):
+        pass
+
+
+def transformed():
+    return TransformedEnv(Counting(), policy_transforms(2))
+
+
+ENVIRONMENTS = {
+    "single": transformed,
+    "serial": lambda: TransformedEnv(SerialEnv(3, Counting), policy_transforms(2)),
+    "serial, transforms inside": lambda: SerialEnv(3, transformed),
+    "two dimensions": lambda: TransformedEnv(SerialEnv(2, lambda: SerialEnv(3, Counting)), policy_transforms(2)),
+}
+
+
+def check(kind, data):
+    observed = data["observation"][..., 0]
+    flat = observed.reshape(-1, observed.shape[-1])
+    actions = data["action"].reshape(len(flat), observed.shape[-1], -1)
+    for row, action in zip(flat, actions, strict=True):
+        for now, got in zip(row.tolist(), action.tolist(), strict=True):
+            first = now - now % 100  # what `expected_action` numbers by environment and episode
+            wanted = expected_action(0, 0, int(now) % 100, 4, kind)
+            shift = [0, *[first] * 2, 0] if kind == "chunks" else [first] * 4
+            assert got == [one + more for one, more in zip(wanted, shift, strict=True)]
+        assert row.max() >= 100  # more than one episode
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_every_action_in_environments_of_any_make(kind, name):
+    env = ENVIRONMENTS[name]()
+    check(kind, env.rollout(15, policy_of(kind, columns=(0, 1)), break_when_any_done=False))
+    steps = 15 * max(env.batch_size.numel(), 1)
+    collector = Collector(env, policy_of(kind, columns=(0, 1)), frames_per_batch=steps, total_frames=steps)
+    (data,) = collector
+    check(kind, data)
+    collector.shutdown()
+
+
+def test_every_action_of_parallel_workers_that_reset_by_themselves():
+    env = ParallelEnv(2, transformed)
+    check("feedback", env.rollout(15, policy_of(columns=(0, 1)), break_when_any_done=False))
+    env.close()
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_batches_of_any_shape_agree_with_the_flat_one_noise_included(kind, batch):
+    torch.manual_seed(0)
+    denoiser = MLPDenoiser(2, 4, horizon=14, width=8, depth=1)
+    if kind == "chunks":
+        policy = make_policy(DiffusionPolicy(denoiser, state_dim=2, action_dim=2), state_of=(0, 1))
+    else:
+        planner = StatePlanner(denoiser, state_dim=2)
+        policy = make_policy(planner, EchoController(), state_of=(0, 1), execution=Execution(kind))
+    observed, noise = torch.randn(*batch, 2, 2), torch.randn(*batch, 14, 2)
+    shaped = step_input(observed, noise=noise)
+    flat = shaped.reshape(-1) if batch else shaped.unsqueeze(0)
+    with torch.no_grad():
+        for _ in range(6):
+            shaped, flat = policy(shaped), policy(flat)
+            assert shaped.batch_size == torch.Size(batch)
+            for key in (*policy.out_keys, "counter"):
+                torch.testing.assert_close(shaped[key], flat[key].reshape(*batch, *flat[key].shape[1:]))
+            for td in (shaped, flat):
+                td["is_init"] = torch.zeros_like(td["is_init"])
+
+
+# ---- real networks
+
+
+def diffusion_policy():
+    """Untrained."""
+    torch.manual_seed(0)
+    policy = DiffusionPolicy(TemporalUnet(2, 6, channels=(8, 16)), state_dim=3, action_dim=2, num_steps=3)
+    actions = torch.stack([0.004 * torch.randn(200), 0.01 * torch.rand(200)], -1)
+    policy.fit_normalizers(0.01 * torch.randn(50, 16, 3).cumsum(1), actions)
+    return policy.eval()
+
+
+@pytest.mark.parametrize("kind", ["feedback", "open_loop"])
+def test_a_real_policy_collects_from_sixty_avoiding_environments(kind):
+    """Plans are made at steps 0, 4, ... only, and all environments, equal at the start, go their own ways."""
+    torch.manual_seed(0)
+    env = TransformedEnv(AvoidingEnv(60), policy_transforms(5))
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2)
+    planner.fit_normalizers(0.01 * torch.randn(50, 16, 2).cumsum(1))
+    controller = make_koopman_inverse_dynamics(2, 2)
+    policy = make_policy(planner, controller, state_of=(2, 3), execution=Execution(kind))
+    calls = []
+    planner.denoiser.register_forward_hook(lambda module, arguments, _: calls.append(len(arguments[0])))
+    collector = Collector(
+        env, policy, frames_per_batch=60 * 6, total_frames=60 * 6, exploration_type=ExplorationType.DETERMINISTIC
+    )
+    calls.clear()  # the collector tries the policy once
+    (data,) = collector
+    assert data.shape == (60, 6) and data["action"].isfinite().all()
+    assert calls == [60] * 4  # two solver steps of two plans
+    assert torch.equal(data["observation_history"][:, 0], data["observation"][:, :1].expand(60, 5, 4))
+    assert torch.equal(data["observation_history"][:, 5, 1:], data["observation"][:, 2:])
+    chunks = data[policy.out_keys[1]]
+    assert all(torch.equal(chunks[:, step], chunks[:, 0]) for step in range(4))
+    assert not torch.equal(chunks[:, 4], chunks[:, 0])
+    assert data["action"][:, 0].unique(dim=0).shape[0] == 60
+    collector.shutdown()
+
+
+def test_evaluations_of_chunks_do_not_depend_on_the_batch_size():
+    policy = make_policy(diffusion_policy(), state_of=(1, 2, 3))
+    seeds = [100, 101, 102, 103]
+    together, apart = (roll_out(policy, AvoidingEnv, seeds, max_steps=10, batch_size=size) for size in (None, 1))
+    for one, other in zip(apart, together, strict=True):
+        for key in (("next", "observation"), "action"):
+            torch.testing.assert_close(one[key], other[key], rtol=1e-3, atol=1e-4)
+    assert not torch.allclose(together[0]["action"], together[1]["action"])
+    chunks = together[0]["action_chunk"]
+    for step in range(10):
+        assert torch.equal(together[0]["action"][step], chunks[step, step % 4])
+        assert torch.equal(chunks[step], chunks[step - step % 4])
+    assert not torch.equal(chunks[4], chunks[0])
+    again = roll_out(policy, AvoidingEnv, seeds[:1], max_steps=10)
+    assert torch.equal(again[0]["action"], apart[0]["action"])
+
+
+def test_pictures_and_latency_need_no_plans():
+    policy = make_policy(diffusion_policy(), state_of=(1, 2, 3))
+    episodes = roll_out(policy, AvoidingEnv, [1, 2], max_steps=6)
+    tensors = rollouts_to_tensors(episodes, position=slice(2, 4), mode_index=mode_index, interval=4)
+    assert tensors["plan"].shape == (2, 0, 1, 2) and tensors["plan_step"].shape == (2, 0)
+    assert tensors["action"].shape == (2, 6, 2) and tensors["position"].shape == (2, 7, 2)
+    result = measure_latency(policy, 4, repeats=5)
+    assert result["plan_ms"] > result["control_ms"] > 0
+    assert result["control_hz"] == pytest.approx(1e3 / (result["control_ms"] + result["plan_ms"] / 4))
+
+
+@pytest.mark.parametrize("kind", ["plans", "chunks"])
+def test_a_stochastic_start_stays_stochastic_under_deterministic_exploration(kind):
+    """Equal observations get different plans: with one fixed start noise all episodes would take the same way."""
+    env = TransformedEnv(AvoidingEnv(20), policy_transforms(2))
+    if kind == "chunks":
+        policy = make_policy(diffusion_policy(), state_of=(1, 2, 3))
+    else:
+        policy = make_policy(wandering_planner(), PlannedStep(), state_of=(2, 3))
+    collector = Collector(
+        env, policy, frames_per_batch=20 * 5, total_frames=20 * 5, exploration_type=ExplorationType.DETERMINISTIC
+    )
+    (data,) = collector
+    collector.shutdown()
+    assert data.shape == (20, 5) and data["action"].isfinite().all()
+    assert data["action"][:, 0].unique(dim=0).shape[0] == 20  # all begin at the same place

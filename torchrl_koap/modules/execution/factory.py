@@ -1,0 +1,100 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The one place where policies are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from torch import Tensor, nn
+
+from torchrl_koap.modules.execution.command_decoder import CommandDecoder, CommandRegression
+from torchrl_koap.modules.execution.command_limits import CommandLimits
+from torchrl_koap.modules.execution.execution import Execution
+from torchrl_koap.modules.execution.followers import ActionRule, Follower, InverseDynamicsFollower
+from torchrl_koap.modules.execution.mpc import MPC
+from torchrl_koap.modules.execution.policy import PlanningPolicy
+from torchrl_koap.modules.execution.response_model import ResponseModel
+
+
+def make_policy(
+    planner: nn.Module,
+    controller: nn.Module | None = None,
+    *,
+    state_of: Callable[[Tensor], Tensor] | Sequence[int],
+    execution: Execution | None = None,
+    columns: Sequence[int] | None = None,
+    action_rule: ActionRule | None = None,
+    changes: Sequence[int] = (),
+    commanded: Mapping[str, Sequence[int]] | None = None,
+    max_steps: int = 400,
+    follower: Follower | None = None,
+) -> PlanningPolicy:
+    """Makes a policy of planner and controller: observations in, an action per control step out.
+
+    The facts of a task, all but the first two keyword arguments, are handed over by
+    :func:`~torchrl_koap.training.policy_facts.policy_facts`.
+
+    Args:
+        planner (StatePlanner or DiffusionPolicy): samples plans; or actions, which no controller decodes.
+        controller (nn.Module, optional): an :class:`~torchrl_koap.modules.InverseDynamics`, a
+            :class:`~torchrl_koap.modules.ResponseModel` (plans are followed by :class:`~torchrl_koap.modules.MPC`) or a
+            :class:`~torchrl_koap.modules.CommandDecoder` (:class:`~torchrl_koap.modules.CommandRegression`).
+
+    Keyword Args:
+        state_of (callable, or sequence of int): from observations ``[*B, obs]`` to states ``[*B, d]``, or the columns
+            that make up the state.
+        execution (Execution, optional): how plans become actions. Default: ``Execution()``.
+        columns (sequence of int, optional): columns of the state that an inverse dynamics reads. Default: all.
+        action_rule (callable, optional): ``action_rule(states [*B, T, d], actions [*B, T, act]) -> actions`` has the
+            last word on the actions of a window, such as a gripper's number, which is read off the planned widths.
+        changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
+        commanded (mapping, optional): for each of these the observation column that repeats the command
+            (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
+        max_steps (int): steps of an episode.
+        follower (Follower, optional): follows plans in place of the controller, such as the oracle.
+
+    Raises:
+        ValueError: as :class:`~torchrl_koap.modules.PlanningPolicy`, or for a gain or lead where no action is a change
+            of a command (that is observed).
+
+    Examples:
+        >>> from torchrl_koap.modules import Execution, StatePlanner, TemporalUnet, make_policy
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> policy = make_policy(planner, make_koopman_inverse_dynamics(2, 2), state_of=(2, 3))
+        >>> policy.history, policy.execution.strategy
+        (5, 'feedback')
+    """
+    execution = Execution() if execution is None else execution
+    if follower is None and controller is not None:
+        follower = _follow(planner, controller, execution, columns, action_rule)
+    limits = None
+    if execution.gain != 1 or execution.lead:
+        own = {} if commanded is None else commanded
+        limits = CommandLimits(
+            changes,
+            gain=execution.gain,
+            lead=execution.lead,
+            commands=own.get("commands", ()),
+            positions=own.get("states", ()),
+            state_of=state_of if callable(state_of) else lambda observed: observed[..., list(state_of)],
+        )
+    policy = PlanningPolicy(
+        planner, follower, state_of=state_of, execution=execution, limits=limits, max_steps=max_steps
+    )
+    return policy.eval()
+
+
+def _follow(
+    planner: nn.Module,
+    controller: nn.Module,
+    execution: Execution,
+    columns: Sequence[int] | None,
+    action_rule: ActionRule | None,
+) -> Follower:
+    if isinstance(controller, ResponseModel):
+        look_ahead = planner.horizon - execution.replan_interval + 1  # what every plan tells at its last step
+        return MPC(controller, look_ahead=look_ahead, blend=execution.blend, action_rule=action_rule)
+    if isinstance(controller, CommandDecoder):
+        return CommandRegression(controller, blend=execution.blend, action_rule=action_rule)
+    return InverseDynamicsFollower(controller, blend=execution.blend, columns=columns, action_rule=action_rule)

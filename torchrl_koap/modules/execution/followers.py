@@ -1,0 +1,181 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What turns a plan into actions: the base class, and an inverse dynamics as a follower."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from torchrl_koap.modules.inverse_dynamics import InverseDynamics
+
+ActionRule = Callable[[Tensor, Tensor], Tensor]  # (states [*B, T, d], actions [*B, T, act]) -> actions
+
+
+class Follower(nn.Module):
+    """Base class of what turns a plan into actions; a subclass writes ``forward``.
+
+    Args:
+        controller (nn.Module, optional): what it decides by, whose weights are saved.
+
+    Keyword Args:
+        num_frames (int): observed frames that it reads, the present one included.
+
+    Attributes:
+        knows_command (bool): it reads the last command. It then looks at every step, and its actions take no gain.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import Follower
+        >>> class Straight(Follower):
+        ...     def forward(self, observations, states, plan, steps=1):
+        ...         return torch.cat([states[..., -1:, :], plan], -2).diff(dim=-2)[..., :steps, :]
+        >>> Straight()(torch.zeros(1, 4), torch.zeros(1, 2), torch.ones(14, 2))
+        tensor([[1., 1.]])
+    """
+
+    knows_command = False
+
+    def __init__(self, controller: nn.Module | None = None, *, num_frames: int = 1):
+        super().__init__()
+        self.controller, self.num_frames = controller, num_frames
+
+    def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
+        """The actions of the next steps.
+
+        Args:
+            observations (Tensor): ``[*B, history, obs]``, the present one last, raw units.
+            states (Tensor): their states ``[*B, history, d]``.
+            plan (Tensor): planned states ``[*B, H, d]``, the next one first.
+            steps (int): number of actions; those after the first are as if every planned state was reached.
+
+        Returns:
+            Tensor: ``[*B, steps, act]``, raw units.
+        """
+        raise NotImplementedError
+
+    def attach(self, env: EnvBase) -> None:
+        """Is told the batch of environments whose episodes are about to begin; needs none by default."""
+
+
+class InverseDynamicsFollower(Follower):
+    """Decodes actions from the window of observed and planned states.
+
+    Before anything is decoded the plan is *blended* into the present state (:func:`blend_plan`). An inverse dynamics is
+    fitted to motions that happened, in which no step leaps; a plan that begins beside the robot it follows badly.
+
+    Args:
+        controller (InverseDynamics): or another module with ``num_past`` that reads a window of states ``[*B, T, d]``
+            and writes actions ``[*B, T, act]``.
+
+    Keyword Args:
+        blend (float): share of the distance to the plan that remains after each frame.
+        columns (sequence of int, optional): columns of the state that the controller reads. Default: all.
+        action_rule (callable, optional): ``action_rule(states [*B, T, d], actions [*B, T, act]) -> actions`` has the
+            last word on the actions of a window, such as ``task.action_rule``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import InverseDynamicsFollower, make_koopman_inverse_dynamics
+        >>> follower = InverseDynamicsFollower(make_koopman_inverse_dynamics(2, 2))
+        >>> follower(torch.zeros(3, 5, 4), torch.zeros(3, 5, 2), torch.zeros(3, 14, 2)).shape
+        torch.Size([3, 1, 2])
+    """
+
+    def __init__(
+        self,
+        controller: InverseDynamics,
+        *,
+        blend: float = 0.8,
+        columns: Sequence[int] | None = None,
+        action_rule: ActionRule | None = None,
+    ):
+        super().__init__(controller, num_frames=controller.num_past + 1)
+        self.blend, self.action_rule = blend, action_rule
+        self.register_buffer("columns", None if columns is None else torch.as_tensor(columns), persistent=False)
+
+    def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
+        """The actions of the next steps; arguments as for :class:`Follower`."""
+        seen = states if self.columns is None else states[..., self.columns]
+        ahead = plan if self.columns is None else plan[..., self.columns]
+        window = torch.cat([seen, blend_plan(seen, ahead, self.blend)], -2)
+        out = self.controller(TensorDict({self.controller.in_keys[0]: window}, batch_size=window.shape[:-2]))
+        actions = out.get(self.controller.out_keys[-1])
+        if self.action_rule is not None:
+            actions = self.action_rule(torch.cat([states, plan], -2), actions)
+        now = states.shape[-2] - 1
+        return actions[..., now : now + steps, :]
+
+
+def command_rest(action_rule: ActionRule | None, states: Tensor, plan: Tensor, width: int, steps: int) -> Tensor:
+    """Actions ``[*B, steps, width]`` that a rule alone tells from observed and planned states; zero where it does not.
+
+    Args:
+        action_rule (callable, optional): as for :class:`InverseDynamicsFollower`.
+        states (Tensor): observed states ``[*B, history, d]``.
+        plan (Tensor): planned states ``[*B, H, d]``.
+        width (int): action entries.
+        steps (int): number of actions.
+    """
+    if action_rule is None:
+        return plan.new_zeros(*plan.shape[:-2], steps, width)
+    window, now = torch.cat([states, plan], -2), states.shape[-2] - 1
+    return action_rule(window, window.new_zeros(*window.shape[:-1], width))[..., now : now + steps, :]
+
+
+def remaining_plan(plan: Tensor, age: Tensor | int) -> Tensor:
+    """What is left of plans, their last state repeated.
+
+    Args:
+        plan (Tensor): ``[*B, H, w]``.
+        age (Tensor or int): steps since they were made ``[*B]``.
+
+    Returns:
+        Tensor: ``[*B, H, w]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.execution.followers import remaining_plan
+        >>> remaining_plan(torch.arange(4.0)[:, None], 2).flatten().tolist()
+        [2.0, 3.0, 3.0, 3.0]
+    """
+    steps, last = torch.arange(plan.shape[-2], device=plan.device), plan.shape[-2] - 1
+    if isinstance(age, int):
+        return plan[..., (steps + age).clamp_max(last), :]
+    index = (steps + age.unsqueeze(-1)).clamp_max(last)
+    return plan.gather(-2, index.unsqueeze(-1).expand(plan.shape))
+
+
+def blend_plan(history: Tensor, plan: Tensor, decay: float) -> Tensor:
+    r"""Bends the beginning of a plan so that it leaves from the present state.
+
+    .. math::
+        x'_{t+k} = x_{t+k} + \rho^k e, \qquad e = x_t - (4 x_{t+1} + x_{t+2} - 2 x_{t+3}) / 3
+
+    with the present state ``x_t`` and where the plan has the robot at present: its first three states, continued
+    backwards along their least-squares line.
+
+    Args:
+        history (Tensor): observed states ``[*B, h, d]``, the present one last.
+        plan (Tensor): planned states ``[*B, H, d]``; one shorter than three states is returned as it is.
+        decay (float): ``rho``.
+
+    Returns:
+        Tensor: the bent plan ``[*B, H, d]``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import blend_plan
+        >>> plan = torch.tensor([[2.0], [3.0], [4.0]])
+        >>> blend_plan(torch.tensor([[0.0]]), plan, 0.5).flatten().tolist()  # the plan begins at 1, the robot is at 0
+        [1.5, 2.75, 3.875]
+    """
+    if decay == 0 or plan.shape[-2] < 3:
+        return plan
+    first, second, third = plan[..., :3, :].unbind(-2)
+    behind = history[..., -1, :] - (4 * first + second - 2 * third) / 3
+    frames = torch.arange(1, plan.shape[-2] + 1, device=plan.device, dtype=plan.dtype)
+    return plan + behind.unsqueeze(-2) * (decay**frames).unsqueeze(-1)

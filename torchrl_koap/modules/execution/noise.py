@@ -1,0 +1,130 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The one source of the plans' start noise: a stream per episode, fixed by its seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+NOISE = "noise"
+
+
+class NoiseStreams:
+    """Draws standard normal noise of episodes, which depends on an episode's seed and step alone.
+
+    Numbers are drawn for a block of steps at once: torch fills tensors in groups of 16, so that draws step by step
+    would be others.
+
+    Args:
+        seeds (sequence of int): one per episode.
+        shape (sequence of int): shape of one draw, ``policy.noise_shape``.
+
+    Keyword Args:
+        block (int): steps that are drawn at once, ``policy.max_steps``.
+
+    Examples:
+        >>> from torchrl_koap.modules import NoiseStreams
+        >>> both, one = NoiseStreams([7, 8], (14, 2), block=3), NoiseStreams([8], (14, 2), block=3)
+        >>> bool((both.draw()[1] == one.draw()[0]).all())
+        True
+    """
+
+    def __init__(self, seeds: Sequence[int], shape: Sequence[int], *, block: int):
+        self.shape, self.block = tuple(shape), block
+        self._generators = [torch.Generator().manual_seed(int(seed)) for seed in seeds]
+        self._draws = torch.empty(0)
+        self._left = 0
+
+    def __len__(self) -> int:
+        return len(self._generators)
+
+    def draw(self) -> Tensor:
+        """The noise of the next step ``[E, *shape]``."""
+        if not self._left:
+            size = (self.block, *self.shape)
+            self._draws = torch.stack([torch.randn(size, generator=generator) for generator in self._generators])
+            self._left = self.block
+        self._left -= 1
+        return self._draws[:, self.block - 1 - self._left]
+
+
+class StartNoise(TensorDictModuleBase):
+    """Writes the noise of the next step, in front of a policy.
+
+    Args:
+        streams (NoiseStreams): where it comes from, a stream per environment.
+
+    Keyword Args:
+        noise_key (NestedKey): entry that is written, ``planner.noise_key``. Defaults to ``"noise"``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules.execution.noise import NoiseStreams, StartNoise
+        >>> StartNoise(NoiseStreams([7], (14, 2), block=3))(TensorDict(batch_size=[1]))["noise"].shape
+        torch.Size([1, 14, 2])
+    """
+
+    def __init__(self, streams: NoiseStreams, *, noise_key: NestedKey = NOISE):
+        super().__init__()
+        self.in_keys, self.out_keys, self.streams = [], [noise_key], streams
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the noise."""
+        noise = self.streams.draw().reshape(*tensordict.batch_size, *self.streams.shape)
+        return tensordict.set(self.out_keys[0], noise.to(tensordict.device or noise.device))
+
+
+class NoiseTransform(Transform):
+    """Writes start noise at every reset and step of an environment; number ``i`` of a batch draws with ``seed + i``.
+
+    TorchRL hands a seed to the innermost environment alone; :class:`~torchrl_koap.modules.PolicyEnv` hands it to this
+    transform too.
+
+    Args:
+        shape (sequence of int): shape of one draw, ``policy.noise_shape``.
+
+    Keyword Args:
+        seed (int): seed until :meth:`set_seed`.
+        block (int): steps that are drawn at once, ``policy.max_steps``.
+        noise_key (NestedKey): entry that is written, ``planner.noise_key``. Defaults to ``"noise"``.
+
+    Examples:
+        >>> from torchrl_koap.modules.execution.noise import NoiseTransform
+        >>> noise = NoiseTransform((14, 2), seed=3, block=100)
+        >>> noise.set_seed(4)
+        >>> noise.seed
+        4
+    """
+
+    def __init__(self, shape: Sequence[int], *, seed: int = 0, block: int, noise_key: NestedKey = NOISE):
+        super().__init__(in_keys=[], out_keys=[noise_key])
+        self.shape, self.block = tuple(shape), block
+        self.set_seed(seed)
+
+    def set_seed(self, seed: int) -> None:
+        """Begins all streams anew."""
+        self.seed = int(seed)
+        self._streams = NoiseStreams([], self.shape, block=self.block)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        batch = next_tensordict.batch_size
+        if len(self._streams) != batch.numel():
+            seeds = range(self.seed, self.seed + batch.numel())
+            self._streams = NoiseStreams(seeds, self.shape, block=self.block)
+        noise = self._streams.draw().reshape(*batch, *self.shape)
+        return next_tensordict.set(self.out_keys[0], noise.to(next_tensordict.device or noise.device))
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """The specification with the noise."""
+        shape = (*observation_spec.shape, *self.shape)
+        observation_spec[self.out_keys[0]] = Unbounded(shape, device=observation_spec.device)
+        return observation_spec

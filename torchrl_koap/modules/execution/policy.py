@@ -1,0 +1,254 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The policy: a plan is made every few steps, followed step by step, then made anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.modules import MultiStepActorWrapper
+
+from torchrl_koap.keys import ACTION, PLAN
+from torchrl_koap.modules.execution.candidates import paths_apart, sample_coherent, steps_apart
+from torchrl_koap.modules.execution.command_limits import CommandLimits
+from torchrl_koap.modules.execution.execution import Execution
+from torchrl_koap.modules.execution.followers import Follower, remaining_plan
+
+OBSERVATION_HISTORY = "observation_history"
+IS_INIT = "is_init"
+PLANNED_STATE = "planned_state"
+ACTION_CHUNK = "action_chunk"
+
+
+class PlanningPolicy(TensorDictModuleBase):
+    """Samples plans of states and follows them, or samples chunks of actions and executes their beginning.
+
+    :func:`~torchrl_koap.modules.make_policy` makes one of the facts of a task. Every environment of a batch re-plans in
+    its own rhythm, counted from its own reset (:class:`torchrl.modules.MultiStepActorWrapper`); batches may have any
+    shape, ``[]`` of a single environment included. The current plan travels in the tensordict; where it is lost on the
+    way (a :class:`torchrl.envs.ParallelEnv` whose workers reset by themselves hands on its own entries alone), the
+    policy remembers what it wrote last.
+
+    Args:
+        planner (StatePlanner or DiffusionPolicy): samples plans from the last observed states.
+        follower (Follower, optional): turns plans into actions. Default: what is sampled are actions.
+
+    Keyword Args:
+        state_of (callable, or sequence of int): from observations ``[*B, obs]`` to states ``[*B, d]``, or the columns
+            that make up the state.
+        execution (Execution, optional): how plans become actions. Default: ``Execution()``.
+        limits (CommandLimits, optional): has the last word on actions.
+        max_steps (int): steps of an episode, whose start noise is drawn at once.
+        history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
+        action_key (NestedKey): action of the current step ``[*B, act]``.
+
+    Raises:
+        ValueError: for an interval longer than the horizon, several candidates of a plan that is decoded at once, or a
+            follower that cannot be executed so. At the first call for a history of another length.
+        KeyError: at the first call, if the environment lacks :func:`~torchrl_koap.modules.policy_transforms`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import DiffusionPolicy, PlanningPolicy, TemporalUnet
+        >>> sampler = DiffusionPolicy(TemporalUnet(3, 4), state_dim=2, action_dim=3)
+        >>> policy = PlanningPolicy(sampler, state_of=(2, 3))
+        >>> td = TensorDict({"observation_history": torch.zeros(5, 2, 4),
+        ...                  "is_init": torch.ones(5, 1, dtype=torch.bool)}, [5])
+        >>> policy(td)["action"].shape
+        torch.Size([5, 3])
+    """
+
+    def __init__(
+        self,
+        planner: nn.Module,
+        follower: Follower | None = None,
+        *,
+        state_of: Callable[[Tensor], Tensor] | Sequence[int],
+        execution: Execution | None = None,
+        limits: CommandLimits | None = None,
+        max_steps: int = 400,
+        history_key: NestedKey = OBSERVATION_HISTORY,
+        action_key: NestedKey = ACTION,
+    ):
+        super().__init__()
+        execution = Execution() if execution is None else execution
+        if follower is None:  # what is sampled is executed
+            execution = execution.replaced(strategy="open_loop")
+        elif execution.strategy == "open_loop":
+            if execution.candidates > 1:
+                raise ValueError("several candidates need strategy 'feedback', which keeps its plan; got 'open_loop'")
+            if follower.knows_command:
+                raise ValueError(f"{type(follower).__name__} looks at every step: strategy must not be 'open_loop'")
+        if follower is not None and follower.knows_command and execution.gain != 1:
+            raise ValueError(f"{type(follower).__name__} knows how commands are answered: gain must be 1")
+        if execution.replan_interval > planner.horizon:
+            raise ValueError(
+                f"replan_interval must be in 1..{planner.horizon} (the horizon), got {execution.replan_interval}"
+            )
+        self.planner, self.follower, self.limits = planner, follower, limits
+        self.execution, self.max_steps = execution, max_steps
+        self.state_of = state_of if callable(state_of) else _Columns(state_of)
+        self.history = max(planner.history, 1 if follower is None else follower.num_frames)
+        self._decodes = follower is not None and execution.strategy != "open_loop"  # at every step
+        chunk_key = PLAN if self._decodes else ACTION_CHUNK
+        self.in_keys, self.out_keys = [history_key, IS_INIT], [action_key, chunk_key]
+        self._written: TensorDictBase | None = None
+        self.receding = MultiStepActorWrapper(
+            _Chunk(self.plan, history_key, planner.noise_key, chunk_key),
+            replan_interval=execution.replan_interval,
+            action_keys=[PLANNED_STATE if self._decodes else action_key],
+            chunk_keys=[chunk_key],
+            init_key=IS_INIT,
+        )
+
+    @property
+    def noise_shape(self) -> tuple[int, ...]:
+        """Shape of everything that is drawn for one environment whenever a plan is due."""
+        candidates = self.execution.candidates
+        return (*((candidates,) if candidates > 1 else ()), *self.planner.noise_shape)
+
+    def plan(
+        self,
+        observations: Tensor,
+        noise: Tensor | None = None,
+        previous: Tensor | None = None,
+        started: Tensor | None = None,
+    ) -> Tensor:
+        """Makes what is executed next: a plan, or a chunk of actions.
+
+        Args:
+            observations (Tensor): ``[*B, history, obs]``, raw units.
+            noise (Tensor, optional): ``[*B, *noise_shape]``, standard normal. Default: random.
+            previous (Tensor, optional): the plan of before, which several candidates are compared with.
+            started (Tensor, optional): where an episode begins, bool ``[*B]``.
+
+        Returns:
+            Tensor: planned states ``[*B, H, d]``, or actions ``[*B, n, act]``.
+        """
+        states = self.state_of(observations)
+        seen, candidates = states[..., -self.planner.history :, :], self.execution.candidates
+        if candidates == 1:
+            chunk = self.planner.sample(seen, noise)
+        else:
+            apart = None if previous is None else self._distance_from(previous)
+            chunk = sample_coherent(self.planner.sample, seen, noise, candidates, distance=apart, started=started)
+        if self._decodes or self.follower is None:
+            return chunk
+        return self.follower(observations, states, chunk, self.execution.replan_interval)
+
+    def act(self, observations: Tensor, plan: Tensor, age: Tensor | int) -> Tensor:
+        """The action of a step, command limits included.
+
+        Args:
+            observations (Tensor): ``[*B, history, obs]``, raw units.
+            plan (Tensor): of :meth:`plan`.
+            age (Tensor or int): steps since it was made ``[*B]``.
+
+        Returns:
+            Tensor: ``[*B, act]``, raw units.
+        """
+        left = remaining_plan(plan, age)
+        if self._decodes:
+            left = self.follower(observations, self.state_of(observations), left)
+        return self._limited(observations, left[..., 0, :])
+
+    def decode_ahead(self, observations: Tensor, noise: Tensor) -> Tensor:
+        """Plans and decodes the actions of the next steps at once: stateless and without branches on data.
+
+        This is what is exported: whoever calls it keeps the last observations and counts steps.
+
+        Args:
+            observations (Tensor): ``[*B, history, obs]``, raw units.
+            noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
+
+        Returns:
+            Tensor: ``[*B, replan_interval, act]``, as if the robot moved as it is commanded.
+        """
+        states, steps = self.state_of(observations), self.execution.replan_interval
+        actions = self.planner.sample(states[..., -self.planner.history :, :], noise)
+        if self.follower is not None:
+            actions = self.follower(observations, states, actions, steps)
+        return self._limited(observations.unsqueeze(-3), actions[..., :steps, :])
+
+    def attach(self, env: EnvBase) -> None:
+        """Tells the follower the batch of environments whose episodes are about to begin."""
+        if self.follower is not None:
+            self.follower.attach(env)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action of the current step, and the plan that the next one continues from."""
+        observed = tensordict.get(self.in_keys[0], None)
+        for name, value in ((self.in_keys[0], observed), (IS_INIT, tensordict.get(IS_INIT, None))):
+            if value is None:
+                raise KeyError(f"the policy reads {name!r}: append policy_transforms() to the environment")
+        if observed.shape[-2] != self.history:
+            raise ValueError(
+                f"{self.in_keys[0]!r} must hold {self.history} frames on axis -2, got {list(observed.shape)}"
+            )
+        batch, kept = tensordict.batch_size, [self.out_keys[1], self.receding.counter_key]
+        if self._written is not None and self._written.batch_size == batch and kept[0] not in tensordict.keys():
+            if not tensordict.get(IS_INIT).all():
+                tensordict.update(self._written)
+        if len(batch) == 1:
+            tensordict = self._step(tensordict)
+        else:  # the wrapper wants one batch dimension
+            noise = [] if self.planner.noise_key is None else [self.planner.noise_key]
+            flat = tensordict.select(*self.in_keys, *noise, *kept, strict=False)
+            flat = self._step(flat.reshape(-1) if batch else flat.unsqueeze(0))
+            written = flat.select(*self.out_keys, *kept, *self.receding.action_keys)
+            tensordict.update(written.reshape(batch) if batch else written[0])
+        self._written = tensordict.select(*kept)
+        return tensordict
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """One step of a batch ``[n]``."""
+        tensordict = self.receding(tensordict)
+        observed, plan = tensordict.get(self.in_keys[0]), tensordict.get(self.out_keys[1])
+        age = tensordict.get(self.receding.counter_key).squeeze(-1).long() - 1
+        return tensordict.set(self.out_keys[0], self.act(observed, plan, age))
+
+    def _limited(self, observations: Tensor, action: Tensor) -> Tensor:
+        return action if self.limits is None else self.limits(observations, action)
+
+    def _distance_from(self, previous: Tensor) -> Callable[[Tensor], Tensor] | None:
+        """How far candidates ``[*B, N, H, w]`` are from the plan of before, every column in units of its spread."""
+        if self.follower is not None:
+            scale = self.planner.scale_columns
+            return lambda plans: paths_apart(scale(plans), scale(previous))
+        left, scale = previous[..., self.execution.replan_interval :, :], self.planner.action_normalizer
+        return (lambda chunks: steps_apart(scale(chunks), scale(left))) if left.shape[-2] else None
+
+
+class _Chunk(TensorDictModuleBase):
+    """The part that runs only when a plan is due."""
+
+    def __init__(self, plan: Callable, history_key: NestedKey, noise_key: NestedKey | None, chunk_key: NestedKey):
+        super().__init__()
+        self.plan, self.noise_key = plan, noise_key
+        self.in_keys, self.out_keys = [history_key], [chunk_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        noise = None if self.noise_key is None else tensordict.get(self.noise_key, None)
+        previous, started = tensordict.get(self.out_keys[0], None), tensordict.get(IS_INIT).squeeze(-1)
+        return tensordict.set(self.out_keys[0], self.plan(tensordict.get(self.in_keys[0]), noise, previous, started))
+
+
+class _Columns(nn.Module):
+    """Some columns of an observation as the state."""
+
+    def __init__(self, columns: Sequence[int]):
+        super().__init__()
+        self.register_buffer("columns", torch.as_tensor(columns), persistent=False)
+        self._widest = int(max(columns))
+
+    def forward(self, observed: Tensor) -> Tensor:
+        if observed.shape[-1] <= self._widest:
+            raise ValueError(
+                f"an observation must have at least {self._widest + 1} columns (state_of), got {observed.shape[-1]}"
+            )
+        return observed[..., self.columns]
