@@ -41,6 +41,9 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
         task (Task): what the data are of. One that names no code is kept with them, any other one by its name.
         notes (mapping, optional): anything JSON can hold that should be kept with the data.
 
+    Returns:
+        Path: the folder.
+
     Raises:
         LayoutError: if the data do not follow the storage layout.
         TypeError: if an entry is no tensor.
@@ -117,6 +120,11 @@ def read_about(folder: str | Path) -> dict[str, Any]:
 
     Raises:
         DataError: if the folder holds no data set, or one in another format.
+
+    Examples:
+        >>> from torchrl_koap.data import read_about
+        >>> read_about("demos/ted")["labelled_steps"]  # doctest: +SKIP
+        8112
     """
     path = Path(folder) / _ABOUT
     try:
@@ -150,20 +158,36 @@ def load_ted(folder: str | Path) -> tuple[TensorDict, Task]:
     Raises:
         DataError: if files are missing, changed or damaged, or the task names code.
         ValueError: if the task is only named, and nobody has registered it.
+
+    Examples:
+        >>> from torchrl_koap.data import load_ted
+        >>> data, task = load_ted("demos/ted")  # doctest: +SKIP
     """
     task = stored_task(folder)
     return read_steps(folder), task
 
 
 def stored_task(folder: str | Path) -> Task:
-    """The task of a data set: the one that it holds, or the registered one that it names.
+    """Reads the task of a data set: the one that it holds, or the registered one that it names.
 
     Args:
         folder (str or Path): folder of the data set.
 
+    Returns:
+        Task: the task.
+
     Raises:
         DataError: if the folder holds no data set, or its task is damaged or names code.
         ValueError: if nobody has registered the task that it names.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from torchrl_koap.data import save_demonstrations, stored_task
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     folder = save_demonstrations(root + "/arm", [np.zeros((9, 2))], control_hz=30, action_dim=7)
+        ...     stored_task(folder / "ted").action_dim
+        7
     """
     about = read_about(folder)
     if about.get("definition") is None:
@@ -175,7 +199,7 @@ def stored_task(folder: str | Path) -> Task:
 
 
 def read_steps(folder: str | Path) -> TensorDict:
-    """The data of a data set ``[N]``, whatever their task.
+    """Reads the data of a data set ``[N]``, whatever their task.
 
     Args:
         folder (str or Path): folder of the data set.

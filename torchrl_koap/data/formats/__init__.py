@@ -30,6 +30,11 @@ class Format:
         read (callable): from a source, and some of the options, to :class:`Recordings`.
         options (tuple of str): which options of :func:`read_recordings` it takes.
         write (callable, optional): writes recordings into a new folder. Default: this format is not written.
+
+    Examples:
+        >>> from torchrl_koap.data.formats import FORMATS
+        >>> [name for name, form in FORMATS.items() if form.write is not None]
+        ['lerobot', 'npz']
     """
 
     what: str
@@ -88,6 +93,9 @@ def read_recordings(
             ``action...``.
         action_dim (int, optional): number of action columns where nothing has actions.
 
+    Returns:
+        Recordings: trajectories with the names of their columns.
+
     Raises:
         DataError: with all faults of the recordings.
         FileNotFoundError: if there is no such source.
@@ -119,6 +127,9 @@ def write_recordings(recordings: Recordings, out: str | Path, name: str) -> Path
         recordings (Recordings): what to write.
         out (str or Path): the folder; it must not exist yet.
         name (str): a format that is written, ``"npz"`` or ``"lerobot"``.
+
+    Returns:
+        Path: the folder.
 
     Raises:
         ValueError: for a format that is not written; the message suggests the nearest.

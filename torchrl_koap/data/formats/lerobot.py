@@ -42,6 +42,13 @@ class Rows:
             ``N`` cells of pictures. ``action`` is missing where no file has it.
         numbers (list of int): of every episode its ``episode_index``.
         spans (list of slice): of every episode its rows.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data.formats.lerobot import Rows
+        >>> rows = Rows({"observation.state": np.zeros((5, 2))}, numbers=[0, 1], spans=[slice(0, 2), slice(2, 5)])
+        >>> rows.columns["observation.state"][rows.spans[1]].shape
+        (3, 2)
     """
 
     columns: dict[str, Any]

@@ -38,6 +38,12 @@ class Attempt:
         steps (int): control steps that were played; one more than actions where D3IL's log was recorded, whose first
             row is the state after the first of them.
         fault (str): what went wrong, one of ``FAULTS``; empty if nothing did.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.envs.experts.recording import Attempt
+        >>> Attempt(np.zeros((40, 4)), np.zeros((39, 2)), steps=40, fault="slow").fault
+        'slow'
     """
 
     frames: np.ndarray
