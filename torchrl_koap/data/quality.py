@@ -80,7 +80,8 @@ def find_warnings(
 
 
 def _column_warnings(state: Tensor, names: Sequence[str]) -> list[str]:
-    found, first = [], {}
+    found: list[str] = []
+    first: dict[bytes, str] = {}
     for name, values in zip(names, state.unbind(-1), strict=True):
         if bool((values == values[:1]).all()):
             found.append(f"column {name!r} is {values[0]:g} in all {len(values)} steps: it says nothing")

@@ -56,7 +56,7 @@ def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
             f"task {task.name!r} has no environment (Task.env is None): it can be trained on data, but not rolled out,"
             " recorded or drawn by a simulator. `koap eval --env ID` takes an environment of Gymnasium"
         )
-    return resolve(task.env, f"env of task {task.name!r}")(num_envs, **(task.env_options | options))
+    return resolve(task.env, f"env of task {task.name!r}")(num_envs, **{**task.env_options, **options})
 
 
 def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:

@@ -151,7 +151,8 @@ def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
     """
     true = entry(data, "true", [None, None])
     predicted, width = entry(data, "predicted", true.shape), true.shape[1]
-    names, units, absolute = [f"action {index + 1}" for index in range(width)], [""] * width, ()
+    names, units = [f"action {index + 1}" for index in range(width)], [""] * width
+    absolute: tuple[str, ...] = ()
     if run.task is not None and run.task.action_dim == width:
         names, units = list(run.task.actions), [action.unit for action in run.task.actions.values()]
         absolute = tuple(name for name, action in run.task.actions.items() if action.kind != "delta")

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, get_args
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, get_args
 
 from torchrl_koap.tasks.action_rules import Action, ActionKind
 from torchrl_koap.tasks.features import FEATURES
@@ -49,7 +50,8 @@ def _action_faults(task: Task) -> list[str]:
     if not task.actions:
         return ["actions: none"]
     faults = []
-    for name, action in task.actions.items():
+    given: Mapping[str, Any] = task.actions
+    for name, action in given.items():
         if not isinstance(action, Action):
             faults.append(f"actions: wanted {name!r}: Action({action!r}), got {action!r}")
         elif action.kind not in get_args(ActionKind):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -80,9 +81,13 @@ class LatentActionSmoothed(LatentActionModule):
             )
         dim = lifting.latent_dim
         # random features as they are: training them was measured to change nothing
-        kernel = {"curvature": curvature, "motion_scale": motion_scale, "position_scale": position_scale}
+        kernel: dict[str, Any] = {
+            "curvature": curvature,
+            "motion_scale": motion_scale,
+            "position_scale": position_scale,
+        }
         kernel["trainable"] = False
-        frames = {"num_past": num_past, "look_ahead": look_ahead}
+        frames: dict[str, Any] = {"num_past": num_past, "look_ahead": look_ahead}
         lifted = LatentActionFourier(dim, num_features, **frames, **kernel)
         raw = LatentActionFourier(
             lifting.state_dim, num_features, num_past=raw_past, look_ahead=raw_look_ahead, **kernel
