@@ -49,6 +49,7 @@ _PART = 1 << 18  # steps that are looked at together, as a check takes several t
 LIFTED_STATE = "lifted_state"
 LATENT_ACTION = "latent_action"
 HISTORY = "history"
+PADDED = "padded"
 PLAN = "plan"
 
 SUCCESS = "success"

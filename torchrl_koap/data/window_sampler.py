@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.data import RandomSampler, Storage
 from torchrl.data.replay_buffers import SampleUnit
 
-PADDED = "padded"
+from torchrl_koap.keys import PADDED
 
 
 class WindowUnit(SampleUnit):

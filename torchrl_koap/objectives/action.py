@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import dispatch
 
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics, LatentInverseDynamics
 from torchrl_koap.objectives.base import WindowLoss
@@ -42,10 +42,8 @@ class ActionLoss(WindowLoss):
     """
 
     network: InverseDynamics
-    network_params: TensorDictParams
-    target_network_params: TensorDictParams
     out_keys = ["loss_action"]
-    uses_labels = True
+    required = ("state", "action", "has_action")
 
     def __init__(
         self, network: InverseDynamics, *, freeze_latents: bool = False, sample: bool = False, reduction: str = "mean"

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What all losses on partially labelled windows share: keys, masks, reduction."""
+"""Base classes of the losses: keys that can be renamed, masks, reduction."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictParams
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
-from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
+from torchrl_koap.keys import ACTION, HAS_ACTION, PADDED, STATE
 from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 
 def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """An entry that must be there.
+    """Reads an entry that must be there.
 
     Args:
         tensordict (TensorDictBase): a batch.
@@ -32,7 +32,7 @@ def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def read_mask(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
-    """A mask of the frames of windows, stored with a trailing 1 or not.
+    """Reads a mask of the frames of windows, stored with a trailing 1 or not.
 
     Args:
         tensordict (TensorDictBase): a batch.
@@ -54,8 +54,62 @@ def read_mask(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tens
     return mask
 
 
-class WindowLoss(LossModule):
-    """Base of the losses on windows of states of which some frames have an action label.
+class NetworkLoss(LossModule):
+    """Base class of all losses here: one network, keys that can be renamed, a reduction.
+
+    A subclass has the dataclass ``_AcceptedKeys`` and names in :attr:`required` the entries that must be there.
+
+    Args:
+        network (nn.Module): the network to train.
+
+    Keyword Args:
+        create_target_params (bool): keep an averaged copy of the weights in ``target_network_params``.
+        reduction (str): ``"mean"``, ``"sum"`` or ``"none"``.
+
+    Raises:
+        ValueError: for an unknown reduction.
+    """
+
+    network: nn.Module
+    network_params: TensorDictParams
+    target_network_params: TensorDictParams
+    required: tuple[str, ...] = ("state",)
+
+    def __init__(self, network: nn.Module, *, create_target_params: bool = False, reduction: str = "mean"):
+        if reduction not in ("none", "mean", "sum"):
+            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
+        super().__init__()
+        self.convert_to_functional(network, "network", create_target_params=create_target_params)
+        self.reduction = reduction
+
+    def train(self, mode: bool = True):
+        """Sets the mode of the loss, and of the network, which is no submodule of it."""
+        super().train(mode)
+        self.network.train(mode)
+        return self
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries that must be there, as renamed by ``set_keys``."""
+        return [getattr(self.tensor_keys, name) for name in self.required]
+
+    @in_keys.setter
+    def in_keys(self, values) -> None:
+        raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        """There is no value estimator."""
+
+    def _recorded(self, tensordict: TensorDictBase, state: Tensor) -> Tensor:
+        """Transitions between two recorded frames, bool ``[*B, T - 1]``."""
+        if tensordict.get(self.tensor_keys.padded, None) is None:
+            return torch.ones(state.shape[:-2] + (state.shape[-2] - 1,), dtype=torch.bool, device=state.device)
+        padded = read_mask(tensordict, self.tensor_keys.padded, state)
+        return ~(padded[..., 1:] | padded[..., :-1])
+
+
+class WindowLoss(NetworkLoss):
+    """Base class of the losses on windows of states of which some frames have an action label.
 
     Args:
         network (InverseDynamics): the controller; its entries of states and actions are those of the loss.
@@ -94,22 +148,14 @@ class WindowLoss(LossModule):
         state: NestedKey = STATE
         action: NestedKey = ACTION
         has_action: NestedKey = HAS_ACTION
-        padded: NestedKey = "padded"
+        padded: NestedKey = PADDED
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     network: InverseDynamics
-    network_params: TensorDictParams
-    target_network_params: TensorDictParams
-
-    uses_labels = False
 
     def __init__(self, network: InverseDynamics, *, reduction: str = "mean"):
-        if reduction not in ("none", "mean", "sum"):
-            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
-        super().__init__()
-        self.convert_to_functional(network, "network", create_target_params=False)
-        self.reduction = reduction
+        super().__init__(network, reduction=reduction)
         super().set_keys(state=network.in_key, action=network.out_key)
 
     def set_keys(self, **kwargs) -> None:
@@ -119,36 +165,10 @@ class WindowLoss(LossModule):
             **{name: getattr(self.tensor_keys, name) for name in ("state", "action") if name in kwargs}
         )
 
-    def train(self, mode: bool = True):
-        """Sets the mode of the loss, and of the network, which is no submodule of it: dropout is off in ``eval()``."""
-        super().train(mode)
-        self.network.train(mode)
-        return self
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys read from the input, as renamed by ``set_keys``."""
-        keys = [self.tensor_keys.state]
-        if self.uses_labels:
-            keys += [self.tensor_keys.action, self.tensor_keys.has_action]
-        return keys
-
-    @in_keys.setter
-    def in_keys(self, values) -> None:
-        raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """There is no value estimator."""
-
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """The raw states and the transitions between two recorded frames ``[*B, T - 1]``."""
         state = read_entry(tensordict, self.tensor_keys.state)
-        if tensordict.get(self.tensor_keys.padded, None) is None:
-            recorded = torch.ones(state.shape[:-2] + (state.shape[-2] - 1,), dtype=torch.bool, device=state.device)
-        else:
-            padded = read_mask(tensordict, self.tensor_keys.padded, state)
-            recorded = ~(padded[..., 1:] | padded[..., :-1])
-        return state, recorded
+        return state, self._recorded(tensordict, state)
 
     def _targets(
         self, tensordict: TensorDictBase, state: Tensor, recorded: Tensor, span: range

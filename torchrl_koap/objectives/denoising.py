@@ -4,24 +4,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives.common import LossModule
 
 from torchrl_koap import keys
 from torchrl_koap.modules.planning.diffusion_policy import DiffusionPolicy
 from torchrl_koap.modules.planning.planner import StatePlanner
 from torchrl_koap.modules.planning.sampler import ConditionalSampler
-from torchrl_koap.objectives.base import read_entry, read_mask
+from torchrl_koap.objectives.base import NetworkLoss, read_entry, read_mask
 
 
-class DenoisingLoss(LossModule):
-    r"""Mean squared error of a denoiser at random noise levels.
+class DenoisingLoss(NetworkLoss):
+    r"""Computes the mean squared error of a denoiser at random noise levels.
 
     With a normalised sequence ``x_0``, noise ``eps ~ N(0, I)`` and a random time ``t`` per sequence::
 
@@ -56,8 +55,6 @@ class DenoisingLoss(LossModule):
     """
 
     network: ConditionalSampler
-    network_params: TensorDictParams
-    target_network_params: TensorDictParams
 
     def __init__(
         self,
@@ -67,11 +64,8 @@ class DenoisingLoss(LossModule):
         reduction: Literal["none", "mean", "sum"] = "mean",
         dtype: torch.dtype | None = None,
     ):
-        super().__init__()
-        if reduction not in ("none", "mean", "sum"):
-            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
-        self.reduction, self.dtype = reduction, dtype
-        self.convert_to_functional(network, "network", create_target_params=create_target_params)
+        super().__init__(network, create_target_params=create_target_params, reduction=reduction)
+        self.dtype = dtype
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Reads raw histories and sequences of a batch, and which of their steps count.
@@ -84,24 +78,6 @@ class DenoisingLoss(LossModule):
             the steps that count, bool ``[*B, H, 1]``, or None where all do.
         """
         raise NotImplementedError
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """There is no value estimator."""
-
-    def train(self, mode: bool = True):
-        """Sets the mode of the loss, and of the network, which is no submodule of it."""
-        super().train(mode)
-        self.network.train(mode)
-        return self
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries that must be there, as renamed by ``set_keys``."""
-        return [self.tensor_keys.state]
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -174,9 +150,7 @@ class PlannerLoss(DenoisingLoss):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     out_keys = ["loss_planner"]
-
-    def __init__(self, planner: StatePlanner, **options: Any):
-        super().__init__(planner, **options)
+    network: StatePlanner
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Reads histories and recorded futures, of which all steps count (:meth:`DenoisingLoss.read`)."""
@@ -231,26 +205,15 @@ class DiffusionPolicyLoss(DenoisingLoss):
         state: NestedKey = keys.STATE
         action: NestedKey = keys.ACTION
         has_action: NestedKey = keys.HAS_ACTION
-        padded: NestedKey = "padded"
+        padded: NestedKey = keys.PADDED
         noise: NestedKey = "policy_noise"
         time: NestedKey = "policy_time"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     out_keys = ["loss_policy"]
+    required = ("state", "action", "has_action")
     network: DiffusionPolicy
-
-    def __init__(self, policy: DiffusionPolicy, **options: Any):
-        super().__init__(policy, **options)
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries that must be there, as renamed by ``set_keys``."""
-        return [self.tensor_keys.state, self.tensor_keys.action, self.tensor_keys.has_action]
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        raise RuntimeError("in_keys follow the keys of the loss: use set_keys")
 
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Reads histories, actions from now on and which of them are labelled (:meth:`DenoisingLoss.read`)."""
@@ -260,10 +223,9 @@ class DiffusionPolicyLoss(DenoisingLoss):
         wanted = (*state.shape[:-1], self.network.action_dim)
         if action.shape != wanted:
             raise ValueError(f"{names.action!r} must be {list(wanted)} ([*B, T, act]), got {list(action.shape)}")
-        counts = read_mask(tensordict, names.has_action, state)[..., now:-1]
-        if tensordict.get(names.padded, None) is not None:
-            padded = read_mask(tensordict, names.padded, state)[..., now:]
-            counts = counts & ~(padded[..., 1:] | padded[..., :-1])
+        counts = (
+            read_mask(tensordict, names.has_action, state)[..., now:-1] & self._recorded(tensordict, state)[..., now:]
+        )
         counts = counts.unsqueeze(-1)
         # zeroed before the network and the residual: masking afterwards would leave NaN in the gradient
         return history, torch.where(counts, action[..., now:-1, :], 0.0), counts

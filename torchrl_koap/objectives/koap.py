@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import dispatch
 from torch import Tensor
 
 from torchrl_koap.modules.baselines.nonlinear import NonlinearInverseDynamics
@@ -31,11 +31,6 @@ class _KoopmanLoss(WindowLoss):
     terms: tuple[str, ...]
 
     network: KoopmanInverseDynamics | NonlinearInverseDynamics
-    network_params: TensorDictParams
-    target_network_params: TensorDictParams
-
-    def __init__(self, network: KoopmanInverseDynamics | NonlinearInverseDynamics, *, reduction: str = "mean"):
-        super().__init__(network, reduction=reduction)
 
     def _terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         network, wanted = self.network, self.terms
@@ -108,7 +103,7 @@ class LatentActionLoss(_KoopmanLoss):
 
     terms = (ACTION,)
     out_keys = [ACTION]
-    uses_labels = True
+    required = ("state", "action", "has_action")
 
 
 class KOAPLoss(_KoopmanLoss):
@@ -140,7 +135,7 @@ class KOAPLoss(_KoopmanLoss):
 
     terms = (RECONSTRUCTION, KOOPMAN, ACTION)
     out_keys = [RECONSTRUCTION, KOOPMAN, ACTION]
-    uses_labels = True
+    required = ("state", "action", "has_action")
     _schedulable_buffers = frozenset({"koopman_coeff", "action_coeff"})
 
     def __init__(

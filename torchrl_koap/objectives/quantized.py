@@ -8,7 +8,7 @@ r"""The loss of latent action policies (LAPO) with a quantised latent.
 from __future__ import annotations
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import dispatch
 
 from torchrl_koap.modules.baselines.quantized import QuantizedInverseDynamics
 from torchrl_koap.objectives.base import WindowLoss
@@ -36,12 +36,7 @@ class QuantizedDynamicsLoss(WindowLoss):
     """
 
     network: QuantizedInverseDynamics
-    network_params: TensorDictParams
-    target_network_params: TensorDictParams
     out_keys = ["loss_dynamics"]
-
-    def __init__(self, network: QuantizedInverseDynamics, *, reduction: str = "mean"):
-        super().__init__(network, reduction=reduction)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import dispatch
 from torch import Tensor
 
 from torchrl_koap.modules.baselines.variational import VariationalInverseDynamics
@@ -59,8 +59,6 @@ class VariationalLoss(WindowLoss):
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     network: VariationalInverseDynamics
-    network_params: TensorDictParams
-    target_network_params: TensorDictParams
     out_keys = ["loss_reconstruction", "loss_kl"]
     _schedulable_buffers = frozenset({"kl_coeff"})
 

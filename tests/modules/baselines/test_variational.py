@@ -140,7 +140,7 @@ def test_samples_and_frozen_latents_need_a_network_that_has_them():
         ({"freeze_latents": True}, "freeze_latents was asked"),
     ):
         with pytest.raises(ValueError, match=f"{message} for, but SupervisedInverseDynamics has no latents"):
-            ActionLoss(supervised, **{asked: True})
+            ActionLoss(supervised, **asked)
 
 
 def test_two_stages_learn_actions_from_few_labels():

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
 from torchrl_koap.modules.koopman.operator import KoopmanOperator
@@ -38,7 +39,7 @@ class KoopmanInverseDynamics(LatentInverseDynamics):
         action_decoder (LinearActionDecoder): the decoder ``D``.
 
     Keyword Args:
-        lifting (KoopmanLifting): the networks ``g``.
+        lifting (KoopmanLifting or CompactLifting): the networks ``g``.
         operator (KoopmanOperator): the matrix ``K``.
         penalty (float): ridge of the decoder where fewer than three trajectories have labels. Defaults to ``0.15``.
         **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
@@ -63,7 +64,7 @@ class KoopmanInverseDynamics(LatentInverseDynamics):
         latent_action: LatentActionModule,
         action_decoder: LinearActionDecoder,
         *,
-        lifting: KoopmanLifting,
+        lifting: KoopmanLifting | CompactLifting,
         operator: KoopmanOperator,
         penalty: float = DEFAULT_PENALTY,
         **kwargs,

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
 from torchrl_koap.modules.koopman.smoothing import WienerSmoother
@@ -32,7 +33,7 @@ class LatentActionSmoothed(LatentActionModule):
     With a lifting that keeps the state (``include_state``, all columns) the first block is the smoothed state itself.
 
     Args:
-        lifting (KoopmanLifting): the lifting ``g``, shared with the Koopman model.
+        lifting (KoopmanLifting or CompactLifting): the lifting ``g``, shared with the Koopman model.
         num_features (int): Fourier features of each block.
 
     Keyword Args:
@@ -62,7 +63,7 @@ class LatentActionSmoothed(LatentActionModule):
 
     def __init__(
         self,
-        lifting: KoopmanLifting,
+        lifting: KoopmanLifting | CompactLifting,
         num_features: int,
         *,
         raw_past: int = 4,
@@ -81,12 +82,8 @@ class LatentActionSmoothed(LatentActionModule):
             )
         dim = lifting.latent_dim
         # random features as they are: training them was measured to change nothing
-        kernel: dict[str, Any] = {
-            "curvature": curvature,
-            "motion_scale": motion_scale,
-            "position_scale": position_scale,
-        }
-        kernel["trainable"] = False
+        kernel: dict[str, Any] = {"curvature": curvature, "motion_scale": motion_scale, "trainable": False}
+        kernel["position_scale"] = position_scale
         frames: dict[str, Any] = {"num_past": num_past, "look_ahead": look_ahead}
         lifted = LatentActionFourier(dim, num_features, **frames, **kernel)
         raw = LatentActionFourier(
