@@ -57,3 +57,9 @@ def test_threads_and_device_are_checked(threads, device, message):
 def test_a_missing_gpu_is_said():
     with pytest.raises(ValueError, match="'cuda:1' was asked for, but torch finds no CUDA here"):
         set_up_torch(1, "cuda:1")
+
+
+def test_no_number_of_threads_leaves_torch_alone():
+    before = torch.get_num_threads()
+    set_up_torch(None, "cpu")
+    assert torch.get_num_threads() == before

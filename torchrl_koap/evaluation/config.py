@@ -33,7 +33,7 @@ class EvalConfig:
         task: refuse a run of another task than this.
         dataset: for a task without an environment: where the data set of the training is now (default: where it was).
         samples: for a task without an environment: plans that are sampled in each recorded situation.
-        threads: torch and simulator threads.
+        threads: torch and simulator threads (default: as many as torch has).
         device: "cpu" or "cuda".
         plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
 
@@ -54,7 +54,7 @@ class EvalConfig:
     task: str | None = None
     dataset: str | None = None
     samples: int = 16
-    threads: int = 2
+    threads: int | None = None
     device: str = "cpu"
     plugins: Plugins = ()
 

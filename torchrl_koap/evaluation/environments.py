@@ -95,7 +95,7 @@ def environment_of(task: Task, config: EvalConfig) -> EvaluationEnv:
         numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
         from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
 
-        make_env = make_env_of(task, num_threads=config.threads)
+        make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
         return EvaluationEnv(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
     for name, unfit in {
         "contexts_file": config.contexts_file is not None,

@@ -50,7 +50,7 @@ class InspectConfig:
         execution: how plans become actions (default: as `koap eval` has it).
         latent_only: look into the latent space alone: seconds, without the experiments in the simulator.
         latent_steps: control steps that the latent dynamics predict (fewer where demonstrations are short).
-        threads: torch and simulator threads.
+        threads: torch and simulator threads (default: as many as torch has).
         device: "cpu" or "cuda".
         plugins: modules that register tasks or methods, besides those that the run was trained with.
 
@@ -66,7 +66,7 @@ class InspectConfig:
     execution: Annotated[ExecutionConfig, tyro.conf.arg(name="")] = ExecutionConfig()
     latent_only: bool = False
     latent_steps: int = 10
-    threads: int = 2
+    threads: int | None = None
     device: str = "cpu"
     plugins: Plugins = ()
 
@@ -172,7 +172,7 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
     seeds = list(range(config.seed, config.seed + config.episodes))
     from torchrl_koap.envs.registry import make_env_of  # takes seconds
 
-    make_env = make_env_of(task, num_threads=config.threads)
+    make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
     _, contexts = choose_contexts(task, config.episodes)
     with progress_bar(3, "experiments", unit="experiment") as bar:
         closed = roll_out(policy, make_env, seeds, max_steps=task.max_steps, contexts=contexts)

@@ -68,17 +68,17 @@ def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
     return any(features.get(name, False) for name in _BFLOAT16)
 
 
-def set_up_torch(threads: int, device: str) -> None:
+def set_up_torch(threads: int | None, device: str) -> None:
     """Sets the number of threads and checks that the device is there.
 
     Args:
-        threads (int): number of torch threads, at least 1.
+        threads (int, optional): number of torch threads, at least 1. None leaves it as it is.
         device (str): ``"cpu"`` or ``"cuda"``, with an index or not.
 
     Raises:
         ValueError: if the number is below 1, or this machine has no such device.
     """
-    if threads < 1:
+    if threads is not None and threads < 1:
         raise ValueError(f"threads must be >= 1, got {threads}")
     kind, colon, index = device.partition(":")
     if kind not in ("cpu", "cuda") or (colon and not index.isdecimal()):
@@ -91,6 +91,8 @@ def set_up_torch(threads: int, device: str) -> None:
         raise ValueError(f"device {device!r} was asked for, but torch finds no CUDA here (see `koap doctor`)")
     if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
         raise ValueError(f"device {device!r} was asked for, but there are {torch.cuda.device_count()}, counted from 0")
+    if threads is None:
+        return
     if threads > _MOST_THREADS:
         raise ValueError(f"threads must be at most {_MOST_THREADS}, got {threads}")
     torch.set_num_threads(threads)
