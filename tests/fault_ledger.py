@@ -27,7 +27,7 @@ EVERY = 25  # of so many faults one is met in `make test`, all of them in `make 
 # where a call begins with what it was called for
 WORK = (
     "torchrl_koap.training.loop.warmup_cosine",
-    "torchrl_koap.evaluation.run.roll_out",
+    "torchrl_koap.evaluation.closed_loop.roll_out",
     "torchrl_koap.evaluation.inspection.roll_out",
     "torchrl_koap.studies.label_efficiency.launch",
     "torchrl_koap.commands.export.export_part",

@@ -72,7 +72,8 @@ def test_more_labels_are_not_proposed_where_the_planner_fails():
 
 @pytest.mark.parametrize(("candidates", "command"), [(8, "koap eval {run} --candidates 1"), (1, "koap inspect {run}")])
 def test_low_entropy(candidates, command):
-    evaluation = {"success_rate": 0.95, "episodes": 60, "mode_entropy": 0.3, "candidates": candidates}
+    evaluation = {"success_rate": 0.95, "episodes": 60, "mode_entropy": 0.3}
+    evaluation["execution"] = {"candidates": candidates}
     task = get_task("avoiding")  # in which 57 episodes without preferences have an entropy of 0.93
     assert commands(task=task, evaluation=evaluation) == [command]
     assert commands(task=task, evaluation=evaluation | {"mode_entropy": 0.8}) == []

@@ -74,7 +74,7 @@ def test_order_headline_labels_pictures_commands(run):
     places = [text.index(word) for word in ("Result", "Labels", "Executed rollouts", "All numbers", "Do it again")]
     assert places == sorted(places)
     assert "koap train --out 'a folder'" in text
-    solver = "--episodes 4 --seed 100 --execution feedback"
+    solver = "--episodes 4 --seed 100 --strategy feedback --replan-interval 4"
     assert f"koap eval {run} {solver}" in text
 
 

@@ -15,7 +15,7 @@ __getattr__ = exports(
         "SuggestedLabels": "torchrl_koap.evaluation.active_labelling",
         "TrainedRun": "torchrl_koap.evaluation.trained_run",
         "build_policy": "torchrl_koap.evaluation.policy_files",
-        "evaluate": "torchrl_koap.evaluation.run",
+        "evaluate": "torchrl_koap.evaluation.closed_loop",
         "inspect": "torchrl_koap.evaluation.inspection",
         "load_policy": "torchrl_koap.evaluation.trained_run",
         "load_run": "torchrl_koap.evaluation.trained_run",

@@ -107,7 +107,7 @@ def one_way_only(run: RunFacts) -> Advice | None:
             f"{seen}: a policy of its own knows the labelled ways only",
             "a method that plans learns the ways from all demonstrations (--method koap)",
         )
-    candidates = run.evaluated("candidates") or 1
+    candidates = number(run.execution.get("candidates")) or 1
     if candidates > 1:
         return Advice(
             f"{seen}, with {candidates:.0f} candidates per plan",

@@ -111,6 +111,12 @@ class RunFacts:
         return expected_entropy(self.successes, self.modes.number) if choice else None
 
     @property
+    def execution(self) -> Mapping[str, Any]:
+        """How plans became actions in the evaluation; empty where nobody says so."""
+        found = self.evaluation.get("execution")
+        return found if isinstance(found, Mapping) else {}
+
+    @property
     def labels(self) -> float | None:
         """Labelled transitions, None if nobody counted."""
         account = self.summary.get("labels")

@@ -147,13 +147,11 @@ def _eval_command(run: RunFacts) -> str:
     evaluation = run.evaluation
     words = ["koap", "eval", str(run.folder)]
     if evaluation.get("kind") == "offline":
-        evaluation = {name: evaluation.get(name) for name in ("seed",)}
+        evaluation = {"seed": evaluation.get("seed")}
     episode = evaluation.get("episode")
     first = episode[0] if isinstance(episode, list) and episode and isinstance(episode[0], Mapping) else {}
     options = {"episodes": evaluation.get("episodes"), "seed": evaluation.get("seed", first.get("seed"))}
-    execution = evaluation.get("execution")
-    options["strategy"] = execution.get("strategy") if isinstance(execution, Mapping) else None
-    options |= {key: evaluation.get(key) for key in ("env", "success_key")}
+    options |= dict(run.execution) | {key: evaluation.get(key) for key in ("env", "success_key")}
     for key, value in options.items():
         if value is not None:
             words += [f"--{key.replace('_', '-')}", str(value)]
