@@ -41,12 +41,6 @@ def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
     return {"d3il_score": 0.5 * (result["success_rate"] + result["mode_entropy"])}
 
 
-def _frame(region) -> Shape:
-    (left, right), (near, far) = region
-    centre, half = ((left + right) / 2, (near + far) / 2), ((right - left) / 2, (far - near) / 2)
-    return Shape("rectangle", centre, half, "region")
-
-
 register_task(
     Task(
         name="aligning",
@@ -86,7 +80,7 @@ register_task(
         env="torchrl_koap.envs.aligning:AligningEnv",
         expert="torchrl_koap.envs.experts.aligning:AligningExpert",
         scene=Scene(
-            shapes=tuple(_frame(region) for region in REGIONS),
+            shapes=tuple(Shape.over(region, "region") for region in REGIONS),
             bodies=(
                 Body(
                     "box",

@@ -41,6 +41,12 @@ class Shape:
     color: str | None = None
     label: str = ""
 
+    @classmethod
+    def over(cls, region: Region, role: str) -> Shape:
+        """Makes the rectangle that covers a region."""
+        (left, right), (near, far) = region
+        return cls("rectangle", ((left + right) / 2, (near + far) / 2), ((right - left) / 2, (far - near) / 2), role)
+
     def __post_init__(self):
         if self.kind not in ("circle", "rectangle", "line"):
             raise ValueError(f"a shape is a 'circle', 'rectangle' or 'line', got {self.kind!r}")

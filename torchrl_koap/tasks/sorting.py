@@ -96,10 +96,6 @@ def _sorting(num_boxes: int) -> Task:
     boxes = [f"{colour}_{index + 1}" for colour in COLOURS for index in range(num_boxes // 2)]
     columns = {part: size for box in boxes for part, size in ((f"{box}_xy", 2), (f"{box}_tan_yaw", 1))}
     orders = tuple(", ".join(COLOURS[colour] for colour in order) for order in arrival_orders(num_boxes))
-    (left, right), (near, far) = PLATFORM_X, PLATFORM_Y
-    platform = Shape(
-        "rectangle", ((left + right) / 2, (near + far) / 2), ((right - left) / 2, (far - near) / 2), "platform"
-    )
     return Task(
         name="sorting" if num_boxes == 4 else f"sorting_{num_boxes}",
         observation_parts={"desired_xy": 2, "measured_xy": 2} | columns,
@@ -122,7 +118,7 @@ def _sorting(num_boxes: int) -> Task:
         env_options={"num_boxes": num_boxes},
         expert="torchrl_koap.envs.experts.sorting:SortingExpert",
         scene=Scene(
-            shapes=(platform, *_walls()),
+            shapes=(Shape.over((PLATFORM_X, PLATFORM_Y), "platform"), *_walls()),
             bodies=tuple(
                 Body(
                     box, f"{box}_xy", f"{box}_tan_yaw", label=f"{colour} boxes", color=colour, half=(BOX_HALF, BOX_HALF)
