@@ -11,7 +11,7 @@ from torchrl_koap.tasks import WINDOW
 from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.methods import METHODS, get_method
 
-CONTROLLERS = [name for name, method in METHODS.items() if method.has_planner]
+CONTROLLERS = [name for name, method in METHODS.items() if method.has_planner and not method.fit]
 
 
 @pytest.fixture(scope="module")
@@ -24,13 +24,7 @@ def data():
 
 def make(name, data):
     torch.manual_seed(0)
-    tracking = {
-        "states": [0, 1],
-        "commands": [0, 1],
-        "actions": [0, 1],
-    }  # read by methods that follow plans by prediction
-    posture = {"state_dim": 3, "commands": [0, 1], "actions": [0, 1]}
-    options = {"method": name, "preset": "default", "revised": True, "tracking": tracking, "posture": posture}
+    options = {"method": name, "preset": "default"}
     return build_controller(options, 3, 2, data)
 
 
@@ -49,7 +43,7 @@ def test_an_entry_holds_together(name):
     if method.has_planner:
         # every method has at most one controller's budget of updates, whatever it does with it
         assert sum(phase.share for phase in method.phases) == (1 if method.phases else 0)
-        assert bool(method.phases) or method.closed_form
+        assert bool(method.phases) or method.closed_form or method.fit
         assert len({phase.name for phase in method.phases}) == len(method.phases)
     assert {phase.windows for phase in method.phases} <= {"all", "mixed", "labelled"}
     if method.labelled_only:

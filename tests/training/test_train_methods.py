@@ -53,6 +53,8 @@ def poisoned(data, budget, *, inside=False, told=False):
     data = data.clone()
     if inside:
         data["action"] = torch.where(labelled["has_action"], data["action"] * 1.5, data["action"])
+        if told:
+            data["observation"] = torch.where(labelled["has_action"], data["observation"] * 1.5, data["observation"])
         return data
     data["action"] = torch.where(labelled["has_action"], data["action"], POISON)
     for key in ("observation", ("next", "observation")):
@@ -74,8 +76,8 @@ def test_no_weight_of_any_method_depends_on_a_hidden_label(
 ):
     budget = LabelBudget(count=2, unit=unit)
     real = load_demonstrations(str(demonstrations), TASK)
-    outside = poisoned(real, budget, told=METHODS[method].keeps_posture)
-    variants = {"clean": real, "outside": outside, "inside": poisoned(real, budget, inside=True)}
+    outside, inside = (poisoned(real, budget, inside=at, told=METHODS[method].knows_commands) for at in (False, True))
+    variants = {"clean": real, "outside": outside, "inside": inside}
     kept = budget.apply(real)[0]["has_action"].squeeze(-1)
     assert (variants["outside"]["action"][~kept] == POISON).all() and 0 < kept.sum() < len(kept)
     assert torch.equal(variants["outside"]["action"][kept], real["action"][kept])
@@ -113,7 +115,6 @@ def settled(summary):
 LONGER = {"steps": 12, "controller_steps": 12}
 KILLED = {
     "koap": ["controller"],
-    "command_regression": ["controller"],
     "pretrain": ["controller", "finetune"],
     "vae": ["controller", "decoder"],
     "lapo": ["controller", "decoder"],

@@ -160,8 +160,8 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
         result = _experiments(config, trained, data)
     result["latent"] = _look_into(config, trained, data)
     result["findings"] = describe_inspection(result, task)
-    values = getattr(getattr(trained.controller, "operator", None), "eigenvalues", None)
-    return Inspection(result, task, None if values is None else values(), directory.path)
+    koopman = trained.controller if isinstance(trained.controller, KoopmanInverseDynamics) else None
+    return Inspection(result, task, None if koopman is None else koopman.operator.eigenvalues(), directory.path)
 
 
 def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBase) -> dict[str, Any]:

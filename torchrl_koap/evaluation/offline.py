@@ -87,6 +87,9 @@ def _actions(trained: TrainedRun, data: TensorDictBase, labelled: TensorDictBase
         note = f"method {trained.config['method']!r} would have to be trained again without each trajectory"
         hint = "; train it on fewer labels than there are (--label-count): the others tell how good it is"
         return {"outside_budget": outside, "left_out": {"note": note + (hint if "note" in outside else "")}}
+    if trained.method.fit is not None:
+        note = {"note": "the controller decodes no recorded states: it follows plans by the command that it gave"}
+        return {"outside_budget": note, "left_out": note}
     view, seen = (controller_view(part, trained.columns, action_targets=task.targets) for part in (data, labelled))
     controller = trained.controller.cpu()
     return {

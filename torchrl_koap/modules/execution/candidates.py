@@ -19,7 +19,11 @@ SHARE = 0.25  # of the candidates, any of which may be taken
 
 
 def steps_apart(candidates: Tensor, previous: Tensor) -> Tensor:
-    """Mean square distance of candidates ``[*B, N, H, w]`` to what is left of a chunk ``[*B, K, w]``, step by step.
+    """Mean square distance to what is left of a chunk, step by step.
+
+    Args:
+        candidates (Tensor): ``[*B, N, H, w]``.
+        previous (Tensor): ``[*B, K, w]``.
 
     Returns:
         Tensor: ``[*B, N]``.
@@ -28,11 +32,15 @@ def steps_apart(candidates: Tensor, previous: Tensor) -> Tensor:
 
 
 def paths_apart(candidates: Tensor, previous: Tensor) -> Tensor:
-    """Mean square distance of the first half of candidates ``[*B, N, H, w]`` to the nearest of a plan ``[*B, L, w]``.
+    """Mean square distance of the first half of candidates to the nearest states of a plan.
 
     Each state is compared with the nearest one of the plan, at whatever time it was meant: a robot that lags behind
     its plan goes on with it by going the same way, not by being where the plan is. The second half would reach beyond
     the end of the plan.
+
+    Args:
+        candidates (Tensor): ``[*B, N, H, w]``.
+        previous (Tensor): ``[*B, L, w]``.
 
     Returns:
         Tensor: ``[*B, N]``.
