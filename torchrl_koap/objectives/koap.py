@@ -88,6 +88,16 @@ class KoopmanDynamicsLoss(_KoopmanLoss):
 
     Args and keywords as of :class:`KoopmanReconstructionLoss`; with ``"none"`` the loss is ``[*B, frames]``, 0 where
     masked.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KoopmanDynamicsLoss
+        >>> batch = TensorDict({"state": torch.randn(4, 16, 2)}, [4])
+        >>> loss = KoopmanDynamicsLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> loss(batch)["loss_koopman"].shape
+        torch.Size([])
     """
 
     terms = (KOOPMAN,)
@@ -99,6 +109,18 @@ class LatentActionLoss(_KoopmanLoss):
 
     Args and keywords as of :class:`KoopmanReconstructionLoss`. A batch without labels gives exactly 0, and exactly zero
     gradients.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import LatentActionLoss
+        >>> batch = TensorDict({"state": torch.randn(4, 16, 2)}, [4])
+        >>> loss = LatentActionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
+        >>> batch["action"] = torch.full((4, 16, 2), torch.nan)
+        >>> batch["has_action"] = torch.zeros(4, 16, 1, dtype=torch.bool)
+        >>> loss(batch)["loss_action"].item()
+        0.0
     """
 
     terms = (ACTION,)

@@ -105,7 +105,13 @@ def templates() -> Environment:
 
 
 def bar(value: float, low: float, high: float) -> tuple[float, ...]:
-    """Returns a share (0 to 1) and the ends of its interval in percent, cut to 0..100."""
+    """Returns a share and the ends of its interval in percent, cut to 0..100.
+
+    Args:
+        value (float): share, 0 to 1.
+        low (float): lower end of its interval.
+        high (float): upper end.
+    """
     return tuple(100 * min(max(part, 0.0), 1.0) for part in (value, low, high))
 
 

@@ -115,8 +115,11 @@ def picture(
 ) -> Callable[[Draw], Draw]:
     """Registers the decorated function as the one that draws a picture of a run; the function stays as it is.
 
-    The arguments are those of :class:`Picture`. Of the source, ``.safetensors`` comes as a dictionary of arrays,
-    ``.json`` as what it holds, ``.csv`` as a list of rows.
+    Of the source, ``.safetensors`` comes as a dictionary of arrays, ``.json`` as what it holds, ``.csv`` as a list of
+    rows.
+
+    Args:
+        name (str): file of the picture; it and all other arguments are those of :class:`Picture`.
 
     Raises:
         ValueError: if there is a picture of that name already.

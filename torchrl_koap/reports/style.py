@@ -74,7 +74,12 @@ def tidy(axes: Axes) -> Axes:
 
 
 def set_title(axes: Axes, text: str) -> None:
-    """Sets the title of a panel, flush left; it may have several lines."""
+    """Sets the title of a panel, flush left.
+
+    Args:
+        axes (Axes): the panel.
+        text (str): the title; it may have several lines.
+    """
     axes.set_title(text, loc="left", fontsize=9.5, color=INK, linespacing=1.35)
 
 

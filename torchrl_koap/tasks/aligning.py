@@ -27,6 +27,10 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
 
     Within :data:`ALIGNED_DISTANCE` of the target, and the quaternions' cosine above that of
     :data:`ROTATION_TOLERANCE` half turns.
+
+    Args:
+        task (Task): the task.
+        state (Tensor): states ``[*B, d]``.
     """
     part = {name: state[..., columns] for name, columns in task.state_slices.items()}
     distance = (part["box_position"] - part["target_position"]).norm(dim=-1)

@@ -29,7 +29,12 @@ OBSTACLES = (
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether the tool is behind the finish line, bool ``[*B]`` of its positions ``[*B, 2]`` (m)."""
+    """Whether the tool is behind the finish line, bool ``[*B]`` of its positions ``[*B, 2]`` (m).
+
+    Args:
+        task (Task): the task.
+        state (Tensor): states ``[*B, d]``.
+    """
     return state[..., 1] > FINISH_Y
 
 

@@ -49,7 +49,12 @@ _CAPTION = (
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether every box is in the bin of its colour, bool ``[*B]`` of states ``[*B, d]``."""
+    """Whether every box is in the bin of its colour, bool ``[*B]`` of states ``[*B, d]``.
+
+    Args:
+        task (Task): the task.
+        state (Tensor): states ``[*B, d]``.
+    """
     done = torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
     for box in task.objects:
         x, y = state[..., task.state_slices[f"{box}_xy"]].unbind(-1)

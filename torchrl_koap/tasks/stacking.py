@@ -36,6 +36,10 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
     """Whether all boxes are piled in the zone, bool ``[*B]`` of states ``[*B, d]``.
 
     All within :data:`ZONE_RADIUS` of its centre, heights more than :data:`HEIGHT_GAP` apart.
+
+    Args:
+        task (Task): the task.
+        state (Tensor): states ``[*B, d]``.
     """
     boxes, near = _boxes_of(task, state)
     height = boxes[..., 2].sort(-1).values
@@ -43,7 +47,12 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
 
 
 def first_box_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether any box is in the zone, bool ``[*B]`` of states ``[*B, d]``."""
+    """Whether any box is in the zone, bool ``[*B]`` of states ``[*B, d]``.
+
+    Args:
+        task (Task): the task.
+        state (Tensor): states ``[*B, d]``.
+    """
     return _boxes_of(task, state)[1].any(-1)
 
 

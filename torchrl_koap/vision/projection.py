@@ -96,6 +96,9 @@ def projection_of(task: str) -> Path:
     Args:
         task (str): name of the task, ``"scooping"`` or ``"scooping_moving_bowl"``.
 
+    Returns:
+        Path: the file.
+
     Raises:
         ValueError: if none was fitted for the task.
 
@@ -122,8 +125,15 @@ def save_encoder(encoder: FrozenImageEncoder, path: str | Path, *, stride: int, 
         stride (int): of the network's stage.
         fitted_on (str): which frames it was fitted on, in words.
 
+    Returns:
+        Path: the file.
+
     Raises:
         ValueError: if the encoder has no projection.
+
+    Examples:
+        >>> from torchrl_koap.vision import load_encoder, save_encoder
+        >>> save_encoder(load_encoder(), "own.safetensors", stride=8, fitted_on="my frames")  # doctest: +SKIP
     """
     if encoder.projection is None:
         raise ValueError("the encoder has no projection: there is nothing to save")
@@ -140,9 +150,19 @@ def load_encoder(projection: str | Path = SCOOPING, network: str | Path | None =
         projection (str or Path): the file. Default: the one of Scooping that comes with the package.
         network (str or Path, optional): see :func:`~torchrl_koap.vision.load_backbone`.
 
+    Returns:
+        FrozenImageEncoder: frozen, in evaluation mode.
+
     Raises:
         WeightsError: if there are no weights, or others than those the projection was fitted behind.
         FileNotFoundError: if there is no such file.
+
+    Examples:
+        >>> from torchrl_koap.vision import load_encoder
+        >>> load_encoder("nowhere.safetensors")
+        Traceback (most recent call last):
+        ...
+        FileNotFoundError: no projection: there is no file nowhere.safetensors
     """
     if not Path(projection).is_file():
         raise FileNotFoundError(f"no projection: there is no file {projection}")

@@ -82,6 +82,18 @@ class Expert(abc.ABC):
         modes (sequence of int): mode of each episode.
         contexts (np.ndarray, optional): context ``[n, bodies, 3]``; None in a task without bodies.
         seeds (sequence): seed of each episode.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.envs.experts.recording import Expert
+        >>> class Still(Expert):
+        ...     def __init__(self, modes, contexts, seeds):
+        ...         self.finished = np.ones(len(modes), dtype=bool)
+        ...
+        ...     def act(self, observation):
+        ...         return np.zeros((len(observation), 2))
+        >>> Still([0, 1], None, [0, 1]).act(np.zeros((2, 4))).shape
+        (2, 2)
     """
 
     rules = RecordingRules()

@@ -25,6 +25,10 @@ def steps_apart(candidates: Tensor, previous: Tensor) -> Tensor:
         candidates (Tensor): ``[*B, N, H, w]``.
         previous (Tensor): ``[*B, K, w]``.
 
+    Args:
+        candidates (Tensor): ``[*B, N, H, w]``.
+        previous (Tensor): ``[*B, K, w]``.
+
     Returns:
         Tensor: ``[*B, N]``.
     """

@@ -53,6 +53,9 @@ def make_policy(
         max_steps (int): steps of an episode.
         follower (Follower, optional): follows plans in place of the controller, such as the oracle.
 
+    Returns:
+        PlanningPolicy: the policy.
+
     Raises:
         ValueError: as :class:`~torchrl_koap.modules.PlanningPolicy`, or for a gain or lead where no action is a change
             of a command (that is observed).
