@@ -13,7 +13,8 @@ from toy_policies import CountingPlanner, EchoController, EpisodesOfRandomLength
 
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
 from torchrl_koap.envs.transforms import EndEffectorNoise
-from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
+from torchrl_koap.evaluation.latency import measure_latency
+from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score
 from torchrl_koap.modules import Execution, StatePlanner, TemporalUnet, make_koopman_inverse_dynamics, make_policy
 

@@ -11,8 +11,9 @@ import torch
 
 from torchrl_koap.evaluation.config import EvalConfig, check_options
 from torchrl_koap.evaluation.environments import choose_contexts, environment_of
+from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.offline import evaluate_offline
-from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
+from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
 from torchrl_koap.evaluation.trained_run import TrainedRun, load_run, trained_policy
 from torchrl_koap.modules import ExecutionConfig

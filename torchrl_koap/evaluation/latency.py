@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
@@ -12,10 +13,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_koap.evaluation.rollouts import device_of
 from torchrl_koap.evaluation.trained_run import load_policy, load_run
-from torchrl_koap.modules import Agent, AsynchronousAgent
+from torchrl_koap.keys import ACTION
+from torchrl_koap.modules import Agent, AsynchronousAgent, PlanningPolicy
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins, load_plugins
 
@@ -41,6 +45,47 @@ class LatencyConfig:
     async_replan: bool = False
     threads: int = 1
     plugins: Plugins = ()
+
+
+@torch.no_grad()
+def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
+    """Measures median times of a plan and of a control step between plans, at batch 1.
+
+    Args:
+        policy (PlanningPolicy): the policy, on the device to measure on.
+        observation_dim (int): number of observation columns.
+
+    Keyword Args:
+        repeats (int): plans timed, and control steps timed; three of each come before, untimed.
+
+    Returns:
+        dict: ``plan_ms``, what a step with a plan takes longer (ms), ``control_ms`` (ms), ``control_hz``, the rate of
+        control with plans spread over the steps (Hz).
+    """
+    device = device_of(policy)
+    observed = torch.zeros(1, policy.history, observation_dim, device=device)
+    td = TensorDict({policy.in_keys[0]: observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1], device=device)
+    between: list[float] = []
+    with_plan: list[float] = []
+    for repeat in range(repeats + 3):
+        td["is_init"] = torch.ones(1, 1, dtype=torch.bool, device=device)
+        for kind in (with_plan, between):
+            _wait(device)
+            began = time.perf_counter()
+            td = policy(td)
+            td[ACTION].sum().item()
+            if repeat >= 3:  # the first calls warm caches up
+                kind.append((time.perf_counter() - began) * 1e3)
+            td["is_init"] = torch.zeros(1, 1, dtype=torch.bool, device=device)
+    control = statistics.median(between)
+    plan = max(statistics.median(with_plan) - control, 0.0)
+    rate = 1e3 / (control + plan / policy.execution.replan_interval)
+    return {"plan_ms": plan, "control_ms": control, "control_hz": rate}
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 def measure_control_loop(run: str | Path, config: LatencyConfig | None = None) -> dict[str, Any]:

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import itertools
-import statistics
-import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -62,7 +60,7 @@ def roll_out(
         raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
     if contexts is not None and len(contexts) != len(seeds):
         raise ValueError(f"one context per seed is needed, got {len(contexts)} and {len(seeds)}")
-    device, noise_key = _device_of(policy), policy.planner.noise_key or NOISE
+    device, noise_key = device_of(policy), policy.planner.noise_key or NOISE
     size, episodes = batch_size or min(len(seeds), AT_ONCE), []
     for begin in range(0, len(seeds), size):
         part = seeds[begin : begin + size]
@@ -96,7 +94,8 @@ def roll_out(
     return episodes
 
 
-def _device_of(policy: PlanningPolicy) -> torch.device:
+def device_of(policy: PlanningPolicy) -> torch.device:
+    """Returns the device of the parameters of a policy, the processor for one without any."""
     return next(itertools.chain(policy.parameters(), policy.buffers()), torch.empty(0)).device
 
 
@@ -109,47 +108,6 @@ def _seed_episodes(env: EnvBase, seeds: Sequence[int]) -> None:
     for transform in transforms if isinstance(transforms, Iterable) else (transforms,):
         if hasattr(transform, "seed_episodes"):
             transform.seed_episodes(seeds)
-
-
-@torch.no_grad()
-def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
-    """Median times of a plan and of a control step between plans, at batch 1.
-
-    Args:
-        policy (PlanningPolicy): the policy, on the device to measure on.
-        observation_dim (int): number of observation columns.
-
-    Keyword Args:
-        repeats (int): plans timed, and control steps timed; three of each come before, untimed.
-
-    Returns:
-        dict: ``plan_ms``, what a step with a plan takes longer (ms), ``control_ms`` (ms), ``control_hz``, the rate of
-        control with plans spread over the steps (Hz).
-    """
-    device = _device_of(policy)
-    observed = torch.zeros(1, policy.history, observation_dim, device=device)
-    td = TensorDict({policy.in_keys[0]: observed, "is_init": torch.ones(1, 1, dtype=torch.bool)}, [1], device=device)
-    between: list[float] = []
-    with_plan: list[float] = []
-    for repeat in range(repeats + 3):
-        td["is_init"] = torch.ones(1, 1, dtype=torch.bool, device=device)
-        for kind in (with_plan, between):
-            _wait(device)
-            began = time.perf_counter()
-            td = policy(td)
-            td[ACTION].sum().item()
-            if repeat >= 3:  # the first calls warm caches up
-                kind.append((time.perf_counter() - began) * 1e3)
-            td["is_init"] = torch.zeros(1, 1, dtype=torch.bool, device=device)
-    control = statistics.median(between)
-    plan = max(statistics.median(with_plan) - control, 0.0)
-    rate = 1e3 / (control + plan / policy.execution.replan_interval)
-    return {"plan_ms": plan, "control_ms": control, "control_hz": rate}
-
-
-def _wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def rollouts_to_tensors(

@@ -21,7 +21,8 @@ from toy_policies import (
 )
 
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
-from torchrl_koap.evaluation.rollouts import measure_latency, roll_out, rollouts_to_tensors
+from torchrl_koap.evaluation.latency import measure_latency
+from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.modules import (
     DiffusionPolicy,
     Execution,
