@@ -31,7 +31,7 @@ class TrainConfig:
         method: "koap", "mpc" (model predictive control), "linear" (ridge on raw frames), "dd" (supervised
             inverse dynamics), "dp" (Diffusion Policy), or another name in torchrl_koap.training.methods.METHODS, those
             that plugins register included (default: that of the task).
-        preset: variant of KOAP: "default", "semi_supervised", "paper" or "released" (default: the
+        preset: variant of KOAP: "default", "absolute", "semi_supervised" or "paper" (default: the
             task's for its own method, else the method's).
         koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
         action_coeff: weight of the action term, for methods whose action decoder is trained with the rest (default: 1).
