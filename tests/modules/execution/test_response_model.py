@@ -22,7 +22,7 @@ def a_system() -> ResponseModel:
 
 
 def rollout(system: ResponseModel, changes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Positions ``[T, J]`` and commands ``[T, J]`` (those in force at each of them) from rest at 0."""
+    """Positions ``[T, J]`` and commands ``[T, J]`` (the last one at each of them) from rest at 0."""
     nothing = torch.zeros(3, AXES, dtype=torch.float64)
     moved = system.predict(nothing, nothing[0], nothing[1:], changes)
     positions = torch.cat([nothing[:1], moved[:-1]])
