@@ -24,7 +24,8 @@ endif
 
 # demonstrations, training with 2 % of the labels, 60 rollouts, report
 demo: setup
-	$(BIN)/koap train --task avoiding --dataset scripted --label-fraction 0.02 --label-unit trajectory --seed 0 --out $(OUT)
+	$(BIN)/koap demos --task avoiding --episodes 96 --seed 0 --out $(OUT)-data
+	$(BIN)/koap train --task avoiding --dataset $(OUT)-data --labels 0.02 --seed 0 --out $(OUT)
 	$(BIN)/koap eval $(OUT) --episodes 60 --seed 100
 	@echo "report: $(OUT)/index.html"
 

@@ -133,20 +133,20 @@ class RecurrentInverseDynamics(InverseDynamics):
         return action if frames is None else action[..., frames.start : frames.stop, :]
 
 
-def build(state_dim, action_dim, normalizers, options):
+def build(task, columns, normalizers, preset):
     """Builds KOAP as the first public code has it."""
     return KoopmanInverseDynamics(
-        FeedForwardAction(state_dim, LATENT_DIM),
-        LinearActionDecoder(LATENT_DIM, action_dim),
-        lifting=RecurrentLifting(state_dim, LATENT_DIM),
+        FeedForwardAction(len(columns), LATENT_DIM),
+        LinearActionDecoder(LATENT_DIM, task.action_dim),
+        lifting=RecurrentLifting(len(columns), LATENT_DIM),
         operator=DiagonalOperator(LATENT_DIM),
         **normalizers,
     )
 
 
-def build_supervised(state_dim, action_dim, normalizers, options):
+def build_supervised(task, columns, normalizers, preset):
     """Builds the supervised LSTM of the first public code."""
-    return RecurrentInverseDynamics(state_dim, action_dim, **normalizers)
+    return RecurrentInverseDynamics(len(columns), task.action_dim, **normalizers)
 
 
 # presets: how states and actions are normalised there, by their range as in the paper

@@ -27,13 +27,15 @@ from torchrl_koap.evaluation.active_labelling import rank_trajectories, variance
 from torchrl_koap.evaluation.latent_space import infer_steps
 from torchrl_koap.modules import PRESETS, KoopmanInverseDynamics, Normalizer
 from torchrl_koap.objectives import KOAPLoss
+from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.tasks import WINDOW, Task, get_task
 from torchrl_koap.training.action_errors import rmse_mm
-from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.loop import train_phase
+from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.networks import build_controller
 
 CHOICES = ("a_optimal", "uncertainty", "random", "longest")
 
@@ -48,9 +50,8 @@ def within(data: TensorDictBase, episodes: list[int]) -> TensorDictBase:
 def train_unlabelled(data: TensorDictBase, task: Task, preset: str, updates: int) -> KoopmanInverseDynamics:
     """The Koopman model of `koap train`, from states alone."""
     torch.manual_seed(0)
-    options = {"method": "koap", "preset": preset}
     # the action normaliser is replaced before every fit; nothing else of the first trajectory's labels is used
-    controller = build_controller(options, data["state"].shape[-1], task.action_dim, within(data, [0]))
+    controller = build_controller(task, get_method("koap"), ControllerConfig(preset, 0, "robot"), within(data, [0]))
     window = max(WINDOW, controller.num_window_frames)
     history = controller.num_past
     controller.prepare(cut_windows(data, window, select=["state"], pad_before=history)["state"])

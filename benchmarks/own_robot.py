@@ -20,9 +20,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrl_koap import Agent, EvalConfig, TrainConfig, evaluate, load_policy, train
+from torchrl_koap import (
+    Agent,
+    EvalConfig,
+    PlannerConfig,
+    RunConfig,
+    TrainConfig,
+    Trained,
+    evaluate,
+    load_policy,
+    train,
+)
 from torchrl_koap.data import controller_view, make_demonstrations, save_ted, select_state
-from torchrl_koap.evaluation import load_run
 from torchrl_koap.modules import LinearInverseDynamics
 from torchrl_koap.training.action_errors import first_actions
 from torchrl_koap.training.closed_form import fit_closed_form
@@ -72,7 +81,7 @@ def drive(run: Path, seed: int, steps: int = 200) -> np.ndarray:
 
 def action_errors(run: Path, states: list[np.ndarray], actions: list[np.ndarray]) -> tuple[float, float]:
     """Errors on the demonstrations whose actions were kept back, of the controller and of a ridge (rad)."""
-    trained = load_run(run)
+    trained = Trained.load(run)
     every, few = (
         controller_view(select_state(data, task.state_of), trained.columns)
         for data, task in (
@@ -108,7 +117,8 @@ def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, A
         task = replace(task, defaults=replace(task.defaults, view={"forecast": False}))
     save_ted(data, folder / "arm" / "ted", task=task)
     run = folder / "run"
-    summary = train(TrainConfig(dataset=str(folder / "arm"), out=run, steps=options.steps, seed=seed))
+    asked = {"planner": PlannerConfig(steps=options.steps), "run": RunConfig(seed=seed)}
+    summary = train(TrainConfig(dataset=str(folder / "arm"), out=run, **asked)).results
     result = evaluate(run, EvalConfig(threads=1))
     error, ridge = action_errors(run, states, actions)
     away = drive(run, seed)

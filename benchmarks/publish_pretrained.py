@@ -23,10 +23,9 @@ from torchrl_koap.runs.pretrained import copy_run
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import compact, load_tensors, save_tensors
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training.digests import write_digests
 
 WEIGHTS = ("planner.safetensors", "controller.safetensors")
-PLACES = ("out", "dataset", "planner_from")
+PLACES = ("out", "dataset")
 ROOT = Path(__file__).resolve().parents[1] / "pretrained"
 CARD = """# {name}
 
@@ -79,14 +78,16 @@ def publish(run: str | Path, folder: str | Path, card: str, *, candidates: int |
     published = RunDirectory(folder)
     config = published.read_json("config.json")
     places = {name: Path(config[name]).name for name in PLACES if config.get(name) is not None}
-    published.write_json("config.json", config | places | ({"candidates": candidates} if candidates else {}))
+    source = config["planner"]["source"]
+    planner = config["planner"] | {"source": None if source is None else Path(source).name}
+    execution = config["execution"] | ({"candidates": candidates} if candidates else {})
+    published.write_json("config.json", config | places | {"planner": planner, "execution": execution})
     for name in WEIGHTS:
         if (folder / name).exists():
             tensors, about = load_tensors(folder / name)
             # a closed-form decoder was fitted to exactly these frequencies: of a controller nothing is rounded
             exact = name == "controller.safetensors" and (folder / WEIGHTS[0]).exists()
             save_tensors(folder / name, tensors if exact else compact(tensors), about)
-    write_digests(published)
     (folder / "README.md").write_text(card)
     return folder
 
@@ -95,8 +96,8 @@ def numbers_of(run: Path, results: list[dict[str, Any]]) -> dict[str, Any]:
     """What a card says of a run and of its evaluations."""
     config, summary = (RunDirectory(run).read_json(name) for name in ("config.json", "summary.json"))
     source, trained = run, config
-    while trained.get("planner_from"):  # a planner that was taken over is described by the run that trained it
-        source = trained["planner_from"]
+    while trained["planner"]["source"]:  # a planner that was taken over is described by the run that trained it
+        source = trained["planner"]["source"]
         trained = RunDirectory(source).read_json("config.json")
     task = get_task(config["task"])
     rows = [row for result in results for row in result["episode"]]
@@ -131,10 +132,10 @@ def numbers_of(run: Path, results: list[dict[str, Any]]) -> dict[str, Any]:
         "demonstrations": labels["total_trajectories"],
         "recorded": recorded + (f" --disturbance {disturbance:g}" if disturbance else ""),
         "labels": f"{labels['selected_units']} of {labels['total_units']} ({labels['unit']})",
-        "denoiser": trained["denoiser"],
-        "updates": trained["steps"],
-        "batch": trained["batch_size"],
-        "training_seed": config["seed"],
+        "denoiser": trained["planner"]["network"],
+        "updates": trained["planner"]["steps"],
+        "batch": trained["planner"]["batch_size"],
+        "training_seed": config["run"]["seed"],
         "train_seconds": round(seconds["controller" if config["method"] == "dp" else "planner"]),
         "command": "\n    ".join(commands),
     }

@@ -72,7 +72,7 @@ def cases(data: Path, run: Path) -> list[Case]:
     """All commands, on small data."""
 
     def train(method: str) -> Case:
-        words = ("--dataset", data, *TINY, "--steps", 60, "--controller-steps", 60, "--checkpoint-every", 7)
+        words = ("--dataset", data, *TINY, "--steps", 60, "--controller.steps", 60)
         return Case(
             f"train {method}",
             lambda out: ("train", "--out", out, "--method", method, *words, "--quiet"),

@@ -26,9 +26,10 @@ from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import STRATEGIES, ExecutionConfig
+from torchrl_koap.runs.config import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS
 from torchrl_koap.training import METHODS as KNOWN
-from torchrl_koap.training import TrainConfig, train
+from torchrl_koap.training import train
 from torchrl_koap.vision.backbones import load_backbone
 from torchrl_koap.vision.demonstrations import Source, embed_demonstrations, fit_projection
 from torchrl_koap.vision.encoder import FrozenImageEncoder
@@ -68,14 +69,23 @@ def planner_of(folder: Path, unlabelled: str, labels: int, seed: int, options) -
     """A run that holds the planner of a cell, trained where it is not there."""
     run = folder / f"planner_{_name(unlabelled, labels)}_{seed}"
     if not (run / "summary.json").is_file():
-        known = {"method": "linear", "steps": options.steps, "seed": seed, "analysis": False, "resume": run.exists()}
+        known = {"method": "linear", "steps": options.steps, "seed": seed, "resume": run.exists()}
         train(_config(run, folder, unlabelled, labels, options.task, **known))
     return run
 
 
 def _config(run: Path, folder: Path, unlabelled: str, labels: int, task: str, **options) -> TrainConfig:
-    known = {"task": task, "dataset": str(data_set(folder, unlabelled, labels, task))}
-    return TrainConfig(out=run, label_episodes=tuple(range(labels)), **known, **options)
+    planner = options.get("planner_from")
+    return TrainConfig(
+        dataset=str(data_set(folder, unlabelled, labels, task)),
+        out=run,
+        task=task,
+        method=options["method"],
+        labels=LabelConfig(episodes=tuple(range(labels))),
+        planner=PlannerConfig(steps=options["steps"]) if planner is None else PlannerConfig(source=planner),
+        controller=ControllerConfig(steps=options.get("controller_steps")),
+        run=RunConfig(seed=options["seed"], resume=options["resume"]),
+    )
 
 
 def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int, options) -> dict:
@@ -87,7 +97,7 @@ def run_cell(folder: Path, unlabelled: str, labels: int, method: str, seed: int,
     if not (run / "summary.json").is_file():
         settings = {"method": method, "seed": seed, "planner_from": planner, "steps": options.steps}
         settings["resume"] = run.exists()
-        settings |= {"controller_steps": options.controller_steps, "analysis": unlabelled not in FEW_ROBOTS}
+        settings |= {"controller_steps": options.controller_steps}
         train(_config(run, folder, unlabelled, labels, options.task, **settings))
     # dp has no plans to follow: its chunks of actions are executed as they are
     strategy = None if method.startswith("dp") else options.execution

@@ -33,7 +33,7 @@ from torchrl_koap.envs.experts.random_play import record_random_play
 from torchrl_koap.modules import InverseDynamics, Normalizer
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
-from torchrl_koap.training import fit_controller
+from torchrl_koap.training import fit as fit_in_memory
 from torchrl_koap.training.action_errors import first_actions, rmse
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
@@ -128,11 +128,10 @@ def controllers(full: TensorDictBase, task: Task, numbers: torch.Tensor, seed: i
             updates = 0  # the state is its own lifting: nothing that is trained would be read
         part = with_labels(full, numbers[:labels])
         if last != method or reads_labels:
-            given = {"preset": preset} if preset else {}
-            trained = fit_controller(
-                part, task, method=kind, steps=updates, seed=seed, progress=False, **given, **settings
-            )
-            controller, fit, last = trained, trained.recipe.results, method
+            section = {"steps": updates, "preset": preset or None}
+            made = fit_in_memory(part, task, method=kind, planner=False, controller=section, seed=seed, progress=False)
+            trained = made.controller
+            controller, fit, last = trained, made.results["decoder_fit"], method
         else:
             controller, fit = refit(trained, part, task)
         yield method, labels, controller, fit, updates

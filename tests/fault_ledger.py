@@ -167,8 +167,10 @@ def make_template(root: Path) -> Path:
     from torchrl_koap.training.datasets import load_demonstrations
 
     data = write_demonstrations(root / "data")
-    run = ("--out", root / "run", "--dataset", data, *TINY, "--checkpoint-every", "10", "--quiet")
-    assert koap("train", *run) == 0
+    run = ("--out", root / "run", "--dataset", data, *TINY, "--quiet")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torchrl_koap.training.loop.CHECKPOINT_EVERY", 10)
+        assert koap("train", *run) == 0
     flat = load_demonstrations(str(data), get_task("avoiding"))
     save_ted(flat, root / "ted" / "ted", get_task("avoiding"))
     (root / "arrays").mkdir()

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from torchrl_koap import ControllerConfig, PlannerConfig, TrainConfig, train
 from torchrl_koap.data import make_demonstrations, save_ted
-from torchrl_koap.training import TrainConfig, train
 
-TINY = {"steps": 20, "controller_steps": 20, "batch_size": 8, "controller_batch_size": 16, "channels": (8, 16)}
+TINY = {"planner": {"steps": 20, "batch_size": 8, "width": 8}, "controller": {"steps": 20}}
 
 
 def record(count: int = 10, steps: int = 40, joints: int = 7, *, seed: int = 0):
@@ -59,6 +59,10 @@ def save_arm(
 
 
 def train_arm(out: Path, dataset: Path, **options) -> Path:
-    """A tiny run on it."""
-    train(TrainConfig(out=out, dataset=str(dataset), **(TINY | options)))
+    """A tiny run on it; sections may be given as mappings, which leave the rest as it is."""
+    sections = {}
+    for name, kind in {"planner": PlannerConfig, "controller": ControllerConfig}.items():
+        asked = options.pop(name, {})
+        sections[name] = asked if isinstance(asked, kind) else kind(**TINY[name] | asked)
+    train(TrainConfig(dataset=str(dataset), out=out, **sections, **options))
     return out

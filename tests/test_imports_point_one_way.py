@@ -73,7 +73,7 @@ def test_training_loads_no_simulator_and_no_pictures():
         "print(*(name for name in set(sys.modules) - before if '.' not in name or 'torchrl_koap' in name))"
     )
     loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
-    assert "torchrl_koap.training.run" in loaded
+    assert "torchrl_koap.training.on_disk" in loaded
     assert not {"mujoco", "numba", "matplotlib", "dm_control", "PIL"} & set(loaded)
     rooms = {name.split(".")[1] for name in loaded if name.startswith("torchrl_koap.")}
     assert rooms == TRAINING

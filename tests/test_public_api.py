@@ -9,14 +9,27 @@ import sys
 
 import pytest
 import torch
-from tiny_runs import TINY, koap
+from tiny_runs import koap
 
 import torchrl_koap
-from torchrl_koap import EvalConfig, TrainConfig, evaluate, load_policy, train
+from torchrl_koap import (
+    ControllerConfig,
+    EvalConfig,
+    LabelConfig,
+    PlannerConfig,
+    TrainConfig,
+    evaluate,
+    load_policy,
+    train,
+)
 from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.evaluation.rollouts import roll_out
 
-PLAIN = {"steps": 20, "batch_size": 8, "controller_batch_size": 8, "channels": (8, 16), "label_count": 2}
+PLAIN = {
+    "labels": LabelConfig(count=2),
+    "planner": PlannerConfig(steps=20, batch_size=8, width=8),
+    "controller": ControllerConfig(steps=20),
+}
 
 
 @pytest.mark.parametrize("name", torchrl_koap.__all__)
@@ -37,7 +50,7 @@ def test_the_package_itself_loads_nothing():
 
 def test_python_trains_and_evaluates_what_the_shell_does(trained_run, demonstrations, tmp_path):
     mine, its = tmp_path / "mine", tmp_path / "its"
-    summary = train(TrainConfig(out=mine, dataset=str(demonstrations), **PLAIN), command="as called")
+    summary = train(TrainConfig(out=mine, dataset=str(demonstrations), **PLAIN), command="as called").results
     assert summary == json.loads((mine / "summary.json").read_text())
     for name in ("planner", "controller"):
         weights = (folder / f"{name}.safetensors" for folder in (mine, trained_run))
@@ -67,4 +80,3 @@ def test_a_training_without_a_command_keeps_none(demonstrations, tmp_path):
     assert "command" not in json.loads((out / "config.json").read_text())
     assert koap("train", "--out", out, "--resume") == 0  # and a shell may go on with it
     assert "command" in json.loads((out / "config.json").read_text())
-    assert set(TINY) & {"--steps", "--label-count"}

@@ -13,7 +13,9 @@ import pytest
 import tyro
 
 import torchrl_koap
+from torchrl_koap import LabelConfig, PlannerConfig
 from torchrl_koap.commands.subcommands import Subcommand
+from torchrl_koap.commands.train import SHORT, expand
 from torchrl_koap.reports import pictures
 
 ROOT = Path(__file__).parents[1]
@@ -36,6 +38,12 @@ RECIPES = [
 CALLS = [words[1:] for words in (*SHELL, *RECIPES) if words and words[0] == "koap"]
 
 
+def parsed(arguments):
+    """The command that a call asks for, its short options included."""
+    words = [arguments[0], *expand(arguments[1:])] if arguments[0] == "train" else arguments
+    return tyro.cli(Subcommand, args=words, prog="koap")
+
+
 def test_set_up_demo_and_tests_come_first():
     language, block = BLOCKS[0]
     assert language == "bash"
@@ -49,34 +57,32 @@ def test_targets_exist(target):
 
 @pytest.mark.parametrize("arguments", CALLS, ids=" ".join)
 def test_commands_parse(arguments):
-    options = tyro.cli(Subcommand, args=arguments, prog="koap")
+    options = parsed(arguments)
     assert type(options).__name__.lower() == arguments[0]
 
 
 def test_every_command_is_shown():
     assert {"demos", "train", "eval", "validate", "doctor"} <= {arguments[0] for arguments in CALLS}
-    assert len(CALLS) >= 8  # the two of `make demo` among them
+    assert len(CALLS) >= 8  # the three of `make demo` among them
 
 
 def test_the_demo_is_the_contract():
     """`make demo` trains on 2 % of the trajectories and rolls out 60 times."""
-    train, evaluation = (tyro.cli(Subcommand, args=words[1:], prog="koap") for words in RECIPES)
-    assert (train.config.label_fraction, train.config.label_unit, train.config.dataset) == (
-        0.02,
-        "trajectory",
-        "scripted",
-    )
+    demos, train, evaluation = (parsed(words[1:]) for words in RECIPES)
+    assert train.config.labels == LabelConfig(fraction=0.02)
+    assert Path(train.config.dataset) == demos.out and demos.episodes == 96
     assert (Path(evaluation.run), evaluation.config.episodes) == (train.config.out, 60)
 
 
 @pytest.mark.parametrize("code", [block for language, block in BLOCKS if language == "python"])
-def test_python_runs(code, tmp_path, monkeypatch):
+def test_python_runs(code, demonstrations, tmp_path, monkeypatch):
     """Everything runs, with fewer demonstrations, updates and rollouts than the text asks for."""
     train, evaluate, called = torchrl_koap.train, torchrl_koap.evaluate, []
 
     def train_shortly(config):
         called.append(config)
-        return train(replace(config, label_fraction=0.2, episodes=8, steps=8, channels=(8, 16), batch_size=8))
+        few = {"planner": PlannerConfig(steps=8, width=8, batch_size=8), "labels": LabelConfig(fraction=0.5)}
+        return train(replace(config, dataset=str(demonstrations), **few))
 
     def evaluate_shortly(run, config):
         called.append(config)
@@ -84,11 +90,8 @@ def test_python_runs(code, tmp_path, monkeypatch):
 
     monkeypatch.setattr(torchrl_koap, "train", train_shortly, raising=False)
     monkeypatch.setattr(torchrl_koap, "evaluate", evaluate_shortly, raising=False)
-    for name, fit in {
-        "fit_planner": partial(torchrl_koap.fit_planner, steps=1, batch_size=2, channels=(8, 16)),
-        "fit_controller": partial(torchrl_koap.fit_controller, steps=0),
-    }.items():
-        monkeypatch.setattr(torchrl_koap, name, fit, raising=False)
+    few = {"planner": {"steps": 1, "batch_size": 2, "width": 8}, "controller": {"steps": 0}}
+    monkeypatch.setattr(torchrl_koap, "fit", partial(torchrl_koap.fit, **few), raising=False)
     monkeypatch.setattr(pictures, "_PICTURES", dict(pictures.all_pictures()))
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
@@ -122,8 +125,9 @@ def test_options_named_in_the_text_exist():
     """Every ``--option`` in running text is one of some command."""
     text = re.sub(r"^```.*?^```", "", TEXT, flags=re.MULTILINE | re.DOTALL)
     sources = "".join(path.read_text() for path in (ROOT / "torchrl_koap").rglob("*.py"))
-    for option in re.findall(r"`--([a-z][a-z-]*)", text):
-        assert re.search(rf"^    {option.replace('-', '_')}:", sources, re.MULTILINE), option
+    for option in re.findall(r"`--([a-z][a-z.-]*)", text):
+        name = option.rpartition(".")[2].replace("-", "_")
+        assert f"--{option}" in SHORT or re.search(rf"^    {name}:", sources, re.MULTILINE), option
 
 
 def test_nothing_is_left_to_fill_in():

@@ -11,8 +11,8 @@ from raw_episodes import write_raw_episode
 from torchrl_koap.commands.cli import main
 
 TINY = (
-    *("--steps", "20", "--batch-size", "8", "--controller-batch-size", "8", "--threads", "1"),
-    *("--denoiser", "unet", "--channels", "8", "16", "--label-count", "2"),
+    *("--steps", "20", "--planner.batch-size", "8", "--threads", "1"),
+    *("--planner.network", "unet", "--planner.width", "8", "--labels", "2", "--controller.steps", "20"),
 )
 START = np.array([0.525, -0.28])
 

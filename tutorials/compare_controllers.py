@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from torchrl_koap import fit_controller, get_task
+from torchrl_koap import fit, get_task
 from torchrl_koap.data import LabelBudget, cut_windows, select_state
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.training.action_errors import hidden_action_errors, rmse_mm
@@ -76,7 +76,7 @@ def proportional(data):
 # %%
 # The comparison
 # --------------
-# ``fit_controller`` is the recipe of ``koap train`` in memory, for every method by its name. Errors are measured on
+# ``fit`` is the recipe of ``koap train`` in memory, for every method by its name. Errors are measured on
 # trajectories of which no label was in the budget; those labels are read here and nowhere else.
 
 titles = {
@@ -97,7 +97,8 @@ for name in titles:
             if name == "own":
                 controller = proportional(data)
             else:
-                controller = fit_controller(data, task, method=name, steps=150, seed=seed, progress=False)
+                options = {"planner": False, "controller": {"steps": 150}}  # controllers alone are compared here
+                controller = fit(data, task, method=name, seed=seed, progress=False, **options).controller
             predicted, true = hidden_action_errors(controller, demonstrations, data)
             values.append(rmse_mm(predicted, true))
             if (count, seed) == (1, 0):

@@ -25,7 +25,15 @@ import gymnasium_robotics
 import numpy as np
 from matplotlib.figure import Figure
 
-from torchrl_koap import EvalConfig, TrainConfig, evaluate, save_demonstrations, train
+from torchrl_koap import (
+    ControllerConfig,
+    EvalConfig,
+    PlannerConfig,
+    TrainConfig,
+    evaluate,
+    save_demonstrations,
+    train,
+)
 from torchrl_koap.runs.weights import load_tensors
 
 gymnasium.register_envs(gymnasium_robotics)
@@ -112,8 +120,9 @@ results = {}
 planner = None
 for method in ("linear", "koap_untrained", "koap"):
     run = folder / method
-    options = {"steps": 800, "channels": (32, 64), "controller_steps": 200, "method": method, "analysis": False}
-    train(TrainConfig(out=run, dataset=str(data), planner_from=planner, **options))
+    shared = PlannerConfig(source=planner) if planner else PlannerConfig(steps=800, width=32)
+    options = {"planner": shared, "controller": ControllerConfig(steps=200)}
+    train(TrainConfig(dataset=str(data), out=run, method=method, **options))
     planner = planner or run
     results[method] = evaluate(run, EvalConfig(episodes=20, env="FlatMaze-v0", success_key="success"))
 

@@ -20,7 +20,8 @@ import statistics
 import torch
 from matplotlib.figure import Figure
 
-from torchrl_koap import fit_controller, get_task
+import torchrl_koap
+from torchrl_koap import get_task
 from torchrl_koap.data import LabelBudget, select_state
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
 from torchrl_koap.evaluation.active_labelling import rank_trajectories
@@ -40,7 +41,7 @@ def labelled(episodes):
 def fit(episodes):
     data = labelled(episodes)
     # the features stay as they are drawn: what is compared is the choice of labels, and a fit takes a moment
-    return fit_controller(data, task, method="koap_untrained", steps=0, progress=False), data
+    return torchrl_koap.fit(data, task, method="koap_untrained", planner=False, progress=False), data
 
 
 # %%
@@ -52,8 +53,8 @@ def fit(episodes):
 
 
 def choose(criterion, first, count):
-    controller, data = fit([first])
-    steps = infer_steps(controller, data)
+    trained, data = fit([first])
+    steps = infer_steps(trained.controller, data)
     if criterion == "random":
         names = steps["episode"][steps["episode"] != first].unique()
         return names[torch.randperm(len(names), generator=torch.Generator().manual_seed(first))[:count]].tolist()
@@ -61,7 +62,7 @@ def choose(criterion, first, count):
         steps["latent_action"],
         steps["episode"],
         steps["has_action"],
-        penalty=controller.recipe.results["penalty"],
+        penalty=trained.results["decoder_fit"]["penalty"],
         count=count,
     )
     return [choice.episode for choice in chosen]
@@ -82,7 +83,7 @@ for first in firsts:
     order = {name: [first, *choose(name, first, max(counts) - 1)] for name in errors}
     for name, episodes in order.items():
         for count in counts:
-            controller, _ = fit(episodes[:count])
+            controller = fit(episodes[:count])[0].controller
             nothing_seen = held_out.clone().set("has_action", torch.zeros_like(held_out["has_action"]))
             errors[name][count].append(rmse_mm(*hidden_action_errors(controller, held_out, nothing_seen)))
 print("the first", firsts[0], "was followed by", {name: chosen[1:] for name, chosen in order.items()})

@@ -38,7 +38,7 @@ from torchrl_koap.modules import (
 )
 from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training import fit_planner
+from torchrl_koap.training import fit
 
 torch.manual_seed(0)
 task = get_task("avoiding")
@@ -100,7 +100,7 @@ print("largest eigenvalues of K:", [round(value, 3) for value in radii[:4].tolis
 # The planner is fitted shortly; ``PolicyEnv`` gives the policy the frames and the noise it reads. What comes out of the
 # collector are ordinary TorchRL batches.
 
-planner = fit_planner(data, task, steps=600, progress=False)
+planner = fit(data, task, method="linear", planner={"steps": 600}, progress=False).planner
 policy = make_policy(planner, model.eval(), state_of=task.state_columns)
 env = PolicyEnv(AvoidingEnv(num_envs=8, max_steps=task.max_steps), policy)
 collector = Collector(env, policy, frames_per_batch=8 * 100, total_frames=8 * 100)

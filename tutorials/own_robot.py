@@ -76,11 +76,12 @@ data, task = torchrl_koap.make_demonstrations(
     states, actions, control_hz=30, state_names=NAMES, state_units="rad", action_units="rad/s", robot=NAMES[:2]
 )
 print(f"{len(states)} trajectories, {int(data['has_action'].sum())} of {len(data)} steps with their command")
-planner = torchrl_koap.fit_planner(data, task, steps=500, channels=(32, 64), progress=False)  # looks at no command
-controllers = {
-    name: torchrl_koap.fit_controller(data, task, method=name, steps=200, progress=False)
-    for name in ("linear", "dd", "koap")
-}
+trained, planner = {}, {"steps": 500, "width": 32}
+for name in ("linear", "dd", "koap"):
+    trained[name] = torchrl_koap.fit(
+        data, task, method=name, planner=planner, controller={"steps": 200}, progress=False
+    )
+    planner = trained[name].planner  # it looks at no command: all of them share it
 
 # %%
 # Before it moves
@@ -89,7 +90,7 @@ controllers = {
 # given no labels of these trajectories; here their commands happen to be known.
 
 columns = list(task.controller_columns("robot"))
-for name, controller in controllers.items():
+for name, controller in ((name, each.controller) for name, each in trained.items()):
     errors = []
     for frames, commands in recordings[3:13]:
         window = torch.tensor(frames, dtype=torch.float32)[None, :, columns]
@@ -107,7 +108,7 @@ for name, controller in controllers.items():
 # tick; frames, plans and random numbers are kept inside.
 
 file = Path(tempfile.mkdtemp()) / "arm.safetensors"
-torchrl_koap.save_policy(torchrl_koap.build_policy(planner, controllers["koap"]), file)
+trained["koap"].save(file)
 print(f"saved {file.name}, {file.stat().st_size / 1e3:.0f} kB")
 policy = torchrl_koap.load_policy(file)
 

@@ -29,9 +29,9 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_koap import EvalConfig, Task, TrainConfig, evaluate, register_task, train
+from torchrl_koap import EvalConfig, LabelConfig, Task, TrainConfig, evaluate, register_task, train
 from torchrl_koap.envs.contexts import check_contexts, draw_contexts
-from torchrl_koap.envs.experts.demonstrations import record_demonstrations
+from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
 from torchrl_koap.envs.experts.recording import Expert
 from torchrl_koap.reports.scenes import draw_scene
 from torchrl_koap.runs.weights import load_tensors
@@ -80,13 +80,7 @@ task = register_task(
         ),
         defaults=Defaults(
             demonstrations=200,
-            planner_steps=4000,
-            planner={
-                "denoiser": "mlp",
-                "denoiser_width": 256,
-                "batch_size": 256,
-                "planner_learning_rate": 1e-3,
-            },
+            planner={"steps": 4000, "network": "mlp", "width": 256, "batch_size": 256},
         ),
     )
 )
@@ -192,11 +186,11 @@ class PushExpert(Expert):
 # ------------------------
 # Demonstrations balanced over modes, a training with 5 % of the labels, rollouts from places the training never saw.
 
-_, report = record_demonstrations(task.name, episodes=8)
-print(report)
-run = Path(tempfile.mkdtemp()) / "run"
-summary = train(TrainConfig(out=run, task=task.name, label_fraction=0.05))
-labels = summary["labels"]
+folder = Path(tempfile.mkdtemp())
+print(record_to_folder(folder / "demos", task, task.defaults.demonstrations))
+run = folder / "run"
+trained = train(TrainConfig(dataset=str(folder / "demos"), out=run, labels=LabelConfig(fraction=0.05)))
+summary, labels = trained.results, trained.results["labels"]
 print(f"labels: {labels['labelled_transitions']} of {labels['total_transitions']} transitions")
 for name, value in summary["action_error_mm"].items():
     print(f"  {name}: {value:.3g}")

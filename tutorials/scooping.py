@@ -77,12 +77,12 @@ print(f"{len(components.mean)} features, {EMBEDDING_DIM} components: the spoon's
 
 data, labels = LabelBudget(episodes=range(LABELLED)).apply(stored)
 print(f"labels: {labels.labelled_transitions} of {labels.total_transitions} steps")
-planner = torchrl_koap.fit_planner(data, task, steps=1000, progress=False)
-controllers = {
-    "linear": torchrl_koap.fit_controller(data, task, method="linear", progress=False),
-    "koap": torchrl_koap.fit_controller(data, task, steps=100, progress=False),
-    "koap_untrained": torchrl_koap.fit_controller(data, task, method="koap_untrained", steps=0, progress=False),
-}
+updates, planner, trained = {"linear": 0, "koap": 100, "koap_untrained": 0}, {"steps": 1000}, {}
+for name, steps in updates.items():
+    trained[name] = torchrl_koap.fit(
+        data, task, method=name, planner=planner, controller={"steps": steps}, progress=False
+    )
+    planner = trained[name].planner  # one for all
 
 # %%
 # Scooping
@@ -91,9 +91,9 @@ controllers = {
 # (``task.defaults.execution``): an error of a place that is read off every frame anew would act as a velocity.
 
 
-def trials(controller):
+def trials(trained):
     """Episodes in the simulator, frames included."""
-    policy = torchrl_koap.build_policy(planner, controller, task, **task.defaults.execution)
+    policy = torchrl_koap.load_policy(trained)
     contexts = draw_contexts("scooping", TRIALS, 1)
 
     def make_env(number):
@@ -103,8 +103,8 @@ def trials(controller):
 
 
 episodes, rates = {}, {}
-for name, controller in controllers.items():
-    episodes[name] = trials(controller)
+for name, each in trained.items():
+    episodes[name] = trials(each)
     over = sum(bool(episode["next", "mode"].any()) for episode in episodes[name])
     taken = sum(bool(episode["next", "success"].any()) for episode in episodes[name])
     rate, low, high = rates[name] = (100 * taken / TRIALS, *(100 * end for end in wilson_interval(taken, TRIALS)))
@@ -147,5 +147,5 @@ figure.savefig("scooping.png", dpi=90)
 # Nor are they told apart in the study with four times the videos, ``docs/results/scooping.md``.
 #
 # From the shell: ``koap demos --task scooping --embodiment robot --out robot``, the same with ``hand``, then ``koap
-# embed robot hand --mixed --out data``, ``koap train --task scooping --dataset data --label-episodes 0 1 2 3 4`` and
+# embed robot hand --mixed --out data``, ``koap train --task scooping --dataset data --labels.episodes 0 1 2 3 4`` and
 # ``koap eval``.

@@ -13,9 +13,10 @@ from pages import escape, execution, heading, planner_rows, read_rows, success, 
 
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import METHODS
-from torchrl_koap.training.resolved import resolve
+from torchrl_koap.training.trained import build_networks
 
 # of networks whose docstring has no equation; "paper" is that of the preset
 EQUATIONS = {
@@ -61,14 +62,12 @@ def write_method(method: Method) -> None:
     sizes = {task: sum(p.numel() for p in build(method, task).parameters()) for task in ("avoiding", "stacking")}
     facts = [
         ("network", f":class:`~{kind.__module__}.{kind.__name__}`"),
-        ("planner", "the one that all controllers share" if method.has_planner else "none: it is a policy of its own"),
+        ("planner", "the one that all controllers share" if method.plans else "none: it is a policy of its own"),
         *frames_read(network),
         ("states it learns from", states_seen(method)),
         ("decoder", "closed form, on every labelled step once" if method.closed_form else "trained by gradients"),
         ("parameters, Avoiding and Stacking", f"{sizes['avoiding']:,} and {sizes['stacking']:,}"),
     ]
-    if method.other_decoder:
-        facts.append(("with the other kind of decoder", f":doc:`{method.other_decoder}`"))
     if method.teacher:
         facts.append(("the rest of the data is labelled by", f":doc:`{method.teacher}`"))
     write_page(
@@ -87,12 +86,7 @@ def write_method(method: Method) -> None:
 def build(method: Method, task_name: str) -> Any:
     """The network as ``koap train`` builds it, untrained."""
     task = get_task(task_name)
-    resolved = resolve(TrainConfig(out="unused", task=task.name, method=method.name))
-    if not method.has_planner:
-        return method.build(task.state_dim, task.action_dim, task.planner_features(), resolved.planner)
-    from torchrl_koap.training.builders import build_controller
-
-    return build_controller(resolved.controller, len(resolved.columns), task.action_dim, method=method)
+    return build_networks(task, resolve(TrainConfig(out="unused", method=method.name), task))[1]
 
 
 def equation(method: Method, kind: type) -> str:
@@ -114,7 +108,7 @@ def frames_read(network: Any) -> list[tuple[str, str]]:
 
 def states_seen(method: Method) -> str:
     """Which states it may learn from."""
-    if method.labelled_only:
+    if method.sees == "labelled":
         return "those of labelled windows, statistics included"
     if not method.phases:
         return "none but their statistics: nothing is trained"

@@ -72,7 +72,10 @@ def write_task(task: Task) -> None:
         ("ends by a collision", "yes" if task.env and resolve(task.env, "env").COLLIDES else "no"),
         ("noise on the measured tool", f"{1e3 * task.noise:g} mm" if task.noise else "none"),
         ("plans are", "displacements" if task.defaults.relative else "positions"),
-        ("demonstrations, planner updates", f"{task.defaults.demonstrations}, {task.defaults.planner_steps:,}"),
+        (
+            "demonstrations, planner updates",
+            f"{task.defaults.demonstrations}, {task.defaults.planner.get('steps', 12000):,}",
+        ),
         ("Gymnasium id", next((f"``torchrl_koap/{name}``" for name, own in IDS.items() if own == task.name), "none")),
         ("environment", f":class:`~{task.env.replace(':', '.')}`" if task.env else "none"),
         ("scripted expert", f":class:`~{task.expert.replace(':', '.')}`" if task.expert else "none"),

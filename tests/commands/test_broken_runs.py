@@ -59,9 +59,9 @@ BROKEN_RUNS = {
     "other sizes": (
         lambda run: edit_json(
             run / "config.json",
-            planner={**json.loads((run / "config.json").read_text())["planner"], "channels": [8, 24]},
+            planner={**json.loads((run / "config.json").read_text())["planner"], "width": 16},
         ),
-        "planner.safetensors does not fit the model",
+        "planner.safetensors was trained on planner.width 8, not on 16",
     ),
 }
 
@@ -79,7 +79,7 @@ def test_a_run_that_cannot_be_evaluated_is_named(kind, copied_run, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--execution", "openloop"), "unknown execution 'openloop'; did you mean 'open_loop'?"),
+        (("--strategy", "openloop"), "unknown strategy 'openloop'; did you mean 'open_loop'?"),
         (("--replan-interval", "15"), "replan_interval must be in 1..14"),
         (("--episodes", "0"), "episodes must be >= 1, got 0"),
         (("--batch-size", "0"), "batch_size must be >= 1, got 0"),
@@ -114,7 +114,7 @@ def test_a_full_disk_damages_no_earlier_result_of_a_training(place, copied_run, 
     after = contents(copied_run)
     assert after.keys() == before.keys()
     assert [name for name in before if after[name] != before[name]] in ([], ["config.json"])
-    assert json.loads(after["config.json"])["steps"] == 20
+    assert json.loads(after["config.json"])["planner"]["steps"] == 20
 
 
 def test_a_full_disk_damages_no_earlier_evaluation(copied_run, monkeypatch, capsys, no_report):
@@ -130,5 +130,5 @@ def test_a_full_disk_damages_no_earlier_evaluation(copied_run, monkeypatch, caps
 
 def test_where_an_error_is_from_is_shown_on_request(monkeypatch):
     monkeypatch.setenv("KOAP_TRACEBACK", "1")
-    with pytest.raises(ValueError, match="unknown task"):
-        koap("train", "--out", "x", "--task", "none")
+    with pytest.raises(ValueError, match="no demonstrations to learn from"):
+        koap("train", "--out", "x")

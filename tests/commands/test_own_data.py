@@ -14,7 +14,7 @@ from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
 from torchrl_koap.tasks import Action
 
-TINY = ("--steps", 20, "--batch-size", 8, "--controller-batch-size", 8, "--channels", 8, 16)
+TINY = ("--steps", 20, "--batch-size", 8, "--planner.width", "8")
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_a_policy_acts_on_the_users_observations(run):
 
 def test_resume_goes_on_with_the_labels_of_before(run, capsys):
     assert koap("train", "--out", run, "--resume") == 0
-    assert koap("train", "--out", run, "--resume", "--label-fraction", 0.5) == 1
+    assert koap("train", "--out", run, "--resume", "--labels.fraction", 0.5) == 1
     assert "was started with another label_fraction" in capsys.readouterr().err
 
 

@@ -9,15 +9,15 @@ import torch
 
 from torchrl_koap.data import (
     DataError,
+    controller_view,
     load_ted,
     make_demonstrations,
+    open_dataset,
     read_about,
     save_demonstrations,
-    select_state,
 )
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import Action
-from torchrl_koap.training import TrainConfig, resolve
 
 RANDOM = np.random.default_rng(0)
 STATES = [RANDOM.normal(size=(30, 4)).cumsum(0) for _ in range(3)]
@@ -81,12 +81,11 @@ def test_a_controller_learns_the_distance_to_absolute_targets(tmp_path):
     targets = [STATES[0][:-1, :2] + ACTIONS[0], None, None]
     names = {"state_names": NAMES, "robot": ["q1", "q2"]}
     folder = save_demonstrations(tmp_path / "reach", STATES, targets, control_hz=20, action_kind="absolute", **names)
-    resolved = resolve(TrainConfig(out=tmp_path / "run", dataset=str(folder), method="linear"))
-    data = select_state(load_ted(folder / "ted")[0], resolved.task.state_of)
-    view, known = resolved.controller_view(data), data["has_action"].squeeze(-1)
+    data, task = open_dataset(folder)
+    view, known = controller_view(data, task.robot, action_targets=task.targets), data["has_action"].squeeze(-1)
     torch.testing.assert_close(view["action"][known], torch.from_numpy(ACTIONS[0]).float(), atol=1e-5, rtol=0)
     assert view["action"][~known].isnan().all()
-    again = resolved.task.action_rule(data["state"], view["action"])
+    again = task.action_rule(data["state"], view["action"])
     torch.testing.assert_close(again[known], data["action"][known], atol=1e-6, rtol=0)
 
 

@@ -10,9 +10,10 @@ import pytest
 import torch
 from tiny_runs import TINY, koap
 
-from torchrl_koap.evaluation import active_labelling, training_data
+from torchrl_koap.evaluation import active_labelling
 from torchrl_koap.evaluation.active_labelling import SuggestConfig, rank_trajectories, suggest
 from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.training import trained
 
 EPISODE = torch.arange(7).repeat_interleave(torch.tensor([5, 3, 6, 4, 5, 2, 5]))
 KNOWN = EPISODE == 2
@@ -134,12 +135,12 @@ def test_suggest_from_the_shell(run, capsys):
     assert all(row["steps"] == 29 + row["episode"] for row in rows)
     assert [line.split()[1] for line in lines[1:4]] == [str(row["episode"]) for row in rows]
     # what to call next keeps the labels that are there
-    assert lines[4].split("--label-episodes ")[1].split()[:-1] == [
+    assert lines[4].split("--labels.episodes ")[1].split()[:-1] == [
         str(episode) for episode in [*written["labelled_episodes"], *(row["episode"] for row in rows)]
     ]
     assert len(written["labelled_episodes"]) == labels["trajectories_touched"]
     dataset = json.loads((run / "config.json").read_text())["dataset"]
-    assert f"koap train --task avoiding --dataset {dataset} --label-episodes" in lines[4]
+    assert f"koap train --task avoiding --dataset {dataset} --labels.episodes" in lines[4]
     assert koap("suggest", run, "--count", "7") == 1  # 2 of 8 are labelled
     assert "count must be in 1..6" in capsys.readouterr().err
 
@@ -147,29 +148,28 @@ def test_suggest_from_the_shell(run, capsys):
 def test_demonstrations_that_were_moved_are_found_again(run, demonstrations, tmp_path, capsys):
     config = json.loads((run / "config.json").read_text())
     (run / "config.json").write_text(json.dumps(config | {"dataset": "moved/away"}))
-    (run / "digests.json").unlink()
     assert koap("suggest", run) == 1
     assert "say where it is with --dataset" in capsys.readouterr().err
     assert koap("suggest", run, "--dataset", demonstrations) == 0
     out = capsys.readouterr().out
-    assert f"--dataset {demonstrations} --label-episodes" in out and len(out.splitlines()) == 7
+    assert f"--dataset {demonstrations} --labels.episodes" in out and len(out.splitlines()) == 7
 
 
 def test_unasked_no_more_are_suggested_than_are_left(demonstrations, tmp_path):
-    tiny = ["6" if before == "--label-count" else word for before, word in zip(["", *TINY], TINY, strict=False)]
+    tiny = ["6" if before == "--labels" else word for before, word in zip(["", *TINY], TINY, strict=False)]
     assert koap("train", "--out", tmp_path / "run", "--dataset", demonstrations, *tiny) == 0
     assert len(suggest(tmp_path / "run").suggestions) == 2
 
 
 def test_no_hidden_label_has_a_say(run, monkeypatch):
-    load = training_data.load_demonstrations
+    load = trained.load_demonstrations
     first = suggest(run, SuggestConfig(count=6))
 
     def other_labels(*arguments, **options):
         data = load(*arguments, **options)
         return data.set("action", torch.randn_like(data["action"]) * 1e3)
 
-    monkeypatch.setattr(training_data, "load_demonstrations", other_labels)
+    monkeypatch.setattr(trained, "load_demonstrations", other_labels)
     assert suggest(run, SuggestConfig(count=6)) == first
     seen, infer = [], active_labelling.infer_steps
     monkeypatch.setattr(
@@ -196,10 +196,8 @@ def test_other_demonstrations_than_those_of_the_training_are_refused(run, monkey
     def without_last(data):
         return data[data["episode"] < 7]
 
-    load = training_data.load_demonstrations
-    monkeypatch.setattr(
-        training_data, "load_demonstrations", lambda *args, **options: without_last(load(*args, **options))
-    )
+    load = trained.load_demonstrations
+    monkeypatch.setattr(trained, "load_demonstrations", lambda *args, **options: without_last(load(*args, **options)))
     with pytest.raises(RunDirectoryError, match="its trajectories or labels differ"):
         suggest(run)
 
@@ -207,13 +205,13 @@ def test_other_demonstrations_than_those_of_the_training_are_refused(run, monkey
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--decoder", "sgd"), "train with `--decoder ridge`"),
+        (("--method", "koap_sgd"), "train with `--method koap`"),
         (("--method", "linear"), "suggestions need latent actions"),
-        (("--label-fraction", "1.0"), "nothing is left to suggest"),
+        (("--labels.fraction", "1.0"), "nothing is left to suggest"),
     ],
 )
 def test_runs_that_cannot_be_asked(demonstrations, tmp_path, capsys, options, message):
-    tiny = [word for word in TINY if word not in ("--label-count", "2")] if "1.0" in options else TINY
+    tiny = [word for word in TINY if word not in ("--labels", "2")] if "1.0" in options else TINY
     assert koap("train", "--out", tmp_path / "run", "--dataset", demonstrations, *tiny, *options) == 0
     assert koap("suggest", tmp_path / "run") == 1
     assert message in capsys.readouterr().err

@@ -32,11 +32,11 @@ from torchrl_koap.evaluation.diagnosis import (
     tracking_errors,
 )
 from torchrl_koap.evaluation.statistics import rate
-from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.modules import Execution, ExecutionConfig, MLPDenoiser, StatePlanner, make_policy
 from torchrl_koap.reports.inspection_plots import draw_experiments
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training import Trained
 
 AVOIDING = get_task("avoiding")
 
@@ -133,20 +133,22 @@ def test_inspect_from_the_shell(trained_run, tmp_path, capsys):
 
 
 def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_goal(trained_run, monkeypatch, tmp_path):
-    trained = load_run(trained_run)
+    trained = Trained.load(trained_run)
     own = {"strategy": "open_loop", "replan_interval": 8, "blend": 0.0, "gain": 1.2, "lead": 0.05}
-    task = replace(trained.task, goal=None, defaults=replace(trained.task.defaults, execution=own))
+    task = replace(trained.task, goal=None)
+    config = replace(trained.config, execution=ExecutionConfig(**own))
+    other = replace(trained, task=task, config=config)
     policies, roll_out = [], diagnosis.roll_out
 
     def noted(policy, *arguments, **options):
         policies.append(policy)
         return roll_out(policy, *arguments, **options)
 
-    monkeypatch.setattr(inspection, "load_run", lambda run: replace(trained, task=task))
+    monkeypatch.setattr(Trained, "load", lambda run: other)
     for module in (inspection, diagnosis):
         monkeypatch.setattr(module, "roll_out", noted)
-    config = inspection.InspectConfig(episodes=2, threads=1)
-    result = inspection.inspect(trained_run, config).result
+    asked = inspection.InspectConfig(episodes=2, threads=1)
+    result = inspection.inspect(trained_run, asked).result
     for policy in policies:  # recordings are followed by the same actions as plans
         assert policy.execution == Execution(**own)
         assert policy.limits.gain == 1.2 and policy.limits.lead == 0.05
@@ -154,11 +156,12 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
     assert "planner_alone" not in result and result["both"]["episodes"] == 2
     assert result["plan_to_execution"] == {}  # actions are kept, not plans
     assert len(draw_experiments(result, RunFacts(tmp_path, task)).axes) == 2
-    inspection.inspect(trained_run, replace(config, execution=ExecutionConfig(replan_interval=4)))
+    inspection.inspect(trained_run, replace(asked, execution=ExecutionConfig(replan_interval=4)))
     assert policies[-1].execution == Execution(**own | {"replan_interval": 4})
-    several = replace(trained, config=trained.config | {"candidates": 3})
-    monkeypatch.setattr(inspection, "load_run", lambda run: several)
-    inspection.inspect(trained_run, config)
+    config = replace(trained.config, execution=ExecutionConfig(candidates=3))
+    several = replace(trained, config=config)
+    monkeypatch.setattr(Trained, "load", lambda run: several)
+    inspection.inspect(trained_run, asked)
     assert [policy.execution.candidates for policy in policies[-2:]] == [3, 1]  # a recording is one plan
 
 

@@ -11,7 +11,17 @@ import pytest
 from tiny_runs import koap
 from toy_gym import NAMES, demonstrations
 
-from torchrl_koap import Agent, EvalConfig, TrainConfig, evaluate, load_policy, save_demonstrations, train
+from torchrl_koap import (
+    Agent,
+    ControllerConfig,
+    EvalConfig,
+    PlannerConfig,
+    TrainConfig,
+    evaluate,
+    load_policy,
+    save_demonstrations,
+    train,
+)
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.runs.weights import load_tensors
 
@@ -23,7 +33,8 @@ def arm_run(tmp_path_factory):
     actions = [steps if index < 2 else None for index, steps in enumerate(actions)]
     data = save_demonstrations(folder / "data", states, actions, control_hz=30, state_names=NAMES, robot=NAMES[:2])
     run = folder / "run"
-    train(TrainConfig(out=run, dataset=str(data), steps=10, batch_size=8, controller_steps=0, channels=(8, 16)))
+    few = {"planner": PlannerConfig(steps=10, batch_size=8, width=8), "controller": ControllerConfig(steps=0)}
+    train(TrainConfig(dataset=str(data), out=run, **few))
     return run
 
 

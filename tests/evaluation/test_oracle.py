@@ -97,7 +97,7 @@ def runs(tmp_path_factory):
     root = tmp_path_factory.mktemp("oracle")
     write_demonstrations(root / "raw")
     for method in ("koap", "dp"):
-        options = ("--method", method, "--controller-steps", 20, *TINY)
+        options = ("--method", method, "--controller.steps", 20, *TINY)
         assert koap("train", "--out", root / method, "--dataset", root / "raw", *options) == 0
     return root
 

@@ -51,17 +51,14 @@ RIGHT = {
     "inspect": ("--seed 0",),
     "suggest": ("--seed 0",),
     "train": (
-        *("--seed 0", "--controller-steps 0", "--episodes -1", "--episodes 0"),
-        "--denoiser-width",
+        *("--run.seed 0", "--controller.steps 0", "--labels.episodes -1", "--labels.episodes 0"),
+        *("--planner.held-out 0", "--execution.blend 0", "--execution.lead 0"),
     ),
 }
 EMPTY = ("--action-units", "--state-units")  # of a number without a unit
 # where the message has another word for the option
 SAYS = {
-    "--label-count": "labelled|label-count",
-    "--label-unit": "unit",
-    "--controller-steps": "steps",
-    "--controller-state": "part of the state|controller-state",
+    "--labels.unit": "unit",
     "--action-kind": "kind of action|action-kind",
     "--to": "unknown format|--to",
     "--tasks": "task",
@@ -69,7 +66,6 @@ SAYS = {
     "--units": "unit",
     "--planners": "planners|n0nsense",
     "--data-share": "share of the data|data[-_]share",
-    "--planner-from": "/dev/null/below|planner-from",
 }
 
 
@@ -82,15 +78,16 @@ def plain(kind: Any) -> tuple[Any, bool]:
     return kind, False
 
 
-def options(command: type) -> Iterator[tuple[str, Any]]:
+def options(command: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Names and types of all options of a command; positional ones are left out."""
     hints, full = get_type_hints(command), get_type_hints(command, include_extras=True)
     for field in fields(command):
         kind = hints[field.name]
         if is_dataclass(kind):
-            yield from options(kind)
+            own = "" if "name=''" in str(full[field.name]) else f"{prefix}{field.name}."
+            yield from options(kind, own)
         elif "Positional" not in str(full[field.name]) and field.name != "plugins":
-            yield f"--{field.name.replace('_', '-')}", kind
+            yield f"--{prefix}{field.name}".replace("_", "-"), kind
 
 
 def faults() -> Iterator[Fault]:

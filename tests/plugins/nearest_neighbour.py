@@ -87,9 +87,9 @@ class NeighboursLoss(LossModule):
         return TensorDict({"loss_neighbours": (found - actions).square().mean()}, [])
 
 
-def build(state_dim, action_dim, normalizers, options):
+def build(task, columns, normalizers, preset):
     """What ``--method nearest_neighbour`` trains."""
-    return NearestNeighbours(state_dim, action_dim, **normalizers)
+    return NearestNeighbours(len(columns), task.action_dim, **normalizers)
 
 
 register_method(

@@ -50,7 +50,7 @@ def run(tmp_path_factory, demonstrations):
 
 def test_a_run_of_a_plugin_s_method(run):
     config, summary = (json.loads((run / f"{name}.json").read_text()) for name in ("config", "summary"))
-    assert config["plugins"] == ["nearest_neighbour"] and config["controller"]["method"] == "nearest_neighbour"
+    assert config["run"]["plugins"] == ["nearest_neighbour"] and config["method"] == "nearest_neighbour"
     remembered = load_tensors(run / "controller.safetensors")[0]["actions"]
     assert len(remembered) == summary["decoder_fit"]["labels_used"] > 20
     assert summary["action_error_mm"]["controller"] > 0
@@ -148,8 +148,8 @@ def test_what_is_no_method_is_refused(methods):
     register_method(Method("mine", "of mine", build))
     with pytest.raises(ValueError, match="there is a method 'mine' already"):
         register_method(Method("mine", "another", build))
-    with pytest.raises(ValueError, match="unknown kind of method 'polcy'; did you mean 'policy'"):
-        Method("other", "", build, kind="polcy")
+    with pytest.raises(ValueError, match="unknown kind of windows 'labeled'; did you mean 'labelled'"):
+        Method("other", "", build, sees="labeled")
     with pytest.raises(ValueError, match="the name of a method must be letters, digits"):
         Method("a/b", "", build)
     with pytest.raises(ValueError, match="phases of method 'other' need names of their own"):

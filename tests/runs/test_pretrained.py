@@ -10,12 +10,12 @@ import torch
 from publish_pretrained import publish
 from tiny_runs import TINY, koap, write_demonstrations
 
-from torchrl_koap.evaluation.trained_run import load_run
 from torchrl_koap.runs import pretrained
 from torchrl_koap.runs.pretrained import copy_run, find_run
 from torchrl_koap.runs.run_directory import RunDirectoryError
-from torchrl_koap.runs.weights import load_tensors
+from torchrl_koap.runs.weights import CheckpointError, load_tensors
 from torchrl_koap.studies.paper_tables import PRESETS, BenchConfig, _curves
+from torchrl_koap.training import Trained
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pretrained")
     data = write_demonstrations(folder / "data")
     out = folder / "run"
-    arguments = ("--task", "avoiding", "--dataset", data, "--controller-steps", "5", "--no-analysis")
+    arguments = ("--task", "avoiding", "--dataset", data, "--controller.steps", "5")
     assert koap("train", "--out", out, *arguments, *TINY) == 0
     return out
 
@@ -59,7 +59,7 @@ def test_a_published_policy_is_small_and_plans_the_same(run, policies):
     )  # frequencies are as the decoder knows them
     small, whole = ((folder / "planner.safetensors").stat().st_size for folder in (policies / "avoiding", run))
     assert small < 0.6 * whole
-    planner, exact = load_run(policies / "avoiding").planner, load_run(run).planner
+    planner, exact = Trained.load(policies / "avoiding").planner, Trained.load(run).planner
     history, noise = torch.rand(20, 2, 2), torch.randn(20, 14, 2)
     with torch.no_grad():
         gap = (planner.sample(history, noise) - exact.sample(history, noise)).abs().mean()
@@ -71,11 +71,11 @@ def test_a_published_policy_is_small_and_plans_the_same(run, policies):
 
 def test_a_planner_is_taken_over_by_name(run, policies, capsys):
     known = ("--task", "avoiding", "--dataset", json.loads((run / "config.json").read_text())["dataset"])
-    few = ("--label-count", "1", "--controller-steps", "2", "--no-analysis", "--quiet", "--threads", "1")
-    assert koap("train", "--out", "mine", *known, "--planner-from", "pretrained:avoiding", *few) == 0
-    mine, published = (load_run(folder).planner.state_dict() for folder in ("mine", policies / "avoiding"))
+    few = ("--labels.count", "1", "--controller.steps", "2", "--quiet", "--threads", "1")
+    assert koap("train", "--out", "mine", *known, "--planner.source", "pretrained:avoiding", *few) == 0
+    mine, published = (Trained.load(folder).planner.state_dict() for folder in ("mine", policies / "avoiding"))
     assert all(torch.equal(mine[name], value) for name, value in published.items())
-    assert koap("train", "--out", "other", *known, "--planner-from", "pretrained:avoidin", *few) == 1
+    assert koap("train", "--out", "other", *known, "--planner.source", "pretrained:avoidin", *few) == 1
     assert "did you mean 'avoiding'?" in capsys.readouterr().err and not (policies.parent / "other").exists()
 
 
@@ -89,12 +89,12 @@ def test_a_table_shares_planners_by_name(policies):
 def test_places_are_left_out_and_what_is_left_is_sealed(run, tmp_path):
     folder = publish(run, tmp_path / "mine", "# mine\n", candidates=3)
     config = json.loads((folder / "config.json").read_text())
-    assert (config["out"], config["dataset"], config["candidates"]) == ("run", "data", 3)
-    assert load_run(folder).directory.path == folder  # which compares the checksums
-    (folder / "config.json").write_text(json.dumps(config | {"steps": 1}))
-    with pytest.raises(RunDirectoryError, match="config.json changed since the training ended"):
-        load_run(folder)
-    assert load_run(publish(run, folder, "# again\n")).directory.path == folder  # over another policy of that name
+    assert (config["out"], config["dataset"], config["execution"]["candidates"]) == ("run", "data", 3)
+    assert Trained.load(folder).folder == folder
+    (folder / "config.json").write_text(json.dumps(config | {"planner": config["planner"] | {"width": 16}}))
+    with pytest.raises(CheckpointError, match="planner.safetensors was trained on planner.width 8, not on 16"):
+        Trained.load(folder)
+    assert Trained.load(publish(run, folder, "# again\n")).folder == folder  # over another policy of that name
 
 
 def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
@@ -102,7 +102,7 @@ def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
     rolled = ("--episodes", "2", "--threads", "1", "--no-animate")
     assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--candidates", "3") == 0
     result = json.loads((out / "eval.json").read_text())
-    assert result["episodes"] == 2 and result["candidates"] == 3
+    assert result["episodes"] == 2 and result["execution"]["candidates"] == 3
     assert (out / "index.html").exists() and not (policies / "avoiding" / "eval.json").exists()
     assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--no-report") == 0  # again, into the same folder
 
@@ -137,7 +137,7 @@ def test_wrong_calls(policies, tmp_path, capfd):
 def test_another_run_is_not_overwritten(run, tmp_path):
     copy_run(run, tmp_path / "mine")
     config = json.loads((run / "config.json").read_text())
-    (tmp_path / "mine" / "config.json").write_text(json.dumps(config | {"seed": 9}))
+    (tmp_path / "mine" / "config.json").write_text(json.dumps(config | {"run": config["run"] | {"seed": 9}}))
     with pytest.raises(RunDirectoryError, match="holds another run than"):
         copy_run(run, tmp_path / "mine")
-    assert json.loads((tmp_path / "mine" / "config.json").read_text())["seed"] == 9
+    assert json.loads((tmp_path / "mine" / "config.json").read_text())["run"]["seed"] == 9

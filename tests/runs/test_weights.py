@@ -47,7 +47,7 @@ def saved(tmp_path):
 def test_weights_bring_their_statistics(saved):
     path, model = saved
     other = Model(fitted=False, seed=1)
-    assert load_weights(path, other, task="avoiding") == {"task": "avoiding", "kind": "planner"}
+    assert load_weights(path, other, {"task": "avoiding"}) == {"task": "avoiding", "kind": "planner"}
     x = torch.randn(5, 3)
     assert torch.equal(model(x), other(x))
 
@@ -74,17 +74,17 @@ def test_weights_that_do_not_fit_are_refused_in_one_line(saved, change, message)
     change(tensors)
     save_tensors(path, tensors, about)
     with pytest.raises(CheckpointError, match=message) as error:
-        load_weights(path, Model(fitted=False), task="avoiding")
+        load_weights(path, Model(fitted=False), {"task": "avoiding"})
     assert str(error.value).startswith(str(path)) and "\n" not in str(error.value)
 
 
 def test_another_task_or_none_is_refused(saved):
     path, model = saved
     with pytest.raises(CheckpointError, match="trained on task 'avoiding', not on 'sorting'"):
-        load_weights(path, model, task="sorting")
+        load_weights(path, model, {"task": "sorting"})
     save_tensors(path, model.state_dict())
     with pytest.raises(CheckpointError, match="trained on task None, not on 'avoiding'"):
-        load_weights(path, model, task="avoiding")
+        load_weights(path, model, {"task": "avoiding"})
 
 
 @pytest.mark.parametrize("length", [0, 4, 40, -1])
@@ -92,7 +92,7 @@ def test_truncated_files_are_named(saved, length):
     path, model = saved
     path.write_bytes(path.read_bytes()[:length])
     with pytest.raises(CheckpointError, match=f"{path} is damaged"):
-        load_weights(path, model, task="avoiding")
+        load_weights(path, model, {"task": "avoiding"})
 
 
 def test_missing_and_foreign_files_are_named(tmp_path):

@@ -21,7 +21,7 @@ from torchrl_koap.training.methods import get_method
 
 
 def test_koap_paper_is_measured_as_published_unless_told_otherwise():
-    assert training_options(CellOptions(), "koap_paper") == {"controller_state": "all"}
+    assert training_options(CellOptions(), "koap_paper") == {}
     assert evaluation_options(CellOptions(), "koap_paper") == {"execution": ExecutionConfig()}
     assert get_method("koap_paper").execution == {"strategy": "open_loop", "blend": 0.0, "candidates": 1}
     asked = CellOptions(strategy="feedback", blend=0.8, controller_state="robot", candidates=4)
@@ -33,16 +33,9 @@ def test_koap_paper_is_measured_as_published_unless_told_otherwise():
     assert training_options(CellOptions(), "koap") == {}
 
 
-def test_coefficients_reach_those_whose_loss_has_them():
-    options = CellOptions(koopman_coeff=0.5, action_coeff=2.0, denoiser="mlp")
-    assert training_options(options, "koap_sgd") == {"denoiser": "mlp", "koopman_coeff": 0.5, "action_coeff": 2.0}
-    assert training_options(options, "koap") == {"denoiser": "mlp", "koopman_coeff": 0.5}
-    assert training_options(options, "dp") == {"denoiser": "mlp"}
-
-
 def test_what_is_said_of_policies_reaches_those_that_have_no_planner():
     options = CellOptions(batch_size=64, policy_steps=900, policy_batch_size=16)
-    assert training_options(options, "dp") == training_options(options, "dp_relabel")
+    assert training_options(options, "dp") == training_options(options, "vpt")
     assert training_options(options, "dp") == {"steps": 900, "batch_size": 16}
     assert training_options(options, "koap") == {"batch_size": 64} == planner_options(options)
 
@@ -54,8 +47,6 @@ def test_what_is_said_of_policies_reaches_those_that_have_no_planner():
         ({"strategy": "open"}, "koap", "unknown strategy 'open'"),
         ({"strategy": "open_loop", "candidates": 4}, "koap", "'open_loop' goes with 1 candidate, got 4"),
         ({"blend": 1.0}, "koap", r"blend must be in \[0, 1\), got 1.0"),
-        ({"koopman_coeff": 1.0}, "dd,dp", "koopman_coeff was given, but no loss of dd, dp has it"),
-        ({"action_coeff": -1.0}, "koap_paper", "action_coeff must be >= 0, got -1.0"),
         ({"controller_state": "arm"}, "koap", "unknown part of the state 'arm'"),
         ({"planner_seeds": 0}, "koap", "planner_seeds must be >= 1, got 0"),
         ({"policy_steps": 0}, "dp", "policy_steps must be >= 1, got 0"),
@@ -71,7 +62,7 @@ def test_a_method_that_cannot_read_the_state_is_named_before_any_work(tmp_path, 
     def refuse(*arguments, **options):
         raise ValueError("include_state needs latent_dim >= state_dim")
 
-    monkeypatch.setattr("torchrl_koap.training.run.build_controller", refuse)
+    monkeypatch.setattr("torchrl_koap.training.trained.build_controller", refuse)
     with pytest.raises(ValueError, match="'koap' cannot read the columns 'all' of task 'sorting': include_state"):
         check_curve(CurveConfig(tmp_path / "c", task="sorting", methods="koap", controller_state="all"))
     assert not (tmp_path / "c").exists()

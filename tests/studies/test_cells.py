@@ -19,7 +19,7 @@ from torchrl_koap.studies import cells
 from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
 from torchrl_koap.studies.table import CELL_COLUMNS
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training import run
+from torchrl_koap.training import on_disk
 from torchrl_koap.training.datasets import load_demonstrations
 
 CELL = Cell("linear", 0.25, 1.0, 0)
@@ -91,7 +91,7 @@ def test_no_action_reaches_a_planner(planner, demonstrations, tmp_path, monkeypa
     data["action"] = torch.full_like(data["action"], 1e9)
     data["observation"][:, task.observation[task.command]] = 1e9
     data["next", "observation"][:, task.observation[task.command]] = 1e9
-    monkeypatch.setattr(run, "load_demonstrations", lambda *arguments: data)
+    monkeypatch.setattr(on_disk, "load_demonstrations", lambda *arguments, **options: data)
     do_planner(folder=str(tmp_path / "run"), observations=1.0, settings=settings_of(demonstrations))
     name = "planner.safetensors"
     assert (tmp_path / "run" / name).read_bytes() == (planner / name).read_bytes()
@@ -100,8 +100,8 @@ def test_no_action_reaches_a_planner(planner, demonstrations, tmp_path, monkeypa
 
 def test_a_planner_sees_the_share_of_the_trajectories_that_it_is_told(planner, demonstrations, tmp_path, monkeypatch):
     seen = []
-    train = run.train_planner
-    monkeypatch.setattr(run, "train_planner", lambda *rest: seen.append(rest[2]) or train(*rest))
+    learn = on_disk.learn_planner
+    monkeypatch.setattr(on_disk, "learn_planner", lambda *rest, **more: seen.append(rest[2]) or learn(*rest, **more))
     do_planner(folder=str(tmp_path / "run"), observations=0.5, settings=settings_of(demonstrations))
     (data,) = seen
     assert len(data["episode"].unique()) == 4

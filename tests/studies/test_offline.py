@@ -7,7 +7,7 @@ import json
 import math
 
 import pytest
-from offline_runs import TINY, save_arm
+from offline_runs import save_arm
 
 from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner
 from torchrl_koap.studies.label_efficiency import CurveConfig, run_curve
@@ -24,7 +24,7 @@ def curve(tmp_path_factory):
     """Three finished cells: one with a closed form, the ridge, and a policy without a planner."""
     root = tmp_path_factory.mktemp("curve")
     arm = save_arm(tmp_path_factory.mktemp("data") / "arm", joints=2)
-    settings = {"dataset": str(arm)} | {name: TINY[name] for name in ("steps", "batch_size", "channels")}
+    settings = {"dataset": str(arm), "steps": 20, "batch_size": 8, "denoiser_width": 8}
     do_planner(folder=str(root / CELLS[0].planner), observations=1.0, settings=settings)
     for cell in CELLS:
         planner = None if cell.planner is None else str(root / cell.planner)

@@ -34,14 +34,13 @@ def jobs(monkeypatch, demonstrations, tmp_path):
 
 
 def test_cells_of_all_seeds_share_a_planner_that_knows_no_seed(jobs):
-    found = jobs(methods="koap,dp", denoiser="mlp", denoiser_width=64, koopman_coeff=0.5)
+    found = jobs(methods="koap,dp", denoiser="mlp", denoiser_width=64)
     assert [name for name in found if not name.startswith("cells")] == ["planner-1"]
     planner = found["planner-1"].arguments["settings"]
-    assert planner["denoiser_width"] == 64 and "seed" not in planner and "koopman_coeff" not in planner
+    assert planner["denoiser_width"] == 64 and "seed" not in planner
     cells = {name: job.arguments for name, job in found.items() if name.startswith("cells")}
     assert {Path(cell["planner"]).name for name, cell in cells.items() if "koap" in name} == {"planner-1"}
     assert all(cell["planner"] is None for name, cell in cells.items() if "dp" in name)
-    assert cells["cells/koap-0.5-1-seed0"]["settings"]["koopman_coeff"] == 0.5
     assert cells["cells/dp-0.5-1-seed0"]["settings"]["denoiser_width"] == 64
 
 
@@ -60,7 +59,7 @@ def test_a_planner_that_does_not_grow_with_the_controllers_data(jobs):
 
 def test_koap_paper_is_told_what_was_published(jobs):
     told = jobs(methods="koap_paper,koap")["cells/koap_paper-0.5-1-seed0"].arguments
-    assert told["settings"]["controller_state"] == "all"
+    assert "controller_state" not in told["settings"]  # the method says it
     assert told["evaluation"] == {"episodes": 60, "threads": 1, "execution": ExecutionConfig()}
 
 

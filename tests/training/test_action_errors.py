@@ -7,6 +7,7 @@ import math
 
 import pytest
 import torch
+from small_controllers import controller_of
 from tensordict.nn import TensorDictModuleBase
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
@@ -14,7 +15,6 @@ from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.action_errors import AFTER, BEFORE, hidden_action_errors, rmse_mm, write_analysis
-from torchrl_koap.training.builders import build_controller
 
 LENGTHS = (25, 18, 31, 13, 22)
 
@@ -104,7 +104,7 @@ def test_a_linear_world_is_predicted_by_the_ridge_and_written_down(tmp_path):
     data = select_state(flatten_trajectories(frames, actions), (2, 3))
     labelled, report = LabelBudget(count=1).apply(data)
     torch.manual_seed(0)
-    controller = build_controller({"method": "koap", "preset": "paper"}, 2, 2, labelled)
+    controller = controller_of("koap", labelled, preset="paper")
     run = RunDirectory(tmp_path)
     result = write_analysis(run, get_task("avoiding"), data, labelled, controller, (0, 1))
     assert result["ridge"] < 1e-2 < result["controller"]

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from small_controllers import controller_of
 
 from torchrl_koap.data import LabelBudget, cut_windows, flatten_trajectories, select_state
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, ridge
-from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.closed_form import fit_closed_form
 
 MODULES = ("koopman.inverse_dynamics", "baselines.linear", "baselines.principal")
@@ -39,7 +39,7 @@ def test_every_label_with_full_look_ahead_is_used_exactly_once(monkeypatch, meth
     data = numbered()
     labelled, _ = budget.apply(data)
     torch.manual_seed(0)
-    controller = build_controller({"method": method, "preset": preset}, 2, 2, labelled)
+    controller = controller_of(method, labelled, preset=preset)
     seen = []
 
     def spy(inputs, targets, **options):
@@ -64,7 +64,7 @@ def test_few_trajectories_take_the_default_penalty_many_choose():
     for count in (1, 2, 3, 5):
         labelled, _ = LabelBudget(count=count).apply(data)
         torch.manual_seed(0)
-        controller = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
+        controller = controller_of("koap", labelled)
         reports.append(fit_closed_form(controller, labelled))
     assert [report["penalty"] == DEFAULT_PENALTY for report in reports] == [True, True, False, False]
     assert all(report["held_out_error"] > 0 for report in reports)
@@ -76,7 +76,7 @@ def test_no_penalty_is_below_that_of_the_errors_of_plans(monkeypatch, method):
     frames = [torch.randn(91, 2, generator=generator).cumsum(0) * 0.01 for _ in range(6)]
     data = select_state(flatten_trajectories(frames, [frame[1:] - frame[:-1] for frame in frames]), (0, 1))
     torch.manual_seed(0)
-    controller = build_controller({"method": method, "preset": "default"}, 2, 2, data)
+    controller = controller_of(method, data)
     seen = []
 
     def spy(*args, **options):
@@ -97,7 +97,7 @@ def test_no_motion_decodes_to_no_action_only_where_zero_is_zero(preset, through_
     """With actions normalised by their root mean square, a bias would be an action out of nothing."""
     labelled, _ = LabelBudget(count=5).apply(numbered())
     torch.manual_seed(0)
-    controller = build_controller({"method": "koap", "preset": preset}, 2, 2, labelled)
+    controller = controller_of("koap", labelled, preset=preset)
     fit_closed_form(controller, labelled)
     bias = controller.action_decoder.linear.bias
     assert (bias == 0).all() == through_zero
@@ -109,7 +109,7 @@ def test_labels_that_see_no_look_ahead_are_an_error():
     labelled["has_action"] = torch.zeros_like(labelled["has_action"])
     labelled["has_action"][-1] = True
     labelled["action"] = torch.where(labelled["has_action"], data["action"], torch.nan)
-    controller = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
+    controller = controller_of("koap", labelled)
     with pytest.raises(ValueError, match="no labelled frame"):
         fit_closed_form(controller, labelled)
 
@@ -119,7 +119,7 @@ def test_keys_of_the_controller_and_no_normalizer_of_actions():
     fits = []
     for keys in ({}, {"state": "frames", "action": ("robot", "u")}):
         torch.manual_seed(0)
-        controller = build_controller({"method": "koap", "preset": "default"}, 2, 2, labelled)
+        controller = controller_of("koap", labelled)
         controller.action_normalizer = None
         controller.set_keys(**keys)
         fit_closed_form(controller, labelled)

@@ -3,12 +3,12 @@
 
 import pytest
 import torch
+from small_controllers import controller_of
 from tensordict import TensorDict
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories
 from torchrl_koap.modules import CommandDecoder
 from torchrl_koap.tasks import get_task
-from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.command_model import (
     LABEL_COMMAND,
     build_decoder,
@@ -94,10 +94,9 @@ def test_columns_of_tasks():
 
 def test_tasks_whose_actions_are_commands_are_refused():
     with pytest.raises(ValueError, match="scooping"):
-        resolve(TrainConfig(out="", task="scooping", method="command_regression"), get_task("scooping"))
+        controller_of("command_regression", task=get_task("scooping"))
 
 
-def test_a_run_says_what_its_decoder_reads():
-    resolved = resolve(TrainConfig(out="", method="command_regression"), get_task("avoiding"))
-    assert resolved.controller["columns"]["commands"] == [0, 1]
-    assert resolved.controller["columns"]["actions"] == [0, 1]
+def test_a_method_builds_the_decoder_of_its_task():
+    decoder = controller_of("command_regression")
+    assert decoder.commands == [0, 1] and decoder.actions == [0, 1]

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import pytest
 import torch
+from small_controllers import controller_of, plain_task
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, make_window_buffer, select_state
+from torchrl_koap.modules import VariationalInverseDynamics
 from torchrl_koap.tasks import WINDOW
-from torchrl_koap.training.builders import build_controller
 from torchrl_koap.training.methods import METHODS, get_method
 
-CONTROLLERS = [name for name, method in METHODS.items() if method.has_planner and not method.fit]
+CONTROLLERS = [name for name, method in METHODS.items() if method.plans and method.fit is None]
 
 
 @pytest.fixture(scope="module")
@@ -24,8 +25,7 @@ def data():
 
 def make(name, data):
     torch.manual_seed(0)
-    options = {"method": name, "preset": "default"}
-    return build_controller(options, 3, 2, data)
+    return controller_of(name, data, task=plain_task(3, 2))
 
 
 def same(first, second):
@@ -37,20 +37,17 @@ def same(first, second):
 def test_an_entry_holds_together(name):
     method = METHODS[name]
     assert method.title and len({other.title for other in METHODS.values()}) == len(METHODS)
-    assert method.name == name and method.has_planner == (method.kind == "controller")
-    assert method.has_planner or not (method.closed_form or method.labelled_only)
-    assert not method.teacher or METHODS[method.teacher].has_planner
-    if method.has_planner:
+    assert method.name == name
+    assert method.plans or not method.closed_form
+    assert not method.teacher or METHODS[method.teacher].plans
+    if method.plans:
         # every method has at most one controller's budget of updates, whatever it does with it
         assert sum(phase.share for phase in method.phases) == (1 if method.phases else 0)
-        assert bool(method.phases) or method.closed_form or method.fit
+        assert bool(method.phases) or method.closed_form or method.fit is not None
         assert len({phase.name for phase in method.phases}) == len(method.phases)
     assert {phase.windows for phase in method.phases} <= {"all", "mixed", "labelled"}
-    if method.labelled_only:
+    if method.sees == "labelled":
         assert {phase.windows for phase in method.phases} == {"labelled"}
-    if method.other_decoder:
-        other = METHODS[method.other_decoder]
-        assert other.closed_form != method.closed_form and METHODS[other.other_decoder] is method
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
@@ -85,24 +82,17 @@ def test_statistics_are_those_of_what_a_method_may_see(name, data):
     assert all(same(clean[key], poisoned[key]) for key in clean)
     changed = [key for key in clean if not same(clean[key], shifted[key])]
     assert not any(key.startswith("action_normalizer") for key in changed)
-    if METHODS[name].labelled_only:
+    if METHODS[name].sees == "labelled":
         assert not changed
     elif "state_normalizer.offset" in clean:
         assert "state_normalizer.offset" in changed
 
 
-def test_unknown_methods_and_decoders_are_answered():
+def test_unknown_methods_are_answered():
     with pytest.raises(ValueError, match="unknown method 'linaer'; did you mean 'linear'?"):
         get_method("linaer")
-    with pytest.raises(ValueError, match="unknown decoder 'rigde'; did you mean 'ridge'?"):
-        get_method("koap", "rigde")
-    with pytest.raises(ValueError, match="the decoder of method 'linear' is a closed form: it has no decoder 'sgd'"):
-        get_method("linear", "sgd")
-    with pytest.raises(ValueError, match="the decoder of method 'dd' is trained by gradients: it has no decoder"):
-        get_method("dd", "ridge")
 
 
-def test_the_other_decoder_is_another_entry():
-    assert get_method("koap", "ridge") is METHODS["koap"]
-    assert get_method("koap", "sgd") is get_method("koap_sgd") is METHODS["koap_sgd"]
-    assert get_method("koap_sgd", "ridge") is METHODS["koap"]
+def test_the_auto_encoder_reads_the_window_that_policies_hand_it():
+    model = controller_of("vae")
+    assert isinstance(model, VariationalInverseDynamics) and model.num_window_frames == 16

@@ -5,11 +5,11 @@ import math
 
 import pytest
 import torch
+from small_controllers import controller_of
 from tensordict import TensorDict
 
 from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Action, Task, get_task
-from torchrl_koap.training import TrainConfig, resolve
 from torchrl_koap.training.response import fit_response, labelled_steps, tracked_columns
 
 
@@ -127,4 +127,4 @@ def test_a_task_without_commands_is_refused_before_any_work():
         name="arm", observation_parts={"joints": 2}, actions={"a": Action("rad"), "b": Action("rad")}, position="joints"
     )
     with pytest.raises(ValueError, match=r"task 'arm' .* repeats the last command \(Task.command\)"):
-        resolve(TrainConfig(out="", method="mpc"), task)
+        controller_of("mpc", task=task)

@@ -17,13 +17,12 @@ import torch
 import tyro
 
 from torchrl_koap.commands.command import Command
-from torchrl_koap.evaluation import load_run
 from torchrl_koap.runs.device import has_bfloat16_units
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.training.digests import DIGESTS
+from torchrl_koap.training import Trained
 
-_LATER = (DIGESTS, "eval.json", "inspect.json", "suggestions.json")  # files that a run may have
+_LATER = ("eval.json", "inspect.json", "suggestions.json")  # files that a run may have
 
 
 @dataclass(kw_only=True)
@@ -74,7 +73,7 @@ def machine_facts() -> dict[str, str]:
 
 
 def check_run(folder: Path) -> dict[str, str]:
-    """Reads every file of a run that a command would read, and compares those that have checksums with them.
+    """Reads every file of a run that a command would read, checksums included.
 
     Args:
         folder (Path): run directory.
@@ -93,7 +92,7 @@ def check_run(folder: Path) -> dict[str, str]:
         found[name] = "readable"
         problems += problem
     if not problems:  # its networks are made of what config.json says
-        problems += _problem(lambda: load_run(folder))
+        problems += _problem(lambda: Trained.load(folder))
     problems += _problem(run.read_metrics)
     for path in sorted([*folder.glob("*.safetensors"), *folder.glob("checkpoints/*.safetensors")]):
         problems += _problem(functools.partial(load_tensors, path))
@@ -101,7 +100,6 @@ def check_run(folder: Path) -> dict[str, str]:
     if problems:
         said = "; ".join(dict.fromkeys(problems))
         raise RunDirectoryError(f"{folder}: {len(dict.fromkeys(problems))} problem(s): {said}")
-    found["checksums"] = "as the training left it" if (folder / DIGESTS).exists() else "none were kept (an older run)"
     return found | {"verdict": "no problem found"}
 
 

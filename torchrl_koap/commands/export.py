@@ -10,7 +10,7 @@ from typing import Any
 import tyro
 
 from torchrl_koap.commands.command import Command
-from torchrl_koap.evaluation import load_policy, load_run
+from torchrl_koap.evaluation import load_policy
 from torchrl_koap.evaluation.latency import time_calls
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import InverseDynamicsFollower
@@ -18,6 +18,7 @@ from torchrl_koap.modules.execution.export import PARTS, SUFFIXES, export_part, 
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import progress_bar
+from torchrl_koap.training import Trained
 
 
 @dataclass(kw_only=True)
@@ -42,7 +43,7 @@ class Export(Command):
         """Exports, compares, times."""
         suffix = lookup(SUFFIXES, self.format, "export format")
         set_up_torch(self.threads, "cpu")
-        trained = load_run(self.run)
+        trained = Trained.load(self.run)
         policy = load_policy(trained)
         out = writable_folder(self.run) / "exported" if self.out is None else self.out
         out.mkdir(parents=True, exist_ok=True)

@@ -3,11 +3,38 @@
 
 from __future__ import annotations
 
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from torchrl_koap.commands.command import Command, Options, as_typed
+from torchrl_koap.files import read_bytes
+from torchrl_koap.runs.config_files import FACTS, from_json
+from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.training import TrainConfig, train
+
+# short names of the options that most calls need: option, what follows, help
+SHORT: dict[str, tuple[str, str, str]] = {
+    "--dataset": ("--dataset", "DIR", "folder with demonstrations, such as `koap demos --out DIR` records"),
+    "--out": ("--out", "DIR", "run directory to write"),
+    "--task": ("--task", "NAME", "name of the task (default: that of the data set)"),
+    "--method": ("--method", "NAME", "koap, linear, dd, dp, mpc, ... (default: the task's)"),
+    "--labels": ("--labels", "NUMBER", "labels that may be seen: 5 trajectories, or 0.02 of them (default: all)"),
+    "--preset": ("--controller.preset", "NAME", "variant of KOAP: default, semi_supervised or paper"),
+    "--steps": ("--planner.steps", "N", "updates of the planner (default: the task's)"),
+    "--strategy": ("--execution.strategy", "NAME", "how plans become actions: feedback or open_loop"),
+    "--seed": ("--run.seed", "N", "of label choice, initialisation and batches"),
+    "--device": ("--run.device", "NAME", "cpu or cuda"),
+    "--threads": ("--run.threads", "N", "torch threads"),
+    "--resume": ("--run.resume", "", "go on with an interrupted run"),
+    "--logger": ("--run.logger", "NAME", "csv, wandb or tensorboard"),
+    "--plugin": ("--run.plugin", "NAME", "module that registers tasks or methods"),
+    "--config": ("--config", "FILE", "JSON file of options in the same sections; options of the call win"),
+}
 
 
 @dataclass(kw_only=True)
@@ -20,6 +47,102 @@ class Train(Command):
 
     config: Options[TrainConfig]
 
-    def __call__(self) -> dict[str, Any]:
+    def __call__(self) -> Mapping[str, Any]:
         """Trains."""
-        return train(self.config, command=as_typed())
+        return train(self.config, command=as_typed()).results
+
+
+def expand(words: Sequence[str]) -> list[str]:
+    """Replaces short options by those that they stand for, and ``--config FILE`` by the options in the file.
+
+    Args:
+        words (sequence of str): what follows ``koap train``.
+
+    Raises:
+        RunDirectoryError: if the file is not there, or holds other things than options.
+        ValueError: if ``--labels`` is no number.
+
+    Examples:
+        >>> from torchrl_koap.commands.train import expand
+        >>> expand(["--steps", "20", "--labels", "0.02", "--seed=3"])
+        ['--planner.steps', '20', '--labels.fraction', '0.02', '--run.seed=3']
+    """
+    found: list[str] = []
+    from_file: list[str] = []
+    rest = iter(words)
+    for word in rest:
+        name, equals, value = word.partition("=")
+        name = name.replace("_", "-")
+        if name == "--help-all":
+            found.append("--help")
+        elif name == "--no-resume":
+            found.append("--run.no-resume")
+        elif name in ("--labels", "--config"):
+            value = value if equals else next(rest, "")
+            if name == "--config":
+                from_file += _words_of(Path(value), {"labels"} if "--labels" in words else set())
+            else:
+                found += [f"--labels.{_kind_of(value)}", value]
+        elif name in SHORT:
+            found.append(SHORT[name][0] + equals + value)
+        else:
+            found.append(word)
+    return [*from_file, *found]
+
+
+def _kind_of(labels: str) -> str:
+    try:
+        int(labels)
+        return "count"
+    except ValueError:
+        pass
+    try:
+        float(labels)
+        return "fraction"
+    except ValueError:
+        raise ValueError(
+            f"--labels must be a number of trajectories such as 5, or a share such as 0.02, got {labels!r}"
+        ) from None
+
+
+def _words_of(path: Path, without: set[str]) -> list[str]:
+    """The options in a file as words of a command line."""
+    try:
+        content = json.loads(read_bytes(path).decode())
+    except (ValueError, OSError) as error:
+        raise RunDirectoryError(f"{path} cannot be read: {error}") from error
+    if not isinstance(content, dict):
+        raise RunDirectoryError(f"{path} is no file of options: wanted an object, got {type(content).__name__}")
+    options = {name: value for name, value in content.items() if name not in FACTS and name not in without}
+    from_json(TrainConfig, {"out": ""} | options, path)
+    return list(_flat(options))
+
+
+def _flat(options: Mapping[str, Any], prefix: str = "--") -> Iterator[str]:
+    for name, value in options.items():
+        name = name.replace("_", "-")
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, bool):
+            yield f"{prefix}{name}" if value else f"{prefix}no-{name}"
+        elif isinstance(value, list):
+            if name == "plugins":
+                yield from (word for plugin in value for word in (f"{prefix}plugin", plugin))
+            elif value:
+                yield from (f"{prefix}{name}", *map(str, value))
+        elif value is not None:
+            yield from (f"{prefix}{name}", str(value))
+
+
+def show_help() -> None:
+    """Prints the options that most calls need, and leaves."""
+    page = argparse.ArgumentParser(
+        prog="koap train",
+        usage="koap train --dataset DIR --out DIR [options]",
+        description="Train planner and controller on demonstrations of which few have action labels. `koap train"
+        " --help-all` shows every option, by section.",
+    )
+    for name, (_, kind, about) in SHORT.items():
+        page.add_argument(name, help=about, **({"metavar": kind} if kind else {"action": "store_true"}))
+    page.print_help()
+    sys.exit(0)

@@ -20,12 +20,11 @@ from torch import Tensor
 
 from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation.latent_space import infer_steps
-from torchrl_koap.evaluation.trained_run import load_run
-from torchrl_koap.evaluation.training_data import hide_labels_again, load_training_data
 from torchrl_koap.keys import EPISODE, HAS_ACTION
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.training.trained import Trained
 
 _FEW = 5  # suggestions that are made unasked
 _MEAN_SPREAD = 30.0  # prior deviation of a fitted mean against that of what the latent actions explain: nearly free
@@ -196,7 +195,7 @@ class SuggestedLabels:
         >>> from torchrl_koap.evaluation.active_labelling import SuggestedLabels
         >>> row = {"rank": 1, "episode": 57, "steps": 120, "score": 0.31}
         >>> print(str(SuggestedLabels(0.1, 80, [3], [row])).splitlines()[-1])
-        with these labelled: koap train --label-episodes 3 57 ...
+        with these labelled: koap train --labels.episodes 3 57 ...
     """
 
     penalty: float
@@ -210,7 +209,7 @@ class SuggestedLabels:
         for row in self.suggestions:
             lines.append(f"{row['rank']:>4}  {row['episode']:>7}  {row['steps']:>5}  {row['score']:>10.4g}")
         every = [*self.labelled_episodes, *(row["episode"] for row in self.suggestions)]
-        words = ["koap", "train", *self.data, "--label-episodes", *map(str, every)]
+        words = ["koap", "train", *self.data, "--labels.episodes", *map(str, every)]
         lines.append(f"with these labelled: {shlex.join(words)} ...")
         return "\n".join(lines)
 
@@ -249,21 +248,20 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
     config = SuggestConfig() if config is None else config
     set_up_torch(config.threads, "cpu")
     load_plugins(config.plugins)
-    trained = load_run(run)
-    directory, task, controller = trained.directory, trained.task, trained.controller
+    trained = Trained.load(run)
+    task, controller = trained.task, trained.controller
     if not isinstance(controller, KoopmanInverseDynamics):
-        method = directory.read_entry("config.json", "method")
         raise ValueError(
-            f"{directory.path} was trained with method {method!r}: suggestions need latent actions, method 'koap'"
+            f"{trained.folder} was trained with method {trained.config.method!r}: suggestions need latent actions,"
+            " method 'koap'"
         )
-    penalty = directory.read_entry("summary.json", "decoder_fit").get("penalty")
+    penalty = trained.results.get("decoder_fit", {}).get("penalty")
     if penalty is None:
         raise ValueError(
-            f"the decoder of {directory.path} was not fitted in closed form and knows no uncertainty:"
-            " train with `--decoder ridge`"
+            f"the decoder of {trained.folder} was not fitted in closed form and knows no uncertainty:"
+            " train with `--method koap`"
         )
-    data = load_training_data(trained, config.dataset)
-    data, report = hide_labels_again(trained, data, config.dataset)
+    data, report = trained.hide_labels(trained.data(config.dataset))
     steps = infer_steps(controller, controller_view(data, trained.columns, action_targets=task.targets))
     left = int(steps[EPISODE][~steps[HAS_ACTION]].unique().numel())
     count = max(1, min(_FEW, left)) if config.count is None else config.count
@@ -286,5 +284,5 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
         for rank, choice in enumerate(choices, 1)
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()
-    again = ["--task", task.name, "--dataset", config.dataset or trained.config["dataset"]]
+    again = ["--task", task.name, "--dataset", config.dataset or trained.config.dataset]
     return SuggestedLabels(penalty, report.labelled_transitions, labelled, rows, again)

@@ -13,15 +13,17 @@ from torchrl_koap.evaluation.config import EvalConfig, check_options
 from torchrl_koap.evaluation.environments import choose_contexts, environment_of
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.offline import evaluate_offline
+from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
-from torchrl_koap.evaluation.trained_run import TrainedRun, load_run, trained_policy
 from torchrl_koap.modules import ExecutionConfig
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import count_up_to, progress_bar
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import save_tensors
+from torchrl_koap.training.trained import Trained
 
 
 def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any]:
@@ -40,19 +42,20 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
 
     Raises:
         ValueError: for unknown options or fewer than one episode.
-        RunDirectoryError, CheckpointError, PluginError: as :func:`load_run`.
+        RunDirectoryError, CheckpointError, PluginError: as :meth:`Trained.load`.
 
     Examples:
         >>> import tempfile
         >>> from pathlib import Path
         >>> import numpy as np
-        >>> from torchrl_koap import EvalConfig, TrainConfig, evaluate, train
+        >>> from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig, TrainConfig, evaluate, train
         >>> from torchrl_koap.data import save_demonstrations
         >>> states = [np.random.default_rng(i).normal(size=(30, 4)).cumsum(0) for i in range(6)]
         >>> actions = [np.diff(frames[:, :2], axis=0) if i < 2 else None for i, frames in enumerate(states)]
         >>> with tempfile.TemporaryDirectory() as root:
         ...     arm = save_demonstrations(root + "/arm", states, actions, control_hz=30, robot=[0, 1])
-        ...     _ = train(TrainConfig(dataset=str(arm), out=Path(root) / "run", steps=2, controller_steps=2, threads=1))
+        ...     few = {"planner": PlannerConfig(steps=2), "controller": ControllerConfig(steps=2)}
+        ...     _ = train(TrainConfig(dataset=str(arm), out=Path(root) / "run", **few))
         ...     scores = evaluate(root + "/run", EvalConfig(samples=2, threads=1))
         >>> scores["kind"], scores["relative_plan_error"] > 0  # without an environment: on recorded data
         ('offline', True)
@@ -61,8 +64,9 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     check_options(config)
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
-    trained = load_run(_folder(run, config), task=config.task)
-    directory, task = trained.directory, trained.task
+    trained = Trained.load(_folder(run, config))
+    _check_task(trained.folder, trained.task.name, config)
+    directory, task = RunDirectory(trained.folder), trained.task
     if task.env is None and config.env is None:
         return _judge_offline(trained, config)
     if config.execution.strategy == "oracle" and config.env is not None:
@@ -121,16 +125,21 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
 def _folder(run: str | Path, config: EvalConfig) -> Path:
     """The folder to evaluate in: the run's own, or a copy of what it is made of."""
     if config.out is not None and config.task is not None:  # before anything is copied
-        load_run(run, task=config.task)
+        _check_task(run, Trained.load(run).task.name, config)
     return writable_folder(run, config.out)
 
 
-def _judge_offline(trained: TrainedRun, config: EvalConfig) -> dict[str, Any]:
+def _check_task(run: str | Path, name: str, config: EvalConfig) -> None:
+    if config.task not in (None, name):
+        raise RunDirectoryError(f"{run} was trained on task {name!r}, not on {config.task!r}")
+
+
+def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
     """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
     choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
     policy = trained_policy(trained, config.execution)
     result = evaluate_offline(trained, dataset=config.dataset, samples=config.samples, seed=config.seed)
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
     result["seed"] = config.seed
-    trained.directory.write_json("eval.json", result)
+    RunDirectory(trained.folder).write_json("eval.json", result)
     return result

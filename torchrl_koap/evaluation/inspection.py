@@ -25,10 +25,9 @@ from torchrl_koap.evaluation.diagnosis import (
 from torchrl_koap.evaluation.environments import choose_contexts
 from torchrl_koap.evaluation.findings import NEAR, describe_inspection
 from torchrl_koap.evaluation.latent_space import analyse_latent
+from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out
 from torchrl_koap.evaluation.statistics import rate
-from torchrl_koap.evaluation.trained_run import TrainedRun, load_run, trained_policy
-from torchrl_koap.evaluation.training_data import load_training_data
 from torchrl_koap.modules import ExecutionConfig, KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins, load_plugins
@@ -36,6 +35,8 @@ from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import Task
+from torchrl_koap.training.datasets import label_budget
+from torchrl_koap.training.trained import Trained
 
 
 @dataclass
@@ -139,7 +140,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
         raise ValueError(f"seed must be >= 0, got {config.seed}")
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
-    trained = load_run(run)
+    trained = Trained.load(run)
     task = trained.task
     if task.env is None and not config.latent_only:
         raise ValueError(
@@ -147,14 +148,13 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
             " `koap eval` judges plans and actions on recorded data"
         )
     folder = writable_folder(run) if config.out is None else None  # refused before anything is read
-    dataset = config.dataset or trained.directory.read_entry("config.json", "dataset")
-    data = load_training_data(trained, dataset)
+    data = trained.data(config.dataset)
     directory = RunDirectory(folder or writable_folder(run, config.out))
     if config.latent_only:  # what earlier experiments found stays
         earlier = directory.read_json("inspect.json") if (directory.path / "inspect.json").exists() else {}
         result = {name: value for name, value in earlier.items() if name != "findings"}
     elif trained.planner is None:
-        method = directory.read_entry("config.json", "method")
+        method = trained.config.method
         raise ValueError(f"method {method!r} is a policy of its own: there are no planner and controller to tell apart")
     else:
         result = _experiments(config, trained, data)
@@ -164,7 +164,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
     return Inspection(result, task, None if koopman is None else koopman.operator.eigenvalues(), directory.path)
 
 
-def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBase) -> dict[str, Any]:
+def _experiments(config: InspectConfig, trained: Trained, data: TensorDictBase) -> dict[str, Any]:
     task = trained.task
     planner = trained.planner.to(config.device)
     policy = trained_policy(trained, config.execution).to(config.device)
@@ -199,15 +199,14 @@ def _experiments(config: InspectConfig, trained: TrainedRun, data: TensorDictBas
     }
 
 
-def _look_into(config: InspectConfig, trained: TrainedRun, data: TensorDictBase) -> dict[str, Any]:
+def _look_into(config: InspectConfig, trained: Trained, data: TensorDictBase) -> dict[str, Any]:
     """What :func:`analyse_latent` finds, or a note for methods without latent actions."""
     controller, task = trained.controller.cpu(), trained.task
     if not isinstance(controller, KoopmanInverseDynamics):
-        method = trained.directory.read_entry("config.json", "method")
-        return {"note": f"method {method!r} has no latent actions to look into"}
+        return {"note": f"method {trained.config.method!r} has no latent actions to look into"}
     labelled = torch.zeros(len(data), dtype=torch.bool)
     if config.dataset is None:
-        labelled = trained.budget.apply(data)[0]["has_action"].squeeze(-1)
+        labelled = label_budget(trained.config).apply(data)[0]["has_action"].squeeze(-1)
     columns = trained.columns
     parts = {
         name: [place for place, column in enumerate(columns) if part.start <= column < part.stop]

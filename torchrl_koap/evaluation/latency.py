@@ -16,12 +16,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_koap.evaluation.policies import load_policy
 from torchrl_koap.evaluation.rollouts import device_of
-from torchrl_koap.evaluation.trained_run import load_policy, load_run
 from torchrl_koap.keys import ACTION
 from torchrl_koap.modules import Agent, AsynchronousAgent, PlanningPolicy
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import Plugins, load_plugins
+from torchrl_koap.training.trained import Trained
 
 
 @dataclass
@@ -108,7 +109,7 @@ def measure_control_loop(run: str | Path, config: LatencyConfig | None = None) -
         raise ValueError(f"steps must be >= 1, got {config.steps}")
     set_up_torch(config.threads, "cpu")
     load_plugins(config.plugins)
-    trained = load_run(run)
+    trained = Trained.load(run)
     rate = trained.task.control_hz if config.control_hz is None else config.control_hz
     policy = load_policy(trained)
     if config.async_replan:

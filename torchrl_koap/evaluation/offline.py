@@ -13,11 +13,10 @@ from torchrl_koap.data import controller_view
 from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chunks, errors_outside_budget
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.plan_errors import plan_errors
-from torchrl_koap.evaluation.training_data import hide_labels_again, load_training_data
 from torchrl_koap.tasks.units import thousandths
 
 if TYPE_CHECKING:
-    from torchrl_koap.evaluation.trained_run import TrainedRun
+    from torchrl_koap.training.trained import Trained
 
 KIND = "offline"
 SPLITS = ("outside_budget", "left_out")
@@ -25,7 +24,7 @@ _CHUNKS = ("policy", "mean_action")
 
 
 def evaluate_offline(
-    trained: TrainedRun, *, dataset: str | None = None, samples: int = 16, plans: int = 500, seed: int = 0
+    trained: Trained, *, dataset: str | None = None, samples: int = 16, plans: int = 500, seed: int = 0
 ) -> dict[str, Any]:
     """Judges a run on recorded data.
 
@@ -35,7 +34,7 @@ def evaluate_offline(
     (:mod:`~torchrl_koap.evaluation.action_errors`). A policy of its own samples chunks of actions outside the budget.
 
     Args:
-        trained (TrainedRun): the run.
+        trained (Trained): the run.
 
     Keyword Args:
         dataset (str, optional): where its data set is now. Default: where it was.
@@ -51,8 +50,8 @@ def evaluate_offline(
     Raises:
         RunDirectoryError: if the data set has moved, or is another one.
     """
-    data = load_training_data(trained, dataset)
-    labelled, _ = hide_labels_again(trained, data, dataset)
+    data = trained.data(dataset)
+    labelled, _ = trained.hide_labels(data)
     plan = _plans(trained, data, samples=samples, plans=plans, seed=seed)
     action = _actions(trained, data, labelled, samples=samples, chunks=plans, seed=seed)
     split = next((name for name in SPLITS if "relative" in action[name]), None)
@@ -68,24 +67,21 @@ def evaluate_offline(
     }
 
 
-def _plans(trained: TrainedRun, data: TensorDictBase, **options: Any) -> dict[str, Any]:
+def _plans(trained: Trained, data: TensorDictBase, **options: Any) -> dict[str, Any]:
     if trained.planner is None:
-        return {"note": f"method {trained.config['method']!r} is a policy of its own: it makes no plans"}
-    held_out = trained.config.get("validation_episodes") or []
-    if not held_out:
-        return {
-            "note": "no trajectory was held out from the planner (--validation-fraction; two trajectories at least)"
-        }
-    unseen = data[torch.isin(data["episode"], torch.tensor(held_out))]
-    return {"trajectories": len(held_out)} | plan_errors(trained.planner, unseen, trained.task, **options)
+        return {"note": f"method {trained.config.method!r} is a policy of its own: it makes no plans"}
+    if not trained.held_out:
+        return {"note": "no trajectory was held out from the planner (--planner.held-out; two trajectories at least)"}
+    unseen = data[torch.isin(data["episode"], torch.tensor(trained.held_out))]
+    return {"trajectories": len(trained.held_out)} | plan_errors(trained.planner, unseen, trained.task, **options)
 
 
-def _actions(trained: TrainedRun, data: TensorDictBase, labelled: TensorDictBase, **options: Any) -> dict[str, Any]:
+def _actions(trained: Trained, data: TensorDictBase, labelled: TensorDictBase, **options: Any) -> dict[str, Any]:
     task = trained.task
     if trained.planner is None:
         outside = errors_of_chunks(trained.controller, data, labelled, task, **options)
-        note = f"method {trained.config['method']!r} would have to be trained again without each trajectory"
-        hint = "; train it on fewer labels than there are (--label-count): the others tell how good it is"
+        note = f"method {trained.config.method!r} would have to be trained again without each trajectory"
+        hint = "; train it on fewer labels than there are (--labels): the others tell how good it is"
         return {"outside_budget": outside, "left_out": {"note": note + (hint if "note" in outside else "")}}
     if trained.method.fit is not None:
         note = {"note": "the controller decodes no recorded states: it follows plans by the command that it gave"}

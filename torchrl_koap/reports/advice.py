@@ -72,7 +72,7 @@ def planner_fails(run: RunFacts) -> Advice | None:
         return None
     return Advice(
         f"plans that come true reach the goal in {_percent(planner)} only: the planner is what fails, not the labels",
-        "more updates (--steps), more demonstrations, or a wide MLP (--denoiser mlp); more labels will not help",
+        "more updates (--steps), more demonstrations, or a wide MLP (--planner.network mlp); more labels will not help",
     )
 
 

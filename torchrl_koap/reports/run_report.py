@@ -98,7 +98,12 @@ def write_report(
 
 
 def _subtitle(run: RunFacts) -> str:
-    shown = [f"{key} {run.config[key]}" for key in ("preset", "dataset", "seed") if _given(run.config, key)]
+    shown = []
+    for option in ("controller.preset", "dataset", "run.seed"):
+        section, _, name = option.rpartition(".")
+        options = run.config.get(section) if section else run.config
+        if isinstance(options, Mapping) and _given(options, name):
+            shown.append(f"{name} {options[name]}")
     return " · ".join([str(run.folder), *shown])
 
 

@@ -1,114 +1,219 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a training is asked to do."""
+"""The options of a training, in sections; ``config.json`` of a run holds the same with every default filled in."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules.execution.execution import ExecutionConfig
+from torchrl_koap.runs.device import PRECISIONS
 from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.runs.pretrained import find_run
+from torchrl_koap.runs.progress import LOGGERS
+from torchrl_koap.tasks import HISTORY
+
+COLUMNS = ("robot", "all")
+UNITS = ("trajectory", "window", "transition")
 
 
-@dataclass
+@dataclass(frozen=True)
+class LabelConfig:
+    """Which labels of the data may be seen; by default all that there are.
+
+    Attributes:
+        fraction: share of the units that keep their actions.
+        count: number of them instead of a share.
+        episodes: these trajectories instead of a random choice, as `koap suggest` names them.
+        unit: what is drawn: "trajectory", "window" (the unit of the first public code) or "transition".
+        trajectories: share of the trajectories that are used at all; those with labels come first.
+
+    Raises:
+        ValueError: for a number out of range, or two ways to choose at once.
+
+    Examples:
+        >>> from torchrl_koap import LabelConfig
+        >>> LabelConfig(count=5).unit
+        'trajectory'
+    """
+
+    fraction: float | None = None
+    count: int | None = None
+    episodes: tuple[int, ...] = ()
+    unit: str = "trajectory"
+    trajectories: float = 1.0
+
+    def __post_init__(self):
+        lookup(UNITS, self.unit, "unit of labels")
+        _check("labels", self, fraction=(0, 1, False, True), count=(1, None), trajectories=(0, 1, False, True))
+        asked = [name for name in ("fraction", "count") if getattr(self, name) is not None]
+        asked += ["episodes"] if self.episodes else []
+        if len(asked) > 1:
+            raise ValueError(f"labels: give one of fraction, count and episodes, got {' and '.join(asked)}")
+        if self.episodes and self.unit != "trajectory":
+            raise ValueError(f"labels.episodes are trajectories of your own choice: no labels.unit {self.unit!r}")
+        if len(set(self.episodes)) < len(self.episodes):
+            raise ValueError(f"labels.episodes must be different numbers, got {list(self.episodes)}")
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """The planner: its network and its training. None: the task's default, else the network's.
+
+    Attributes:
+        steps: updates.
+        network: "unet" or "mlp".
+        width: channels of the first level of "unet" (the second has twice as many), or hidden width of "mlp".
+        batch_size: windows per update.
+        learning_rate: peak learning rate.
+        frames: frames that it sees, 1 or 2.
+        held_out: share of the trajectories that it never sees, those without labels first, for `koap eval` to evaluate
+            its plans on (default: 0.1 for a task without an environment, else 0).
+        source: run whose planner is taken over instead of training one, or pretrained:NAME.
+
+    Raises:
+        ValueError: for a number out of range.
+
+    Examples:
+        >>> from torchrl_koap import PlannerConfig
+        >>> PlannerConfig(steps=2, width=8).network is None
+        True
+    """
+
+    steps: int | None = None
+    network: str | None = None
+    width: int | None = None
+    batch_size: int | None = None
+    learning_rate: float | None = None
+    frames: int | None = None
+    held_out: float | None = None
+    source: Path | None = None
+
+    def __post_init__(self):
+        _check("planner", self, steps=(1, None), width=(1, None), batch_size=(1, None), frames=(1, HISTORY))
+        _check("planner", self, learning_rate=(0, None, False), held_out=(0, 1, True, False))
+        if self.source is not None:
+            object.__setattr__(self, "source", find_run(self.source))
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """The controller, which turns states into actions. None: the method's default, else the task's.
+
+    Attributes:
+        preset: variant of KOAP: "default", "semi_supervised" or "paper".
+        steps: updates (default: 500); with 0 only a closed form is fitted.
+        columns: what it reads: "robot" (the robot's own columns) or "all" (KOAP's configurations).
+
+    Raises:
+        ValueError: for a number out of range.
+
+    Examples:
+        >>> from torchrl_koap import ControllerConfig
+        >>> ControllerConfig(steps=0).columns is None
+        True
+    """
+
+    preset: str | None = None
+    steps: int | None = None
+    columns: str | None = None
+
+    def __post_init__(self):
+        _check("controller", self, steps=(0, None))
+        if self.columns is not None:
+            lookup(COLUMNS, self.columns, "controller.columns")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """The process of a training: seed, machine, log.
+
+    Attributes:
+        seed: seed of label choice, initialisation and batches.
+        threads: torch threads.
+        device: "cpu" or "cuda".
+        precision: "float32", "bfloat16" for the matrix products of the planner's training, several times quicker where
+            the processor has units for them and many times slower where not, or "auto", which looks.
+        logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise) or
+            "tensorboard".
+        resume: go on with an interrupted run; options left at their defaults are those it was started with.
+        plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
+            reads the run.
+
+    Raises:
+        ValueError: for a number out of range, or an unknown precision or logger.
+
+    Examples:
+        >>> from torchrl_koap import RunConfig
+        >>> RunConfig(seed=3).device
+        'cpu'
+    """
+
+    seed: int = 0
+    threads: int = 1
+    device: str = "cpu"
+    precision: str = "float32"
+    logger: str = "csv"
+    resume: bool = False
+    plugins: Plugins = ()
+
+    def __post_init__(self):
+        _check("run", self, seed=(0, None), threads=(1, None))
+        lookup(PRECISIONS, self.precision, "precision")
+        lookup(LOGGERS, self.logger, "logger")
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Train planner and controller on demonstrations of which few have action labels.
 
     Attributes:
-        out: run directory to write.
-        task: name of the task (default: that of the data set, if it says so; else "avoiding").
-        dataset: "scripted", or a folder: written by `koap demos`, `koap convert` or save_demonstrations, of D3IL raw
+        dataset: folder with demonstrations: of `koap demos`, `koap convert` or save_demonstrations, of D3IL raw
             pickles, or a LeRobot data set.
-        label_fraction: share of the trajectories, windows or transitions that keep their actions (default: 0.02; all
-            labels that there are, where data lack some or the task has no environment).
-        label_count: number of them instead of a share.
-        label_episodes: these trajectories instead of a random choice, as `koap suggest` names them.
-        label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
-        seed: seed of label choice, initialisation and batches.
-        observation_fraction: share of the trajectories that are used at all; those with labels come first.
-        validation_fraction: share of the trajectories that the planner never sees, those without labels first, for
-            `koap eval` to judge its plans by (default: 0.1 for a task without an environment, else none).
-        method: "koap", "mpc" (model predictive control), "linear" (ridge on raw frames), "dd" (supervised
-            inverse dynamics), "dp" (Diffusion Policy), or another name in torchrl_koap.training.methods.METHODS, those
-            that plugins register included (default: that of the task).
-        preset: variant of KOAP: "default", "absolute", "semi_supervised" or "paper" (default: the
-            task's for its own method, else the method's).
-        koopman_coeff: weight of the Koopman term in the loss, for methods that have one (default: 1).
-        action_coeff: weight of the action term, for methods whose action decoder is trained with the rest (default: 1).
-        decoder: "ridge" (closed form on frozen latent actions) or "sgd" (trained with the rest); default: the method's.
-        steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
-        controller_steps: controller updates.
-        batch_size: windows per planner update (default: the denoiser's, 128 for "unet" and 512 for "mlp").
-        controller_batch_size: windows per controller update.
-        planner_learning_rate: peak learning rate of the planner (default: the denoiser's, 3e-3 and 1e-3).
-        controller_learning_rate: peak learning rate of the controller.
-        denoiser: "unet" or "mlp" (default: the task's, else "unet").
-        denoiser_width: hidden width of "mlp" (default: 512).
-        precision: "float32", "bfloat16" for the matrix products of the planner's training, several times quicker where
-            the processor has units for them and many times slower where not, or "auto", which looks (default: float32).
-        candidates: plans sampled whenever one is due at evaluation, unless told otherwise there (default: 1).
-        channels: widths of the U-Net's levels (default: the task's).
-        observed_frames: frames that the planner sees, 1 or 2 (default: the task's).
-        controller_state: what the controller reads, "robot" (the robot's own columns) or "all" (KOAP's configurations).
-        planner_from: run directory whose planner is taken over instead of training one, or pretrained:NAME.
-        episodes: number of scripted demonstrations (default: that of the task).
-        threads: torch threads.
-        device: "cpu" or "cuda".
-        checkpoint_every: updates between two checkpoints, from which --resume goes on.
-        resume: go on with an interrupted run; options left at their defaults are those it was started with.
-        force_data: resume although the demonstrations, or the version of this package, are others than at the start.
-        logger: "csv" (metrics.csv alone), or as well "wandb" (offline unless WANDB_MODE says otherwise) or
-            "tensorboard".
-        analysis: measure the action error on unlabelled demonstrations (reads labels outside the budget, afterwards).
-        plugins: modules that register tasks, methods or pictures; imported before anything else, and again by whatever
-            reads the run.
+        out: run directory to write.
+        task: name of the task (default: that of the data set).
+        method: "koap", "mpc" (plans followed by an identified model of the robot), "linear" (ridge on raw frames),
+            "dd" (supervised inverse dynamics), "dp" (Diffusion Policy), or another name in
+            torchrl_koap.training.methods.METHODS, those that plugins register included (default: the task's).
+        labels: which labels may be seen.
+        planner: its network and training.
+        controller: its variant and training.
+        execution: how plans become actions.
+        run: seed, machine, log.
 
     Examples:
-        >>> from pathlib import Path
-        >>> from torchrl_koap.training import TrainConfig, train
-        >>> config = TrainConfig(out=Path("runs/koap"), task="avoiding", label_fraction=0.05)
-        >>> train(config)  # doctest: +SKIP
+        >>> from torchrl_koap import LabelConfig, TrainConfig, train
+        >>> config = TrainConfig(dataset="demos", out="runs/koap", labels=LabelConfig(fraction=0.05))
+        >>> trained = train(config)  # doctest: +SKIP
     """
 
+    dataset: str | None = None
     out: Path
     task: str | None = None
-    dataset: str = "scripted"
-    label_fraction: float | None = None
-    label_count: int | None = None
-    label_episodes: tuple[int, ...] | None = None
-    label_unit: str = "trajectory"
-    observation_fraction: float = 1.0
-    validation_fraction: float | None = None
-    seed: int = 0
     method: str | None = None
-    preset: str | None = None
-    koopman_coeff: float | None = None
-    action_coeff: float | None = None
-    decoder: str | None = None
-    steps: int | None = None
-    controller_steps: int = 500
-    batch_size: int | None = None
-    controller_batch_size: int = 256
-    planner_learning_rate: float | None = None
-    controller_learning_rate: float = 1e-3
-    denoiser: str | None = None
-    denoiser_width: int | None = None
-    precision: str | None = None
-    candidates: int | None = None
-    channels: tuple[int, ...] | None = None
-    observed_frames: int | None = None
-    controller_state: str = "robot"
-    planner_from: Path | None = None
-    episodes: int | None = None
-    threads: int = 1
-    device: str = "cpu"
-    checkpoint_every: int = 500
-    resume: bool = False
-    force_data: bool = False
-    logger: str = "csv"
-    analysis: bool = True
-    plugins: Plugins = ()
+    labels: LabelConfig = field(default_factory=LabelConfig)
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    controller: ControllerConfig = field(default_factory=ControllerConfig)
+    execution: ExecutionConfig = field(default_factory=ExecutionConfig)
+    run: RunConfig = field(default_factory=RunConfig)
 
     def __post_init__(self):
-        self.out = Path(self.out)  # so that a string will do in Python
-        self.planner_from = None if self.planner_from is None else find_run(self.planner_from)
+        object.__setattr__(self, "out", Path(self.out))  # so that a string will do in Python
+
+
+def _check(section: str, config: object, **ranges: tuple) -> None:
+    """Refuses numbers out of range; a range is least, most (None: any), and whether each of them is allowed itself."""
+    for name, limits in ranges.items():
+        least, most, from_least, to_most = (*limits, *(None, True, True)[len(limits) - 1 :])
+        value = getattr(config, name)
+        if value is None:
+            continue
+        fits = (value >= least if from_least else value > least) and (
+            most is None or (value <= most if to_most else value < most)
+        )
+        if not fits or not math.isfinite(value):
+            below = "" if most is None else f" and {'<=' if to_most else '<'} {most}"
+            wanted = f"{'>=' if from_least else '>'} {least}{below}"
+            raise ValueError(f"{section}.{name} must be {wanted}, got {value}")

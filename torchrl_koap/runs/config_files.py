@@ -1,86 +1,148 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Options that are read from a file: compared with the dataclass that they were written from before anything uses them.
-
-A file may be edited by hand, cut off, or of another version. Entries that are not known, and known ones that are not
-there, are nobody's fault; one of another type is named with its file.
-"""
+"""Options as JSON: read into the dataclasses that they were written from, and refused with file and name otherwise."""
 
 from __future__ import annotations
 
+import difflib
+import importlib.metadata
+import platform
 import types
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
-# what `config.json` holds besides the options: how planner and controller are built
-PLANNER = {
-    "denoiser": str,
-    "channels": tuple[int, ...],
-    "history": int,
-    "horizon": int,
-    "relative": bool,
-    "width": int,
-    "forecast": bool,
-}
-CONTROLLER = {
-    "method": str,
-    "decoder": str | None,
-    "preset": str,
-    "state": str,
-}
+Config = TypeVar("Config")
+FACTS = ("task_definition", "data", "held_out_episodes", "versions", "command")  # beside the options in config.json
+_PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco")
 _LARGEST = 2**63 - 1
 
 
-def check_config(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Checks what ``config.json`` of a run holds.
+def read_config(run: RunDirectory) -> TrainConfig:
+    """Reads the options of a run.
 
     Args:
-        path (str or Path): the file, for the message.
-        content (mapping): its content.
+        run (RunDirectory): the run.
 
     Raises:
-        RunDirectoryError: naming file, entry, the type that was wanted and what is there.
+        RunDirectoryError: if ``config.json`` is not there or damaged; the message names file and entry.
+    """
+    content = run.read_json("config.json")
+    for field in fields(TrainConfig):
+        if field.name not in content:
+            raise RunDirectoryError(f"{run.path / 'config.json'} has no entry {field.name!r}")
+    return from_json(TrainConfig, {k: v for k, v in content.items() if k not in FACTS}, run.path / "config.json")
+
+
+def to_json(config: Any) -> dict[str, Any]:
+    """Returns options as plain values, section by section."""
+    return _plain(asdict(config))
+
+
+def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
+    """Makes a dataclass, and those that are its sections, of a JSON object.
+
+    Args:
+        kind (type): the dataclass.
+        content (mapping): its fields by name; those that are left out keep their defaults.
+        path (str or Path): the file, for the message.
+
+    Raises:
+        RunDirectoryError: naming the file and an option that is unknown, in another section, of another type or out of
+            range.
 
     Examples:
-        >>> from torchrl_koap.runs.config_files import check_config
-        >>> check_config("config.json", {"seed": 3, "planner": {"channels": [8, 16]}})
+        >>> from torchrl_koap.runs.config import TrainConfig
+        >>> from torchrl_koap.runs.config_files import from_json
+        >>> from_json(TrainConfig, {"out": "runs/a", "planner": {"steps": 20}}, "a.json").planner.steps
+        20
         >>> try:
-        ...     check_config("config.json", {"planner": {"channels": 8.5}})
+        ...     from_json(TrainConfig, {"out": "runs/a", "labels": {"cuont": 5}}, "a.json")
         ... except ValueError as error:
         ...     print(error)
-        config.json is damaged: entry 'planner.channels' must be a list of int, got 8.5
+        a.json: unknown option labels.cuont: did you mean labels.count?
     """
-    from torchrl_koap.runs.config import TrainConfig  # it reads run directories itself
-
-    kinds = get_type_hints(TrainConfig)
-    kinds |= {"task": str, "planner": dict, "controller": dict, "validation_episodes": tuple[int, ...], "data": dict}
-    check_types(path, content, kinds)
-    parts: dict[str, Mapping[str, Any]] = {"planner": PLANNER, "controller": CONTROLLER}
-    for name, inner in parts.items():
-        check_types(path, content.get(name, {}), inner, prefix=f"{name}.")
+    return _read(kind, content, f"{path}", "", tuple(_names(kind)))
 
 
-def check_types(path: str | Path, content: Mapping[str, Any], kinds: Mapping[str, Any], *, prefix: str = "") -> None:
-    """Checks the entries of a JSON object that are known.
+def _read(kind: Any, content: Any, path: str, prefix: str, known: tuple[str, ...]) -> Any:
+    if not isinstance(content, Mapping):
+        raise RunDirectoryError(f"{path}: {prefix.rstrip('.') or 'the file'} must be an object, got {_short(content)}")
+    kinds, values = get_type_hints(kind), {}
+    for name, value in content.items():
+        if name not in kinds:
+            raise RunDirectoryError(f"{path}: {_unknown(prefix + str(name), known)}")
+        if is_dataclass(kinds[name]):
+            values[name] = _read(kinds[name], value, path, f"{prefix}{name}.", known)
+        else:
+            check_type(value, kinds[name], f"{path}: {prefix}{name}")
+            values[name] = tuple(value) if isinstance(value, list) else value
+    try:
+        return kind(**values)
+    except (TypeError, ValueError) as error:
+        raise RunDirectoryError(f"{path}: {error}") from error
+
+
+def check_type(value: Any, kind: Any, what: str) -> None:
+    """Refuses a value of JSON that does not fit a type hint.
 
     Args:
-        path (str or Path): the file, for the message.
-        content (mapping): the object.
-        kinds (mapping): name to type, as :func:`typing.get_type_hints` returns them.
-
-    Keyword Args:
-        prefix (str): where the object lies in the file.
+        value (Any): the value.
+        kind (Any): the hint, as :func:`typing.get_type_hints` returns it.
+        what (str): file and entry, for the message.
 
     Raises:
-        RunDirectoryError: as :func:`check_config`.
+        RunDirectoryError: naming what was wanted and what is there.
     """
-    for name, kind in kinds.items():
-        if name in content and not _fits(content[name], kind):
-            got = repr(content[name])
-            got = got if len(got) <= 60 else f"{got[:57]}..."
-            raise RunDirectoryError(f"{path} is damaged: entry '{prefix}{name}' must be {_words(kind)}, got {got}")
+    if not _fits(value, kind):
+        raise RunDirectoryError(f"{what} must be {_words(kind)}, got {_short(value)}")
+
+
+def _names(kind: Any, prefix: str = "") -> Iterator[str]:
+    """Every option with its section, ``"planner.steps"``."""
+    for name, inner in get_type_hints(kind).items():
+        if is_dataclass(inner):
+            yield from _names(inner, f"{prefix}{name}.")
+        else:
+            yield prefix + name
+
+
+def _unknown(name: str, known: tuple[str, ...]) -> str:
+    last = name.rpartition(".")[2]
+    elsewhere = [other for other in known if other.rpartition(".")[2] == last]
+    if elsewhere:
+        sections = [f"section {other.rpartition('.')[0]}" if "." in other else "no section" for other in elsewhere]
+        return f"unknown option {name}: {last} is in {' or '.join(sections)}"
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"unknown option {name}" + (f": did you mean {near[0]}?" if near else "")
+
+
+def versions() -> dict[str, str]:
+    """Returns the versions of Python and of the packages that results depend on."""
+    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
+
+
+def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
+    """Returns the names of the options, with their sections, in which two configurations of one kind differ."""
+    changed = []
+    for field in fields(one):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if is_dataclass(a):
+            changed += changed_options(a, b, f"{prefix}{field.name}.")
+        elif a != b:
+            changed.append(prefix + field.name)
+    return changed
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    return str(value) if isinstance(value, Path) else value
 
 
 def _fits(value: Any, kind: Any) -> bool:
@@ -92,8 +154,6 @@ def _fits(value: Any, kind: Any) -> bool:
         return isinstance(value, (list, tuple)) and all(_fits(entry, get_args(kind)[0]) for entry in value)
     if kind is Path:
         return isinstance(value, str) and "\0" not in value
-    if kind is str:
-        return isinstance(value, str)
     if kind is int:
         return type(value) is int and abs(value) <= _LARGEST
     if kind is float:
@@ -106,12 +166,10 @@ def _words(kind: Any) -> str:
         return " or ".join(_words(part) for part in get_args(kind))
     if get_origin(kind) is tuple:
         return f"a list of {_words(get_args(kind)[0])}"
-    names = {
-        type(None): "null",
-        Path: "a path",
-        dict: "an object",
-        bool: "true or false",
-        str: "text",
-        float: "a number",
-    }
+    names = {type(None): "null", Path: "a path", bool: "true or false", str: "text", float: "a number"}
     return names.get(kind, getattr(kind, "__name__", str(kind)))
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -11,15 +11,7 @@ from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 
 PREFIX = "pretrained:"
 # what a run is made of; evaluations, reports and checkpoints are made from it
-FILES = (
-    "config.json",
-    "summary.json",
-    "metrics.csv",
-    "eigenvalues.safetensors",
-    "planner.safetensors",
-    "controller.safetensors",
-    "digests.json",
-)
+FILES = ("config.json", "summary.json", "metrics.csv", "planner.safetensors", "controller.safetensors")
 
 
 def pretrained_folders() -> dict[str, Path]:

@@ -52,7 +52,7 @@ class RunDirectory:
             aside.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
     def read_json(self, name: str) -> dict[str, Any]:
-        """Reads a JSON file; the entries of ``config.json`` are compared with the types of the options.
+        """Reads a JSON file.
 
         Raises:
             RunDirectoryError: if it is not there or damaged; the message names it.
@@ -68,10 +68,6 @@ class RunDirectory:
             raise RunDirectoryError(f"{path} cannot be read: {error}") from error
         if not isinstance(content, dict):
             raise RunDirectoryError(f"{path} is damaged: expected an object, got {type(content).__name__}")
-        if name == "config.json":
-            from torchrl_koap.runs.config_files import check_config  # knows the options, and with them TorchRL
-
-            check_config(path, content)
         return content
 
     def read_entry(self, name: str, key: str) -> Any:

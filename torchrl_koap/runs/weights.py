@@ -33,36 +33,58 @@ def save_weights(path: str | Path, module: nn.Module, about: Mapping[str, Any]) 
     Args:
         path (str or Path): file to write.
         module (nn.Module): the module.
-        about (mapping): JSON-serialisable facts kept in the header; ``task`` is checked by :func:`load_weights`.
+        about (mapping): JSON-serialisable facts kept in the header; :func:`load_weights` compares those it expects.
     """
     save_tensors(path, module.state_dict(), about)
 
 
-def load_weights(path: str | Path, module: nn.Module, *, task: str) -> dict[str, Any]:
+def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any]) -> dict[str, Any]:
     """Loads weights into a module of the same architecture.
 
     Args:
         path (str or Path): the file.
         module (nn.Module): receives the weights.
-        task (str): name of the task that they must have been trained on.
+        expected (mapping): facts that its header must hold: the task, and the options that build the module.
 
     Returns:
         dict: the facts in the header.
 
     Raises:
-        CheckpointError: if the file is missing or damaged, belongs to another task, lacks entries (a normaliser's
-            statistics, say) or has entries of other shapes.
+        CheckpointError: if the file is missing or damaged, belongs to another task or other options, lacks entries (a
+            normaliser's statistics, say) or has entries of other shapes.
     """
     tensors, about = load_tensors(path)
-    if about.get("task") != task:
-        raise CheckpointError(f"{path} was trained on task {about.get('task')!r}, not on {task!r}")
+    for name, value in expected.items():
+        if about.get(name) != value:
+            raise CheckpointError(f"{path} was trained on {name} {about.get(name)!r}, not on {value!r}")
+    _load(path, module, expand(tensors))
+    return about
+
+
+def load_parts(path: str | Path, tensors: Mapping[str, Tensor], parts: Mapping[str, nn.Module | None]) -> None:
+    """Hands several modules their weights, of names ``"PART.ENTRY"``.
+
+    Args:
+        path (str or Path): the file they are from, for the message.
+        tensors (mapping): all weights.
+        parts (mapping): modules by name; None is passed over.
+
+    Raises:
+        CheckpointError: as :func:`load_weights`.
+    """
+    for part, module in parts.items():
+        if module is not None:
+            own = {name.removeprefix(f"{part}."): t for name, t in tensors.items() if name.startswith(f"{part}.")}
+            _load(f"{path} ({part})", module, own)
+
+
+def _load(path: str | Path, module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
     try:
-        module.load_state_dict(expand(tensors))
+        module.load_state_dict(tensors)
     except RuntimeError as error:
         problems = " ".join(str(error).split("\n", 1)[-1].split())
         raise CheckpointError(f"{path} does not fit the model: {problems}") from error
     check_weights(path, module)
-    return about
 
 
 def check_weights(path: str | Path, module: nn.Module) -> None:

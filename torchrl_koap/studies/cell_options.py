@@ -11,11 +11,9 @@ from typing import Any
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ExecutionConfig
-from torchrl_koap.training.method import COEFFICIENTS, Method, loss_coefficients
+from torchrl_koap.training.method import Method
 from torchrl_koap.training.methods import get_method
 
-# how a method is measured where no option says otherwise; what is not named is as for any other method
-PUBLISHED = {"koap_paper": {"controller_state": "all"}}
 PLANNER = (
     "denoiser",
     "denoiser_width",
@@ -39,30 +37,26 @@ class CellOptions:
         candidates: plans sampled whenever one is due (default: the method's, 1).
         controller_state: what controllers read, "robot" (the robot's own columns) or "all" (default: robot; all for
             koap_paper).
-        koopman_coeff: weight of the Koopman term in the loss of every method that has one (default: 1).
-        action_coeff: weight of the action term in the loss of KOAP's jointly trained methods (default: 1).
         denoiser: network of planner and dp, a name as of `koap train` (default: unet; `koap bench`: the wide mlp).
         denoiser_width: its hidden width.
         precision: of the matrix products of its training, a name as of `koap train` (default: float32; `koap bench`:
             auto).
         batch_size: windows per update of planner and dp (default: 128).
         planner_learning_rate: peak learning rate of planner and dp (default: 3e-3).
-        policy_steps: updates of dp and dp_relabel (default: as many as a planner's; `koap bench`: at most 8,000).
-        policy_batch_size: windows per update of dp and dp_relabel (default: as a planner).
+        policy_steps: updates of dp and vpt (default: as many as a planner's; `koap bench`: at most 8,000).
+        policy_batch_size: windows per update of dp and vpt (default: as a planner).
         planner_seeds: number of planners, trained with seeds 0, 1, ...; a cell of seed s has planner s modulo that.
 
     Examples:
         >>> from torchrl_koap.studies.cell_options import CellOptions, training_options
-        >>> training_options(CellOptions(koopman_coeff=0.5), "koap_paper")
-        {'koopman_coeff': 0.5, 'controller_state': 'all'}
+        >>> training_options(CellOptions(controller_state="robot"), "koap_paper")
+        {'controller_state': 'robot'}
     """
 
     strategy: str | None = None
     blend: float | None = None
     candidates: int | None = None
     controller_state: str | None = None
-    koopman_coeff: float | None = None
-    action_coeff: float | None = None
     denoiser: str | None = None
     denoiser_width: int | None = None
     precision: str | None = None
@@ -88,13 +82,12 @@ def training_options(options: CellOptions, method: str) -> dict[str, Any]:
         options (CellOptions): what was asked for.
         method (str): name of the method.
     """
-    has = loss_coefficients(get_method(method))
-    chosen = planner_options(options) | {
-        name: getattr(options, name) for name in COEFFICIENTS if name in has and getattr(options, name) is not None
-    }
-    if not get_method(method).has_planner:
-        chosen |= {name: getattr(options, own) for name, own in POLICY.items() if getattr(options, own) is not None}
-    state = options.controller_state or PUBLISHED.get(method, {}).get("controller_state")
+    chosen = planner_options(options)
+    if not get_method(method).plans:
+        return chosen | {
+            name: getattr(options, own) for name, own in POLICY.items() if getattr(options, own) is not None
+        }
+    state = options.controller_state
     return chosen if state is None else chosen | {"controller_state": state}
 
 
@@ -111,7 +104,7 @@ def evaluation_options(options: CellOptions, method: str) -> dict[str, Any]:
         0.0
     """
     own, candidates = get_method(method), options.candidates
-    if not own.has_planner:
+    if not own.plans:
         return {"execution": ExecutionConfig(candidates=candidates)}
     if options.strategy is None and own.execution.get("strategy") == "open_loop":
         candidates = None  # no plan is kept that several could be compared with
@@ -132,7 +125,7 @@ def check_cell_options(options: CellOptions, methods: list[Method]) -> None:
     ExecutionConfig(options.strategy, blend=options.blend, candidates=options.candidates)
     if options.controller_state is not None:
         lookup(("robot", "all"), options.controller_state, "part of the state")
-    chunked = [method.name for method in methods if not method.has_planner]
+    chunked = [method.name for method in methods if not method.plans]
     if options.strategy == "open_loop" and chunked:
         raise ValueError(
             f"strategy 'open_loop' was asked of {', '.join(chunked)}: a policy of its own executes chunks of actions"
@@ -146,11 +139,3 @@ def check_cell_options(options: CellOptions, methods: list[Method]) -> None:
     for name in ("candidates", "planner_seeds", "batch_size", *POLICY.values()):
         if getattr(options, name) is not None and getattr(options, name) < 1:
             raise ValueError(f"{name} must be >= 1, got {getattr(options, name)}")
-    for name in COEFFICIENTS:
-        value = getattr(options, name)
-        if value is None:
-            continue
-        if value < 0:
-            raise ValueError(f"{name} must be >= 0, got {value}")
-        if not any(name in loss_coefficients(method) for method in methods):
-            raise ValueError(f"{name} was given, but no loss of {', '.join(m.name for m in methods)} has it")

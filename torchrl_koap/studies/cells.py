@@ -14,15 +14,34 @@ from typing import Any
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.offline import KIND
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.config_files import from_json
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.tasks.units import thousandths
-from torchrl_koap.training import TrainConfig, get_method, train
-from torchrl_koap.training.run import train_shared_planner
+from torchrl_koap.training import get_method, train
 
 DONE = "cell.json"
 # evaluation seeds of a training seed lie so far from the next one's: rollouts that differ in nothing but the training
 # would count as 180 where they are hardly more than 60
 NOISE_STEP = 1000
+# options of a curve, in the sections of TrainConfig
+_NAMES = {
+    "denoiser": "planner.network",
+    "denoiser_width": "planner.width",
+    "batch_size": "planner.batch_size",
+    "planner_learning_rate": "planner.learning_rate",
+    "planner_from": "planner.source",
+    "steps": "planner.steps",
+    "controller_steps": "controller.steps",
+    "controller_state": "controller.columns",
+    "label_fraction": "labels.fraction",
+    "label_unit": "labels.unit",
+    "observation_fraction": "labels.trajectories",
+    "precision": "run.precision",
+    "seed": "run.seed",
+    "resume": "run.resume",
+    "plugins": "run.plugins",
+}
 _ERRORS = ("relative_plan_error", "relative_action_error")
 
 
@@ -55,7 +74,7 @@ class Cell:
     @property
     def planner(self) -> str | None:
         """The folder of the planner that it shares, None for a method without one."""
-        return planner_folder(self.observations) if get_method(self.method).has_planner else None
+        return planner_folder(self.observations) if get_method(self.method).plans else None
 
 
 def planner_folder(observations: float, seed: int = 0) -> str:
@@ -90,6 +109,25 @@ def _is_readable(run: RunDirectory, name: str) -> bool:
     return True
 
 
+def train_config(**options: Any) -> TrainConfig:
+    """Sorts the options of a cell into the sections of a configuration.
+
+    Args:
+        **options: of :class:`~torchrl_koap.studies.cell_options.CellOptions` and of a cell, None where left open.
+
+    Examples:
+        >>> from torchrl_koap.studies.cells import train_config
+        >>> train_config(out="cell", steps=20, denoiser="mlp").planner.network
+        'mlp'
+    """
+    content: dict[str, Any] = {}
+    for name, value in options.items():
+        section, dot, own = _NAMES.get(name, name).rpartition(".")
+        if value is not None:
+            (content.setdefault(section, {}) if dot else content)[own] = value
+    return from_json(TrainConfig, content, "options of a cell")
+
+
 def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) -> None:
     """Trains a planner on states alone: all actions are hidden before anything looks at the data.
 
@@ -100,10 +138,9 @@ def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) ->
     """
     began = time.perf_counter()
     resume = (Path(folder) / "config.json").exists()
-    values = train_shared_planner(
-        TrainConfig(out=Path(folder), observation_fraction=observations, resume=resume, **settings)
-    )
-    RunDirectory(folder).write_json(DONE, {"train_seconds": time.perf_counter() - began} | values)
+    config = train_config(out=folder, observation_fraction=observations, resume=resume, **settings)
+    losses = train(config, planner_only=True).results["planner"]
+    RunDirectory(folder).write_json(DONE, {"train_seconds": time.perf_counter() - began} | losses)
 
 
 def do_cell(
@@ -130,13 +167,13 @@ def do_cell(
     began = time.perf_counter()
     if not _is_readable(RunDirectory(path), "summary.json"):
         train(
-            TrainConfig(
-                out=path,
+            train_config(
+                out=folder,
                 method=this.method,
                 label_fraction=this.fraction if label_fraction is None else label_fraction,
                 observation_fraction=this.observations,
                 seed=this.seed,
-                planner_from=None if planner is None else Path(planner),
+                planner_from=planner,
                 resume=(path / "config.json").exists(),
                 **settings,
             )

@@ -7,7 +7,7 @@ import os
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from torchrl_koap.runs.config_files import check_types
+from torchrl_koap.runs.config_files import check_type
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.cell_options import OPTION_NAMES
 
@@ -70,7 +70,9 @@ def read_options(root: RunDirectory, kind: type) -> dict[str, Any]:
         RunDirectoryError: if it is missing or damaged.
     """
     earlier = root.read_json("curve.json")
-    check_types(root.path / "curve.json", earlier, get_type_hints(kind))
+    for name, hint in get_type_hints(kind).items():
+        if name in earlier:
+            check_type(earlier[name], hint, f"{root.path / 'curve.json'} is damaged: entry {name!r}")
     return earlier
 
 

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.runs.progress import progress_bar
@@ -22,18 +21,18 @@ from torchrl_koap.studies.cell_options import (
     planner_options,
     training_options,
 )
-from torchrl_koap.studies.cells import Cell, do_cell, do_planner, is_trained, planner_folder
+from torchrl_koap.studies.cells import Cell, do_cell, do_planner, is_trained, planner_folder, train_config
 from torchrl_koap.studies.curve_data import check_budgets, demonstrations_of, first_look
 from torchrl_koap.studies.curve_folder import GROWS, check_folder, read_options, with_earlier_plugins, write_options
 from torchrl_koap.studies.curve_table import CurveTable
 from torchrl_koap.studies.launchers import Job, check_launcher, launch
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_curve_report
-from torchrl_koap.tasks import Task
+from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
+from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
-from torchrl_koap.training.resolved import resolve
-from torchrl_koap.training.run import check_networks
+from torchrl_koap.training.trained import build_networks
 
 ALL = "koap,koap_labelled_only,linear,dd,vae,lapo,dp,relabel,nonlinear,pretrain"
 
@@ -55,7 +54,7 @@ class CurveConfig(CellOptions):
         observations: shares of the trajectories that are used at all, with commas between.
         seeds: number of seeds of label choice and training.
         episodes: rollouts per cell; all cells with the same seed meet the same contexts and noise.
-        steps: planner updates (default: that of the task); a number below controller_steps shortens that too.
+        steps: planner updates (default: that of the task).
         controller_steps: updates of every controller.
         workers: cells at a time (default: one per core; a cluster given by its address decides for itself).
         launcher: "local" or "ray".
@@ -160,7 +159,11 @@ def check_curve(config: CurveConfig) -> tuple[CurveConfig, Task, list[Cell], Run
     options = with_earlier_plugins(config)
     load_plugins(options.plugins)
     cells = _cells(options)
-    task = find_task_of(options.dataset, options.task)
+    task = (
+        get_task(options.task or "avoiding")
+        if options.dataset == "scripted"
+        else find_task_of(options.dataset, options.task)
+    )
     options = replace(options, task=task.name)
     for name in ("seeds", "demonstrations", "episodes", "steps", "controller_steps", "workers"):
         value = getattr(options, name)
@@ -180,17 +183,17 @@ def _check_method(name: str, options: CurveConfig, task: Task) -> None:
     """Refuses a method whose networks cannot be built for the task, or for the planner that is to be shared."""
     method = get_method(name)
     settings: dict[str, Any] = {
-        "out": options.out,
+        "out": str(options.out),
         "task": task.name,
         "method": name,
         "steps": options.steps,
-        "planner_from": options.planner_from if method.has_planner else None,
+        "planner_from": str(options.planner_from) if method.plans and options.planner_from is not None else None,
     }
-    resolved = resolve(TrainConfig(**settings | training_options(options, name)), task)
+    config = resolve(train_config(**settings | training_options(options, name)), task)
     try:
-        check_networks(resolved)
+        build_networks(task, config)
     except ValueError as error:
-        read = f"the columns {resolved.options.controller_state!r} of " if method.has_planner else ""
+        read = f"the columns {config.controller.columns!r} of " if method.plans else ""
         raise ValueError(f"method {name!r} cannot read {read}task {task.name!r}: {error}") from error
 
 
@@ -309,7 +312,7 @@ def _planner_seed(cell: Cell, options: CurveConfig) -> int:
 
 def _planner_of(cell: Cell, root: RunDirectory, options: CurveConfig) -> Path | None:
     """The run whose planner a cell takes over, None for a method without one."""
-    if not get_method(cell.method).has_planner:
+    if not get_method(cell.method).plans:
         return None
     if options.planner_from is not None:
         return Path(options.planner_from).absolute()

@@ -251,7 +251,7 @@ def _curves(config: BenchConfig, preset: Preset) -> list[CurveConfig]:
                 once = _shares(task, [level for level in levels if level in preset.first_seed_only])
         planner = planners.get(task.name)
         if config.policy_steps is None:
-            own["policy_steps"] = values["steps"] or min(POLICY_STEPS, task.defaults.planner_steps)
+            own["policy_steps"] = values["steps"] or min(POLICY_STEPS, task.defaults.planner["steps"])
         share = paper_share(task.name) if config.data_share == "paper" else None
         usual = [] if config.table is None else [task.defaults.method]  # what `koap train` takes
         methods = config.methods or ",".join(dict.fromkeys([*common, *usual]))

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape
-from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
+from torchrl_koap.tasks.task import Defaults, Modes, Task
 
 DISTANCE_TOLERANCE = 0.018  # m, between the centres, height included
 ROTATION_TOLERANCE = 0.048  # of half a turn
@@ -119,9 +119,7 @@ register_task(
         defaults=Defaults(
             demonstrations=1000,
             disturbance=0.5,
-            planner_steps=8000,
-            planner=WIDE_MLP,
-            view={"observed_frames": 1},
+            planner={"steps": 8000, "network": "mlp", "frames": 1},
             execution={"lead": COMMAND_LEAD},
         ),
     )

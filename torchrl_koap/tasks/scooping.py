@@ -92,7 +92,7 @@ _SCOOPING = register_task(
         ),
         defaults=Defaults(
             demonstrations=100,
-            planner_steps=4000,
+            planner={"steps": 4000},
             relative=False,
             recovery_sigma=0.0,
             view={"neighbor_recovery": 2.0},  # no column is a position that could be displaced

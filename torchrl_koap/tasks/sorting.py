@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape
-from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
+from torchrl_koap.tasks.task import Defaults, Modes, Task
 
 # of PO-Sorting, where time is short: noise makes decoded actions too small, and plans are followed from behind; chosen
 # on one trained planner (docs/results/planners.md)
@@ -139,9 +139,7 @@ def _sorting(num_boxes: int) -> Task:
         ),
         defaults=Defaults(
             demonstrations=1000,
-            planner_steps=24000,
-            planner=WIDE_MLP,
-            view={"observed_frames": 1},
+            planner={"steps": 24000, "network": "mlp", "frames": 1},
             execution={"lead": COMMAND_LEAD},
         ),
     )
@@ -157,11 +155,9 @@ register_task(
         noise=PO_NOISE,
         data_from="sorting",
         defaults=Defaults(
-            preset="semi_supervised",  # positions are noisy
             demonstrations=1000,
-            planner_steps=24000,
-            planner=WIDE_MLP,
-            view={"observed_frames": 1},
+            planner={"steps": 24000, "network": "mlp", "frames": 1},
+            controller={"preset": "semi_supervised"},  # positions are noisy
             execution={"lead": COMMAND_LEAD, "gain": ACTION_GAIN},
         ),
     )

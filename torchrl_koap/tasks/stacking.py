@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape
-from torchrl_koap.tasks.task import WIDE_MLP, Defaults, Modes, Task
+from torchrl_koap.tasks.task import Defaults, Modes, Task
 
 TARGET = (0.5, 0.2)  # centre of the target zone (m)
 TARGET_HALF = 0.05  # half its width (m)
@@ -103,7 +103,7 @@ _STACKING = register_task(
             " never moved and for those dropped on the way.",
             camera="front",
         ),
-        defaults=Defaults(method="mpc", demonstrations=1000, planner_steps=18000, planner=WIDE_MLP),
+        defaults=Defaults(method="mpc", demonstrations=1000, planner={"steps": 18000, "network": "mlp"}),
     )
 )
 _STACKING_1 = register_task(

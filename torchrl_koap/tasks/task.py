@@ -25,8 +25,6 @@ from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePosi
 from torchrl_koap.tasks.scene import Body, Scene
 
 CONTROL_HZ = 1 / 0.035
-# what wins on the tasks with objects: capacity and many samples (docs/results/planners.md)
-WIDE_MLP = {"denoiser": "mlp"}
 # planner and controller see the same window in every task: 2 observed frames, 14 planned ones; 4 actions of each plan
 # are executed
 HISTORY, HORIZON, REPLAN_INTERVAL = 2, 14, 4
@@ -89,36 +87,32 @@ class Defaults:
 
     Args:
         method (str): what `koap train` trains.
-        preset (str, optional): of that method, where none is asked for. Default: the method's own.
         demonstrations (int): number of scripted demonstrations to record.
         disturbance (float): share of them in which the operator is disturbed.
-        planner_steps (int): planner updates.
-        channels (tuple of int): widths of the planner's U-Net.
         relative (bool): plans are displacements from the present state.
         recovery_sigma (float): typical shift of the recovery augmentation, in the units of the robot's columns.
-        planner (dict): options of `koap train` for the planner's network and its training that are used together where
-            no denoiser is asked for: ``denoiser``, its sizes, ``batch_size``, ``planner_learning_rate``.
-        view (dict): what the planner sees: ``observed_frames`` (1 or 2, the default), ``neighbor_recovery`` (farthest
-            share of the way to the nearest other window that windows are moved, for states without a column that is a
-            position) and ``forecast`` (default: in tasks without an environment).
-        execution (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig` for how plans are followed.
+        view (dict): ``neighbor_recovery`` (farthest share of the way to the nearest other window that windows are
+            moved, for states without a column that is a position) and ``forecast`` (plans are deviations from a linear
+            forecast; default: in tasks without an environment).
+        planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Its sizes are those of its network alone:
+            another one that is asked for by name comes with its own.
+        controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method``.
+        execution (dict): fields of :class:`~torchrl_koap.Execution`.
 
     Examples:
         >>> from torchrl_koap.tasks.task import Defaults
-        >>> Defaults(demonstrations=50, relative=False).planner_steps
-        12000
+        >>> Defaults(demonstrations=50, planner={"steps": 4000}).method
+        'koap'
     """
 
     method: str = "koap"
-    preset: str | None = None
     demonstrations: int = 200
     disturbance: float = 0.0
-    planner_steps: int = 12000
-    channels: tuple[int, ...] = (64, 128)
     relative: bool = True
     recovery_sigma: float = 0.004
-    planner: Mapping[str, Any] = field(default_factory=dict)
     view: Mapping[str, Any] = field(default_factory=dict)
+    planner: Mapping[str, Any] = field(default_factory=dict)
+    controller: Mapping[str, Any] = field(default_factory=dict)
     execution: Mapping[str, Any] = field(default_factory=dict)
 
 

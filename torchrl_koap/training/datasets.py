@@ -1,43 +1,51 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Demonstrations of a task as one tensordict, wherever they are from."""
+"""Demonstrations of a task, and which of their trajectories and labels are learnt from."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+import math
+import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import open_dataset, read_about, select_state
-from torchrl_koap.data.sources import with_noise
+from torchrl_koap.data import LabelBudget, open_dataset, read_about, trajectory_lengths
 from torchrl_koap.data.ted import stored_folder, stored_task
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.config_files import read_config
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import Task, adopt_task, get_task
 
-DEFAULT_TASK = "avoiding"
+DEFAULT_TASK = "avoiding"  # of raw pickles
+# what is derived from these may differ from version to version
+_RECORDED = ("observation", "action", "has_action", "episode", "step_count", ("next", "observation"), ("next", "done"))
 
 
-def find_task_of(dataset: str, name: str | None = None) -> Task:
-    """The task of a data set.
+def find_task_of(dataset: str | None, name: str | None = None) -> Task:
+    """Finds the task of a data set.
 
     Args:
-        dataset (str): as for :func:`load_demonstrations`.
+        dataset (str): a folder, as for :func:`load_demonstrations`.
         name (str, optional): name of a registered task, or of the one that the data set holds. Default: the task that
-            the data set holds or names, else ``"avoiding"``.
+            the data set holds or names; of raw pickles ``"avoiding"``.
 
     Raises:
         FileNotFoundError: if there is no such folder.
-        ValueError: if the name is unknown, or the data set holds the definition of another task.
+        ValueError: if none is named, the name is unknown, or the data set holds the definition of another task.
         DataError: if the data set's task is damaged or names code.
-
-    Examples:
-        >>> from torchrl_koap.training.datasets import find_task_of
-        >>> find_task_of("scripted").name, find_task_of("scripted", "sorting").name
-        ('avoiding', 'sorting')
     """
-    if dataset == "scripted":
-        return get_task(DEFAULT_TASK if name is None else name)
+    if dataset is None:
+        what = name or DEFAULT_TASK
+        raise ValueError(
+            f"no demonstrations to learn from: record some with `koap demos --task {what} --out DEMOS`, then"
+            f" `koap train --task {what} --dataset DEMOS --out RUN`"
+        )
     if not Path(dataset).is_dir():
-        raise FileNotFoundError(f"dataset {dataset!r} is neither 'scripted' nor a folder of {Path.cwd()}")
+        raise FileNotFoundError(f"dataset {dataset!r} is no folder of {Path.cwd()}; `koap demos --out DIR` records one")
     folder = stored_folder(dataset)
     if folder is None:
         return get_task(DEFAULT_TASK if name is None else name)
@@ -51,36 +59,116 @@ def find_task_of(dataset: str, name: str | None = None) -> Task:
 
 
 def load_demonstrations(
-    dataset: str,
-    task: Task,
-    *,
-    episodes: int | None = None,
-    seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    dataset: str, task: Task, *, progress: Callable[[int, int], None] | None = None
 ) -> TensorDictBase:
-    """Demonstrations with all labels that there are, flat, with the columns that a policy may see as ``state``.
+    """Reads demonstrations as :func:`~torchrl_koap.data.open_dataset`, without their task."""
+    return open_dataset(dataset, task=task, progress=progress)[0]
+
+
+def label_budget(config: TrainConfig) -> LabelBudget:
+    """Makes the label budget that a resolved configuration asks for."""
+    labels = config.labels
+    chosen = {"fraction": labels.fraction, "count": labels.count, "episodes": labels.episodes or None}
+    return LabelBudget(**chosen, unit=labels.unit, seed=config.run.seed)
+
+
+def fingerprint(data: TensorDictBase) -> dict[str, Any]:
+    """What tells data from others: their size, and a checksum of what was recorded.
 
     Args:
-        dataset (str): ``"scripted"``, or a folder for :func:`~torchrl_koap.data.open_dataset`.
-        task (Task): the task.
-        episodes (int, optional): number of scripted demonstrations to record. Default: that of the task.
-        seed (int): seed of the scripted demonstrations.
-        progress (callable, optional): called with the number of demonstrations that were recorded, or read from raw
-            files, and that of all.
+        data (TensorDictBase): flat data ``[N]``, on any device.
 
-    Returns:
-        TensorDictBase: flat data ``[N]`` with ``state`` and every recorded label.
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.training.datasets import fingerprint
+        >>> one, other = (TensorDict({"action": torch.tensor([[0.0], [last]])}, [2]) for last in (1.0, 2.0))
+        >>> fingerprint(one) == fingerprint(one.clone()), fingerprint(one) == fingerprint(other)
+        (True, False)
+    """
+    digest = hashlib.sha256()
+    present = set(data.keys(True, True))
+    for name in [name for name in _RECORDED if name in present]:
+        value = data.get(name).detach().cpu().contiguous()
+        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+        digest.update(value.reshape(-1).view(torch.uint8).numpy())
+    return {"steps": len(data), "sha256": digest.hexdigest()}
+
+
+def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int = 0) -> list[int]:
+    """Numbers of the trajectories to hold out from the planner: those without a label first.
+
+    Trajectories with labels are taken only where the others do not suffice. They lose no label: the planner does not
+    see them, the controller does. At least one trajectory is held out, and at least one is left; of a single trajectory
+    none can be.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
+        fraction (float, optional): share of all trajectories in ``[0, 1)``; None is 0.
+
+    Keyword Args:
+        seed (int): seed of the choice.
 
     Raises:
-        FileNotFoundError: if there is no such folder, or it holds no demonstrations.
-    """
-    if dataset != "scripted":
-        return open_dataset(dataset, task=task, progress=progress)[0]
-    from torchrl_koap.envs.experts.demonstrations import record_demonstrations  # needs a simulator
+        ValueError: if the share is out of range.
 
-    data, _ = record_demonstrations(
-        task.name, task.defaults.demonstrations if episodes is None else episodes, seed, progress=progress
-    )
-    if task.noise:
-        data = with_noise(data, task.observation[task.position], task.noise)
-    return select_state(data, task.state_of)
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories
+        >>> from torchrl_koap.training.datasets import choose_held_out
+        >>> data = flatten_trajectories([torch.zeros(5, 2)] * 10, [torch.zeros(4, 1)] * 10)
+        >>> labelled, _ = LabelBudget.of_episodes([1, 2, 3, 4, 5, 6, 7, 8, 9]).apply(data)
+        >>> choose_held_out(labelled, 0.1)
+        [0]
+    """
+    if not fraction:
+        return []
+    if not 0 < fraction < 1:
+        raise ValueError(f"planner.held_out must be in [0, 1), got {fraction}")
+    lengths = trajectory_lengths(data)
+    total = len(lengths)
+    number = min(max(math.floor(fraction * total + 0.5), 1), total - 1)
+    episodes = data["episode"][torch.cumsum(lengths, 0) - lengths].cpu()
+    labelled = torch.stack([part.any() for part in data["has_action"].split(lengths.tolist())]).cpu()
+    order = torch.randperm(total, generator=torch.Generator().manual_seed(seed))
+    order = torch.cat([order[~labelled[order]], order[labelled[order]]])
+    return sorted(episodes[order[:number]].tolist())
+
+
+def held_out_by(source: Path, dataset: str) -> list[int]:
+    """Reads which trajectories a planner that is taken over has never seen.
+
+    Args:
+        source (Path): its run directory.
+        dataset (str): the data set at hand; of another one than the planner's own nothing is known to be unseen.
+    """
+    run = RunDirectory(source)
+    same = os.path.abspath(str(read_config(run).dataset)) == os.path.abspath(dataset)
+    return list(run.read_json("config.json").get("held_out_episodes") or ()) if same else []
+
+
+def without_held_out(data: TensorDictBase, episodes: Sequence[int], *, keep_labelled: bool = False) -> TensorDictBase:
+    """The data that may be learnt from.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
+        episodes (sequence of int): held-out trajectories.
+
+    Keyword Args:
+        keep_labelled (bool): keep those of them that have a label, as a controller does.
+
+    Raises:
+        ValueError: if nothing is left.
+    """
+    if not len(episodes):
+        return data
+    episode = data["episode"]
+    held_out = torch.isin(episode, torch.as_tensor(list(episodes), device=episode.device))
+    if keep_labelled:
+        held_out &= ~torch.isin(episode, episode[data["has_action"].squeeze(-1)].unique())
+    if held_out.all():
+        raise ValueError(
+            f"all {len(episode.unique())} trajectories that are used are held out: nothing is left to"
+            " train on; lower planner.held_out or raise labels.trajectories"
+        )
+    return data[~held_out]

@@ -20,6 +20,8 @@ from torchrl_koap.runs.weights import CheckpointError
 from torchrl_koap.training.checkpoints import load_training_state, save_training_state
 from torchrl_koap.training.outlier_gradients import limit_outlier
 
+CHECKPOINT_EVERY = 500
+
 
 def warmup_cosine(step: int, num_steps: int, warmup: int) -> float:
     """Share of the peak learning rate at ``step``: linear warm-up, then half a cosine to 0.
@@ -71,7 +73,7 @@ def train_phase(
     run: RunDirectory | None = None,
     logger: Any = None,
     log_every: int = 50,
-    checkpoint_every: int = 500,
+    checkpoint_every: int | None = None,
     resume: bool = False,
     progress: Callable[[int, dict[str, float]], None] | None = None,
 ) -> dict[str, float]:
@@ -95,7 +97,7 @@ def train_phase(
         run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
         logger (optional): a TorchRL logger; scalars are named ``phase/term``.
         log_every (int): updates per row of the log.
-        checkpoint_every (int): updates per checkpoint.
+        checkpoint_every (int, optional): updates per checkpoint. Default: 500.
         resume (bool): go on from the checkpoint of this phase, if there is one. On a CPU the outcome equals that of an
             uninterrupted run bit for bit.
         progress (callable, optional): called with the number of updates done and the last logged values.
@@ -109,6 +111,7 @@ def train_phase(
         CheckpointError: if the checkpoint is damaged or that of another model.
         ValueError: if a number of steps is below 1.
     """
+    checkpoint_every = CHECKPOINT_EVERY if checkpoint_every is None else checkpoint_every
     for name, value in {"num_steps": num_steps, "log_every": log_every, "checkpoint_every": checkpoint_every}.items():
         if value < 1:
             raise ValueError(f"{name} must be >= 1, got {value}")

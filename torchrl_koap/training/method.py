@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""What a method is: the network that it builds, the phases that it is trained in, and what it may see."""
+"""What a method is: the network that it builds, the phases that it is trained in, what it may see, its defaults."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
 from torchrl.objectives import LossModule
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.modules import Execution
+from torchrl_koap.modules.execution.execution import Execution
 
-KINDS = ("controller", "policy")
 # share of every batch that has labels; None: as it comes
 LABELLED_SHARES = {"all": None, "mixed": 0.25, "labelled": 1.0}
-COEFFICIENTS = ("koopman_coeff", "action_coeff")  # of losses, that a training may be given
+SEES = ("all", "labelled")
 
 
 @dataclass(frozen=True)
@@ -30,7 +28,6 @@ class Phase:
         loss (callable): the loss of a network, a ``LossModule`` whose ``loss_*`` entries are minimised and logged.
         windows (str): ``"all"`` (labelled or not), ``"mixed"`` (a quarter of every batch has labels) or ``"labelled"``.
         share (float): of the updates that a controller may have.
-        coefficients (tuple of str): those of :data:`COEFFICIENTS` that ``loss`` takes as keyword arguments.
 
     Raises:
         ValueError: for an unknown kind of windows, or a share outside (0, 1].
@@ -46,7 +43,6 @@ class Phase:
     loss: Callable[[Any], LossModule]
     windows: str = "all"
     share: float = 1.0
-    coefficients: tuple[str, ...] = ()
 
     def __post_init__(self):
         lookup(LABELLED_SHARES, self.windows, "kind of windows")
@@ -56,47 +52,45 @@ class Phase:
 
 @dataclass(frozen=True)
 class Method:
-    """A way to get from few labels to a policy.
+    """A way to get from few labels to a policy, with its own defaults.
 
-    A ``"controller"`` maps windows of states ``[*B, T, d]`` to actions ``[*B, T, act]`` and follows the plans of the
-    planner that all controllers share: a :class:`~torchrl_koap.modules.InverseDynamics`, whose docstring lists what is
-    asked of one. With ``closed_form`` its ``fit_labels`` is called once after all updates, with windows of which frame
-    ``num_past`` counts where ``mask`` is True; it returns numbers for the summary.
+    Its network maps windows of states ``[*B, T, d]`` to actions ``[*B, T, act]`` and follows the plans of the planner
+    that all controllers share: a :class:`~torchrl_koap.modules.InverseDynamics`. With ``closed_form`` it also has
+    ``fit_decoder(windows, mask, groups=)``, called once after all updates with windows of which frame ``num_past``
+    counts where ``mask`` is True; it returns numbers for the summary, or a :class:`~torchrl_koap.modules.RidgeFit`.
 
-    A ``"policy"`` has no planner beside it: see :class:`~torchrl_koap.modules.DiffusionPolicy` for what it offers.
+    A method that does not plan samples actions: see :class:`~torchrl_koap.modules.DiffusionPolicy` for what it offers.
 
     Args:
         name (str): what ``--method`` calls it.
         title (str): what tables and legends call it.
-        build (callable): for a controller ``build(state_dim, action_dim, normalizers, options)`` with the keyword
-            arguments ``state_normalizer`` and ``action_normalizer`` in ``normalizers`` and the ``controller`` entry of
-            ``config.json`` as ``options``; for a policy ``build(state_dim, action_dim, features, options)`` with the
-            task's relative positions, or None, and the ``planner`` entry.
+        build (callable): ``build(task, columns, normalizers, preset)`` with the state columns that the controller
+            reads, and ``state_normalizer`` and ``action_normalizer`` as keyword arguments in ``normalizers``; of a
+            method that does not plan ``build(task, section)`` with the planner's section.
         phases (tuple of Phase): how it is trained.
-        kind (str): ``"controller"``, or ``"policy"``, which has the planner's updates instead of a planner.
         closed_form (bool): its decoder is fitted in closed form at the end.
-        labelled_only (bool): it sees labelled windows and nothing else, statistics of the states included.
+        sees (str): ``"all"`` windows, or ``"labelled"`` ones and nothing else, statistics of the states included.
+        plans (bool): it follows the plans of a planner; otherwise it has the planner's updates instead of one.
         teacher (str): the method whose controller labels the rest of the data first.
-        other_decoder (str): the same method with the other way to get a decoder.
         presets (tuple of str): values of ``--preset`` that it can be built with; the first is its own.
-        columns (callable, optional): ``columns(task) -> dict``, for a controller that is no inverse dynamics: what
-            ``build`` finds under ``"columns"`` of the options.
-        fit (callable, optional): ``fit(controller, data, updates) -> dict`` fits such a controller to flat data after
-            the label budget was applied, in place of phases and closed form; returns numbers for the summary.
+        columns (str, optional): what its controller reads, ``"robot"`` or ``"all"``. Default: the task's.
+        updates (int, optional): of its controller. Default: the task's.
+        execution (mapping): fields of :class:`~torchrl_koap.modules.Execution` that are its own.
+        fit (callable, optional): ``fit(controller, data, updates) -> dict`` fits a controller that is no inverse
+            dynamics to flat data after the label budget was applied, in place of phases and closed form; returns
+            numbers for the summary.
         knows_commands (bool): it is told the last command at every labelled step, which is a recording's as the action
             is (:func:`~torchrl_koap.training.command_model.with_label_commands`).
-        execution (dict): fields of :class:`~torchrl_koap.modules.Execution` that it is executed with unless others are
-            asked for.
 
     Raises:
-        ValueError: for an unknown kind, a name that cannot be a folder's, or two phases of one name.
+        ValueError: for a name that cannot be a folder's, two phases of one name, or an unknown default.
 
     Examples:
         >>> from torchrl_koap.modules import LinearInverseDynamics
         >>> from torchrl_koap.training import Method
-        >>> def build(state_dim, action_dim, normalizers, options):
-        ...     return LinearInverseDynamics(state_dim, action_dim)
-        >>> Method("my_ridge", "a ridge of mine", build, closed_form=True).has_planner
+        >>> def build(task, columns, normalizers, preset):
+        ...     return LinearInverseDynamics(len(columns), task.action_dim)
+        >>> Method("my_ridge", "a ridge of mine", build, closed_form=True).plans
         True
     """
 
@@ -104,59 +98,26 @@ class Method:
     title: str
     build: Callable[..., TensorDictModuleBase]
     phases: tuple[Phase, ...] = ()
-    kind: str = "controller"
     closed_form: bool = False
-    labelled_only: bool = False
+    sees: str = "all"
+    plans: bool = True
     teacher: str = ""
-    other_decoder: str = ""
     presets: tuple[str, ...] = ("default",)
-    columns: Callable[[Any], dict[str, Any]] | None = None
+    columns: str | None = None
+    updates: int | None = None
+    execution: Mapping[str, Any] = field(default_factory=dict)
     fit: Callable[[Any, Any, int], dict[str, Any]] | None = None
     knows_commands: bool = False
-    execution: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
-        lookup(KINDS, self.kind, "kind of method")
+        lookup(SEES, self.sees, "kind of windows")
         if not re.fullmatch(r"[A-Za-z0-9_.]+", self.name):
             raise ValueError(f"the name of a method must be letters, digits, '_' and '.', got {self.name!r}")
         names = [phase.name for phase in self.phases]
         if len(set(names)) < len(names):
             raise ValueError(f"phases of method {self.name!r} need names of their own, got {names}")
-        Execution().replaced(**self.execution)
-        if (self.fit is None) != (self.columns is None) or (self.fit is not None and (names or self.closed_form)):
-            raise ValueError(f"method {self.name!r}: columns and fit come together, and without phases or closed form")
-        if self.kind == "policy" and len(names) != 1:
+        if not self.plans and len(names) != 1:
             raise ValueError(f"a policy is trained in one phase, method {self.name!r} has {len(names)}")
-
-    @property
-    def has_planner(self) -> bool:
-        """Whether a planner is trained beside it."""
-        return self.kind != "policy"
-
-
-def loss_coefficients(method: Method) -> set[str]:
-    """Names of the coefficients that the losses of a method take, such as ``"koopman_coeff"``.
-
-    Args:
-        method (Method): the method.
-
-    Examples:
-        >>> from torchrl_koap.training.method import loss_coefficients
-        >>> from torchrl_koap.training.methods import get_method
-        >>> sorted(loss_coefficients(get_method("koap_paper"))), loss_coefficients(get_method("dd"))
-        (['action_coeff', 'koopman_coeff'], set())
-    """
-    return {name for phase in method.phases for name in phase.coefficients}
-
-
-def normalizers_of(state: nn.Module, action: nn.Module) -> Mapping[str, nn.Module]:
-    """The two normalisers as the keyword arguments that every network takes.
-
-    Args:
-        state (nn.Module): maps raw states ``[*B, d]`` to the network's units.
-        action (nn.Module): maps raw actions ``[*B, act]`` to them.
-
-    Returns:
-        dict: ``state_normalizer`` and ``action_normalizer``.
-    """
-    return {"state_normalizer": state, "action_normalizer": action}
+        if self.fit is not None and (names or self.closed_form):
+            raise ValueError(f"method {self.name!r}: fit comes without phases or closed form")
+        Execution().replaced(**self.execution)

@@ -8,7 +8,7 @@ Fair by construction: all controllers get the same labelled windows, the same pl
 (two-stage methods share theirs between the stages). Networks that may look ahead read the same frames, 4 before and up
 to 5 after the present one, but for two that are defined otherwise: Decision Diffuser's controller (``dd``, and
 ``relabel``, which is one trained on a teacher's actions) is told the next state, ``vae`` encodes the whole window.
-``dp`` and ``dp_relabel`` have no planner and make its number of updates instead; relabelling costs the updates of the
+``dp`` and ``vpt`` have no planner and make its number of updates instead; relabelling costs the updates of the
 teacher besides.
 
 Two controllers are no inverse dynamics and have nothing of KOAP: ``mpc`` follows plans by an identified model of how
@@ -49,66 +49,54 @@ from torchrl_koap.objectives import (
 )
 from torchrl_koap.runs.plugins import load_entry_points
 from torchrl_koap.training.command_model import SHARE, UPDATES, build_decoder, decoder_columns, fit_decoder
-from torchrl_koap.training.diffusion_builders import build_diffusion_policy
 from torchrl_koap.training.method import Method, Phase
+from torchrl_koap.training.networks import build_sampler
 from torchrl_koap.training.response import fit_response, tracked_columns
 
 LOOK_AHEAD = (1, 2, 3, 4, 5)
 GROUP = "torchrl_koap.methods"  # of entry points
 
 
-def _koap(state_dim, action_dim, normalizers, options, **overrides):
-    return make_koopman_inverse_dynamics(state_dim, action_dim, preset=options["preset"], **normalizers, **overrides)
+def _koap(task, columns, normalizers, preset, **overrides):
+    return make_koopman_inverse_dynamics(len(columns), task.action_dim, preset=preset, **normalizers, **overrides)
 
 
-def _response(state_dim, action_dim, normalizers, options):
-    return ResponseModel(**options["columns"], action_dim=action_dim)
+def _response(task, columns, normalizers, preset):
+    return ResponseModel(**tracked_columns(task), action_dim=task.action_dim)
 
 
 def _fit_response(response, data, updates):
     return fit_response(response, data)
 
 
-def _command_decoder(state_dim, action_dim, normalizers, options):
-    return build_decoder(options["columns"], action_dim)
+def _command_decoder(task, columns, normalizers, preset):
+    return build_decoder(decoder_columns(task), task.action_dim)
 
 
 def _fit_command_decoder(decoder, data, updates):
     return fit_decoder(decoder, data, updates=min(max(SHARE * updates, 1), UPDATES))
 
 
-def _linear(state_dim, action_dim, normalizers, options):
-    return LinearInverseDynamics(state_dim, action_dim)
+def _linear(task, columns, normalizers, preset):
+    return LinearInverseDynamics(len(columns), task.action_dim)
 
 
-def _supervised(state_dim, action_dim, normalizers, options, *, look_ahead):
-    return SupervisedInverseDynamics(state_dim, action_dim, look_ahead=look_ahead, **normalizers)
+def _supervised(task, columns, normalizers, preset, *, look_ahead):
+    return SupervisedInverseDynamics(len(columns), task.action_dim, look_ahead=look_ahead, **normalizers)
 
 
-def _network(state_dim, action_dim, normalizers, options, *, kind):
-    return kind(state_dim, action_dim, **normalizers)
+def _network(task, columns, normalizers, preset, *, kind):
+    return kind(len(columns), task.action_dim, **normalizers)
 
 
-def _diffusion_policy(state_dim, action_dim, features, options):
-    return build_diffusion_policy(options, state_dim, action_dim, features)
+def without_actions(network: nn.Module) -> LossModule:
+    """KOAP's loss on states alone."""
+    return KOAPLoss(network, action_coeff=0.0)
 
 
-def without_actions(network: nn.Module, *, koopman_coeff: float = 1.0) -> LossModule:
-    """KOAP's loss on states alone.
-
-    Args:
-        network (nn.Module): the model.
-
-    Keyword Args:
-        koopman_coeff (float): weight of its Koopman term. Defaults to ``1``.
-    """
-    return KOAPLoss(network, action_coeff=0.0, koopman_coeff=koopman_coeff)
-
-
-_BOTH = ("koopman_coeff", "action_coeff")
-_UNLABELLED = Phase("controller", without_actions, coefficients=("koopman_coeff",))
+_UNLABELLED = Phase("controller", without_actions)
 _LABELS = (Phase("controller", ActionLoss, "labelled"),)
-_JOINT = (Phase("controller", KOAPLoss, "mixed", coefficients=_BOTH),)
+_JOINT = (Phase("controller", KOAPLoss, "mixed"),)
 # the decoder that is fitted afterwards, on a frozen encoder
 _DECODER = Phase("decoder", partial(ActionLoss, freeze_latents=True), "labelled", share=0.5)
 
@@ -144,7 +132,7 @@ def register_method(method: Method) -> Method:
         raise ValueError(
             f"there is a method {method.name!r} already ({METHODS[method.name].title!r}); choose another name"
         )
-    if method.teacher and not lookup(METHODS, method.teacher, "teacher").has_planner:
+    if method.teacher and not lookup(METHODS, method.teacher, "teacher").plans:
         raise ValueError(f"the teacher of method {method.name!r} must be a controller, {method.teacher!r} is a policy")
     METHODS[method.name] = method
     return method
@@ -157,14 +145,12 @@ for _method in (
         _koap,
         (_UNLABELLED,),
         closed_form=True,
-        other_decoder="koap_sgd",
         presets=_ANY_PRESET,
     ),
     Method(
         "mpc",
         "MPC with an identified response",
         _response,
-        columns=tracked_columns,
         fit=_fit_response,
         execution=_EVERY_STEP,
     ),
@@ -172,18 +158,18 @@ for _method in (
         "command_regression",
         "regression of the command on the state",
         _command_decoder,
-        columns=decoder_columns,
         fit=_fit_command_decoder,
         knows_commands=True,
         execution=_EVERY_STEP,
     ),
-    Method("koap_sgd", "KOAP, decoder trained with the rest", _koap, _JOINT, other_decoder="koap", presets=_ANY_PRESET),
+    Method("koap_sgd", "KOAP, decoder trained with the rest", _koap, _JOINT, presets=_ANY_PRESET),
     Method(
         "koap_paper",
         "KOAP as in the paper",
         _koap,
         _JOINT,
         presets=("paper",),
+        columns="all",
         execution={"strategy": "open_loop", "blend": 0.0, "candidates": 1},
     ),
     Method(
@@ -192,7 +178,7 @@ for _method in (
         _koap,
         (replace(_UNLABELLED, windows="labelled"),),
         closed_form=True,
-        labelled_only=True,
+        sees="labelled",
         presets=_ANY_PRESET,
     ),
     Method("koap_untrained", "KOAP, nothing trained but the decoder", _koap, closed_form=True, presets=_ANY_PRESET),
@@ -202,7 +188,7 @@ for _method in (
         _koap,
         (
             replace(_UNLABELLED, share=0.5),
-            Phase("finetune", KOAPLoss, "labelled", share=0.5, coefficients=_BOTH),
+            Phase("finetune", KOAPLoss, "labelled", share=0.5),
         ),
         presets=_ANY_PRESET,
     ),
@@ -237,7 +223,7 @@ for _method in (
         partial(_network, kind=NonlinearInverseDynamics),
         _JOINT,
     ),
-    Method("dp", "Diffusion Policy", _diffusion_policy, _POLICY, kind="policy"),
+    Method("dp", "Diffusion Policy", build_sampler, _POLICY, plans=False),
     Method(
         "relabel",
         "Decision Diffuser on relabelled data",
@@ -246,34 +232,32 @@ for _method in (
         teacher="dd_lookahead",
     ),
     Method(
-        "dp_relabel",
+        "vpt",
         "Diffusion Policy on relabelled data",
-        _diffusion_policy,
+        build_sampler,
         _POLICY,
-        kind="policy",
+        plans=False,
         teacher="dd_lookahead",
     ),
 ):
     register_method(_method)
 
 
-def get_method(name: str, decoder: str | None = None) -> Method:
+def get_method(name: str) -> Method:
     """Looks a method up.
 
     Args:
         name (str): a name in :data:`METHODS`.
-        decoder (str, optional): ``"ridge"`` (closed form, fitted at the end) or ``"sgd"`` (trained with the rest), for
-            methods that exist with both. Default: the method's own.
 
     Returns:
         Method: the entry of :data:`METHODS`.
 
     Raises:
-        ValueError: if there is no such method, or not with that decoder; the message suggests the nearest name.
+        ValueError: if there is no such method; the message suggests the nearest name.
 
     Examples:
         >>> from torchrl_koap.training.methods import get_method
-        >>> get_method("koap").closed_form, get_method("koap", "sgd").closed_form
+        >>> get_method("koap").closed_form, get_method("koap_sgd").closed_form
         (True, False)
         >>> get_method("kaop")
         Traceback (most recent call last):
@@ -282,10 +266,4 @@ def get_method(name: str, decoder: str | None = None) -> Method:
     """
     if name not in METHODS:
         load_entry_points(GROUP)
-    method = lookup(METHODS, name, "method")
-    if decoder is None or lookup(("ridge", "sgd"), decoder, "decoder") == ("ridge" if method.closed_form else "sgd"):
-        return method
-    if not method.other_decoder:
-        own = "a closed form" if method.closed_form else "trained by gradients"
-        raise ValueError(f"the decoder of method {name!r} is {own}: it has no decoder {decoder!r}")
-    return lookup(METHODS, method.other_decoder, "method")
+    return lookup(METHODS, name, "method")

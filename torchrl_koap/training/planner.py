@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -25,66 +24,37 @@ from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import training_dtype
 from torchrl_koap.runs.progress import progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import load_weights, save_weights
 from torchrl_koap.tasks import HISTORY, Task
-from torchrl_koap.training.diffusion_builders import build_planner
-from torchrl_koap.training.loop import moving_average, phase_finished, train_phase
-from torchrl_koap.training.resolved import ResolvedConfig
+from torchrl_koap.training.loop import moving_average, train_phase
+from torchrl_koap.training.networks import build_planner
 
-WEIGHT_DECAY = 1e-4  # of a planner, or of a policy of its own
-
-
-def train_planner(
-    run: RunDirectory, resolved: ResolvedConfig, data: TensorDictBase, logger: Any = None
-) -> tuple[StatePlanner, dict[str, float]]:
-    """Trains the planner, takes it over from another run, or loads it where that is done.
-
-    Args:
-        run (RunDirectory): where weights, metrics and checkpoints go.
-        resolved (ResolvedConfig): all options.
-        data (TensorDictBase): flat data with the whole ``state``; no action is looked at.
-        logger (optional): a TorchRL logger.
-
-    Returns:
-        tuple: the planner and its last losses.
-    """
-    options, task = resolved.options, resolved.task
-    planner = build_planner(resolved.planner, data["state"].shape[-1], task.planner_features()).to(options.device)
-    source = run.path if options.planner_from is None else Path(options.planner_from)
-    if options.planner_from is not None or (options.resume and phase_finished(run, "planner")):
-        load_weights(source / "planner.safetensors", planner, task=task.name)
-        if options.planner_from is not None:
-            save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
-        return planner, run.last_metrics("planner")
-    values = learn_states(planner, data, task, options, run=run, logger=logger)
-    save_weights(run.path / "planner.safetensors", planner, {"task": task.name, "kind": "planner"})
-    return planner, values
+WEIGHT_DECAY = 1e-4  # of a planner, or of a network that samples actions
 
 
-def learn_states(
-    planner: StatePlanner,
-    data: TensorDictBase,
+def learn_planner(
     task: Task,
-    options: TrainConfig,
+    config: TrainConfig,
+    data: TensorDictBase,
     *,
     run: RunDirectory | None = None,
     logger: Any = None,
-) -> dict[str, float]:
-    """Fits a planner's statistics and trains it; it is left with the average of its parameters.
+) -> tuple[StatePlanner, dict[str, float]]:
+    """Builds and trains a planner.
 
     Args:
-        planner (StatePlanner): the planner; it is trained in place.
-        data (TensorDictBase): flat data with the whole ``state``; no action is looked at.
-        task (Task): whose data they are.
-        options (TrainConfig): updates, batch size, learning rate, augmentation, with the task's defaults filled in.
+        task (Task): the task of the data.
+        config (TrainConfig): nothing left open.
+        data (TensorDictBase): flat data ``[N]`` with the whole ``state``; no action is looked at.
 
     Keyword Args:
         run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
         logger (optional): a TorchRL logger.
 
     Returns:
-        dict: its last losses.
+        tuple: the planner, which has the average of its parameters, and its last losses.
     """
+    section = config.planner
+    planner = build_planner(task, section).to(config.run.device)
     # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
     # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
     length, unseen = HISTORY + planner.horizon, HISTORY - planner.history
@@ -94,34 +64,33 @@ def learn_states(
     states, groups = windows["state"][:, unseen:], windows["episode"][:, -1]
     seen = None if planner.forecast is None else augment(windows.clone())["state"][:, unseen:]
     planner.fit_normalizers(states, seen=seen, groups=groups)
-    planner.to(options.device)
-    buffer = make_window_buffer(extended, length, options.batch_size, select=["state"], pad_before=1)
+    planner.to(config.run.device)
+    buffer = make_window_buffer(extended, length, section.batch_size, select=["state"], pad_before=1)
 
     def draw() -> TensorDictBase:
         return augment(buffer.sample())[:, unseen:]
 
-    loss = PlannerLoss(planner, dtype=training_dtype(options.precision, options.device))
-    with progress_bar(options.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
+    loss = PlannerLoss(planner, dtype=training_dtype(config.run.precision, config.run.device))
+    with progress_bar(section.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
         values = train_phase(
             "planner",
             loss,
             draw,
-            num_steps=options.steps,
-            learning_rate=options.planner_learning_rate,
+            num_steps=section.steps,
+            learning_rate=section.learning_rate,
             weight_decay=WEIGHT_DECAY,
-            target_update=moving_average(loss, options.steps),
+            target_update=moving_average(loss, section.steps),
             run=run,
             logger=logger,
-            checkpoint_every=options.checkpoint_every,
-            resume=options.resume,
+            resume=config.run.resume,
             progress=show_losses(bar),
         )
     loss.target_network_params.to_module(planner)
-    return values
+    return planner, values
 
 
 def augmentation(task: Task, *, actions: bool = False) -> TensorDictSequential:
-    """What windows undergo before the planner, or a policy of its own, learns from them.
+    """Makes what windows undergo before a planner, or a network that samples actions, learns from them.
 
     Args:
         task (Task): the task of the windows.

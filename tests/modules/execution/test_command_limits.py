@@ -9,9 +9,8 @@ import torch
 from tensordict import TensorDict
 from toy_policies import CountingPlanner, CountingSampler, EchoController
 
-from torchrl_koap import load_policy, save_policy
-from torchrl_koap.evaluation.trained_run import execution_of, load_run
-from torchrl_koap.modules import CommandLimits, Execution, ExecutionConfig, make_policy
+from torchrl_koap import Trained, load_policy
+from torchrl_koap.modules import CommandLimits, Execution, make_policy
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.policy_facts import policy_facts
 
@@ -110,17 +109,16 @@ def test_a_trained_policy_has_those_of_its_task_unless_told_otherwise(tmp_path):
     policy = load_policy("pretrained:sorting")
     assert policy.limits.lead == policy.execution.lead == 0.1
     assert load_policy("pretrained:sorting", lead=0.0).limits is None
-    saved = save_policy(load_policy("pretrained:sorting", gain=1.2), tmp_path / "policy.safetensors")
-    assert load_policy(saved).execution == Execution(lead=0.1, gain=1.2)
+    saved = Trained.load("pretrained:sorting").save(tmp_path / "policy.safetensors")
+    assert load_policy(saved, gain=1.2).execution == Execution(lead=0.1, gain=1.2)
     assert load_policy(saved, lead=0.0, gain=1.0).limits is None
 
 
 def test_those_who_know_what_they_commanded_go_without_gain():
     own = get_task("po_sorting").defaults.execution["gain"]
-    trained = load_run("pretrained:po_sorting")
-    assert own > 1 and execution_of(trained, ExecutionConfig()).gain == own
-    assert execution_of(trained, ExecutionConfig(gain=1.4)).gain == 1.4
-    assert execution_of(trained, ExecutionConfig(strategy="oracle")).gain == 1.0
+    assert own > 1 and load_policy("pretrained:po_sorting").execution.gain == own
+    assert load_policy("pretrained:po_sorting", gain=1.4).execution.gain == 1.4
+    assert load_policy("pretrained:po_sorting", strategy="oracle").execution.gain == 1.0
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,6 @@ TASK = register_task(
             y=(-0.05, 0.55),
             caption=" The puck passes the post on one side.",
         ),
-        defaults=Defaults(demonstrations=12, planner_steps=100, channels=(16, 32)),
+        defaults=Defaults(demonstrations=12, planner={"steps": 100, "width": 16}),
     )
 )

@@ -10,16 +10,15 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from torchrl_koap import ControllerConfig, PlannerConfig, RunConfig, TrainConfig, fit, train
 from torchrl_koap.data import LabelBudget, cut_windows, load_ted, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.keys import LayoutError
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.runs.weights import load_tensors
-from torchrl_koap.tasks import WINDOW, Action, get_task
-from torchrl_koap.training import Recipe, TrainConfig, fit_controller, fit_planner, train
-from torchrl_koap.training.resolved import resolve
+from torchrl_koap.tasks import WINDOW, Action
 
 NAMES = ["q1", "q2", "goal_1", "goal_2"]
-SMALL = {"batch_size": 8, "channels": (8, 16)}
+SMALL = {"batch_size": 8, "width": 8}
 
 
 def record(number=6, steps=40, seed=0):
@@ -39,6 +38,12 @@ def record(number=6, steps=40, seed=0):
     return states, actions
 
 
+def fit_controller(data, task=None, *, steps=500, preset=None, columns=None, **options):
+    """What was trained of a controller alone."""
+    section = {"steps": steps, "preset": preset, "columns": columns}
+    return fit(data, task, planner=False, controller=section, progress=False, **options)
+
+
 def few_labels(labelled=2, **options):
     states, actions = record()
     actions = [steps if index < labelled else None for index, steps in enumerate(actions)]
@@ -52,53 +57,57 @@ def same_weights(module, other):
 
 def test_the_weights_of_a_training_bit_for_bit(tmp_path):
     folder = save_demonstrations(tmp_path / "arm", **few_labels())
-    options = {"controller_batch_size": 8, "validation_fraction": 0.0, **SMALL}
-    train(TrainConfig(out=tmp_path / "run", dataset=str(folder), steps=30, controller_steps=20, seed=3, **options))
+    sections = {"planner": PlannerConfig(steps=30, held_out=0.0, **SMALL), "controller": ControllerConfig(steps=20)}
+    train(TrainConfig(dataset=str(folder), out=tmp_path / "run", run=RunConfig(seed=3), **sections))
     data, task = load_ted(folder / "ted")[0], make_demonstrations(name="arm", **few_labels())[1]
     before = torch.get_rng_state()
-    planner = fit_planner(data, task, steps=30, seed=3, progress=False, **SMALL)
-    controller = fit_controller(data, task, steps=20, seed=3, progress=False, controller_batch_size=8)
+    trained = fit(data, task, planner={"steps": 30, **SMALL}, controller={"steps": 20}, seed=3, progress=False)
     assert torch.equal(torch.get_rng_state(), before)
-    assert same_weights(planner, load_tensors(tmp_path / "run" / "planner.safetensors")[0])
-    assert same_weights(controller, load_tensors(tmp_path / "run" / "controller.safetensors")[0])
+    assert same_weights(trained.planner, load_tensors(tmp_path / "run" / "planner.safetensors")[0])
+    assert same_weights(trained.controller, load_tensors(tmp_path / "run" / "controller.safetensors")[0])
 
 
 def test_how_it_was_made_is_kept():
     data, task = make_demonstrations(**few_labels())
-    controller = fit_controller(data, task, steps=5, progress=False, controller_state="all", controller_batch_size=8)
-    recipe = controller.recipe
-    assert isinstance(recipe, Recipe) and recipe.task is task
-    assert recipe.entry["method"] == "koap" and recipe.entry["state"] == "all"
-    assert recipe.results["labels_used"] == 68 and recipe.results["updates"] == 5
-    assert not controller.training
+    trained = fit_controller(data, task, steps=5, columns="all")
+    assert trained.task is task and trained.method.name == "koap" and trained.columns == (0, 1, 2, 3)
+    assert trained.results["decoder_fit"]["labels_used"] == 68 and trained.results["controller_updates"] == 5
+    assert not trained.controller.training and trained.planner is None
+
+
+def test_a_planner_is_shared():
+    data, task = make_demonstrations(**few_labels())
+    first = fit(data, task, method="linear", planner={"steps": 2, "frames": 1, **SMALL}, progress=False)
+    other = fit(data, task, method="koap_untrained", planner=first.planner, progress=False)
+    assert other.planner is first.planner
+    built = {name: getattr(other.config.planner, name) for name in ("network", "width", "frames")}
+    assert built == {"network": "unet", "width": 8, "frames": 1}
 
 
 def test_labels_marked_missing_or_found():
     data, task = make_demonstrations(**few_labels())
-    expected = fit_controller(data, task, method="linear", progress=False)
+    expected = fit_controller(data, task, method="linear").controller
     unmarked = data.exclude("has_action")
-    assert same_weights(fit_controller(unmarked, task, method="linear", progress=False), expected)
+    assert same_weights(fit_controller(unmarked, task, method="linear").controller, expected)
     full, _ = make_demonstrations(**few_labels(6))
     budgeted, _ = LabelBudget(episodes=[0, 1]).apply(full)
-    assert same_weights(fit_controller(budgeted, task, method="linear", progress=False), expected)
+    assert same_weights(fit_controller(budgeted, task, method="linear").controller, expected)
     with_state = select_state(data, task.state_of)
-    assert same_weights(fit_controller(with_state, task, method="linear", progress=False), expected)
+    assert same_weights(fit_controller(with_state, task, method="linear").controller, expected)
 
 
 def test_without_a_task_every_column_is_the_robots():
     data, _ = make_demonstrations(**few_labels())
-    planner = fit_planner(data, steps=2, progress=False, **SMALL)
-    controller = fit_controller(data, method="linear", progress=False)
-    assert planner.state_dim == 4 and controller.recipe.task.robot == ()
-    only_states = select_state(data, (0, 1))
-    assert fit_planner(only_states, steps=2, progress=False, **SMALL).recipe.task.observation_dim == 2
+    trained = fit(data, method="linear", planner={"steps": 2, **SMALL}, progress=False)
+    assert trained.planner.state_dim == 4 and trained.task.robot == ()
+    assert fit_controller(select_state(data, (0, 1)), method="linear").task.observation_dim == 2
 
 
 def errors_of(method, task, data, gains=1.0):
     """Action errors on trajectories that were not in the data, as shares of the actions."""
     states, actions = record(4, seed=9)
     windows = torch.from_numpy(np.stack(states)[..., :2]).float()
-    controller = fit_controller(data, task, method=method, steps=0, progress=False)
+    controller = fit_controller(data, task, method=method, steps=0).controller
     with torch.no_grad():
         decoded = controller(TensorDict({"state": windows}, [len(windows)]))["action"][:, 4:-12]
     true = torch.from_numpy(np.stack(actions) * gains).float()[:, 4:-12]
@@ -117,46 +126,39 @@ def test_a_guess_about_axes_is_dropped_where_it_predicts_worse():
     states, actions = record()
     scaled = [steps * gains if index < 3 else None for index, steps in enumerate(actions)]
     data, task = make_demonstrations(**few_labels(actions=scaled))
-    guessed = fit_controller(data, task, steps=0, progress=False)
-    without = fit_controller(data, replace(task, env="none:at_all"), steps=0, progress=False)
-    assert same_weights(guessed, without)
+    guessed = fit_controller(data, task, steps=0)
+    without = fit_controller(data, replace(task, env="none:at_all"), steps=0)
+    assert same_weights(guessed.controller, without.controller)
     tied = fit_controller(
-        data, replace(task, actions={"x": Action("m", column=0), "y": Action("m", column=1)}), steps=0, progress=False
+        data, replace(task, actions={"x": Action("m", column=0), "y": Action("m", column=1)}), steps=0
     )
-    assert tied.recipe.results["held_out_error"] > guessed.recipe.results["held_out_error"]
+
+    def error(trained):
+        return trained.results["decoder_fit"]["held_out_error"]
+
+    assert error(tied) > error(guessed)
 
 
 def test_refusals():
     data, task = make_demonstrations(**few_labels())
-    with pytest.raises(ValueError, match="unknown option of fit_planner 'chanels'; did you mean 'channels'"):
-        fit_planner(data, task, chanels=(8,))
-    with pytest.raises(ValueError, match="unknown option of fit_controller 'channels'"):
-        fit_controller(data, task, channels=(8,))
-    with pytest.raises(ValueError, match="method 'dp' is a policy of its own"):
-        fit_controller(data, task, method="dp")
+    with pytest.raises(ValueError, match="unknown option of PlannerConfig 'widht'; did you mean 'width'"):
+        fit(data, task, planner={"widht": 8})
+    with pytest.raises(ValueError, match="unknown option of ControllerConfig 'width'"):
+        fit(data, task, controller={"width": 8})
     with pytest.raises(ValueError, match="unknown method 'kaop'; did you mean 'koap'"):
-        fit_controller(data, task, method="kaop")
+        fit(data, task, method="kaop")
     unlabelled, _ = make_demonstrations(**few_labels(0, actions=None, action_dim=2))
     with pytest.raises(ValueError, match="none of the 234 steps has an action: there are no labels to learn from"):
-        fit_controller(unlabelled, task)
+        fit(unlabelled, task)
     with pytest.raises(ValueError, match="'state' has 3 columns, task 'robot' has 4"):
-        fit_planner(select_state(data, (0, 1, 2)), task)
+        fit(select_state(data, (0, 1, 2)), task)
     wrong = data.clone()
     wrong["has_action"][-1] = True
     with pytest.raises(LayoutError, match="'action' is not finite in 1 labelled steps"):
-        fit_controller(wrong, task)
-
-
-def test_a_forecast_is_the_default_without_an_environment(tmp_path):
-    _, task = make_demonstrations([np.zeros((20, 2))], control_hz=30, action_dim=2)
-
-    def entry(task=task, **options):
-        return resolve(TrainConfig(out=tmp_path, **options), task).planner
-
-    assert entry()["forecast"] is True and "forecast" not in entry(get_task("avoiding"))
-    assert "forecast" not in entry(method="dp")
-    plain = replace(task, defaults=replace(task.defaults, view={"forecast": False}))
-    assert "forecast" not in entry(plain)
+        fit(wrong, task)
+    planner = fit(data, task, method="linear", planner={"steps": 1, **SMALL}, progress=False).planner
+    with pytest.raises(ValueError, match="method 'dp' samples actions and has no planner"):
+        fit(data, task, method="dp", planner=planner)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +182,7 @@ def test_a_lifting_starts_from_isomap_for_as_many_updates_as_it_is_trained_and_o
     walks = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(4)]
     wide = [np.tanh(walk @ np.random.default_rng(9).normal(size=(2, 20)) / 4) for walk in walks]
     data, task = make_demonstrations(wide, [np.diff(walks[0], axis=0), None, None, None], control_hz=30)
-    fit_controller(data, task, method=method, preset="semi_supervised", steps=steps, progress=False)
+    fit_controller(data, task, method=method, preset="semi_supervised", steps=steps)
     own = len(cut_windows(select_state(data, task.state_of), WINDOW, pad_before=8)) // 4  # of a trajectory
     assert [(updates, round(windows / own)) for updates, windows in seen] == asked
 
@@ -191,13 +193,6 @@ def test_data_in_double_precision_are_fitted_like_others(method):
     wide = data.clone()
     for key in ("observation", ("next", "observation"), "action"):
         wide[key] = data[key].double()
-    fitted = [fit_controller(each, task, method=method, steps=2, progress=False) for each in (data, wide)]
-    assert same_weights(*fitted)
+    fitted = [fit_controller(each, task, method=method, steps=2) for each in (data, wide)]
+    assert same_weights(*(each.controller for each in fitted))
     assert wide["observation"].dtype == torch.float64
-
-
-def test_a_planner_needs_neither_actions_nor_their_number():
-    data, task = make_demonstrations(**few_labels())
-    unlabelled = data.exclude("action", "has_action")
-    planners = [fit_planner(each, steps=2, progress=False, **SMALL) for each in (data, unlabelled)]
-    assert same_weights(*planners)

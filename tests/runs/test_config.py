@@ -1,0 +1,49 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Every section refuses numbers out of range by its own name."""
+
+from __future__ import annotations
+
+import pytest
+
+from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
+
+
+@pytest.mark.parametrize(
+    ("section", "options", "message"),
+    [
+        (LabelConfig, {"fraction": 0.0}, "labels.fraction must be > 0 and <= 1, got 0.0"),
+        (LabelConfig, {"fraction": 1.5}, "labels.fraction must be > 0 and <= 1, got 1.5"),
+        (LabelConfig, {"fraction": float("nan")}, "labels.fraction must be"),
+        (LabelConfig, {"count": 0}, "labels.count must be >= 1, got 0"),
+        (LabelConfig, {"trajectories": 0}, "labels.trajectories must be > 0 and <= 1, got 0"),
+        (
+            LabelConfig,
+            {"fraction": 0.5, "count": 3},
+            "give one of fraction, count and episodes, got .*",
+        ),
+        (LabelConfig, {"episodes": (1,), "unit": "window"}, "labels.episodes are trajectories of your own choice"),
+        (LabelConfig, {"episodes": (1, 1)}, "labels.episodes must be different numbers"),
+        (LabelConfig, {"unit": "trajectries"}, "unknown unit of labels 'trajectries'; did you mean 'trajectory'"),
+        (PlannerConfig, {"steps": 0}, "planner.steps must be >= 1, got 0"),
+        (PlannerConfig, {"width": 0}, "planner.width must be >= 1, got 0"),
+        (PlannerConfig, {"batch_size": 0}, "planner.batch_size must be >= 1, got 0"),
+        (PlannerConfig, {"learning_rate": 0.0}, "planner.learning_rate must be > 0, got 0.0"),
+        (PlannerConfig, {"frames": 3}, "planner.frames must be >= 1 and <= 2, got 3"),
+        (PlannerConfig, {"held_out": 1.0}, "planner.held_out must be >= 0 and < 1, got 1.0"),
+        (PlannerConfig, {"source": "pretrained:avoidin"}, "did you mean 'avoiding'"),
+        (ControllerConfig, {"steps": -1}, "controller.steps must be >= 0, got -1"),
+        (ControllerConfig, {"columns": "robbot"}, "unknown controller.columns 'robbot'; did you mean 'robot'"),
+        (RunConfig, {"seed": -1}, "run.seed must be >= 0, got -1"),
+        (RunConfig, {"threads": 0}, "run.threads must be >= 1, got 0"),
+        (RunConfig, {"precision": "float8"}, "unknown precision 'float8'"),
+        (RunConfig, {"logger": "wandbb"}, "unknown logger 'wandbb'; did you mean 'wandb'"),
+    ],
+)
+def test_what_is_refused(section, options, message):
+    with pytest.raises(ValueError, match=message):
+        section(**options)
+
+
+def test_a_string_will_do_for_a_path():
+    assert TrainConfig(out="runs/a").out.name == "a"
+    assert PlannerConfig(source="runs/b").source.name == "b"

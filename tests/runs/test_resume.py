@@ -1,0 +1,63 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A run goes on as what it was begun as."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from torchrl_koap import LabelConfig, PlannerConfig, RunConfig, TrainConfig
+from torchrl_koap.runs.config_files import to_json, versions
+from torchrl_koap.runs.resume import begun_with, check_data, check_resume
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+
+SAVED = TrainConfig(
+    dataset="/no/longer/there",
+    out="run",
+    labels=LabelConfig(fraction=0.5),
+    planner=PlannerConfig(steps=7),
+    run=RunConfig(seed=3, threads=2),
+)
+RESUME = RunConfig(resume=True)
+
+
+@pytest.fixture
+def run(tmp_path):
+    run = RunDirectory(tmp_path / "run")
+    run.write_json("config.json", to_json(SAVED) | {"data": {"steps": 5, "sha256": "a"}, "versions": versions()})
+    return run
+
+
+def test_what_is_left_out_is_as_it_was(run):
+    config = begun_with(run, TrainConfig(out="elsewhere", run=RESUME))
+    assert config == replace(SAVED, out=config.out, run=replace(SAVED.run, resume=True))
+    asked = begun_with(run, TrainConfig(out="run", labels=LabelConfig(count=3), run=RESUME))
+    assert asked.labels == LabelConfig(count=3) and asked.planner.steps == 7
+    fresh = TrainConfig(out="run")
+    assert begun_with(run, fresh) is fresh
+
+
+def test_other_options_are_refused_by_name(run):
+    check_resume(run, replace(SAVED, dataset="/moved", run=replace(SAVED.run, resume=True, threads=1)))
+    with pytest.raises(RunDirectoryError, match="started with another planner.steps, run.seed; it cannot be resumed"):
+        check_resume(run, replace(SAVED, planner=PlannerConfig(steps=8), run=replace(RESUME, seed=4, threads=2)))
+    with pytest.raises(RunDirectoryError, match="holds a run already; choose another --out, or --resume it"):
+        check_resume(run, SAVED)
+
+
+def test_rests_without_options_are_refused(tmp_path):
+    check_resume(RunDirectory(tmp_path), SAVED)
+    (tmp_path / "checkpoints").mkdir()
+    with pytest.raises(RunDirectoryError, match="holds checkpoints but no config.json"):
+        check_resume(RunDirectory(tmp_path), SAVED)
+
+
+def test_other_data_and_versions_are_refused(run, caplog):
+    content = run.read_json("config.json")
+    check_data(run, content)
+    with pytest.raises(RunDirectoryError, match=r"started with other demonstrations .* \(5 steps then, 6 now\)"):
+        check_data(run, content | {"data": {"steps": 6, "sha256": "b"}})
+    with pytest.raises(RunDirectoryError, match="started with torchrl_koap .*, this is 9"):
+        check_data(run, content | {"versions": content["versions"] | {"torchrl_koap": "9"}})
+    check_data(run, content | {"versions": content["versions"] | {"torch": "9"}})  # a warning is enough

@@ -1,0 +1,134 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Demonstrations of a task, and trajectories that the planner never sees."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from offline_runs import save_arm, train_arm
+from tiny_runs import demonstration
+
+from torchrl_koap import PlannerConfig, RunConfig
+from torchrl_koap.data import LabelBudget, flatten_trajectories, save_ted
+from torchrl_koap.keys import validate
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training.datasets import (
+    choose_held_out,
+    find_task_of,
+    held_out_by,
+    load_demonstrations,
+    without_held_out,
+)
+
+
+def flat(count):
+    return flatten_trajectories([torch.zeros(5, 2)] * count, [torch.zeros(4, 1)] * count)
+
+
+def test_trajectories_without_labels_are_taken_first():
+    for seed in range(5):
+        data, _ = LabelBudget(count=6, seed=seed).apply(flat(10))
+        labelled = set(data["episode"][data["has_action"].squeeze(-1)].tolist())
+        chosen = choose_held_out(data, 0.4, seed=seed)
+        assert len(chosen) == 4 and not labelled & set(chosen)
+    assert choose_held_out(data, 0.2, seed=0) != choose_held_out(data, 0.2, seed=1)
+
+
+def test_where_all_have_labels_some_of_these_are_held_out_and_lose_none():
+    data = flat(10)
+    chosen = choose_held_out(data, 0.3)
+    assert len(chosen) == 3
+    assert len(without_held_out(data, chosen)["episode"].unique()) == 7
+    kept = without_held_out(data, chosen, keep_labelled=True)
+    assert len(kept["episode"].unique()) == 10 and kept["has_action"].all()
+
+
+@pytest.mark.parametrize(
+    ("count", "fraction", "number"), [(1, 0.1, 0), (2, 0.1, 1), (2, 0.9, 1), (50, 0.1, 5), (5, 0, 0)]
+)
+def test_one_is_held_out_at_least_and_one_is_left(count, fraction, number):
+    assert len(choose_held_out(flat(count), fraction)) == number
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match=r"planner.held_out must be in \[0, 1\), got 1.5"):
+        choose_held_out(flat(3), 1.5)
+    with pytest.raises(ValueError, match="all 3 trajectories that are used are held out"):
+        without_held_out(flat(3), [0, 1, 2])
+
+
+def test_a_run_lists_them_resumes_and_hands_them_on(tmp_path):
+    arm = save_arm(tmp_path / "arm", labelled=9)
+    run = train_arm(tmp_path / "run", arm, method="linear")
+    config = json.loads((run / "config.json").read_text())
+    assert config["planner"]["held_out"] == 0.1 and config["held_out_episodes"] == [9]  # the one without a label
+    weights = (run / "planner.safetensors").read_bytes()
+    for name in ("planner.safetensors", "controller.safetensors", "summary.json"):
+        (run / name).unlink()
+    train_arm(run, arm, method="linear", run=RunConfig(resume=True))
+    assert (run / "planner.safetensors").read_bytes() == weights
+    assert json.loads((run / "config.json").read_text())["held_out_episodes"] == [9]
+    assert held_out_by(run, str(arm)) == [9] and held_out_by(run, str(tmp_path)) == []
+    again = train_arm(
+        tmp_path / "again", arm, method="linear", planner=PlannerConfig(source=run), run=RunConfig(seed=3)
+    )
+    assert json.loads((again / "config.json").read_text())["held_out_episodes"] == [9]
+
+
+def test_the_planner_does_not_depend_on_what_is_held_out(tmp_path):
+    """Nothing of these trajectories reaches it, not even through its statistics."""
+    from torchrl_koap.data import load_ted, save_ted
+
+    arm = save_arm(tmp_path / "arm", labelled=9)
+    run = train_arm(tmp_path / "run", arm, method="linear")
+    data, task = load_ted(arm / "ted")
+    for key in ("observation", ("next", "observation")):
+        data[key][data["episode"] == 9] *= 100
+    save_ted(data, arm / "ted", task)
+    other = train_arm(tmp_path / "other", arm, method="linear")
+    for name in ("planner.safetensors", "controller.safetensors"):
+        assert (other / name).read_bytes() == (run / name).read_bytes()
+
+
+TASK = get_task("avoiding")
+
+
+@pytest.fixture(scope="module")
+def data(demonstrations):
+    return load_demonstrations(str(demonstrations), TASK)
+
+
+def test_raw_folders_become_states_and_actions(data):
+    validate(data)
+    commanded, measured = demonstration(2, 32)
+    third = data[data["episode"] == 2]
+    assert len(third) == 31
+    np.testing.assert_allclose(third["state"].numpy(), measured[:-1], atol=1e-7)
+    np.testing.assert_allclose(third["action"].numpy(), np.diff(commanded, axis=0), atol=1e-9)
+    assert data["has_action"].all()
+
+
+def test_recorded_folders_give_the_same(tmp_path, data):
+    save_ted(data, tmp_path / "ted", TASK)
+    again = load_demonstrations(str(tmp_path), TASK)
+    for key in ("state", "action", "episode", "observation"):
+        assert torch.equal(again[key], data[key])
+    again["action"][0] = 7.0  # in memory: the file stays as it is
+    assert torch.equal(load_demonstrations(str(tmp_path), TASK)["action"], data["action"])
+
+
+def test_missing_and_empty_folders_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="'nowhere' is no folder"):
+        load_demonstrations("nowhere", TASK)
+    with pytest.raises(FileNotFoundError, match=f"no demonstrations .* in {tmp_path}"):
+        load_demonstrations(str(tmp_path), TASK)
+
+
+def test_a_call_without_data_names_both_commands():
+    with pytest.raises(
+        ValueError, match="koap demos --task sorting --out DEMOS.*koap train --task sorting --dataset DEMOS"
+    ):
+        find_task_of(None, "sorting")

@@ -1,0 +1,137 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What is trained where nothing is asked for: asked > method > task > network > library."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+
+from torchrl_koap import ControllerConfig, Execution, ExecutionConfig, LabelConfig, PlannerConfig, TrainConfig
+from torchrl_koap.data import make_demonstrations
+from torchrl_koap.runs.config_files import to_json
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.tasks import TASKS, get_task
+from torchrl_koap.training import METHODS, resolve
+from torchrl_koap.training.networks import build_planner, forecasts
+
+
+def resolved(task="avoiding", method=None, **sections):
+    return resolve(TrainConfig(out="run", method=method, **sections), get_task(task))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("task", ["avoiding", "stacking", "po_sorting"])
+def test_nothing_is_left_open_and_a_second_pass_changes_nothing(task, method):
+    config = resolved(task, method)
+    for section in (config.planner, config.controller, config.execution):
+        missing = {field.name for field in fields(section) if getattr(section, field.name) is None}
+        assert missing <= {"source"}
+    assert config.labels.fraction == 1.0 and config.task == task
+    assert resolve(config, get_task(task)) == config
+
+
+class TestTheTasksMethod:
+    @pytest.mark.parametrize(
+        "task, method",
+        [
+            ("avoiding", "koap"),
+            ("stacking", "mpc"),
+            ("stacking_1", "mpc"),
+            ("stacking_unobserved_joints", "command_regression"),
+        ],
+    )
+    def test_is_trained_unless_another_is_asked_for(self, task, method):
+        assert resolved(task).method == method
+        assert resolved(task, "linear").method == "linear"
+
+
+class TestTheTasksPreset:
+    def test_is_that_of_its_own_method_unless_another_is_asked_for(self):
+        assert resolved("po_sorting").controller.preset == "semi_supervised"
+        assert resolved("po_sorting", controller=ControllerConfig(preset="default")).controller.preset == "default"
+        assert resolved("sorting").controller.preset == "default"
+
+    @pytest.mark.parametrize(
+        ("method", "own"), [("koap_untrained", "default"), ("koap_paper", "paper"), ("pca", "default")]
+    )
+    def test_is_not_that_of_other_methods(self, method, own):
+        assert resolved("po_sorting", method).controller.preset == own
+
+    def test_must_be_one_of_the_methods(self):
+        with pytest.raises(ValueError, match="method 'pca' has no preset 'paper', it has"):
+            resolved(method="pca", controller=ControllerConfig(preset="paper"))
+        with pytest.raises(ValueError, match="unknown preset 'papper'; did you mean 'paper'"):
+            resolved(controller=ControllerConfig(preset="papper"))
+
+
+class TestThePlanner:
+    def test_is_the_tasks_unless_a_network_is_named(self):
+        aligning, named = (
+            resolved("aligning", planner=PlannerConfig(network=network)).planner for network in (None, "unet")
+        )
+        assert (aligning.network, aligning.width, aligning.batch_size, aligning.learning_rate) == (
+            "mlp",
+            512,
+            512,
+            1e-3,
+        )
+        assert (named.network, named.width, named.batch_size, named.learning_rate) == ("unet", 64, 128, 3e-3)
+        assert named.steps == aligning.steps == 8000 and named.frames == aligning.frames == 1
+        assert resolved(planner=PlannerConfig(network="mlp")).planner.width == 512
+        assert resolved("stacking", planner=PlannerConfig(width=64)).planner.width == 64
+        assert resolved().planner.width == 32
+
+    def test_of_a_network_that_samples_actions_sees_two_frames(self):
+        assert resolved("sorting", "dp").planner.frames == 2 and resolved("sorting").planner.frames == 1
+        for name, value in {"source": "run", "held_out": 0.5, "frames": 1}.items():
+            with pytest.raises(ValueError, match=f"planner.{name}: method 'dp' samples actions and has no planner"):
+                resolved(method="dp", planner=PlannerConfig(**{name: value}))
+
+    def test_is_kept_from_a_tenth_of_the_data_where_there_is_no_environment(self):
+        _, task = make_demonstrations([[[0.0, 0.0]] * 20], control_hz=30, action_dim=2)
+        config = resolve(TrainConfig(out="run"), task)
+        assert config.planner.held_out == 0.1 and resolved().planner.held_out == 0.0
+        assert forecasts(task) and build_planner(task, config.planner).forecast is not None
+        assert not forecasts(get_task("avoiding"))
+        plain = replace(task, defaults=replace(task.defaults, view={"forecast": False}))
+        assert not forecasts(plain)
+
+    def test_that_is_taken_over_is_as_it_was_trained(self, tmp_path):
+        theirs = resolved(planner=PlannerConfig(steps=7, width=8))
+        RunDirectory(tmp_path).write_json("config.json", to_json(theirs))
+        mine = resolved(planner=PlannerConfig(source=tmp_path)).planner
+        assert mine == replace(theirs.planner, source=tmp_path)
+        with pytest.raises(ValueError, match="planner.width 64 was asked for, but that of .* is 8"):
+            resolved(planner=PlannerConfig(source=tmp_path, width=64))
+
+
+class TestExecution:
+    def test_of_a_method_goes_before_the_tasks(self):
+        def execution(*names, **asked):
+            return resolved(*names, execution=ExecutionConfig(**asked)).execution.on(Execution())
+
+        assert execution() == Execution()
+        assert execution("scooping") == Execution("open_loop", replan_interval=8, blend=0.0)
+        assert execution("scooping", strategy="feedback") == Execution(replan_interval=8, blend=0.0)
+        assert execution("avoiding", "koap_paper") == Execution("open_loop", blend=0.0)
+        assert execution("avoiding", "koap_paper", blend=0.5).blend == 0.5
+        assert execution("po_sorting").gain > 1 and execution("po_sorting", "mpc").gain == 1
+        assert execution("avoiding", "dp").strategy == "open_loop"
+
+    def test_of_plans_is_refused_where_there_are_none(self):
+        with pytest.raises(ValueError, match="execution.strategy 'feedback' was asked of method 'dp', which samples"):
+            resolved(method="dp", execution=ExecutionConfig(strategy="feedback"))
+        with pytest.raises(ValueError, match="'oracle' reads a simulation: it is for `koap eval`"):
+            resolved(execution=ExecutionConfig(strategy="oracle"))
+
+
+def test_a_method_declares_columns_and_labels_stay_as_asked():
+    assert resolved("sorting", "koap_paper").controller.columns == "all"
+    assert resolved("sorting").controller.columns == "robot" and resolved("sorting").controller.steps == 500
+    assert resolved(labels=LabelConfig(count=3)).labels == LabelConfig(count=3)
+
+
+def test_every_task_s_defaults_are_options():
+    for name in TASKS:
+        resolved(name)

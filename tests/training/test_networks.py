@@ -1,0 +1,96 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""From options to planners and controllers."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from small_controllers import controller_of
+from tensordict import TensorDict
+
+from torchrl_koap import PlannerConfig, TrainConfig
+from torchrl_koap.data import LabelBudget
+from torchrl_koap.tasks import get_task
+from torchrl_koap.training import resolve
+from torchrl_koap.training.datasets import load_demonstrations
+from torchrl_koap.training.methods import METHODS
+from torchrl_koap.training.networks import NETWORKS, build_planner, sizes_of
+
+TASK = get_task("avoiding")
+
+
+@pytest.fixture(scope="module")
+def data(demonstrations):
+    return load_demonstrations(str(demonstrations), TASK)
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("frames", [1, 2])
+@pytest.mark.parametrize("task", ["avoiding", "sorting"])
+def test_every_network_plans(network, frames, task):
+    task = get_task(task)
+    planner = build_planner(task, PlannerConfig(network=network, width=16, frames=frames))
+    assert planner.sample(torch.zeros(3, frames, task.state_dim)).shape == (3, 14, task.state_dim)
+    assert (planner.clip, planner.relative, planner.history) == (1.2, task.defaults.relative, frames)
+    assert sizes_of(planner) == {"network": network, "width": 16, "frames": frames}
+
+
+def test_unknown_networks_suggest_the_nearest():
+    with pytest.raises(ValueError, match="unknown planner.network 'unnet'; did you mean 'unet'"):
+        build_planner(TASK, PlannerConfig(network="unnet", width=8, frames=2))
+
+
+@pytest.mark.parametrize(
+    ("preset", "method"),
+    [(preset, name) for name, method in METHODS.items() if method.plans for preset in method.presets],
+)
+def test_every_controller_takes_over_weights(method, preset, data):
+    labelled, _ = LabelBudget(count=2).apply(data)
+    torch.manual_seed(0)
+    controller = controller_of(method, labelled, preset=preset).eval()
+    if METHODS[method].fit is not None:
+        METHODS[method].fit(controller, with_commands(labelled, data), 1)
+    restored = controller_of(method, preset=preset).eval()
+    restored.load_state_dict(controller.state_dict())
+    state, other = controller.state_dict(), restored.state_dict()
+    assert all(torch.allclose(state[name], other[name], rtol=0, atol=0, equal_nan=True) for name in state)
+    if METHODS[method].fit is None:
+        states = data["state"][:32].reshape(2, 16, 2)
+        expected = controller(TensorDict({"state": states}, [2]))["action"]
+        assert expected.shape == (2, 16, 2)
+        torch.testing.assert_close(restored(TensorDict({"state": states}, [2]))["action"], expected, rtol=0, atol=0)
+
+
+def with_commands(labelled, data):
+    from torchrl_koap.training.command_model import with_label_commands
+
+    return with_label_commands(labelled, data, TASK.command_columns)
+
+
+def test_statistics_are_those_of_all_states_and_of_the_labelled_actions(data):
+    labelled, _ = LabelBudget(count=2).apply(data)
+    shown = data["action"][labelled["has_action"].squeeze(-1)]
+    default = controller_of("koap", labelled)
+    torch.testing.assert_close(default.action_normalizer.scale, shown.square().mean(0).sqrt())
+    assert (default.action_normalizer.offset == 0).all()
+    torch.testing.assert_close(default.state_normalizer.offset, data["state"].mean(0))
+    paper = controller_of("dd", labelled, preset="paper")
+    torch.testing.assert_close(paper.action_normalizer.inverse(torch.ones(1, 2))[0], shown.amax(0))
+    torch.testing.assert_close(paper.state_normalizer.inverse(-torch.ones(1, 2))[0], data["state"].amin(0))
+
+
+def test_unknown_presets_suggest_the_nearest():
+    with pytest.raises(ValueError, match="unknown preset 'papper'; did you mean 'paper'"):
+        controller_of("koap", preset="papper")
+
+
+def test_absolute_actions_are_centred_and_read_off_the_present_frame():
+    task = get_task("scooping")
+    state = torch.randn(60, task.state_dim) * torch.arange(1.0, task.state_dim + 1)
+    labelled = TensorDict({"state": state, "action": torch.randn(60, task.action_dim) + 5}, [60])
+    labelled["has_action"] = torch.ones(60, 1, dtype=torch.bool)
+    preset = resolve(TrainConfig(out="run"), task).controller.preset
+    assert preset == "absolute" and resolve(TrainConfig(out="run"), TASK).controller.preset == "default"
+    controller = controller_of("koap", labelled, task=task, preset=preset)
+    assert (controller.action_normalizer.offset > 4).all()
+    assert controller.state_normalizer.scale.unique().numel() == 1

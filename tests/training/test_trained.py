@@ -1,0 +1,133 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A training as one file acts as it did, and files that cannot be used are named."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_runs import TINY, koap
+
+from torchrl_koap import Agent, Execution, ExecutionConfig, Trained, fit, load_policy
+from torchrl_koap.data import make_demonstrations
+from torchrl_koap.modules import SupervisedInverseDynamics
+from torchrl_koap.runs.weights import CheckpointError, load_tensors, save_tensors
+
+PATH = np.random.default_rng(0).normal(size=(9, 4)) / 100 + np.array([0.5, -0.2, 0.5, -0.2])
+
+
+def actions(policy, path=PATH):
+    agent = Agent(policy, seed=5)
+    agent.reset()
+    return np.stack([agent.act(row) for row in path])
+
+
+@pytest.fixture(scope="module")
+def own():
+    random = np.random.default_rng(0)
+    states = [random.normal(size=(40, 3)).cumsum(0) for _ in range(3)]
+    data, task = make_demonstrations(
+        states, [np.diff(states[0][:, :2], axis=0), None, None], control_hz=30, name="my_arm", robot=[0, 1]
+    )
+    trained = fit(data, task, method="linear", planner={"steps": 2, "width": 8}, progress=False)
+    return replace(trained, config=replace(trained.config, execution=ExecutionConfig(replan_interval=3, blend=0.5)))
+
+
+def test_a_run_as_one_file(trained_run, tmp_path):
+    shutil.copytree(trained_run, tmp_path / "run")
+    expected = actions(load_policy(tmp_path / "run", strategy="open_loop", replan_interval=2))
+    path = Trained.load(tmp_path / "run").save(tmp_path / "elsewhere" / "policy.safetensors")
+    shutil.rmtree(tmp_path / "run")
+    loaded = load_policy(path, strategy="open_loop", replan_interval=2)
+    assert loaded.execution == Execution("open_loop", replan_interval=2) and not loaded.training
+    np.testing.assert_array_equal(actions(loaded), expected)
+    assert load_policy(str(path)).execution == Execution()
+
+
+def test_a_policy_follows_plans_as_it_was_trained_for_unless_asked(own):
+    assert own.policy().execution == own.execution == Execution(replan_interval=3, blend=0.5)
+    assert own.policy(Execution("open_loop", blend=0.0)).execution == Execution("open_loop", blend=0.0)
+    assert load_policy(own, blend=0.1).execution == Execution(replan_interval=3, blend=0.1)
+
+
+def test_a_method_that_samples_actions(demonstrations, tmp_path):
+    assert koap("train", "--out", tmp_path / "dp", "--dataset", demonstrations, "--method", "dp", *TINY) == 0
+    with pytest.raises(ValueError, match="strategy 'feedback' was asked of method 'dp', which samples actions"):
+        load_policy(tmp_path / "dp", strategy="feedback")
+    loaded = load_policy(Trained.load(tmp_path / "dp").save(tmp_path / "dp.safetensors"), replan_interval=3)
+    assert loaded.follower is None and loaded.execution == Execution("open_loop", replan_interval=3)
+    np.testing.assert_array_equal(actions(loaded), actions(load_policy(tmp_path / "dp", replan_interval=3)))
+
+
+def test_a_robot_that_nobody_registered(own, tmp_path):
+    loaded = Trained.load(own.save(tmp_path / "arm.safetensors"))
+    assert loaded.task.name == "my_arm" and loaded.columns == (0, 1) and loaded.execution == own.execution
+    np.testing.assert_array_equal(actions(loaded.policy(), PATH[:, :3]), actions(own.policy(), PATH[:, :3]))
+    again = Trained.load(loaded.save(tmp_path / "again.safetensors"))
+    np.testing.assert_array_equal(actions(again.policy(), PATH[:, :3]), actions(own.policy(), PATH[:, :3]))
+
+
+def test_absolute_targets_come_back(tmp_path):
+    states = [np.random.default_rng(index).normal(size=(40, 2)).cumsum(0) for index in range(3)]
+    data, task = make_demonstrations(
+        states, [states[0][1:], None, None], control_hz=30, action_kind="absolute", targets=[0, 1]
+    )
+    trained = fit(data, task, method="linear", planner={"steps": 2, "width": 8}, progress=False)
+    loaded = load_policy(trained.save(tmp_path / "arm.safetensors"))
+    far = PATH[:, :2] + 1000
+    np.testing.assert_array_equal(actions(loaded, far), actions(trained.policy(), far))
+    assert np.abs(actions(loaded, far) - far).max() < 500  # near where it is, not near 0
+
+
+def test_files_that_cannot_be_used_are_named(own, trained_run, tmp_path):
+    good = own.save(tmp_path / "good.safetensors")
+    tensors, about = load_tensors(good)
+
+    def written(name, tensors, about):
+        save_tensors(tmp_path / name, tensors, about)
+        return tmp_path / name
+
+    def changed(section, **options):
+        return about | {"config": about["config"] | {section: about["config"][section] | options}}
+
+    cut = tmp_path / "cut.safetensors"
+    cut.write_bytes(good.read_bytes()[:1000])
+    half = {name: value for name, value in tensors.items() if not name.startswith("controller.")}
+    lost = {name: value for name, value in about.items() if name != "config"}
+    code = about | {"task_definition": about["task_definition"] | {"env": "os:system"}}
+    plugin = changed("run", plugins=["mine"])
+    plugin["config"] = plugin["config"] | {"method": "m"}
+    wrong = {
+        cut: "cut.safetensors is damaged",
+        trained_run / "planner.safetensors": "planner.safetensors is no policy that Trained.save",
+        written("new", tensors, about | {"version": 3}): "new is a policy of format 3, this version reads 2",
+        written("half", half, about): r"half \(controller\) does not fit the model: .*Missing key",
+        written("wide", tensors, changed("planner", width=16)): r"wide \(planner\) does not fit .*size mismatch",
+        written("lost", tensors, lost): "lost cannot be built: entry 'config' is missing",
+        written("typo", tensors, changed("planner", widht=16)): "planner.widht: did you mean planner.width",
+        written("code", tensors, code): "code cannot be built: task 'my_arm' names code in env",
+        written(
+            "plugin", tensors, plugin
+        ): "plugin cannot be built: unknown method 'm'.*; it was made with the plugins mine",
+    }
+    for path, message in wrong.items():
+        with pytest.raises(CheckpointError, match=message):
+            load_policy(path)
+
+
+def test_what_cannot_be_saved_or_executed(own, tmp_path):
+    with pytest.raises(IsADirectoryError, match="is a folder; a policy is one file, such as"):
+        own.save(tmp_path)
+    assert not list(tmp_path.iterdir())
+    for part in ("planner", "controller"):
+        with pytest.raises(ValueError, match=f"a policy needs planner and controller: no {part} was trained here"):
+            replace(own, **{part: None}).policy()
+
+
+def test_relabel_is_a_decision_diffuser(demonstrations, tmp_path):
+    assert koap("train", "--out", tmp_path / "run", "--dataset", demonstrations, "--method", "relabel", *TINY) == 0
+    trained = Trained.load(tmp_path / "run")
+    assert isinstance(trained.controller, SupervisedInverseDynamics) and trained.planner is not None
+    assert trained.controller.reader.look_ahead == (1,) and trained.method.teacher == "dd_lookahead"

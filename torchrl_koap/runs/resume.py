@@ -1,0 +1,101 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Going on with an interrupted run: its options, and the checks that nothing else is asked for now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from torchrl._utils import logger
+
+from torchrl_koap.runs.config import LabelConfig, TrainConfig
+from torchrl_koap.runs.config_files import changed_options, read_config
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+
+# with which a run may be resumed differently; with other threads sums are rounded differently
+FREE = frozenset({"out", "run.threads", "run.resume", "run.plugins", "run.logger"})
+_ONE_OF = ("fraction", "count", "episodes")
+
+
+def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
+    """Returns the options of a resumed run: what is not asked for otherwise is as it was.
+
+    Args:
+        run (RunDirectory): the run, which may be new.
+        asked (TrainConfig): what is asked for now.
+    """
+    if not (asked.run.resume and (run.path / "config.json").exists()):
+        return asked
+    return _merged(asked, read_config(run))
+
+
+def _merged(asked: Any, saved: Any) -> Any:
+    kept = {}
+    for field in fields(asked):
+        value, earlier = getattr(asked, field.name), getattr(saved, field.name)
+        if is_dataclass(value):
+            kept[field.name] = _merged(value, earlier)
+        elif value == field.default and field.name != "resume":
+            kept[field.name] = earlier
+    if isinstance(asked, LabelConfig) and any(getattr(asked, name) for name in _ONE_OF):
+        kept = {name: value for name, value in kept.items() if name not in _ONE_OF}
+    return replace(asked, **kept)
+
+
+def check_resume(run: RunDirectory, config: TrainConfig) -> None:
+    """Refuses a folder that holds another run, or one that was not asked to be resumed.
+
+    Args:
+        run (RunDirectory): the folder.
+        config (TrainConfig): what is to be trained, nothing left open.
+
+    Raises:
+        RunDirectoryError: naming what differs.
+    """
+    if not (run.path / "config.json").exists():
+        names = ("planner.safetensors", "controller.safetensors", "checkpoints")
+        if left := [name for name in names if (run.path / name).exists()]:
+            raise RunDirectoryError(f"{run.path} holds {', '.join(left)} but no config.json; choose another --out")
+        return
+    if not config.run.resume:
+        raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
+    saved = read_config(run)
+    # a folder that is gone was moved, probably together with this run: there is nothing to compare with
+    paths = {"dataset": saved.dataset, "planner.source": saved.planner.source}
+    moved = {name for name, path in paths.items() if path is not None and not Path(path).exists()}
+    if changed := [name for name in changed_options(config, saved) if name not in FREE | moved]:
+        raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so")
+
+
+def check_data(run: RunDirectory, content: Mapping[str, Any]) -> None:
+    """Refuses to go on with other demonstrations, or another version of this package, than a run was begun with.
+
+    Args:
+        run (RunDirectory): the folder.
+        content (mapping): what ``config.json`` is to hold, ``data`` and ``versions`` included.
+
+    Raises:
+        RunDirectoryError: naming what differs.
+    """
+    if not (run.path / "config.json").exists():
+        return
+    earlier = run.read_json("config.json")
+    before, now = earlier.get("data"), content["data"]
+    if before != now:
+        steps = (before or {}).get("steps")
+        sizes = f"{steps} steps then, {now['steps']} now" if steps != now["steps"] else "others"
+        raise RunDirectoryError(
+            f"{run.path} was started with other demonstrations than {content['dataset']} holds now ({sizes}); bring the"
+            " earlier ones back, or choose another --out"
+        )
+    then, here = earlier.get("versions") or {}, content["versions"]
+    if then.get("torchrl_koap", here["torchrl_koap"]) != here["torchrl_koap"]:
+        raise RunDirectoryError(
+            f"{run.path} was started with torchrl_koap {then['torchrl_koap']}, this is {here['torchrl_koap']}; choose"
+            " another --out"
+        )
+    others = [f"{name} {then[name]} (now {here[name]})" for name in here if then.get(name, here[name]) != here[name]]
+    if others:
+        logger.warning("%s was started with %s: the last bits of its weights may differ", run.path, ", ".join(others))

@@ -1,0 +1,133 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Defaults of a training, filled in once: asked > method > task > network > library."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any, TypeVar
+
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import PRESETS
+from torchrl_koap.modules.execution.execution import Execution, ExecutionConfig
+from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, TrainConfig
+from torchrl_koap.runs.config_files import read_config
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.tasks import HISTORY, Task
+from torchrl_koap.training.method import Method
+from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.networks import NETWORKS
+
+CONTROLLER_UPDATES = 500
+PLACES = "absolute"  # what the default preset is where actions are places
+HELD_OUT = 0.1  # share that is held out by default where no rollout can tell what a planner is worth
+Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)
+
+
+def resolve(config: TrainConfig, task: Task) -> TrainConfig:
+    """Looks every name up and fills every default in, in one pass; plugins must have been imported.
+
+    Args:
+        config (TrainConfig): what is asked for.
+        task (Task): the task, registered or not.
+
+    Returns:
+        TrainConfig: of its options none is None but ``planner.source`` and the two ways to draw labels that are not
+        used.
+
+    Raises:
+        ValueError: for unknown names, and options that exclude each other.
+        RunDirectoryError: if ``planner.source`` is no run.
+
+    Examples:
+        >>> from torchrl_koap import ControllerConfig, TrainConfig
+        >>> from torchrl_koap.tasks import get_task
+        >>> from torchrl_koap.training import resolve
+        >>> config = TrainConfig(out="run", method="linear", controller=ControllerConfig(columns="all"))
+        >>> config = resolve(config, get_task("avoiding"))
+        >>> config.planner.steps, config.planner.network, config.controller.columns, config.execution.strategy
+        (5000, 'unet', 'all', 'feedback')
+    """
+    method = get_method(config.method or task.defaults.method)
+    labels = config.labels
+    if labels.fraction is None and labels.count is None and not labels.episodes:
+        labels = replace(labels, fraction=1.0)
+    return replace(
+        config,
+        task=task.name,
+        method=method.name,
+        labels=labels,
+        planner=_planner(config.planner, method, task),
+        controller=_controller(config.controller, method, task),
+        execution=_execution(config.execution, method, task),
+    )
+
+
+def _planner(asked: PlannerConfig, method: Method, task: Task) -> PlannerConfig:
+    if not method.plans:
+        for name in ("source", "held_out", "frames"):
+            if getattr(asked, name) not in (None, {"held_out": 0.0, "frames": HISTORY}.get(name)):
+                raise ValueError(f"planner.{name}: method {method.name!r} samples actions and has no planner")
+    if asked.source is not None:
+        return _taken_over(asked)
+    own = {"network": "unet", **task.defaults.planner}
+    if asked.network not in (None, own["network"]):  # another network comes with its own sizes
+        own = {name: value for name, value in own.items() if name in ("steps", "frames")}
+    if not method.plans:
+        own |= {"frames": HISTORY, "held_out": 0.0}
+    network = asked.network or own["network"]
+    library = {"steps": 12000, "frames": HISTORY, "held_out": HELD_OUT if task.env is None else 0.0}
+    return _filled(asked, own, lookup(NETWORKS, network, "planner.network"), library)
+
+
+def _taken_over(asked: PlannerConfig) -> PlannerConfig:
+    """The planner section of the run that the planner is taken from."""
+    if all(getattr(asked, field.name) is not None for field in fields(asked)):  # of a run that is resumed
+        return asked
+    theirs = read_config(RunDirectory(asked.source)).planner
+    for name in ("network", "width", "frames"):
+        if getattr(asked, name) not in (None, getattr(theirs, name)):
+            raise ValueError(
+                f"planner.{name} {getattr(asked, name)!r} was asked for, but that of {asked.source} is"
+                f" {getattr(theirs, name)!r}"
+            )
+    return replace(theirs, source=asked.source)
+
+
+def _controller(asked: ControllerConfig, method: Method, task: Task) -> ControllerConfig:
+    own = dict(task.defaults.controller)
+    if method.name != task.defaults.method:
+        own.pop("preset", None)  # of the task's own method
+    declared = {"columns": method.columns, "steps": method.updates}
+    library = {"preset": method.presets[0], "steps": CONTROLLER_UPDATES, "columns": "robot"}
+    section = _filled(asked, {k: v for k, v in declared.items() if v is not None}, own, library)
+    lookup(PRESETS, section.preset, "preset")
+    places = not task.delta_actions and not task.targets  # every action says where the robot is to be
+    preset = "default" if places and section.preset == PLACES else section.preset
+    if preset not in method.presets:
+        raise ValueError(f"method {method.name!r} has no preset {preset!r}, it has {list(method.presets)}")
+    return replace(section, preset=PLACES if places and preset == "default" else preset)
+
+
+def _execution(asked: ExecutionConfig, method: Method, task: Task) -> ExecutionConfig:
+    own = dict(task.defaults.execution)
+    if asked.strategy == "oracle":
+        raise ValueError("execution.strategy 'oracle' reads a simulation: it is for `koap eval`")
+    if not method.plans:
+        if asked.strategy not in (None, "open_loop"):
+            raise ValueError(
+                f"execution.strategy {asked.strategy!r} was asked of method {method.name!r}, which samples actions and"
+                " executes chunks of them: there is no plan to follow"
+            )
+        own["strategy"] = "open_loop"
+    filled = Execution().replaced(**own).replaced(**method.execution)
+    return ExecutionConfig(**vars(asked.on(filled)))
+
+
+def _filled(asked: Section, *layers: Mapping[str, Any]) -> Section:
+    """A section whose open options are those of the first layer that has them."""
+    known = {field.name for field in fields(asked)}
+    for layer in layers:
+        missing = {name: value for name, value in layer.items() if name in known and getattr(asked, name) is None}
+        asked = replace(asked, **missing)
+    return asked

@@ -1,0 +1,170 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The recipe of ``koap train`` in memory: demonstrations in, trained networks out.
+
+Normalisers, scales, losses, augmentation, averaged weights and the closed form at the end are those of ``koap train``:
+with the same data, seed and options the weights are the same bit for bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_koap import keys
+from torchrl_koap.data import mark_labels, select_state
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import StatePlanner
+from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, RunConfig, TrainConfig
+from torchrl_koap.runs.progress import without_progress_bars
+from torchrl_koap.tasks import Action, Task
+from torchrl_koap.training.controller import learn_controller
+from torchrl_koap.training.datasets import choose_held_out, without_held_out
+from torchrl_koap.training.defaults import resolve
+from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.networks import sizes_of
+from torchrl_koap.training.planner import learn_planner
+from torchrl_koap.training.trained import Trained
+
+
+def fit(
+    data: TensorDictBase,
+    task: Task | None = None,
+    *,
+    method: str | None = None,
+    planner: StatePlanner | Mapping[str, Any] | Literal[False] | None = None,
+    controller: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    device: str = "cpu",
+    precision: str = "float32",
+    progress: bool = True,
+) -> Trained:
+    """Trains planner and controller, or a network that samples actions, on data in memory.
+
+    From recorded arrays to an action on the robot::
+
+        data, task = make_demonstrations(states, actions, control_hz=30, robot=range(7))
+        trained = torchrl_koap.fit(data, task)
+        trained.save("policy.safetensors")
+        agent = torchrl_koap.Agent(trained.policy())
+        agent.reset()
+        action = agent.act(observation)
+
+    Args:
+        data (TensorDictBase): flat data ``[N]`` (:func:`~torchrl_koap.data.make_demonstrations`, or a data set of D3IL
+            or LeRobot). Without ``state``, the columns that the task names are taken from ``observation``.
+            ``has_action`` says which actions may be seen; without it, those that are not NaN. A
+            :class:`~torchrl_koap.data.LabelBudget` takes labels away.
+        task (Task, optional): the task, as ``make_demonstrations`` returns it. Default: all columns of ``state`` (of
+            ``observation`` where there is none) are the robot's.
+
+    Keyword Args:
+        method (str, optional): a name in :data:`~torchrl_koap.training.METHODS`. Default: the task's, mostly
+            ``"koap"``.
+        planner (StatePlanner or mapping, optional): a planner to share instead of training one, or options of
+            :class:`~torchrl_koap.PlannerConfig` such as ``{"steps": 5000}``; False trains a controller alone. Default:
+            the task's options.
+        controller (mapping, optional): options of :class:`~torchrl_koap.ControllerConfig`.
+        seed (int): seed of initialisation and batches; torch's generators are left as they were.
+        device (str): ``"cpu"`` or ``"cuda"``.
+        precision (str): of the planner's matrix products, see :class:`~torchrl_koap.RunConfig`.
+        progress (bool): show progress bars.
+
+    Returns:
+        Trained: its networks are in evaluation mode.
+
+    Raises:
+        ValueError: for an unknown method or option, data without any label or that do not fit the task, or trajectories
+            shorter than a window.
+        LayoutError: if the data do not follow the storage layout.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap import fit
+        >>> from torchrl_koap.data import make_demonstrations
+        >>> states = [np.random.default_rng(i).normal(size=(40, 2)).cumsum(0) for i in range(3)]
+        >>> actions = [np.diff(states[0], axis=0), None, None]
+        >>> data, task = make_demonstrations(states, actions, control_hz=30)
+        >>> trained = fit(data, task, planner={"steps": 2, "width": 8}, progress=False)
+        >>> trained.planner.sample(data["observation"][None, :2]).shape
+        torch.Size([1, 14, 2])
+        >>> other = fit(data, task, method="linear", planner=trained.planner, progress=False)
+        >>> other.planner is trained.planner, other.results["decoder_fit"]["labels_used"]
+        (True, 31)
+    """
+    data, task = _prepared(data, task)
+    shared = planner if isinstance(planner, StatePlanner) else None
+    # all trajectories are learnt from, unless asked otherwise
+    options = {"held_out": 0.0} | (dict(planner or {}) if shared is None else sizes_of(shared))
+    config = resolve(
+        TrainConfig(
+            out=Path(),
+            method=method,
+            planner=_section(PlannerConfig, options),
+            controller=_section(ControllerConfig, controller or {}),
+            run=RunConfig(seed=seed, device=device, precision=precision),
+        ),
+        task,
+    )
+    held_out = choose_held_out(data, config.planner.held_out, seed=seed)
+    if not data[keys.HAS_ACTION].any():
+        raise ValueError(f"none of the {len(data)} steps has an action: there are no labels to learn from")
+    data, results = data.to(device), dict[str, Any]()
+    plans = get_method(config.method).plans
+    if shared is not None and not plans:
+        raise ValueError(f"planner: method {config.method!r} samples actions and has no planner")
+    with _seeded(seed, device, progress):
+        if plans and shared is None and planner is not False:
+            shared, results["planner"] = learn_planner(task, config, without_held_out(data, held_out))
+        torch.manual_seed(seed)
+        data = without_held_out(data, held_out, keep_labelled=True)
+        module, found = learn_controller(task, config, data)
+    return Trained(
+        task, config, None if shared is None else shared.eval(), module.eval(), results | found, tuple(held_out)
+    )
+
+
+def _section(kind: type, options: Mapping[str, Any]) -> Any:
+    for name in options:
+        lookup([field.name for field in fields(kind)], name, f"option of {kind.__name__}")
+    return kind(**options)
+
+
+def _prepared(data: TensorDictBase, task: Task | None) -> tuple[TensorDictBase, Task]:
+    """The data with labels marked and ``state``, and the task they are of."""
+    if keys.ACTION not in data.keys() or keys.HAS_ACTION not in data.keys():
+        data = mark_labels(data, action_dim=None if task is None else task.action_dim)
+    task = _task_of_columns(data) if task is None else task
+    keys.validate(data, command=task.command_columns)
+    if keys.STATE not in data.keys():
+        data = select_state(data, task.state_of)
+    for key, wanted in {keys.STATE: task.state_dim, keys.ACTION: task.action_dim}.items():
+        if data[key].shape[-1] != wanted:
+            raise ValueError(f"{key!r} has {data[key].shape[-1]} columns, task {task.name!r} has {wanted}")
+    networks = torch.get_default_dtype()
+    wide = {key: data[key].to(networks) for key in (keys.STATE, keys.ACTION) if data[key].dtype != networks}
+    return (data.copy().update(wide) if wide else data), task
+
+
+def _task_of_columns(data: TensorDictBase) -> Task:
+    """A task about which nothing is known but the number of columns."""
+    seen = data.get(keys.STATE, None)
+    width = (data[keys.OBSERVATION] if seen is None else seen).shape[-1]
+    actions = {f"action_{column}": Action() for column in range(data[keys.ACTION].shape[-1])}
+    return Task(name="robot", observation_parts={"robot": width}, actions=actions, position="robot")
+
+
+@contextlib.contextmanager
+def _seeded(seed: int, device: str, progress: bool) -> Iterator[None]:
+    """Draws from a seed of its own, with or without bars."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(torch.random.fork_rng(devices=None if device != "cpu" else []))
+        if not progress:
+            stack.enter_context(without_progress_bars())
+        torch.manual_seed(seed)
+        yield

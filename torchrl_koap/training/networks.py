@@ -1,0 +1,109 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Networks of the options that a run keeps in ``config.json``; weights, or data, bring their statistics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import TensorDictBase
+from torch import nn
+
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import PRESETS, DiffusionPolicy, MLPDenoiser, Normalizer, StatePlanner, TemporalUnet
+from torchrl_koap.runs.config import ControllerConfig, PlannerConfig
+from torchrl_koap.tasks import HORIZON, Task
+from torchrl_koap.training.method import Method
+
+CLIP = 1.2  # of normalised sequences, which lie in [-1, 1] in the data
+# the networks of planners, and what they are built and trained with where nothing else is asked for
+NETWORKS: dict[str, dict[str, Any]] = {
+    "unet": {"width": 64, "batch_size": 128, "learning_rate": 3e-3},
+    "mlp": {"width": 512, "batch_size": 512, "learning_rate": 1e-3},
+}
+
+
+def build_planner(task: Task, section: PlannerConfig) -> StatePlanner:
+    """Builds a planner of states without statistics.
+
+    Args:
+        task (Task): the task.
+        section (PlannerConfig): network, width and frames, nothing left open.
+
+    Raises:
+        ValueError: for an unknown network.
+    """
+    return StatePlanner(forecast=forecasts(task), **_diffusion(task, section, task.state_dim))
+
+
+def build_sampler(task: Task, section: PlannerConfig) -> DiffusionPolicy:
+    """Builds a Diffusion Policy with the network of :func:`build_planner`, without statistics.
+
+    Args:
+        task (Task): the task.
+        section (PlannerConfig): as for :func:`build_planner`.
+
+    Raises:
+        ValueError: for an unknown network.
+    """
+    return DiffusionPolicy(action_dim=task.action_dim, **_diffusion(task, section, task.action_dim))
+
+
+def _diffusion(task: Task, section: PlannerConfig, size: int) -> dict[str, Any]:
+    """What planner and Diffusion Policy take alike, with a network for sequences of that many columns."""
+    lookup(NETWORKS, section.network, "planner.network")
+    features = task.planner_features()
+    seen = section.frames * task.state_dim + (0 if features is None else features.num_features)
+    if section.network == "unet":
+        network: nn.Module = TemporalUnet(size, seen, channels=(section.width, 2 * section.width))
+    else:
+        network = MLPDenoiser(size, seen, horizon=HORIZON, width=section.width)
+    return {
+        "denoiser": network,
+        "state_dim": task.state_dim,
+        "history": section.frames,
+        "horizon": HORIZON,
+        "relative": task.defaults.relative,
+        "features": features,
+        "clip": CLIP,
+    }
+
+
+def build_controller(
+    task: Task, method: Method, section: ControllerConfig, labelled: TensorDictBase | None = None
+) -> nn.Module:
+    """Builds a controller, with statistics of the data if these are given.
+
+    Args:
+        task (Task): the task.
+        method (Method): the method.
+        section (ControllerConfig): preset and columns, nothing left open.
+        labelled (TensorDictBase, optional): flat data ``[N]`` as the controller sees them, after the label budget was
+            applied. State statistics come from all of it (of the labelled steps for a method that sees no others),
+            action statistics from the labelled steps alone.
+
+    Raises:
+        ValueError: for an unknown preset or columns.
+    """
+    modes = lookup(PRESETS, section.preset, "preset")["normalization"]
+    columns = task.controller_columns(section.columns)
+    if labelled is None:
+        state, action = Normalizer(len(columns)), Normalizer(task.action_dim)
+    else:
+        seen = labelled["has_action"] if method.sees == "labelled" else None
+        state = Normalizer.fit(labelled["state"], mode=modes["state"], mask=seen)
+        action = Normalizer.fit(labelled["action"], mode=modes["action"], mask=labelled["has_action"])
+    normalizers = {"state_normalizer": state, "action_normalizer": action}
+    return method.build(task, columns, normalizers, section.preset)
+
+
+def forecasts(task: Task) -> bool:
+    """Whether plans are deviations from a linear forecast, which carries over to goals that nobody demonstrated."""
+    return task.defaults.view.get("forecast", task.env is None)
+
+
+def sizes_of(planner: StatePlanner) -> dict[str, Any]:
+    """Network, width and frames that a planner was built with."""
+    network = planner.denoiser
+    unet = isinstance(network, TemporalUnet)
+    width = network.shrink[0].out_channels if unet else network.first.out_features
+    return {"network": "unet" if unet else "mlp", "width": width, "frames": planner.history}

@@ -1,0 +1,198 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The whole training: demonstrations and a label budget in, a run directory with planner and controller out."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_koap.data import LabelReport, WindowTable, subsample_trajectories
+from torchrl_koap.modules import StatePlanner
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.config_files import to_json, versions
+from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.plugins import load_plugins
+from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, progress_bar
+from torchrl_koap.runs.resume import begun_with, check_data, check_resume
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.runs.weights import load_weights, save_weights
+from torchrl_koap.tasks import WINDOW, Task
+from torchrl_koap.tasks.registry import is_adopted
+from torchrl_koap.training.action_errors import AFTER, BEFORE, error_entry, write_analysis
+from torchrl_koap.training.command_model import with_label_commands
+from torchrl_koap.training.controller import learn_controller
+from torchrl_koap.training.datasets import (
+    choose_held_out,
+    find_task_of,
+    fingerprint,
+    held_out_by,
+    label_budget,
+    load_demonstrations,
+    without_held_out,
+)
+from torchrl_koap.training.defaults import resolve
+from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.networks import build_planner
+from torchrl_koap.training.planner import learn_planner
+from torchrl_koap.training.trained import Trained, build_networks, facts_of
+
+
+def train(config: TrainConfig, *, command: str | None = None, planner_only: bool = False) -> Trained:
+    """Trains planner and controller, or a network that samples actions; ``koap train`` calls this.
+
+    Args:
+        config (TrainConfig): what to train on what, and where to write it.
+
+    Keyword Args:
+        command (str, optional): how it was called, if from a shell; kept in ``config.json``.
+        planner_only (bool): train a planner alone, for other runs to take over (``planner.source``); all actions are
+            hidden before.
+
+    Returns:
+        Trained: the networks; its ``results`` are also written to ``summary.json``: labels spent, sizes, losses.
+
+    Raises:
+        ValueError: for unknown options and budgets that select nothing.
+        RunDirectoryError: if the folder holds another run, one that was not asked to be resumed, or one that is being
+            worked on.
+        PluginError: if a plugin cannot be imported.
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from torchrl_koap import ControllerConfig, PlannerConfig, TrainConfig, train
+        >>> from torchrl_koap.data import save_demonstrations
+        >>> states = [np.random.default_rng(i).normal(size=(30, 4)).cumsum(0) for i in range(6)]
+        >>> actions = [np.diff(frames[:, :2], axis=0) if i < 2 else None for i, frames in enumerate(states)]
+        >>> few = {"planner": PlannerConfig(steps=2), "controller": ControllerConfig(steps=2)}
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     arm = save_demonstrations(root + "/arm", states, actions, control_hz=30, robot=[0, 1])
+        ...     trained = train(TrainConfig(dataset=str(arm), out=Path(root) / "run", **few))
+        >>> trained.results["labels"]["labelled_transitions"], trained.results["labels"]["total_transitions"]
+        (58, 174)
+    """
+    run = RunDirectory(config.out)
+    with ExitStack() as held:
+        mine = (run.path / ".lock").exists()  # a new folder is not made before the options are known to do
+        if mine:
+            held.enter_context(run.locked("koap train"))
+        config = begun_with(run, config)
+        load_plugins(config.run.plugins)
+        task = find_task_of(config.dataset, config.task)
+        config = resolve(config, task)
+        check_logger(config.run.logger)
+        set_up_torch(config.run.threads, config.run.device)
+        check_resume(run, config)
+        frames = _frames(task, config)
+        data, every, held_out, report = _read_data(task, config, planner_only)
+        content = to_json(config) | {"data": fingerprint(data), "versions": versions()}
+        check_data(run, content)
+        if is_adopted(task):
+            content["task_definition"] = task.to_json()  # nobody has registered it: it comes with the data
+        if held_out:
+            content["held_out_episodes"] = held_out
+        if not planner_only:  # trajectories that are too short are found now rather than after the planner was trained
+            WindowTable.build(data, frames[0], pad_before=frames[1])
+            if get_method(config.method).plans:
+                WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
+        for_planner = without_held_out(data, held_out)
+        data = data if planner_only else without_held_out(data, held_out, keep_labelled=True)
+        if not mine:
+            held.enter_context(run.locked("koap train"))
+            check_resume(run, config)  # another one may have begun here in the meantime
+        if (
+            run.path / "config.json"
+        ).exists():  # what a run was begun with says what it is; going on leaves options out
+            command = run.read_json("config.json").get("command") or command
+        # not before the data are known to be good: a wrong call leaves nothing
+        run.write_json("config.json", content | ({"command": command} if command else {}))
+        began = time.perf_counter()
+        with open_logger(config.run.logger, config.out) as logger:
+            torch.manual_seed(config.run.seed)
+            planner, losses = None, dict[str, float]()
+            if get_method(config.method).plans:
+                planner, losses = _planner(run, task, config, for_planner, logger)
+            planned = time.perf_counter()
+            if planner_only:
+                return Trained(task, config, planner, None, {"planner": losses}, tuple(held_out), run.path)
+            torch.manual_seed(config.run.seed)  # the controller does not depend on where the planner is from
+            controller, results = learn_controller(task, config, data, run=run, logger=logger)
+            save_weights(run.path / "controller.safetensors", controller, facts_of("controller", task, config))
+        summary = {
+            "labels": report.as_dict(),
+            "trajectories_used": len(data["episode"].unique()),
+            "planner_parameters": 0 if planner is None else sum(p.numel() for p in planner.parameters()),
+            "controller_parameters": sum(p.numel() for p in controller.parameters()),
+            "train_seconds": {"planner": planned - began, "controller": time.perf_counter() - planned},
+            "planner": losses,
+            **results,
+        }
+        if get_method(config.method).plans:  # afterwards: it reads labels that the training was not given
+            columns = task.controller_columns(config.controller.columns)
+            analysis = write_analysis(run, task, every, data, controller, columns)
+            summary[error_entry(task.action_unit)] = analysis
+        run.write_json("summary.json", summary)
+    return Trained(task, config, planner, controller, summary, tuple(held_out), run.path)
+
+
+def _frames(task: Task, config: TrainConfig) -> tuple[int, int]:
+    """Length of a window of the controller, and frames that may be repeated before an episode.
+
+    Finds networks that cannot read the task's state, and weights to take over that do not fit, before any work.
+    """
+    with torch.random.fork_rng(devices=[]):
+        planner, module = build_networks(task, config)
+    if planner is None:
+        return WINDOW, 1
+    source = config.planner.source
+    if source is not None and not (config.run.resume and (config.out / "planner.safetensors").exists()):
+        load_weights(source / "planner.safetensors", planner, facts_of("planner", task, config))
+    if get_method(config.method).fit is not None:
+        return WINDOW, 1
+    return max(WINDOW, module.num_window_frames), module.num_past
+
+
+def _read_data(
+    task: Task, config: TrainConfig, planner_only: bool
+) -> tuple[TensorDictBase, TensorDictBase, list[int], LabelReport | None]:
+    """The trajectories that are used, all data, those that the planner does not see, a report of the labels seen."""
+    with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:  # read in a moment, but for thousands
+        data = load_demonstrations(config.dataset, task, progress=count_up_to(bar))
+    planner, share, seed = config.planner, config.labels.trajectories, config.run.seed
+    if planner_only:
+        # all cells of a curve share it, whichever labels they draw: only labels that there are count as such here
+        held_out = choose_held_out(data, planner.held_out, seed=seed)
+        data["action"] = torch.full_like(data["action"], torch.nan)
+        data["has_action"] = torch.zeros_like(data["has_action"])
+        return subsample_trajectories(data, share).to(config.run.device), data, held_out, None
+    labelled, report = label_budget(config).apply(data, command=task.command_columns)
+    if get_method(config.method).knows_commands:
+        labelled = with_label_commands(labelled, data, task.command_columns)
+    # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
+    labelled = subsample_trajectories(labelled, share).to(config.run.device)
+    if planner.source is not None:
+        return labelled, data, held_out_by(planner.source, config.dataset), report
+    return labelled, data, choose_held_out(labelled, planner.held_out, seed=seed), report
+
+
+def _planner(
+    run: RunDirectory, task: Task, config: TrainConfig, data: TensorDictBase, logger: Any
+) -> tuple[StatePlanner, dict[str, float]]:
+    """The planner: trained, taken over from another run, or loaded where that is done."""
+    path, facts = run.path / "planner.safetensors", facts_of("planner", task, config)
+    if path.exists() and config.run.resume:  # weights are written once, at the end of their phase
+        planner = build_planner(task, config.planner).to(config.run.device)
+        load_weights(path, planner, facts)
+        return planner, run.last_metrics("planner")
+    if config.planner.source is not None:
+        planner, losses = build_planner(task, config.planner).to(config.run.device), dict[str, float]()
+        load_weights(config.planner.source / "planner.safetensors", planner, facts)
+    else:
+        planner, losses = learn_planner(task, config, data, run=run, logger=logger)
+    save_weights(path, planner, facts)
+    return planner, losses

@@ -1,0 +1,279 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A finished training: its networks with their weights, and what they were trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from torch import nn
+
+from torchrl_koap.data import LabelReport
+from torchrl_koap.modules import CommandDecoder, Execution, Follower, PlanningPolicy, StatePlanner, make_policy
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.config_files import from_json, read_config, to_json, versions
+from torchrl_koap.runs.plugins import load_plugins
+from torchrl_koap.runs.pretrained import find_run
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
+from torchrl_koap.tasks import Task, get_task, task_of
+from torchrl_koap.tasks.registry import plain_task
+from torchrl_koap.training.command_model import decoder_columns
+from torchrl_koap.training.datasets import label_budget, load_demonstrations
+from torchrl_koap.training.method import Method
+from torchrl_koap.training.methods import get_method
+from torchrl_koap.training.networks import build_controller, build_planner
+from torchrl_koap.training.policy_facts import policy_facts
+
+FORMAT, VERSION = "torchrl_koap policy", 2
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What a training leaves: networks in evaluation mode, and everything that tells how they were made.
+
+    Args:
+        task (Task): the task.
+        config (TrainConfig): its options, nothing left open.
+        planner (StatePlanner, optional): None for a method that samples actions, or where only a controller was
+            trained.
+        controller (nn.Module, optional): the controller, or the network that samples actions; None where only a planner
+            was trained.
+        results (mapping): last losses, labels spent and what a closed form found, as in ``summary.json``.
+        held_out (tuple of int): trajectories that the planner has never seen.
+        folder (Path, optional): the run directory or file that it was loaded from.
+
+    Examples:
+        >>> from torchrl_koap import Trained
+        >>> trained = Trained.load("pretrained:avoiding")  # or the folder of a run of yours
+        >>> trained.task.name, trained.method.name, trained.planner.horizon
+        ('avoiding', 'koap', 14)
+    """
+
+    task: Task
+    config: TrainConfig
+    planner: StatePlanner | None
+    controller: nn.Module | None
+    results: Mapping[str, Any] = field(default_factory=dict)
+    held_out: tuple[int, ...] = ()
+    folder: Path | None = None
+
+    @classmethod
+    def load(cls, where: str | Path, *, plugins: Sequence[str] = ()) -> Trained:
+        """Loads a finished run, or a file of :meth:`save`; the plugins of a run are imported first.
+
+        Args:
+            where (str or Path): run directory, ``"pretrained:NAME"``, or a file.
+
+        Keyword Args:
+            plugins (sequence of str): modules that register the task or method; a file cannot have them imported
+                itself.
+
+        Raises:
+            RunDirectoryError: if the folder is no finished run.
+            CheckpointError: if weights, or the file, are missing, damaged, of another task or of other options.
+            PluginError: if a plugin cannot be imported.
+        """
+        load_plugins(plugins)
+        path = find_run(where)
+        return cls._from_file(path, plugins) if path.is_file() else cls._from_folder(path)
+
+    @classmethod
+    def _from_folder(cls, path: Path) -> Trained:
+        run = RunDirectory(path)
+        config, content = read_config(run), run.read_json("config.json")
+        load_plugins(config.run.plugins)
+        try:
+            task = task_of(content)
+            planner, controller = build_networks(task, config)
+        except (KeyError, TypeError, ValueError) as error:
+            problem = f"an entry {error} is missing" if isinstance(error, KeyError) else error
+            raise RunDirectoryError(f"{path / 'config.json'} cannot be used: {problem}") from error
+        for name, module in {"planner": planner, "controller": controller}.items():
+            if module is not None:
+                load_weights(path / f"{name}.safetensors", module, facts_of(name, task, config))
+        results = run.read_json("summary.json") if (path / "summary.json").exists() else {}
+        return cls(task, config, planner, controller, results, tuple(content.get("held_out_episodes") or ()), path)
+
+    @classmethod
+    def _from_file(cls, path: Path, plugins: Sequence[str]) -> Trained:
+        tensors, about = load_tensors(path)
+        if about.get("format") != FORMAT:
+            raise CheckpointError(f"{path} is no policy that Trained.save() wrote")
+        if about.get("version") != VERSION:
+            raise CheckpointError(f"{path} is a policy of format {about.get('version')}, this version reads {VERSION}")
+        try:
+            config = from_json(TrainConfig, about["config"], path)
+            definition = about["task_definition"]
+            task = get_task(config.task) if definition is None else plain_task(definition)
+            planner, controller = build_networks(task, config)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            problem = f"entry {error} is missing" if isinstance(error, KeyError) else error
+            needs = [name for name in about.get("config", {}).get("run", {}).get("plugins", ()) if name not in plugins]
+            hint = f"; it was made with the plugins {', '.join(map(str, needs))}" if needs else ""
+            raise CheckpointError(f"{path} cannot be built: {problem}{hint}") from error
+        load_parts(path, tensors, {"planner": planner, "controller": controller})
+        return cls(task, config, planner, controller, folder=path)
+
+    def save(self, path: str | Path) -> Path:
+        """Writes networks and options to one file, from which :meth:`load` makes the same without any data.
+
+        Args:
+            path (str or Path): file to write, such as ``"policy.safetensors"``; replaced in one step.
+
+        Raises:
+            IsADirectoryError: if the path is a folder.
+        """
+        path = Path(path)
+        if path.is_dir():
+            raise IsADirectoryError(f"{path} is a folder; a policy is one file, such as {path / 'policy.safetensors'}")
+        networks = {"planner": self.planner, "controller": self.controller}
+        tensors = {
+            f"{name}.{key}": value
+            for name, module in networks.items()
+            if module is not None
+            for key, value in module.state_dict().items()
+        }
+        about = {
+            "format": FORMAT,
+            "version": VERSION,
+            "config": to_json(self.config),
+            "task_definition": None if self.task.import_strings() else self.task.to_json(),
+            "versions": versions(),
+        }
+        save_tensors(path, tensors, about)
+        return path
+
+    @property
+    def method(self) -> Method:
+        """The method."""
+        return get_method(self.config.method)
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """State columns that the controller reads."""
+        return self.task.controller_columns(self.config.controller.columns)
+
+    @property
+    def execution(self) -> Execution:
+        """How its plans become actions unless asked otherwise."""
+        return self.config.execution.on(Execution())
+
+    def policy(self, execution: Execution | None = None, *, follower: Follower | None = None) -> PlanningPolicy:
+        """Makes a policy of the networks: observations in, an action per control step out.
+
+        Args:
+            execution (Execution, optional): how plans become actions. Default: as it was trained for.
+
+        Keyword Args:
+            follower (Follower, optional): follows plans in place of the controller.
+
+        Returns:
+            PlanningPolicy: in evaluation mode. A :class:`~torchrl_koap.modules.PolicyEnv` hands it what it reads; an
+            :class:`~torchrl_koap.modules.Agent` keeps that itself.
+
+        Raises:
+            ValueError: as :func:`~torchrl_koap.modules.make_policy`, for a strategy of plans where actions are sampled,
+                or where a planner or a controller was trained alone.
+
+        Examples:
+            >>> import numpy as np
+            >>> from torchrl_koap import Agent, Trained
+            >>> agent = Agent(Trained.load("pretrained:avoiding").policy(), seed=0)
+            >>> agent.reset()
+            >>> agent.act(np.array([0.525, -0.28, 0.525, -0.28])).shape  # commanded, measured xy to a change of xy (m)
+            (2,)
+        """
+        execution = self.execution if execution is None else execution
+        missing = [name for name in ("planner", "controller") if getattr(self, name) is None]
+        if self.method.plans and missing:
+            raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
+        gripper = decoder_columns(self.task)["gripper"] if isinstance(self.controller, CommandDecoder) else None
+        facts = policy_facts(self.task, columns=self.columns, gripper=gripper)
+        if self.method.plans:
+            return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
+        if execution.strategy != "open_loop" or follower is not None:
+            raise ValueError(
+                f"strategy {execution.strategy!r} was asked of method {self.method.name!r}, which samples actions and"
+                " executes chunks of them: there is no plan to follow"
+            )
+        return make_policy(self.controller, **facts, execution=execution)
+
+    def data(self, dataset: str | None = None) -> TensorDictBase:
+        """Reads the demonstrations that it was trained on, with all labels that there are.
+
+        Args:
+            dataset (str, optional): where they are now. Default: where they were.
+
+        Raises:
+            RunDirectoryError: if they are not there.
+        """
+        where = dataset or self.config.dataset
+        if where is None or not Path(where).is_dir():
+            raise RunDirectoryError(
+                f"the data set {where!r} of {self.folder} is not there (moved, or named relative to another working"
+                " directory?): say where it is with --dataset"
+            )
+        return load_demonstrations(where, self.task)
+
+    def hide_labels(self, data: TensorDictBase) -> tuple[TensorDictBase, LabelReport]:
+        """Hides all labels that the training did not see: their actions are NaN.
+
+        Args:
+            data (TensorDictBase): what :meth:`data` returned.
+
+        Returns:
+            tuple: the data, and what the budget took.
+
+        Raises:
+            RunDirectoryError: if they are not the demonstrations that it was trained on.
+        """
+        hidden, report = label_budget(self.config).apply(data, command=self.task.command_columns)
+        if "labels" not in self.results:
+            raise RunDirectoryError(f"{self.folder}: summary.json has no entry 'labels'")
+        recorded = self.results["labels"]
+        if {name: report.as_dict().get(name) for name in recorded} != recorded:
+            raise RunDirectoryError(
+                f"the data set at hand is not the one that {self.folder} was trained on: its trajectories or labels"
+                " differ"
+            )
+        return hidden, report
+
+
+def build_networks(task: Task, config: TrainConfig) -> tuple[StatePlanner | None, nn.Module]:
+    """Builds the networks of a training without weights, in evaluation mode.
+
+    Args:
+        task (Task): the task.
+        config (TrainConfig): nothing left open.
+
+    Returns:
+        tuple: the planner, None for a method that samples actions, and the controller, or what samples them.
+
+    Raises:
+        ValueError: for unknown names, or networks that cannot read the task's state.
+    """
+    method = get_method(config.method)
+    if not method.plans:
+        return None, method.build(task, config.planner).eval()
+    return build_planner(task, config.planner).eval(), build_controller(task, method, config.controller).eval()
+
+
+def facts_of(part: str, task: Task, config: TrainConfig) -> dict[str, Any]:
+    """What a file of weights says about them: the options that build their network.
+
+    Args:
+        part (str): ``"planner"`` or ``"controller"``.
+        task (Task): the task.
+        config (TrainConfig): nothing left open.
+    """
+    planner = {f"planner.{name}": getattr(config.planner, name) for name in ("network", "width", "frames")}
+    if part == "planner":
+        return {"task": task.name} | planner
+    facts: dict[str, Any] = {"task": task.name, "method": config.method}
+    if not get_method(config.method).plans:
+        return facts | planner
+    return facts | {f"controller.{name}": getattr(config.controller, name) for name in ("preset", "columns")}
