@@ -93,7 +93,7 @@ for name, steps in updates.items():
 
 def trials(trained):
     """Episodes in the simulator, frames included."""
-    policy = torchrl_koap.load_policy(trained)
+    policy = trained.policy()
     contexts = draw_contexts("scooping", TRIALS, 1)
 
     def make_env(number):

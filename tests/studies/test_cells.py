@@ -65,7 +65,7 @@ def test_cells_have_folders_of_their_own():
     assert len({cell.folder for cell in cells}) == len(cells)
     assert Cell("koap", 0.01, 1.0, 2).folder == "cells/koap-0.01-1-seed2"
     assert Cell("koap", 0.01, 0.5, 2).planner == planner_folder(0.5) == "planner-0.5"
-    assert Cell("dp", 0.01, 1.0, 2).planner is None and Cell("dp_relabel", 0.01, 1.0, 2).planner is None
+    assert Cell("dp", 0.01, 1.0, 2).planner is None and Cell("vpt", 0.01, 1.0, 2).planner is None
 
 
 def test_every_training_seed_meets_noise_of_its_own(monkeypatch, tmp_path):
@@ -209,7 +209,7 @@ def test_a_cell_with_other_settings_is_not_continued(root, planner, demonstratio
     (root / CELL.folder / "cell.json").unlink()
     (root / CELL.folder / "summary.json").unlink()
     other = {**settings_of(demonstrations), "controller_steps": 7}
-    with pytest.raises(RunDirectoryError, match="was started with another controller_steps"):
+    with pytest.raises(RunDirectoryError, match="was started with another controller.steps"):
         do_cell(
             folder=str(root / CELL.folder),
             cell=vars(CELL),

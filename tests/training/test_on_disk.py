@@ -53,6 +53,8 @@ def poisoned(data, budget, *, inside=False, told=False):
     data = data.clone()
     if inside:
         data["action"] = torch.where(labelled["has_action"], data["action"] * 1.5, data["action"])
+        if told:
+            data["observation"] = torch.where(labelled["has_action"], data["observation"] * 1.5, data["observation"])
         return data
     data["action"] = torch.where(labelled["has_action"], data["action"], POISON)
     for key in ("observation", ("next", "observation")):
