@@ -114,7 +114,7 @@ def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, A
         robot=NAMES[:JOINTS],
     )
     if not options.forecast:
-        task = replace(task, defaults=replace(task.defaults, view={"forecast": False}))
+        task = replace(task, defaults=replace(task.defaults, forecast=False))
     save_ted(data, folder / "arm" / "ted", task=task)
     run = folder / "run"
     asked = {"planner": PlannerConfig(steps=options.steps), "run": RunConfig(seed=seed)}

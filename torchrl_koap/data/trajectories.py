@@ -183,9 +183,7 @@ def select_state(
     return data.copy().set(keys.STATE, data.get(keys.OBSERVATION)[..., columns])
 
 
-def controller_view(
-    data: TensorDictBase, columns: Sequence[int], *, action_targets: Sequence[int] = ()
-) -> TensorDictBase:
+def controller_view(data: TensorDictBase, columns: Sequence[int], *, targets: Sequence[int] = ()) -> TensorDictBase:
     """The same data as a controller with a mask sees them.
 
     Args:
@@ -193,7 +191,7 @@ def controller_view(
         columns (sequence of int): columns of the state to keep.
 
     Keyword Args:
-        action_targets (sequence of int): for actions that are targets, the state column of each: what is left of an
+        targets (sequence of int): for actions that are targets, the state column of each: what is left of an
             action is the distance to it. Default: actions stay as they are.
 
     Returns:
@@ -207,8 +205,8 @@ def controller_view(
         tensor([[1., 3.]])
     """
     state, view = data.get(keys.STATE), data.copy()
-    if action_targets:
-        view.set(keys.ACTION, view.get(keys.ACTION) - state[..., list(action_targets)])
+    if targets:
+        view.set(keys.ACTION, view.get(keys.ACTION) - state[..., list(targets)])
     return view.set(keys.STATE, state[..., list(columns)])
 
 

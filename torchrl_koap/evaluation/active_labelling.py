@@ -262,7 +262,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
             " train with `--method koap`"
         )
     data, report = trained.hide_labels(trained.data(config.dataset))
-    steps = infer_steps(controller, controller_view(data, trained.columns, action_targets=task.targets))
+    steps = infer_steps(controller, controller_view(data, trained.columns, targets=task.targets))
     left = int(steps[EPISODE][~steps[HAS_ACTION]].unique().numel())
     count = max(1, min(_FEW, left)) if config.count is None else config.count
     choices = rank_trajectories(

@@ -213,5 +213,5 @@ def _look_into(config: InspectConfig, trained: Trained, data: TensorDictBase) ->
         for name, part in task.state_slices.items()
     }
     parts = {name: places for name, places in parts.items() if places}
-    view = controller_view(data, columns, action_targets=task.targets)
+    view = controller_view(data, columns, targets=task.targets)
     return analyse_latent(controller, view, labelled, parts, horizon=config.latent_steps)

@@ -86,7 +86,7 @@ def _actions(trained: Trained, data: TensorDictBase, labelled: TensorDictBase, *
     if trained.method.fit is not None:
         note = {"note": "the controller decodes no recorded states: it follows plans by the command that it gave"}
         return {"outside_budget": note, "left_out": note}
-    view, seen = (controller_view(part, trained.columns, action_targets=task.targets) for part in (data, labelled))
+    view, seen = (controller_view(part, trained.columns, targets=task.targets) for part in (data, labelled))
     controller = trained.controller.cpu()
     return {
         "outside_budget": errors_outside_budget(controller, view, seen, task),

@@ -12,7 +12,7 @@ from typing import Any
 
 from torchrl_koap.evaluation.statistics import expected_entropy
 from torchrl_koap.files import read_bytes
-from torchrl_koap.tasks import Modes, Task, task_of
+from torchrl_koap.tasks import Modes, Task, task_from_config
 
 
 def number(value: Any) -> float | int | None:
@@ -78,7 +78,7 @@ class RunFacts:
             files[key], wrong = _read(path) if path.exists() else ({}, "")
             damaged += [wrong] if wrong else []
         try:
-            task = task_of(files["config"])
+            task = task_from_config(files["config"])
         except (ValueError, KeyError, TypeError, AttributeError):  # a run of a task that nobody knows here
             task = None
         return cls(folder, task, damaged=tuple(damaged), **files)

@@ -3,9 +3,10 @@
 
 from torchrl_koap.tasks.action_rules import Action
 from torchrl_koap.tasks.columns import Columns
-from torchrl_koap.tasks.registry import TASKS, adopt_task, get_task, register_task, task_of
+from torchrl_koap.tasks.modes import Modes
+from torchrl_koap.tasks.registry import TASKS, get_task, register_task, task_from_config
 from torchrl_koap.tasks.scene import Body, Scene, Shape
-from torchrl_koap.tasks.task import CONTROL_HZ, HISTORY, HORIZON, REPLAN_INTERVAL, WINDOW, Defaults, Modes, Task
+from torchrl_koap.tasks.task import CONTROL_HZ, HISTORY, HORIZON, REPLAN_INTERVAL, WINDOW, Defaults, Task
 
 from torchrl_koap.tasks import avoiding, aligning, sorting, stacking, scooping  # isort: skip  # in the order of TASKS
 
@@ -24,7 +25,6 @@ __all__ = [
     "Scene",
     "Shape",
     "Task",
-    "adopt_task",
     "aligning",
     "avoiding",
     "get_task",
@@ -32,5 +32,5 @@ __all__ = [
     "scooping",
     "sorting",
     "stacking",
-    "task_of",
+    "task_from_config",
 ]

@@ -9,9 +9,10 @@ import numpy as np
 from torch import Tensor
 
 from torchrl_koap.tasks.action_rules import Action
+from torchrl_koap.tasks.modes import Modes
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Scene, Shape
-from torchrl_koap.tasks.task import Defaults, Modes, Task
+from torchrl_koap.tasks.task import Defaults, Task
 
 FINISH_Y = 0.35  # m
 ROD_RADIUS = 0.01  # m

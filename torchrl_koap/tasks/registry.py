@@ -13,7 +13,6 @@ from torchrl_koap.tasks.task import Task
 GROUP = "torchrl_koap.tasks"
 TASKS: dict[str, Task] = {}
 _loaded = False
-_adopted: set[str] = set()  # names of tasks that came with data
 
 
 def register_task(task: Task) -> Task:
@@ -88,61 +87,27 @@ def find_task(name: object) -> Task | None:
     return TASKS.get(name) if isinstance(name, str) else None
 
 
-def adopt_task(task: Task) -> Task:
-    """Makes a task known that came with a data set or a run; the next one of that name takes its place.
-
-    Args:
-        task (Task): the task.
-
-    Returns:
-        Task: the task, which its name finds from now on.
-
-    Raises:
-        ValueError: if a package has registered another task of that name.
-
-    Examples:
-        >>> from torchrl_koap.tasks import Action, Task, get_task
-        >>> from torchrl_koap.tasks.registry import adopt_task
-        >>> for n in (6, 7):
-        ...     arm = Task(name="my_arm", observation_parts={"q": n}, actions={"a": Action("rad")}, position="q")
-        ...     adopted = adopt_task(arm)
-        >>> get_task("my_arm").observation_dim
-        7
-    """
-    if task.name in _adopted:
-        TASKS[task.name] = task
-    elif TASKS.get(task.name) != task:
-        register_task(task)
-        _adopted.add(task.name)
-    return TASKS[task.name]
-
-
-def is_adopted(task: Task) -> bool:
-    """Whether a task came with data: no package registers it, so a run has to bring it along."""
-    return task.name in _adopted
-
-
-def task_of(config: Mapping[str, Any]) -> Task:
-    """The task of a run, from its ``config.json``: the one it brings along, or a registered one.
+def task_from_config(config: Mapping[str, Any]) -> Task:
+    """Finds the task of a run by its ``config.json``: the one that it holds, or a registered one.
 
     Args:
         config (mapping): content of ``config.json``.
 
     Returns:
-        Task: the registered task of that name, or the one that the mapping defines.
+        Task: the one that the mapping defines, else the registered one of that name.
 
     Raises:
-        ValueError: if the task it brings along is damaged or names code, or nobody has registered it.
+        ValueError: if the task that it defines is damaged or names code, or nobody has registered it.
 
     Examples:
-        >>> from torchrl_koap.tasks.registry import task_of
-        >>> task_of({"task": "avoiding"}).state_dim
+        >>> from torchrl_koap.tasks.registry import task_from_config
+        >>> task_from_config({"task": "avoiding"}).state_dim
         2
     """
     definition = config.get("task_definition")
     if definition is None:
         return get_task(config["task"])
-    return adopt_task(plain_task(definition))
+    return plain_task(definition)
 
 
 def plain_task(entries: object) -> Task:

@@ -94,8 +94,8 @@ _SCOOPING = register_task(
             demonstrations=100,
             planner={"steps": 4000},
             relative=False,
-            recovery_sigma=0.0,
-            view={"neighbor_recovery": 2.0},  # no column is a position that could be displaced
+            recovery=0.0,
+            neighbor_recovery=2.0,  # no column is a position that could be displaced
             # a place read off every frame with an error acts as a velocity: docs/results/scooping.md
             execution={"strategy": "open_loop", "replan_interval": 8, "blend": 0.0},
         ),
@@ -115,7 +115,7 @@ register_task(
         hidden=("spoon", "bowl"),
         env_options={"task": "scooping_moving_bowl"},
         # the nearest other picture may show the bowl elsewhere: no gain (docs/results/scooping.md)
-        defaults=replace(_SCOOPING.defaults, view={}),
+        defaults=replace(_SCOOPING.defaults, neighbor_recovery=0.0),
         scene=replace(
             _SCOOPING.scene,
             shapes=(),

@@ -16,9 +16,10 @@ import torch
 from torch import Tensor
 
 from torchrl_koap.tasks.action_rules import Action
+from torchrl_koap.tasks.modes import Modes
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape
-from torchrl_koap.tasks.task import Defaults, Modes, Task
+from torchrl_koap.tasks.task import Defaults, Task
 
 # of PO-Sorting, where time is short: noise makes decoded actions too small, and plans are followed from behind; chosen
 # on one trained planner (docs/results/planners.md)

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from torchrl_koap.tasks.action_rules import Action
+from torchrl_koap.tasks.modes import Modes
 from torchrl_koap.tasks.registry import register_task
 from torchrl_koap.tasks.scene import Body, Scene, Shape
-from torchrl_koap.tasks.task import Defaults, Modes, Task
+from torchrl_koap.tasks.task import Defaults, Task
 
 TARGET = (0.5, 0.2)  # centre of the target zone (m)
 TARGET_HALF = 0.05  # half its width (m)

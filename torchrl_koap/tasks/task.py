@@ -8,7 +8,6 @@ data set, and no simulator is imported before it is used.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -21,7 +20,7 @@ from torchrl_koap.lookup import lookup, resolve
 from torchrl_koap.tasks.action_rules import Action, ActionRule
 from torchrl_koap.tasks.checks import check_task
 from torchrl_koap.tasks.columns import Columns
-from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
+from torchrl_koap.tasks.modes import Modes
 from torchrl_koap.tasks.scene import Body, Scene
 
 CONTROL_HZ = 1 / 0.035
@@ -32,68 +31,19 @@ WINDOW = HISTORY + HORIZON
 
 
 @dataclass(frozen=True)
-class Modes:
-    """The ways in which a task can be done.
-
-    Args:
-        choices (tuple): what a mode is made of, slowest digit first: ``(choice, names of its values)`` each.
-        index (str): import string of the function from the leaf ``mode`` ``[*B, ...]`` to the number of the mode
-            ``[*B]``, int64, -1 while it is not decided.
-        entropy (str): over which episodes the entropy of the modes is taken: ``"all"`` successful ones together, or
-            per context and then averaged over ``"contexts"`` or ``"solved_contexts"`` (those with a success).
-        of_path (str, optional): import string of the function from recorded positions of the tool ``[T, 2]`` (numpy, m)
-            to the number of the mode, -1 while it is not decided; None where the path does not tell.
-
-    Examples:
-        >>> from torchrl_koap.tasks import Modes
-        >>> modes = Modes((("row 1", ("left", "right")), ("row 2", ("left", "middle", "right"))))
-        >>> modes.number, modes.name_of(5), modes.name_of(-1)
-        (6, 'right, right', 'no mode')
-    """
-
-    choices: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    index: str | None = None
-    entropy: str = "all"
-    of_path: str | None = None
-
-    @property
-    def number(self) -> int:
-        """Number of modes; 1 where nothing is to choose."""
-        return math.prod(len(names) for _, names in self.choices)
-
-    def name_of(self, index: int) -> str:
-        """Names a mode by its choices, the slowest first; ``"no mode"`` where the number is none of them.
-
-        Args:
-            index (int): number of the mode.
-
-        Examples:
-            >>> from torchrl_koap.tasks import get_task
-            >>> get_task("avoiding").modes.name_of(23), get_task("sorting").modes.name_of(1)
-            ('right, right, gap 4', 'red, blue, red, blue')
-        """
-        if not 0 <= index < self.number:
-            return "no mode"
-        words = []
-        for _, names in reversed(self.choices):
-            index, digit = divmod(index, len(names))
-            words.append(names[digit])
-        return ", ".join(reversed(words))
-
-
-@dataclass(frozen=True)
 class Defaults:
     """Settings that are a task's own unless a command gives others.
 
     Args:
         method (str): what `koap train` trains.
         demonstrations (int): number of scripted demonstrations to record.
-        disturbance (float): share of them in which the operator is disturbed.
+        disturbance (float): share of them in which the expert is disturbed.
         relative (bool): plans are displacements from the present state.
-        recovery_sigma (float): typical shift of the recovery augmentation, in the units of the robot's columns.
-        view (dict): ``neighbor_recovery`` (farthest share of the way to the nearest other window that windows are
-            moved, for states without a column that is a position) and ``forecast`` (plans are deviations from a linear
-            forecast; default: in tasks without an environment).
+        recovery (float): typical shift of the recovery augmentation, in the units of the robot's columns.
+        neighbor_recovery (float): farthest share of the way to the nearest other window that windows are moved, where
+            no column is a position that could be shifted.
+        forecast (bool, optional): plans are deviations from a linear forecast, which carries over to goals that nobody
+            demonstrated. Default: in tasks without an environment.
         planner (dict): options of :class:`~torchrl_koap.PlannerConfig`. Its sizes are those of its network alone:
             another one that is asked for by name comes with its own.
         controller (dict): options of :class:`~torchrl_koap.ControllerConfig`; the preset is that of ``method``.
@@ -109,8 +59,9 @@ class Defaults:
     demonstrations: int = 200
     disturbance: float = 0.0
     relative: bool = True
-    recovery_sigma: float = 0.004
-    view: Mapping[str, Any] = field(default_factory=dict)
+    recovery: float = 0.004
+    neighbor_recovery: float = 0.0
+    forecast: bool | None = None
     planner: Mapping[str, Any] = field(default_factory=dict)
     controller: Mapping[str, Any] = field(default_factory=dict)
     execution: Mapping[str, Any] = field(default_factory=dict)
@@ -311,11 +262,6 @@ class Task(Columns):
     def relative_columns(self) -> list[tuple[slice, ...]]:
         """State columns of ``relative_positions``: a position, the one it is seen from, a yaw and another one."""
         return [tuple(self.state_slices[name] for name in names) for names in self.relative_positions]
-
-    def planner_features(self) -> RelativePositionFeatures | None:
-        """The task's relative positions as a module, None if it has none."""
-        pairs = [RelativePosition(*columns) for columns in self.relative_columns()]
-        return RelativePositionFeatures(pairs) if pairs else None
 
     def interchangeable_columns(self) -> list[list[list[int]]]:
         """State columns of the bodies that may be permuted, by group and body."""

@@ -151,8 +151,8 @@ def write_analysis(
     save_tensors(run.path / "demonstrations.safetensors", shown)
     if not isinstance(controller, InverseDynamics):
         return {"note": "the controller decodes no recorded states: it follows plans by the command that it gave"}
-    labelled = controller_view(labelled.cpu(), columns, action_targets=task.targets)
-    viewed = controller_view(data, columns, action_targets=task.targets)
+    labelled = controller_view(labelled.cpu(), columns, targets=task.targets)
+    viewed = controller_view(data, columns, targets=task.targets)
     predicted, true = hidden_action_errors(controller, viewed, labelled)
     if not len(true):
         return {"note": "no trajectory outside the budget has labels: there is nothing to measure on"}

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, STATE
 from torchrl_koap.modules import CommandDecoder
+from torchrl_koap.modules.planning.relative_positions import RelativePosition, RelativePositionFeatures
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
-from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
 
 LABEL_COMMAND = "label_command"  # last commands at labelled steps [N, J], NaN elsewhere
 SHARE = 16  # updates for each of another controller's, up to UPDATES

@@ -93,7 +93,7 @@ class _Loop:
 
 def _view(task: Task, config: TrainConfig, data: TensorDictBase) -> TensorDictBase:
     """Flat data ``[N]`` as the controller sees them: its columns, and actions as distances to their targets."""
-    return controller_view(data, task.controller_columns(config.controller.columns), action_targets=task.targets)
+    return controller_view(data, task.controller_columns(config.controller.columns), targets=task.targets)
 
 
 def _train_network(

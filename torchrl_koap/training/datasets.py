@@ -18,7 +18,7 @@ from torchrl_koap.data.ted import stored_folder, stored_task
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import read_config
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.tasks import Task, adopt_task, get_task
+from torchrl_koap.tasks import Task, get_task
 
 DEFAULT_TASK = "avoiding"  # of raw pickles
 # what is derived from these may differ from version to version
@@ -55,7 +55,7 @@ def find_task_of(dataset: str | None, name: str | None = None) -> Task:
     own = stored_task(folder)
     if name not in (None, own.name):
         raise ValueError(f"dataset {dataset!r} holds its own task {own.name!r}; --task {name} does not fit it")
-    return adopt_task(own)
+    return own
 
 
 def load_demonstrations(

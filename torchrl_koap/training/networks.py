@@ -10,6 +10,7 @@ from torch import nn
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import PRESETS, DiffusionPolicy, MLPDenoiser, Normalizer, StatePlanner, TemporalUnet
+from torchrl_koap.modules.planning.relative_positions import relative_features
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig
 from torchrl_koap.tasks import HORIZON, Task
 from torchrl_koap.training.method import Method
@@ -51,7 +52,7 @@ def build_sampler(task: Task, section: PlannerConfig) -> DiffusionPolicy:
 def _diffusion(task: Task, section: PlannerConfig, size: int) -> dict[str, Any]:
     """What planner and Diffusion Policy take alike, with a network for sequences of that many columns."""
     lookup(NETWORKS, section.network, "planner.network")
-    features = task.planner_features()
+    features = relative_features(task.relative_columns())
     seen = section.frames * task.state_dim + (0 if features is None else features.num_features)
     if section.network == "unet":
         network: nn.Module = TemporalUnet(size, seen, channels=(section.width, 2 * section.width))
@@ -98,7 +99,8 @@ def build_controller(
 
 def forecasts(task: Task) -> bool:
     """Whether plans are deviations from a linear forecast, which carries over to goals that nobody demonstrated."""
-    return task.defaults.view.get("forecast", task.env is None)
+    own = task.defaults.forecast
+    return task.env is None if own is None else own
 
 
 def sizes_of(planner: StatePlanner) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from torchrl_koap.runs.resume import begun_with, check_data, check_resume
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import load_weights, save_weights
 from torchrl_koap.tasks import WINDOW, Task
-from torchrl_koap.tasks.registry import is_adopted
 from torchrl_koap.training.action_errors import AFTER, BEFORE, error_entry, write_analysis
 from torchrl_koap.training.command_model import with_label_commands
 from torchrl_koap.training.controller import learn_controller
@@ -92,8 +91,8 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         data, every, held_out, report = _read_data(task, config, planner_only)
         content = to_json(config) | {"data": fingerprint(data), "versions": versions()}
         check_data(run, content)
-        if is_adopted(task):
-            content["task_definition"] = task.to_json()  # nobody has registered it: it comes with the data
+        if not task.import_strings():
+            content["task_definition"] = task.to_json()  # plain facts, such as those that come with data
         if held_out:
             content["held_out_episodes"] = held_out
         if not planner_only:  # trajectories that are too short are found now rather than after the planner was trained

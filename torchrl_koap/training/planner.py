@@ -110,11 +110,11 @@ def augmentation(task: Task, *, actions: bool = False) -> TensorDictSequential:
     if moved_by or not actions:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
         tool: dict[str, Any] = {"tool": task.tool_columns, "kinematics": task.tool_position}
-        sigma = task.defaults.recovery_sigma
-        steps.append(RecoveryAugmentation(sigma, history=HISTORY, columns=arm, moved_by=moved_by, **tool))
+        steps.append(
+            RecoveryAugmentation(task.defaults.recovery, history=HISTORY, columns=arm, moved_by=moved_by, **tool)
+        )
     if task.gripper is not None and not actions:
         steps.append(GripperRecovery(task.gripper[1], history=HISTORY))
-    neighbor = task.defaults.view.get("neighbor_recovery")
-    if neighbor and not actions:
-        steps.append(NeighborRecovery(neighbor, history=HISTORY))
+    if task.defaults.neighbor_recovery and not actions:
+        steps.append(NeighborRecovery(task.defaults.neighbor_recovery, history=HISTORY))
     return TensorDictSequential(*steps)

@@ -19,7 +19,7 @@ from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import CheckpointError, load_parts, load_tensors, load_weights, save_tensors
-from torchrl_koap.tasks import Task, get_task, task_of
+from torchrl_koap.tasks import Task, get_task, task_from_config
 from torchrl_koap.tasks.registry import plain_task
 from torchrl_koap.training.command_model import decoder_columns
 from torchrl_koap.training.datasets import label_budget, load_demonstrations
@@ -87,7 +87,7 @@ class Trained:
         config, content = read_config(run), run.read_json("config.json")
         load_plugins(config.run.plugins)
         try:
-            task = task_of(content)
+            task = task_from_config(content)
             planner, controller = build_networks(task, config)
         except (KeyError, TypeError, ValueError) as error:
             problem = f"an entry {error} is missing" if isinstance(error, KeyError) else error

@@ -9,8 +9,13 @@ import pytest
 import torch
 
 from torchrl_koap.modules import StatePlanner, TemporalUnet
+from torchrl_koap.modules.planning.relative_positions import (
+    NEAR,
+    RelativePosition,
+    RelativePositionFeatures,
+    relative_features,
+)
 from torchrl_koap.tasks import TASKS, get_task
-from torchrl_koap.tasks.relative_positions import NEAR, RelativePosition, RelativePositionFeatures
 
 TOOL, BOX, YAW, GOAL_YAW = slice(0, 3), slice(3, 5), slice(5, 7), slice(7, 9)
 
@@ -62,7 +67,7 @@ def test_a_millimetre_near_the_box_is_felt():
 @pytest.mark.parametrize("name", [name for name, task in TASKS.items() if task.relative_positions])
 def test_every_task_s_relations_fit_its_state_and_travel_with_the_planner(name):
     task = get_task(name)
-    features = task.planner_features()
+    features = relative_features(task.relative_columns())
     width = 2 * task.state_dim + features.num_features
     planner = StatePlanner(
         TemporalUnet(task.state_dim, width, channels=(8, 16)), state_dim=task.state_dim, features=features
@@ -74,4 +79,4 @@ def test_every_task_s_relations_fit_its_state_and_travel_with_the_planner(name):
 
 
 def test_avoiding_has_none():
-    assert get_task("avoiding").planner_features() is None
+    assert relative_features(get_task("avoiding").relative_columns()) is None

@@ -28,7 +28,7 @@ class RelativePosition:
         other_yaw (slice, optional): ``cos, sin`` of a yaw to be told relative to that frame, too.
 
     Examples:
-        >>> from torchrl_koap.tasks.relative_positions import RelativePosition
+        >>> from torchrl_koap.modules.planning.relative_positions import RelativePosition
         >>> tool_from_box = RelativePosition(place=slice(0, 2), origin=slice(2, 4), yaw=slice(4, 6))
         >>> tool_from_box.other_yaw is None
         True
@@ -56,7 +56,7 @@ class RelativePositionFeatures(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.tasks.relative_positions import RelativePosition, RelativePositionFeatures
+        >>> from torchrl_koap.modules.planning.relative_positions import RelativePosition, RelativePositionFeatures
         >>> features = RelativePositionFeatures([RelativePosition(slice(0, 2), slice(2, 4), yaw=slice(4, 6))])
         >>> state = torch.tensor([[0.1, 0.3, 0.1, 0.2, 0.0, 1.0]])  # 0.1 m ahead of an object turned by 90 deg
         >>> features(state)[:2]
@@ -88,6 +88,15 @@ class RelativePositionFeatures(nn.Module):
                     parts.append(_turn_back(state[..., pair.other_yaw], frame))
             parts += [gap, *(torch.tanh(gap / near) for near in NEAR)]
         return torch.cat(parts, -1)
+
+
+def relative_features(pairs: Sequence[Sequence[slice]]) -> RelativePositionFeatures | None:
+    """Makes the features of a task from its columns, ``Task.relative_columns()``; None where it has no pair of them.
+
+    Args:
+        pairs (sequence of sequence of slice): ``(place, origin)`` each, with ``yaw`` and ``other_yaw`` where there are.
+    """
+    return RelativePositionFeatures([RelativePosition(*pair) for pair in pairs]) if pairs else None
 
 
 def _size(part: slice) -> int:

@@ -1,0 +1,57 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The ways in which a task can be done: their number, and their names."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Modes:
+    """The ways in which a task can be done.
+
+    Args:
+        choices (tuple): what a mode is made of, slowest digit first: ``(choice, names of its values)`` each.
+        index (str): import string of the function from the leaf ``mode`` ``[*B, ...]`` to the number of the mode
+            ``[*B]``, int64, -1 while it is not decided.
+        entropy (str): over which episodes the entropy of the modes is taken: ``"all"`` successful ones together, or
+            per context and then averaged over ``"contexts"`` or ``"solved_contexts"`` (those with a success).
+        of_path (str, optional): import string of the function from recorded positions of the tool ``[T, 2]`` (numpy, m)
+            to the number of the mode, -1 while it is not decided; None where the path does not tell.
+
+    Examples:
+        >>> from torchrl_koap.tasks import Modes
+        >>> modes = Modes((("row 1", ("left", "right")), ("row 2", ("left", "middle", "right"))))
+        >>> modes.number, modes.name_of(5), modes.name_of(-1)
+        (6, 'right, right', 'no mode')
+    """
+
+    choices: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    index: str | None = None
+    entropy: str = "all"
+    of_path: str | None = None
+
+    @property
+    def number(self) -> int:
+        """Number of modes; 1 where nothing is to choose."""
+        return math.prod(len(names) for _, names in self.choices)
+
+    def name_of(self, index: int) -> str:
+        """Names a mode by its choices, the slowest first; ``"no mode"`` where the number is none of them.
+
+        Args:
+            index (int): number of the mode.
+
+        Examples:
+            >>> from torchrl_koap.tasks import get_task
+            >>> get_task("avoiding").modes.name_of(23), get_task("sorting").modes.name_of(1)
+            ('right, right, gap 4', 'red, blue, red, blue')
+        """
+        if not 0 <= index < self.number:
+            return "no mode"
+        words = []
+        for _, names in reversed(self.choices):
+            index, digit = divmod(index, len(names))
+            words.append(names[digit])
+        return ", ".join(reversed(words))
