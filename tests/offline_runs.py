@@ -54,7 +54,7 @@ def save_arm(
         action_units=units,
         robot=list(range(joints)),
     )
-    task = replace(task, defaults=replace(task.defaults, view={"forecast": forecast}))
+    task = replace(task, defaults=replace(task.defaults, forecast=forecast))
     return save_ted(data, folder / "ted", task=task).parent
 
 

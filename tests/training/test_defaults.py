@@ -94,7 +94,7 @@ class TestThePlanner:
         assert config.planner.held_out == 0.1 and resolved().planner.held_out == 0.0
         assert forecasts(task) and build_planner(task, config.planner).forecast is not None
         assert not forecasts(get_task("avoiding"))
-        plain = replace(task, defaults=replace(task.defaults, view={"forecast": False}))
+        plain = replace(task, defaults=replace(task.defaults, forecast=False))
         assert not forecasts(plain)
 
     def test_that_is_taken_over_is_as_it_was_trained(self, tmp_path):

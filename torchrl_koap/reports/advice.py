@@ -90,7 +90,7 @@ def plans_are_not_followed(run: RunFacts) -> Advice | None:
         )
     return Advice(
         f"{seen}; recorded futures are followed well: executed states leave what the planner was trained on",
-        "train the planner with larger disturbances (recovery_sigma of the task, twice the present one)",
+        "train the planner with larger disturbances (`recovery` of the task, twice the present one)",
     )
 
 
