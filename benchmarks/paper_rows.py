@@ -12,20 +12,19 @@ from typing import Any
 from tables import SOURCE, percent, share, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.studies.paper_layout import (
+from torchrl_koap.studies.paper import (
     DEFAULT,
+    PAPER_TASKS,
     Entry,
     above_the_paper,
-    as_markdown,
     average_over_tasks,
     default_entries,
+    draw_average,
     layout_rows,
     paper_entries,
-    plot_average,
 )
 from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels
-from torchrl_koap.studies.paper_tables import PAPER_TASKS
-from torchrl_koap.studies.table import read_cells
+from torchrl_koap.studies.table import as_markdown, read_cells
 
 _PLURAL = {"window": "windows", "trajectory": "trajectories"}
 CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
@@ -62,7 +61,7 @@ def bench_table(name: str, beside: str = "", methods: Sequence[str] = ()) -> str
 
 
 def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[part] for part in ("task", "fraction", "seed", "label_unit"))
+    return tuple(row[part] for part in ("task", "labels", "seed", "label_unit"))
 
 
 def observation_table(name: str) -> str:
@@ -84,7 +83,7 @@ def _by_observations(name: str) -> dict[float, dict[str, Counter[str]]]:
     """Successes and rollouts of all seeds, by share of the trajectories and method."""
     found: dict[float, dict[str, Counter[str]]] = {}
     for row in _done(name):
-        counts = found.setdefault(row["observations"], {}).setdefault(row["method"], Counter())
+        counts = found.setdefault(row["demonstrations"], {}).setdefault(row["method"], Counter())
         counts.update(successes=row["successes"], n=row["episodes"])
     return found
 
@@ -100,7 +99,7 @@ def bench_entropy(name: str, method: str, observations: float) -> str:
     found = [
         row["mode_entropy"]
         for row in _done(name)
-        if row["method"] == method and row["observations"] == observations and row["mode_entropy"] is not None
+        if row["method"] == method and row["demonstrations"] == observations and row["mode_entropy"] is not None
     ]
     return f"`{sum(found) / len(found):.2f}`"
 
@@ -142,14 +141,14 @@ def bench_default_mean(name: str, level: int) -> str:
 
 def draw_bench_average(name: str, path: Path) -> Path:
     """Draws the success of a comparison averaged over its tasks."""
-    return plot_average(_entries(name), path)
+    return draw_average(_entries(name), path)
 
 
 def first_successes(name: str, task: str, method: str, *, most_labels: bool = False) -> str:
     """Successes of a method with seed 0 at the lowest (or highest) label level of a task, of how many rollouts."""
     wanted = (task, method, 0)
     rows = [row for row in _done(name) if (row["task"], row["method"], row["seed"]) == wanted]
-    row = (max if most_labels else min)(rows, key=lambda row: row["fraction"])
+    row = (max if most_labels else min)(rows, key=lambda row: row["labels"])
     return f"{row['successes']} of {row['episodes']}"
 
 
@@ -176,7 +175,7 @@ def bench_means(name: str) -> str:
     for row in _done(name):
         found.setdefault(row["task"], {}).setdefault(row["method"], []).append(row)
     whole = {
-        task: {method: rows for method, rows in own.items() if len({row["fraction"] for row in rows}) == 5}
+        task: {method: rows for method, rows in own.items() if len({row["labels"] for row in rows}) == 5}
         for task, own in found.items()
     }
     methods = list(dict.fromkeys(method for own in whole.values() for method in own))
@@ -193,7 +192,7 @@ def _together(rows: list[Mapping[str, Any]]) -> str:
     trials = rows[0]["episodes"]
     levels: dict[float, list[float]] = {}  # some have more seeds than others
     for row in rows:
-        levels.setdefault(row["fraction"], []).append(row["successes"] / row["episodes"])
+        levels.setdefault(row["labels"], []).append(row["successes"] / row["episodes"])
     mean = sum(sum(level) / len(level) for level in levels.values()) / len(levels)
     low, high = wilson_interval(round(mean * trials), trials)
     return f"{100 * mean:.1f} % ({100 * low:.0f}-{100 * high:.0f})"

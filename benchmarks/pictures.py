@@ -18,7 +18,7 @@ from unlabelled_rows import REGIMES, Cells, unlabelled_errors, unlabelled_succes
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.reports.style import BLUE, FAINT, INK, MUTED, ORANGE, PALE, set_title, tidy
-from torchrl_koap.studies.lines import method_styles
+from torchrl_koap.studies.plots import method_styles
 
 _NAMES = {
     "koap": "KOAP",
@@ -83,7 +83,7 @@ def draw_label_curves(curves: Mapping[str, Sequence[Mapping[str, float]]], path:
         style = styles[method]
         shift = 1.02 ** (index - (len(curves) - 1) / 2)  # whiskers beside each other
         place = [point["fraction"] * shift for point in points]
-        line = {"color": style["color"], "marker": style["marker"], "linestyle": style["dash"], "markersize": 4.5}
+        line = {"color": style["color"], "marker": style["marker"], "linestyle": style["linestyle"], "markersize": 4.5}
         line |= {"linewidth": 1.5, "label": _NAMES.get(method, method)}
         left.plot(place, [100 * point["success"] for point in points], **line)
         ends = [100 * point["low"] for point in points], [100 * point["high"] for point in points]

@@ -91,8 +91,9 @@ def cases(data: Path, run: Path) -> list[Case]:
         return ("demos", "--out", out, "--episodes", 3, "--threads", 1, "--quiet")
 
     def curve(out: Path) -> tuple[object, ...]:
-        words = ("--methods", "linear,koap", "--fractions", "0.25", "--seeds", 1, "--steps", 20, "--episodes", 1)
-        return ("curve", "--out", out, "--dataset", data, *words, "--workers", 1, "--quiet")
+        words = ("--methods", "linear", "koap", "--labels", 0.25, "--seeds", 1, "--planner.steps", 20)
+        words += ("--evaluation.episodes", 1)
+        return ("curve", "--out", out, "--datasets", data, *words, "--workers", 1, "--quiet")
 
     return [
         *(train(method) for method in ("koap", "linear", "dp", "dd", "koap_sgd", "vae", "relabel")),
@@ -104,7 +105,7 @@ def cases(data: Path, run: Path) -> list[Case]:
             lambda out: shutil.copytree(run, out),
         ),
         Case("demos", recorded, recorded, ("ted/**/*", "raw/*")),
-        Case("curve", curve, curve, ("cells/*/*.safetensors", "planner*/*.safetensors", "cells.csv")),
+        Case("curve", curve, curve, ("cells/*/*/*.safetensors", "planners/*/*/*.safetensors", "cells.csv")),
     ]
 
 

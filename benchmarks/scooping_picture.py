@@ -3,21 +3,19 @@
 
     python benchmarks/scooping_picture.py --folder runs/scooping
 
-Frames are those of the recordings, bars those of ``benchmarks/results/scooping_recovery2.csv``, whose planners are the
-task's default, and for Diffusion Policy, which has none, of ``scooping.csv``.
+Frames are those of the recordings, bars those of ``benchmarks/results/scooping.csv``.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
 from matplotlib.figure import Figure
 from scooping_rows import scooping_cells
-from tables import read_rows
 
 from torchrl_koap.data.formats.lerobot_frames import read_image_episodes
 from torchrl_koap.evaluation.statistics import wilson_interval
@@ -54,11 +52,7 @@ def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], pa
             axes.spines[:].set_visible(False)
         row[0].set_ylabel(caption, fontsize=9)
     axes = right.subplots()
-    shown = {
-        (cell["labels"], cell["method"]): cell
-        for cell in cells
-        if (cell["unlabelled"], cell["execution"], cell["blend_decay"]) == ("both", "open_loop", "0.0")
-    }
+    shown = {(cell["labels"], cell["method"]): cell for cell in cells if cell["unlabelled"] == "both"}
     for group, labels in enumerate(LABELS):
         for place, method in enumerate(NAMES):
             cell = shown.get((labels, method))
@@ -78,20 +72,16 @@ def draw(films: Mapping[str, np.ndarray], cells: Sequence[Mapping[str, Any]], pa
     return path
 
 
-def bars() -> list[dict[str, Any]]:
-    """Cells behind the planners that are the default, and those that have none."""
-    without = [cell for cell in scooping_cells() if cell["method"].startswith("dp")]
-    return [*scooping_cells(read_rows("scooping_recovery2")), *without]
+def main(*, folder: Path) -> None:
+    """Draws the picture.
 
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--folder", type=Path, required=True, help="of benchmarks/scooping.py")
-    options = parser.parse_args()
+    Args:
+        folder: of benchmarks/scooping.py.
+    """
     captions = {"hand": "a hand: no actions", "robot": "robot: few labels"}
-    films = {words: read_image_episodes(options.folder / who, episodes=1)[0].frames for who, words in captions.items()}
-    print(draw(films, bars(), PICTURE), PICTURE.stat().st_size)
+    films = {words: read_image_episodes(folder / who, episodes=1)[0].frames for who, words in captions.items()}
+    print(draw(films, scooping_cells(), PICTURE), PICTURE.stat().st_size)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -9,8 +9,7 @@ from typing import Any
 from tables import percent, read_rows, table
 
 STARTS = ("left", "near", "right")
-_CELL = ("labels", "unlabelled", "method", "execution", "blend_decay")
-_HOW = ("open_loop", "0.0")  # execution and blending of plans in the study itself
+_CELL = ("labels", "unlabelled", "method")
 
 
 def scooping_cells(rows: Sequence[Mapping[str, str]] | None = None) -> list[dict[str, Any]]:
@@ -59,7 +58,7 @@ def scooping_cell(
 
 def _cell(task: str, labels: int, unlabelled: str, method: str) -> dict[str, Any]:
     """A cell whose plans are followed as the study does."""
-    wanted = (str(labels), unlabelled, method, *_HOW)
+    wanted = (str(labels), unlabelled, method)
     for cell in scooping_cells(read_rows(task)):
         if tuple(cell[key] for key in _CELL) == wanted:
             return cell
@@ -67,12 +66,12 @@ def _cell(task: str, labels: int, unlabelled: str, method: str) -> dict[str, Any
 
 
 def scooping_table(task: str = "scooping") -> str:
-    """A row per cell of the study: plans decoded once and left as they are.
+    """A row per cell of the study.
 
     Args:
         task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
     """
-    cells = [cell for cell in scooping_cells(read_rows(task)) if (cell["execution"], cell["blend_decay"]) == _HOW]
+    cells = scooping_cells(read_rows(task))
     order = ("both", "robot", "hand", "none")
     cells.sort(key=lambda cell: (int(cell["labels"]), order.index(cell["unlabelled"]), -cell["successes"] / cell["n"]))
     body = []

@@ -29,7 +29,7 @@ WORK = (
     "torchrl_koap.training.loop.warmup_cosine",
     "torchrl_koap.evaluation.closed_loop.roll_out",
     "torchrl_koap.evaluation.inspection.roll_out",
-    "torchrl_koap.studies.label_efficiency.launch",
+    "torchrl_koap.studies.run.launch",
     "torchrl_koap.commands.export.export_part",
     "torchrl_koap.data.demonstrations.save_ted",
 )

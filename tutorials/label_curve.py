@@ -5,7 +5,7 @@ A label curve on a cluster of two workers
 
 **What you will learn**
 
-* how methods, budgets and seeds become cells that run wherever there is a processor,
+* how methods, shares of labels and seeds become cells that run wherever there is a processor,
 * how to read the table: intervals, paired differences, and what a few seeds cannot tell.
 
 Run it with ``python tutorials/label_curve.py``; it leaves ``label_curve.png`` behind. With ``ray`` installed
@@ -16,10 +16,9 @@ results are the same.
 # %%
 # A small curve
 # -------------
-# Two workers, three methods, two budgets, two seeds: twelve cells on one planner. Networks, rollouts and demonstrations
-# are kept few so that it takes minutes; ``koap curve`` asks for the same with options of the same names.
+# Two workers, three methods, two shares of labels, two seeds: twelve cells on one planner. Networks, rollouts and
+# demonstrations are kept few so that it takes minutes; ``koap curve`` asks for the same with options of the same names.
 
-import csv
 import importlib.util
 import tempfile
 from collections import defaultdict
@@ -27,31 +26,30 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from torchrl_koap import CurveConfig, run_curve
+from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig
 from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.studies import Machines, Study, run_study
 
 if __name__ == "__main__":  # workers import this file
-    out = Path(tempfile.mkdtemp()) / "curve"
     launcher = "ray" if importlib.util.find_spec("ray") else "local"
-    config = CurveConfig(
-        out=out,
-        methods="koap,koap_untrained,linear",
-        fractions="0.025,0.1",
+    study = Study(
+        out=Path(tempfile.mkdtemp()) / "curve",
+        methods=("koap", "koap_untrained", "linear"),
+        labels=(0.025, 0.1),
         seeds=2,
-        demonstrations=40,
-        episodes=12,
-        steps=600,
-        controller_steps=100,
-        workers=2,
-        launcher=launcher,
+        record=40,
+        planner=PlannerConfig(steps=600),
+        controller=ControllerConfig(steps=100),
+        evaluation=EvalConfig(episodes=12, threads=1),
     )
-    result = run_curve(config)
-    print(f"launcher {launcher}: {result['done']} cells done, {result['failed']} failed")
+    machines = Machines(workers=2, launcher=launcher)
+    result = run_study(study, machines)
+    print(f"launcher {launcher}: {result.counts['done']} cells done, {result.counts['failed']} failed")
 
     # %%
-    # A call with the same folder does what is missing, which now is nothing. A larger budget would add its cells only.
+    # A call with the same folder does what is missing, which now is nothing. More labels would add their cells only.
 
-    again = run_curve(config)
+    again = run_study(study, machines).counts
     print(f"called again: {again['done']} done, {again['missing']} missing")
 
     # %%
@@ -60,25 +58,21 @@ if __name__ == "__main__":  # workers import this file
     # Seeds are pooled: 24 rollouts per entry. An interval of that many is up to forty points wide, so only the large
     # differences mean anything here. ``comparisons.csv`` pairs the methods rollout by rollout.
 
-    with (out / "cells.csv").open() as file:
-        cells = list(csv.DictReader(file))
     pooled = defaultdict(list)
-    for cell in cells:
-        pooled[cell["method"], float(cell["fraction"])].append(cell)
+    for row in result.rows:
+        pooled[row["method"], row["labels"]].append(row)
     print(f"\n{'method':16}{'labelled':>10}{'success in % (95 %)':>24}{'action error':>16}")
     points = defaultdict(list)
-    for (method, fraction), rows in sorted(pooled.items()):
-        trials = sum(int(row["episodes"]) for row in rows)
-        wins = sum(int(row["successes"]) for row in rows)
+    for (method, labels), rows in sorted(pooled.items()):
+        trials = sum(row["episodes"] for row in rows)
+        wins = sum(row["successes"] for row in rows)
         low, high = (100 * end for end in wilson_interval(wins, trials))
-        error = sum(float(row["action_error"]) for row in rows) / len(rows)
-        points[method].append((fraction, 100 * wins / trials, low, high))
-        print(f"{method:16}{fraction:>10.1%}{f'{100 * wins / trials:.0f} ({low:.0f}-{high:.0f})':>24}{error:>13.2f} mm")
-    with (out / "comparisons.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    print("\npaired with koap, first rows of comparisons.csv")
-    for row in rows[:4]:
-        print("  " + ", ".join(f"{name} {value}" for name, value in list(row.items())[:8] if value))
+        error = sum(row["action_error"] for row in rows) / len(rows)
+        points[method].append((labels, 100 * wins / trials, low, high))
+        print(f"{method:16}{labels:>10.1%}{f'{100 * wins / trials:.0f} ({low:.0f}-{high:.0f})':>24}{error:>13.2f} mm")
+    print("\npaired with koap, rows of comparisons.csv")
+    for line in (study.out / "comparisons.csv").read_text().splitlines()[:5]:
+        print("  " + ", ".join(line.split(",")[3:9]))
 
     # %%
     figure = Figure(figsize=(6, 3.6), layout="constrained")

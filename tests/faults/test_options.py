@@ -24,8 +24,8 @@ BASE = {
     "train": ("--out", "{out}", "--dataset", "{data}", *TINY),
     "eval": ("{run}", "--episodes", "1", "--threads", "1", "--no-report"),
     "curve": (
-        *("--out", "{out}", "--dataset", "{data}", "--methods", "linear", "--fractions", "0.5", "--seeds", "1"),
-        *("--steps", "2", "--episodes", "1", "--workers", "1"),
+        *("--out", "{out}", "--datasets", "{data}", "--methods", "linear", "--labels", "0.5", "--seeds", "1"),
+        *("--planner.steps", "2", "--evaluation.episodes", "1", "--workers", "1"),
     ),
     "bench": ("--out", "{out}", "--table", "1", "--tasks", "avoiding", "--seeds", "1", "--workers", "1"),
     "inspect": ("{run}", "--episodes", "1", "--threads", "1"),

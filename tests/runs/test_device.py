@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from torchrl_koap.runs.device import has_bfloat16_units, set_up_torch, training_dtype
-from torchrl_koap.studies.paper_tables import SMALL_PLANNER, WIDE_PLANNER
 
 
 @pytest.fixture(params=["amx_bf16", "avx512_bf16", None])
@@ -38,10 +37,6 @@ def test_bfloat16_by_name_is_obeyed_and_warns_where_it_is_emulated(units):
 def test_another_precision_is_refused_by_name():
     with pytest.raises(ValueError, match="precision 'bfloat61'"):
         training_dtype("bfloat61")
-
-
-def test_comparisons_train_planners_with_what_the_machine_is_quick_at():
-    assert WIDE_PLANNER["precision"] == SMALL_PLANNER["precision"] == "auto"
 
 
 @pytest.mark.parametrize(

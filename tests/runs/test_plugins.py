@@ -86,12 +86,14 @@ def test_a_curve_killed_goes_on_with_the_plugin_in_every_cell(tmp_path, demonstr
     """Killed when the first cell is done; the second call does not name the plugin, its folder does."""
     out, env = tmp_path / "curve", {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(PLUGINS)])}
     arguments = (
-        *("curve", "--out", out, "--dataset", demonstrations, "--methods", "nearest_neighbour,linear"),
-        *("--fractions", 0.25, "--seeds", 1, "--steps", 3, "--episodes", 1, "--workers", 1),
+        *("curve", "--out", out, "--datasets", demonstrations, "--methods", "nearest_neighbour", "linear"),
+        *("--labels", 0.25, "--seeds", 1, "--planner.steps", 3, "--evaluation.episodes", 1, "--workers", 1),
     )
     command = [sys.executable, "-m", "torchrl_koap.commands.cli", *map(str, arguments)]
-    first = subprocess.Popen([*command, *PLUGIN], env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    mark = out / "cells/nearest_neighbour-0.25-1-seed0/cell.json"
+    first = subprocess.Popen(
+        [*command, "--run.plugin", "nearest_neighbour"], env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    mark = out / "cells/avoiding/nearest_neighbour-0.25-1-seed0/result.json"
     try:
         for _ in range(1200):
             if mark.exists() or first.poll() is not None:
@@ -102,7 +104,7 @@ def test_a_curve_killed_goes_on_with_the_plugin_in_every_cell(tmp_path, demonstr
         first.send_signal(signal.SIGKILL)
         first.wait()
     made = mark.stat().st_mtime_ns
-    assert json.loads((out / "curve.json").read_text())["plugins"] == ["nearest_neighbour"]
+    assert json.loads((out / "study.json").read_text())["run"]["plugins"] == ["nearest_neighbour"]
     second = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
     assert second.returncode == 0, second.stderr
     assert {row["method"]: row["status"] for row in read_cells(out / "cells.csv")} == {

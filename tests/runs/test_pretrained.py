@@ -14,7 +14,6 @@ from torchrl_koap.runs import pretrained
 from torchrl_koap.runs.pretrained import copy_run, find_run
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.runs.weights import CheckpointError, load_tensors
-from torchrl_koap.studies.paper_tables import PRESETS, BenchConfig, _curves
 from torchrl_koap.training import Trained
 
 
@@ -77,13 +76,6 @@ def test_a_planner_is_taken_over_by_name(run, policies, capsys):
     assert all(torch.equal(mine[name], value) for name, value in published.items())
     assert koap("train", "--out", "other", *known, "--planner.source", "pretrained:avoidin", *few) == 1
     assert "did you mean 'avoiding'?" in capsys.readouterr().err and not (policies.parent / "other").exists()
-
-
-def test_a_table_shares_planners_by_name(policies):
-    asked = BenchConfig(out="bench", table=1, tasks="avoiding", planners="avoiding=pretrained:avoiding")
-    (curve,) = _curves(asked, PRESETS["table 1"])
-    assert curve.planner_from.resolve() == policies / "avoiding"
-    assert curve.dataset == "scripted"  # a published policy does not say where its data set was
 
 
 def test_places_are_left_out_and_what_is_left_is_sealed(run, tmp_path):

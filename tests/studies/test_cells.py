@@ -1,56 +1,60 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Planners and cells of a curve: labels reach no planner, results that cannot be read are made again or named."""
+"""Planners and cells of a study: labels reach no planner, results that cannot be read are made again or named."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
+from offline_runs import save_arm
 
-from torchrl_koap.evaluation import EvalConfig
+from torchrl_koap import ControllerConfig, EvalConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.studies import cells
-from torchrl_koap.studies.cells import Cell, cell_row, do_cell, do_planner, is_done, is_trained, planner_folder
-from torchrl_koap.studies.table import CELL_COLUMNS
+from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result, run_cell
+from torchrl_koap.studies.paired_comparison import compare, compare_cells
+from torchrl_koap.studies.report import write_study_report
+from torchrl_koap.studies.summary import summarise
+from torchrl_koap.studies.table import CELL_COLUMNS, read_cells, write_cells
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training import on_disk
-from torchrl_koap.training.datasets import load_demonstrations
 
-CELL = Cell("linear", 0.25, 1.0, 0)
-ROW = {"task": "avoiding", "label_unit": "trajectory"}
+CELL = Cell("avoiding", "linear", 0.25, 1.0, 0)
+ROW = {"label_unit": "trajectory"}
+FEW = {"planner": PlannerConfig(steps=3), "controller": ControllerConfig(steps=3)}
 
 
-def settings_of(demonstrations):
-    return {"task": "avoiding", "dataset": str(demonstrations), "steps": 3, "controller_steps": 3}
+def planner_config(out, demonstrations, share=1.0):
+    labels = LabelConfig(trajectories=share)
+    return TrainConfig(out=out, dataset=str(demonstrations), labels=labels, planner=FEW["planner"])
+
+
+def make(folder, config, evaluation=None):
+    prepare_cell(folder, config, evaluation)
+    run_cell(folder)
+    return folder
+
+
+def cell_config(root, planner, demonstrations, **options):
+    known = {"labels": LabelConfig(fraction=0.25), "planner": PlannerConfig(source=planner)}
+    known |= {"method": "linear", "controller": FEW["controller"]}
+    return TrainConfig(out=root / CELL.folder, dataset=str(demonstrations), **known | options)
 
 
 @pytest.fixture(scope="module")
 def planner(tmp_path_factory, demonstrations):
-    folder = tmp_path_factory.mktemp("curve") / "planner-1"
-    do_planner(folder=str(folder), observations=1.0, settings=settings_of(demonstrations))
-    return folder
-
-
-def do(root: Path, planner: Path, demonstrations, cell=CELL):
-    do_cell(
-        folder=str(root / cell.folder),
-        cell=vars(cell),
-        planner=str(planner),
-        settings=settings_of(demonstrations),
-        evaluation={"episodes": 1, "threads": 1},
-    )
+    folder = tmp_path_factory.mktemp("study") / "planner"
+    return make(folder, planner_config(folder, demonstrations))
 
 
 @pytest.fixture(scope="module")
 def finished(planner, demonstrations):
-    do(planner.parent, planner, demonstrations)
-    return planner.parent
+    root = planner.parent
+    make(root / CELL.folder, cell_config(root, planner, demonstrations), EvalConfig(episodes=1, threads=1))
+    return root
 
 
 @pytest.fixture
@@ -60,49 +64,34 @@ def root(finished, tmp_path):
 
 
 def test_cells_have_folders_of_their_own():
-    fractions = (0.01, 0.25, 1.0, 1 / 3, 0.3333333, 1e-5, 1e-7)
-    cells = [Cell(method, fraction, 1.0, 0) for method in ("koap", "dp") for fraction in fractions]
+    shares = (0.01, 0.25, 1.0, 1 / 3, 0.3333333, 1e-5, 1e-7)
+    cells = [Cell(task, method, share, 1.0, 0) for task in "ab" for method in ("koap", "dp") for share in shares]
     assert len({cell.folder for cell in cells}) == len(cells)
-    assert Cell("koap", 0.01, 1.0, 2).folder == "cells/koap-0.01-1-seed2"
-    assert Cell("koap", 0.01, 0.5, 2).planner == planner_folder(0.5) == "planner-0.5"
-    assert Cell("dp", 0.01, 1.0, 2).planner is None and Cell("vpt", 0.01, 1.0, 2).planner is None
-
-
-def test_every_training_seed_meets_noise_of_its_own(monkeypatch, tmp_path):
-    asked = []
-
-    def note(path, config):
-        asked.append((config.seed, config.episodes))
-        return {"episodes": 2, "success_rate": 0.5}
-
-    monkeypatch.setattr(cells, "train", lambda config: None)
-    monkeypatch.setattr(cells, "evaluate", note)
-    monkeypatch.setattr(RunDirectory, "read_entry", lambda *names: {})
-    for cell in (CELL, replace(CELL, seed=1), replace(CELL, seed=2), replace(CELL, method="dd", seed=2)):
-        folder = tmp_path / cell.folder
-        do_cell(folder=str(folder), cell=vars(cell), planner=None, settings={}, evaluation={"episodes": 2})
-    assert asked == [(EvalConfig.seed, 2), (1100, 2), (2100, 2), (2100, 2)]
+    assert Cell("avoiding", "koap", 0.01, 1.0, 2).folder == "cells/avoiding/koap-0.01-1-seed2"
 
 
 def test_no_action_reaches_a_planner(planner, demonstrations, tmp_path, monkeypatch):
     """Neither actions nor commands nor which steps have one."""
-    task = get_task("avoiding")
-    data = load_demonstrations(str(demonstrations), task)
-    data["action"] = torch.full_like(data["action"], 1e9)
-    data["observation"][:, task.observation[task.command]] = 1e9
-    data["next", "observation"][:, task.observation[task.command]] = 1e9
-    monkeypatch.setattr(on_disk, "load_demonstrations", lambda *arguments, **options: data)
-    do_planner(folder=str(tmp_path / "run"), observations=1.0, settings=settings_of(demonstrations))
+    task, load = get_task("avoiding"), on_disk.load_demonstrations
+
+    def with_wild_actions(*arguments, **options):
+        data = load(*arguments, **options)
+        data["action"] = torch.full_like(data["action"], 1e9)
+        data["observation"][:, task.observation[task.command]] = 1e9
+        data["next", "observation"][:, task.observation[task.command]] = 1e9
+        return data
+
+    monkeypatch.setattr(on_disk, "load_demonstrations", with_wild_actions)
+    make(tmp_path / "run", planner_config(tmp_path / "run", demonstrations))
     name = "planner.safetensors"
     assert (tmp_path / "run" / name).read_bytes() == (planner / name).read_bytes()
-    assert is_trained(tmp_path / "run")
+    assert read_result(tmp_path / "run")[0]["train_seconds"] > 0
 
 
-def test_a_planner_sees_the_share_of_the_trajectories_that_it_is_told(planner, demonstrations, tmp_path, monkeypatch):
-    seen = []
-    learn = on_disk.learn_planner
-    monkeypatch.setattr(on_disk, "learn_planner", lambda *rest, **more: seen.append(rest[2]) or learn(*rest, **more))
-    do_planner(folder=str(tmp_path / "run"), observations=0.5, settings=settings_of(demonstrations))
+def test_a_planner_sees_the_share_of_the_demonstrations_that_it_is_told(planner, demonstrations, tmp_path, monkeypatch):
+    seen, train = [], on_disk.learn_planner
+    monkeypatch.setattr(on_disk, "learn_planner", lambda *rest, **more: seen.append(rest[2]) or train(*rest, **more))
+    make(tmp_path / "run", planner_config(tmp_path / "run", demonstrations, 0.5))
     (data,) = seen
     assert len(data["episode"].unique()) == 4
     assert data["action"].isnan().all() and not data["has_action"].any()
@@ -110,26 +99,14 @@ def test_a_planner_sees_the_share_of_the_trajectories_that_it_is_told(planner, d
     assert (tmp_path / "run" / name).read_bytes() != (planner / name).read_bytes()
 
 
-def test_a_planner_without_its_weights_or_its_mark_is_not_trained(planner, tmp_path):
-    assert is_trained(planner) and not is_trained(tmp_path / "none")
-    for name in ("planner.safetensors", "cell.json"):
-        folder = tmp_path / name
-        shutil.copytree(planner, folder)
-        (folder / name).unlink()
-        assert not is_trained(folder)
-    shutil.copytree(planner, tmp_path / "cut")
-    os.truncate(tmp_path / "cut" / "cell.json", 5)
-    assert not is_trained(tmp_path / "cut")
-
-
 def test_a_row_says_what_a_cell_found(finished):
-    row = cell_row(finished, CELL, **ROW)
+    row, outcomes = cell_row(finished, CELL, **ROW)
     run = RunDirectory(finished / CELL.folder)
     result, summary = run.read_json("eval.json"), run.read_json("summary.json")
-    assert row["status"] == "done" and is_done(run.path) and set(row) <= set(CELL_COLUMNS)
-    assert (row["method"], row["fraction"], row["observations"], row["seed"]) == ("linear", 0.25, 1.0, 0)
-    assert row["episodes"] == len(result["episode"]) == 1
-    assert row["successes"] == sum(episode["outcome"] == "success" for episode in result["episode"])
+    assert row["status"] == "done" and set(row) <= set(CELL_COLUMNS)
+    assert (row["method"], row["labels"], row["demonstrations"], row["seed"]) == ("linear", 0.25, 1.0, 0)
+    assert row["episodes"] == len(result["episode"]) == len(outcomes) == 1
+    assert row["successes"] == sum(outcomes.values())
     assert row["mean_steps"] == result["episode"][0]["steps"]
     assert row["labelled_units"] == row["trajectories_touched"] == 2
     assert row["labelled_transitions"] == summary["labels"]["labelled_transitions"] > 0
@@ -137,84 +114,102 @@ def test_a_row_says_what_a_cell_found(finished):
 
 
 def test_a_cell_that_is_not_done_is_missing_or_failed(tmp_path):
-    assert not is_done(tmp_path / CELL.folder)
-    assert cell_row(tmp_path, CELL, **ROW)["status"] == "missing"
-    row = cell_row(tmp_path, CELL, **ROW, reason="no memory")
-    assert (row["status"], row["reason"]) == ("failed", "no memory")
-    (tmp_path / "cells").mkdir()
-    (tmp_path / CELL.folder).write_text("a file in its place")
-    assert not is_done(tmp_path / CELL.folder)
-    assert cell_row(tmp_path, CELL, **ROW, reason="in the way")["reason"] == "in the way"
+    assert read_result(tmp_path / CELL.folder) is None
+    assert cell_row(tmp_path, CELL, **ROW)[0]["status"] == "missing"
+    row, outcomes = cell_row(tmp_path, CELL, **ROW, reason="no memory")
+    assert (row["status"], row["reason"], outcomes) == ("failed", "no memory", {})
 
 
 DAMAGES = {
-    "truncated": lambda file: os.truncate(file, file.stat().st_size // 2),
-    "empty": lambda file: os.truncate(file, 0),
-    "another": lambda file: file.write_text("{}"),
+    "truncated": lambda file: file.write_bytes(file.read_bytes()[:20]),
+    "empty": lambda file: file.write_bytes(b""),
+    "an empty object": lambda file: file.write_text("{}"),
     "a list": lambda file: file.write_text("[1, 2]"),
     "null": lambda file: file.write_text(json.dumps(dict.fromkeys(json.loads(file.read_text())))),
     "binary": lambda file: file.write_bytes(b"\xff\xfe\x00" * 30),
-    "gone": lambda file: file.unlink(),
+    "twice": lambda file: file.write_text(file.read_text().replace('"outcomes": [', '"outcomes": [[100, 100, true], ')),
 }
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("name", ["cell.json", "summary.json", "eval.json"])
-def test_results_that_cannot_be_read_are_named_and_not_done(name, damage, root):
-    DAMAGES[damage](root / CELL.folder / name)
-    assert not is_done(root / CELL.folder)
-    row = cell_row(root, CELL, **ROW)
-    if (name, damage) == ("cell.json", "gone"):
-        assert row["status"] == "missing"
-    else:
-        assert row["status"] == "failed" and CELL.folder in row["reason"]
-    assert cell_row(root, CELL, **ROW, reason="tried again")["reason"] == "tried again"
-
-
-@pytest.mark.parametrize("change", [{"episodes": 2}, {"success_rate": 1.0}])
-def test_an_evaluation_of_somebody_else_is_named_and_not_done(change, root):
-    """`koap eval` in the folder of a cell must not slip into the curve."""
-    file = root / CELL.folder / "eval.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | change))
-    assert not is_done(root / CELL.folder)
-    assert "eval.json is another evaluation than the curve's" in cell_row(root, CELL, **ROW)["reason"]
-
-
-def test_a_cell_of_before_that_kept_no_number_of_episodes_is_done(root):
-    file = root / CELL.folder / "cell.json"
+def test_a_result_that_cannot_be_read_is_named_and_not_done(damage, root):
+    file = root / CELL.folder / "result.json"
     content = json.loads(file.read_text())
-    assert content.pop("episodes") == 1
-    file.write_text(json.dumps(content))
-    assert is_done(root / CELL.folder)
+    file.write_text(json.dumps(content))  # on one line
+    DAMAGES[damage](file)
+    row, _ = cell_row(root, CELL, **ROW)
+    assert row["status"] == "failed" and CELL.folder in row["reason"]
+    assert cell_row(root, CELL, **ROW, reason="tried again")[0]["reason"] == "tried again"
 
 
-@pytest.mark.parametrize("name", ["cell.json", "summary.json", "eval.json"])
-def test_a_damaged_cell_is_made_again_without_being_trained_again(name, root, planner, demonstrations):
-    before = cell_row(root, CELL, **ROW)
-    weights = (root / CELL.folder / "controller.safetensors").stat().st_mtime_ns
-    edit = json.loads((root / CELL.folder / "config.json").read_text()) | {"out": str(root / CELL.folder)}
-    (root / CELL.folder / "config.json").write_text(json.dumps(edit))
-    DAMAGES["truncated"](root / CELL.folder / name)
-    do(root, planner, demonstrations)
-    after = cell_row(root, CELL, **ROW)
-    clock = ("train_seconds", "eval_seconds")
-    assert {key: after[key] for key in after if key not in clock} == {
-        key: before[key] for key in before if key not in clock
-    }
-    if name != "summary.json":
-        assert (root / CELL.folder / "controller.safetensors").stat().st_mtime_ns == weights
+def test_a_damaged_cell_is_made_again_without_being_trained_again(finished):
+    folder = finished / CELL.folder
+    before = read_result(folder)
+    weights = (folder / "controller.safetensors").stat().st_mtime_ns
+    (folder / "result.json").write_text("{")
+    run_cell(folder)
+    (after, outcomes), clock = read_result(folder), ("train_seconds", "eval_seconds")
+    assert outcomes == before[1]
+    assert {k: v for k, v in after.items() if k not in clock} == {k: v for k, v in before[0].items() if k not in clock}
+    assert (folder / "controller.safetensors").stat().st_mtime_ns == weights
 
 
-def test_a_cell_with_other_settings_is_not_continued(root, planner, demonstrations):
-    (root / CELL.folder / "cell.json").unlink()
-    (root / CELL.folder / "summary.json").unlink()
-    other = {**settings_of(demonstrations), "controller_steps": 7}
+def test_a_cell_of_which_something_else_was_asked_is_refused(root, planner, demonstrations):
+    config = replace(cell_config(root, planner, demonstrations), out=planner.parent / CELL.folder)
+    folder, evaluation = root / CELL.folder, EvalConfig(episodes=1, threads=1)
+    prepare_cell(folder, replace(config, run=RunConfig(plugins=("json",))), evaluation)  # plugins may grow
     with pytest.raises(RunDirectoryError, match="was started with another controller.steps"):
-        do_cell(
-            folder=str(root / CELL.folder),
-            cell=vars(CELL),
-            planner=str(planner),
-            settings=other,
-            evaluation={"episodes": 1},
-        )
-    assert cell_row(root, CELL, **ROW)["status"] == "missing"
+        prepare_cell(folder, replace(config, controller=ControllerConfig(steps=7)), evaluation)
+
+
+OFFLINE = [Cell("arm", method, 1.0, 1.0, 0) for method in ("koap", "linear", "dp")]
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    """Three cells without an environment: one with a closed form, the ridge, and a policy without a planner."""
+    root = tmp_path_factory.mktemp("study")
+    dataset = str(save_arm(tmp_path_factory.mktemp("data") / "arm", joints=2))
+    few = PlannerConfig(steps=20, batch_size=8, network="unet", width=8)
+    make(root / "planner", TrainConfig(out=root / "planner", dataset=dataset, planner=few))
+    for cell in OFFLINE:
+        planner = few if cell.method == "dp" else PlannerConfig(source=root / "planner")
+        known = {"method": cell.method, "planner": planner, "controller": ControllerConfig(steps=20)}
+        config = TrainConfig(out=root / cell.folder, dataset=dataset, labels=LabelConfig(fraction=1.0), **known)
+        make(root / cell.folder, config, EvalConfig(threads=1, samples=2))
+    return root, [cell_row(root, cell, **ROW) for cell in OFFLINE]
+
+
+def test_cells_without_an_environment_hold_errors_and_no_success(arm, tmp_path):
+    root, found = arm
+    koap, linear, dp = rows = [row for row, _ in found]
+    assert [row["status"] for row in rows] == ["done"] * 3 and {row["kind"] for row in rows} == {"offline"}
+    assert "success_rate" not in koap and koap["relative_action_error"] > 0 and koap["action_error"] > 0
+    assert koap["relative_plan_error"] == linear["relative_plan_error"] > 0  # they share the planner
+    assert dp["relative_plan_error"] is dp["relative_action_error"] is None
+    held_out = [RunDirectory(root / cell.folder).read_json("config.json").get("held_out_episodes") for cell in OFFLINE]
+    shared = RunDirectory(root / "planner").read_json("config.json")["held_out_episodes"]
+    assert held_out == [shared, shared, None]
+    again = read_cells(write_cells(tmp_path / "cells.csv", rows))
+    assert [row["relative_action_error"] for row in again] == [row["relative_action_error"] for row in rows]
+    assert again[0]["episodes"] is again[0]["success_rate"] is None
+
+
+def test_the_report_compares_by_action_errors(arm):
+    root, found = arm
+    rows, outcomes = [row for row, _ in found], {row["run"]: own for row, own in found}
+    page = write_study_report(root, rows, outcomes, title="Label efficiency on arm").read_text()
+    assert "Errors on recorded data" in page and "koap errs less" in page and "succeeds more often" not in page
+    assert "Wilson" not in page and (root / "plots" / "arm_relative_action_error.png").exists()
+    table = (root / "table.md").read_text()
+    assert "action error (of the mean action" in table and "success" not in table
+    linear, dp = compare_cells(rows, outcomes)
+    koap, other = (item.mean("relative_action_error") for item in summarise(rows)[:2])
+    assert math.copysign(1, linear["difference"]) == math.copysign(1, koap - other) and linear["contexts"] == 3
+    assert dp["difference"] is None
+
+
+def test_errors_have_no_bounds_and_need_two_trajectories_for_an_interval():
+    large = compare({0: {(1, 0): 5.0, (2, 0): 6.0}}, {0: {(1, 0): 1.0, (2, 0): 2.0}}, errors=True)
+    assert (large.difference, large.low, large.high) == (4, 4, 4)
+    assert math.isnan(compare({0: {(1, 0): 5.0}}, {0: {(1, 0): 1.0}}, errors=True).low)

@@ -56,9 +56,9 @@ def surroundings(monkeypatch, folder: Path, short: Path) -> dict[str, str]:
 def curve_of(folder: Path) -> list[str]:
     """A curve of two cells on two workers."""
     data = write_demonstrations(folder / "data")
-    words = [sys.executable, "-m", "torchrl_koap.commands.cli", "curve", "--out", folder / "curve", "--dataset", data]
-    words += ["--methods", "linear,koap", "--fractions", "0.25", "--seeds", "1", "--episodes", "1", "--steps", "400"]
-    words += ["--controller-steps", "400", "--workers", "2", "--launcher", "ray", "--quiet"]
+    words = [sys.executable, "-m", "torchrl_koap.commands.cli", "curve", "--out", folder / "curve", "--datasets", data]
+    words += ["--methods", "linear", "koap", "--labels", "0.25", "--seeds", "1", "--evaluation.episodes", "1"]
+    words += ["--planner.steps", "400", "--controller.steps", "400", "--workers", "2", "--launcher", "ray", "--quiet"]
     return list(map(str, words))
 
 
@@ -74,7 +74,7 @@ def short():
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed (extra 'ray')")
 def test_a_killed_worker_costs_its_cell_alone_and_the_next_call_does_it(tmp_path, short, monkeypatch):
     settings, out = surroundings(monkeypatch, tmp_path, short), tmp_path / "curve"
-    words, killed = curve_of(tmp_path), out / "cells" / "koap-0.25-1-seed0"
+    words, killed = curve_of(tmp_path), out / "cells" / "avoiding" / "koap-0.25-1-seed0"
     process = subprocess.Popen(words, env=settings)
     worker = kill_when_it_trains(killed, process)
     assert process.wait(LONGEST) == 1
@@ -126,7 +126,7 @@ def group_of(leader: int) -> list[int]:
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed (extra 'ray')")
 def test_a_curve_goes_on_where_it_was_when_the_head_is_started_again(tmp_path, short, monkeypatch):
     settings, out = surroundings(monkeypatch, tmp_path, short) | {"RAY_AUTH_MODE": "disabled"}, tmp_path / "curve"
-    words, disturbed = curve_of(tmp_path), out / "cells" / "koap-0.25-1-seed0"
+    words, disturbed = curve_of(tmp_path), out / "cells" / "avoiding" / "koap-0.25-1-seed0"
     with cluster(short / "first", settings) as address:
         process = subprocess.Popen([*words, "--address", address], env=settings, stderr=subprocess.PIPE, text=True)
         wait_for(disturbed / "metrics.csv", process)

@@ -8,16 +8,16 @@ import math
 import pytest
 
 from torchrl_koap.evaluation.statistics import wilson_interval
-from torchrl_koap.studies.summary import summarise
+from torchrl_koap.studies.summary import Measure, summarise
 from torchrl_koap.studies.table import CELL_COLUMNS, markdown_table, read_cells, table_rows, write_cells
 
 
-def cell(method="koap", fraction=0.02, seed=0, *, successes=20, episodes=30, **more):
+def cell(method="koap", labels=0.02, seed=0, *, successes=20, episodes=30, **more):
     return {
         "task": "avoiding",
         "method": method,
-        "fraction": fraction,
-        "observations": 1.0,
+        "labels": labels,
+        "demonstrations": 1.0,
         "seed": seed,
         "label_unit": "trajectory",
         "status": "done",
@@ -40,7 +40,7 @@ def cell(method="koap", fraction=0.02, seed=0, *, successes=20, episodes=30, **m
         "controller_updates": 500,
         "train_seconds": 12.25,
         "eval_seconds": 3.5,
-        "run": f"{method}/{fraction}/{seed}",
+        "run": f"{method}/{labels}/{seed}",
     } | more
 
 
@@ -57,7 +57,7 @@ def failed(**more):
 
 
 def test_columns_are_those_agreed_on():
-    assert CELL_COLUMNS[:7] == ("task", "method", "fraction", "observations", "seed", "label_unit", "status")
+    assert CELL_COLUMNS[:7] == ("task", "method", "labels", "demonstrations", "seed", "label_unit", "status")
     assert CELL_COLUMNS[-1] == "run"
     assert tuple(cell()) == CELL_COLUMNS
 
@@ -87,8 +87,8 @@ def test_rows_that_cannot_be_written_leave_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("avoiding,koap,0.02", "avoiding,koap,many", ("line 2", "'fraction'", "'many'")),
-        ("avoiding,koap,0.02", "avoiding,koap,nan", ("line 2", "'fraction'", "finite")),
+        ("avoiding,koap,0.02", "avoiding,koap,many", ("line 2", "'labels'", "'many'")),
+        ("avoiding,koap,0.02", "avoiding,koap,nan", ("line 2", "'labels'", "finite")),
         (",1.0,0,", ",1.0,0.5,", ("line 2", "'seed'", "whole number")),
         (",done,", ",dome,", ("line 2", "'status'", "'dome'")),
         ("avoiding,koap", "avoiding,", ("line 2", "'method'", "empty")),
@@ -112,17 +112,17 @@ def test_damage_is_named(tmp_path, old, new, words):
 
 def test_seeds_are_pooled():
     item = summarise([cell(seed=0, successes=30), cell(seed=1, successes=15), failed(seed=2)])[0]
-    assert (item.successes, item.episodes, item.success) == (45, 60, 0.75)
-    assert (item.low, item.high) == wilson_interval(45, 60)
-    assert (item.lowest, item.highest) == (0.5, 1.0)
+    assert (item.successes, item.episodes) == (45, 60)
+    assert item.measures["success"] == Measure(0.75, *wilson_interval(45, 60))
+    assert item.measures["seed_success"] == Measure(0.75, 0.5, 1.0)
     assert (item.done, item.failed, item.missing) == ((0, 1), (2,), ())
-    assert item.entropy == pytest.approx(0.55)
-    assert (item.action_error, item.action_error_low, item.action_error_high) == (1.5, 1.0, 2.0)
-    assert item.labelled_transitions == 320.5
+    assert item.mean("mode_entropy") == pytest.approx(0.55)
+    assert item.measures["action_error"] == Measure(1.5, 1.0, 2.0)
+    assert item.mean("labelled_transitions") == 320.5 and item.mean("relative_plan_error") is None
 
 
 def test_nothing_is_pooled_that_differs():
-    rows = [cell(), cell(fraction=0.1), cell("vae"), cell(observations=0.5), cell(label_unit="window")]
+    rows = [cell(), cell(labels=0.1), cell("vae"), cell(demonstrations=0.5), cell(label_unit="window")]
     items = summarise(rows + [row | {"task": "sorting"} for row in rows])
     assert len(items) == 10
     assert all(item.episodes == 30 for item in items)
@@ -131,7 +131,7 @@ def test_nothing_is_pooled_that_differs():
 
 def test_a_method_without_any_done_cell_stays():
     item = summarise([failed(seed=0), failed(seed=1)])[0]
-    assert (item.success, item.low, item.episodes, item.failed) == (None, None, 0, (0, 1))
+    assert (item.mean("success"), item.episodes, item.failed) == (None, 0, (0, 1))
     assert table_rows([item])[0]["success (95 %)"] == "no cell done"
 
 
@@ -157,8 +157,8 @@ def test_table_counts_failures_and_says_why():
 
 
 def test_columns_that_say_nothing_are_left_out():
-    one, two = (list(table_rows(summarise(rows))[0]) for rows in ([cell()], [cell(), cell(observations=0.5)]))
-    assert "trajectories used" not in one
-    assert "trajectories used" in two
+    one, two = (list(table_rows(summarise(rows))[0]) for rows in ([cell()], [cell(), cell(demonstrations=0.5)]))
+    assert "demonstrations used" not in one
+    assert "demonstrations used" in two
     assert "task" not in one
     assert "task" in table_rows(summarise([cell(), cell(task="sorting")]))[0]

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from torchrl_koap.reports.pictures import draw_pictures
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.progress import check_logger, log_scores, open_logger
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.studies import BenchConfig, CurveConfig, run_bench, run_curve
+from torchrl_koap.studies import Machines, Study, run_study
 
 
 @dataclass(kw_only=True)
@@ -120,29 +120,32 @@ class Latency(Command):
 
 @dataclass(kw_only=True)
 class Curve(Command):
-    """Measure success against the number of labels: methods x label fractions x seeds.
+    """Measure success against the number of labels: tasks x methods x shares of labels x seeds.
 
     Attributes:
         config: all options.
+        machines: where the cells are made.
     """
 
-    config: Options[CurveConfig]
+    config: Options[Study]
+    machines: Options[Machines] = field(default_factory=Machines)
 
     def __call__(self) -> dict[str, Any]:
-        """Does what is missing of the curve and writes its report."""
-        return run_curve(self.config)
+        """Does what is missing of the study and writes its report."""
+        result = run_study(self.config, self.machines)
+        return {**result.counts, "report": str(result.report)}
 
 
 @dataclass(kw_only=True)
-class Bench(Command):
-    """Reproduce a comparison of the paper: a curve per task, and one report over all.
+class Bench(Curve):
+    """Reproduce a table of the paper: `koap curve --preset table1` by another name.
 
     Attributes:
-        config: all options.
+        table: 1 (methods) or 2 (variants).
     """
 
-    config: Options[BenchConfig]
+    table: int
 
     def __call__(self) -> dict[str, Any]:
-        """Does what is missing of the comparison and writes its report."""
-        return run_bench(self.config)
+        """Does what is missing of the table and writes its report."""
+        return Curve(config=replace(self.config, preset=f"table{self.table}"), machines=self.machines)()

@@ -18,7 +18,7 @@ def training_dtype(precision: str | None, device: str | torch.device = "cpu") ->
     """Type of the denoiser's matrix products in training; None leaves them as they are.
 
     With units for bfloat16 a processor is several times quicker than with float32; without them it emulates it and is
-    many times slower (``benchmarks/planner_precision.py`` measures both).
+    many times slower (``benchmarks/training_speed.py`` measures both).
 
     Args:
         precision (str, optional): "float32", "bfloat16", or "auto": bfloat16 where the device has units for it.

@@ -7,16 +7,16 @@ from torchrl_koap.lookup import exports
 __getattr__ = exports(
     __name__,
     {
-        "BenchConfig": "torchrl_koap.studies.paper_tables",
-        "CurveConfig": "torchrl_koap.studies.label_efficiency",
-        "run_bench": "torchrl_koap.studies.paper_tables",
-        "run_curve": "torchrl_koap.studies.label_efficiency",
+        "Cell": "torchrl_koap.studies.cells",
+        "Machines": "torchrl_koap.studies.launchers",
+        "Study": "torchrl_koap.studies.study",
+        "run_study": "torchrl_koap.studies.run",
     },
 )
 
 __all__ = [  # noqa: F822
-    "BenchConfig",
-    "CurveConfig",
-    "run_bench",
-    "run_curve",
+    "Cell",
+    "Machines",
+    "Study",
+    "run_study",
 ]

@@ -1,104 +1,118 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The work of a label-efficiency curve: shared planners and cells, each in a folder that says when it is finished.
+"""A cell of a study on disk: what was asked of it, written before it begins, and what it found, written last.
 
-A cell is one method, one budget of labels, one seed. Its folder is an ordinary run directory; ``cell.json``, written
-last and in one go, marks it as done, so a process may be killed at any moment.
+``cell.json`` holds whole configurations, so a worker needs the folder alone: a process of this machine, of a cluster,
+or somebody by hand. ``result.json`` is written in one go, so a process may be killed at any moment.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.evaluation.offline import KIND
 from torchrl_koap.runs.config import TrainConfig
-from torchrl_koap.runs.config_files import from_json
+from torchrl_koap.runs.config_files import changed_options, from_json, to_json
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.studies.summary import needed_when_done
 from torchrl_koap.tasks.units import thousandths
-from torchrl_koap.training import get_method, train
+from torchrl_koap.training import train
 
-DONE = "cell.json"
+ASKED, FOUND = "cell.json", "result.json"
 # evaluation seeds of a training seed lie so far from the next one's: rollouts that differ in nothing but the training
 # would count as 180 where they are hardly more than 60
 NOISE_STEP = 1000
-# options of a curve, in the sections of TrainConfig
-_NAMES = {
-    "denoiser": "planner.network",
-    "denoiser_width": "planner.width",
-    "batch_size": "planner.batch_size",
-    "planner_learning_rate": "planner.learning_rate",
-    "planner_from": "planner.source",
-    "steps": "planner.steps",
-    "controller_steps": "controller.steps",
-    "controller_state": "controller.columns",
-    "label_fraction": "labels.fraction",
-    "label_unit": "labels.unit",
-    "observation_fraction": "labels.trajectories",
-    "precision": "run.precision",
-    "seed": "run.seed",
-    "resume": "run.resume",
-    "plugins": "run.plugins",
-}
-_ERRORS = ("relative_plan_error", "relative_action_error")
+_MAY_CHANGE = ("out", "planner.source", "run.plugins")  # a folder may be moved, plugins may be added
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell of a curve.
+    """One cell of a study.
 
     Args:
+        task (str): name of the task.
         method (str): name in :data:`~torchrl_koap.training.methods.METHODS`.
-        fraction (float): share of the units that keep their labels.
-        observations (float): share of the trajectories that are used at all.
+        labels (float): share of the units that keep their labels.
+        demonstrations (float): share of the demonstrations that is known at all.
         seed (int): of label choice, initialisation and batches.
 
     Examples:
         >>> from torchrl_koap.studies.cells import Cell
-        >>> Cell("koap", fraction=0.02, observations=1.0, seed=0).folder
-        'cells/koap-0.02-1-seed0'
+        >>> Cell("avoiding", "koap", labels=0.02, demonstrations=1.0, seed=0).folder
+        'cells/avoiding/koap-0.02-1-seed0'
     """
 
+    task: str
     method: str
-    fraction: float
-    observations: float
+    labels: float
+    demonstrations: float
     seed: int
 
     @property
     def folder(self) -> str:
-        """Its run directory, relative to the curve's."""
-        return f"cells/{self.method}-{self.fraction:.15g}-{self.observations:.15g}-seed{self.seed}"
-
-    @property
-    def planner(self) -> str | None:
-        """The folder of the planner that it shares, None for a method without one."""
-        return planner_folder(self.observations) if get_method(self.method).plans else None
+        """Its run directory, relative to the study's."""
+        return f"cells/{self.task}/{self.method}-{self.labels:.15g}-{self.demonstrations:.15g}-seed{self.seed}"
 
 
-def planner_folder(observations: float, seed: int = 0) -> str:
-    """Folder of the planner that all cells with this share of the trajectories, and this seed of it, have in common.
+def prepare_cell(folder: Path, config: TrainConfig, evaluation: EvalConfig | None) -> None:
+    """Writes what is asked of a cell, or of a shared planner, before its work begins.
 
     Args:
-        observations (float): share of the trajectories that it is trained on.
-        seed (int): its seed. Defaults to ``0``.
+        folder (Path): where to; made if it is not there.
+        config (TrainConfig): its training.
+        evaluation (EvalConfig, optional): its rollouts; None for a planner alone.
+
+    Raises:
+        RunDirectoryError: if something else was asked of it before.
     """
-    return f"planner-{observations:.15g}" + (f"-seed{seed}" if seed else "")
+    run = RunDirectory(folder)
+    if (folder / ASKED).exists():
+        changed = changed_options(read_asked(folder)[0], config)
+        changed = [name for name in changed if name not in _MAY_CHANGE]
+        if changed:
+            raise RunDirectoryError(f"{folder} was started with another {', '.join(changed)}")
+    content = {"train": to_json(config), "evaluation": None if evaluation is None else to_json(evaluation)}
+    run.write_json(ASKED, content)
 
 
-def is_trained(folder: Path) -> bool:
-    """Whether a planner was finished."""
-    return _is_readable(RunDirectory(folder), DONE) and (folder / "planner.safetensors").is_file()
+def read_asked(folder: Path) -> tuple[TrainConfig, EvalConfig | None]:
+    """Reads what is asked of a cell.
+
+    Raises:
+        RunDirectoryError: if ``cell.json`` is not there or damaged.
+    """
+    content, path = RunDirectory(folder).read_json(ASKED), folder / ASKED
+    if set(content) != {"train", "evaluation"}:
+        raise RunDirectoryError(f"{path} is damaged: wanted the entries 'train' and 'evaluation'")
+    evaluation = content["evaluation"]
+    config = from_json(TrainConfig, content["train"], path)
+    return config, None if evaluation is None else from_json(EvalConfig, evaluation, path)
 
 
-def is_done(folder: Path) -> bool:
-    """Whether a cell was finished and all its results can be read; if not, it is to be done (again)."""
-    try:
-        _results(RunDirectory(folder))
-    except RunDirectoryError:
-        return False
-    return True
+def run_cell(folder: str | Path) -> None:
+    """Trains and evaluates a cell, or trains a shared planner, from where it was left.
+
+    Args:
+        folder (str or Path): where :func:`prepare_cell` said what to do.
+    """
+    folder = Path(folder)
+    config, evaluation = read_asked(folder)
+    config = replace(config, run=replace(config.run, resume=(folder / "config.json").exists()))
+    run, began = RunDirectory(folder), time.perf_counter()
+    if evaluation is None:
+        results = train(config, planner_only=True).results
+        run.write_json(FOUND, {"row": {"train_seconds": time.perf_counter() - began}, "outcomes": [], **results})
+        return
+    if not _is_readable(run, "summary.json"):
+        train(config)
+    trained, summary = time.perf_counter(), run.read_json("summary.json")
+    result = evaluate(folder, evaluation)
+    seconds = {"train_seconds": trained - began, "eval_seconds": time.perf_counter() - trained}
+    run.write_json(FOUND, {"row": row_of(summary, result) | seconds, "outcomes": outcomes_of(result)})
 
 
 def _is_readable(run: RunDirectory, name: str) -> bool:
@@ -109,169 +123,100 @@ def _is_readable(run: RunDirectory, name: str) -> bool:
     return True
 
 
-def train_config(**options: Any) -> TrainConfig:
-    """Sorts the options of a cell into the sections of a configuration.
+def read_result(folder: str | Path) -> tuple[dict[str, Any], dict[tuple[int, int], float]] | None:
+    """Reads what a cell found, None if it is not finished.
+
+    Returns:
+        tuple or None: columns of :data:`~torchrl_koap.studies.table.CELL_COLUMNS`; success by (context, evaluation
+        seed), or without an environment the relative action error by (trajectory, 0).
+
+    Raises:
+        RunDirectoryError: if ``result.json`` is damaged.
+    """
+    path = Path(folder) / FOUND
+    if not path.exists():
+        return None
+    content = RunDirectory(folder).read_json(FOUND)
+    try:
+        row = {str(name): value for name, value in content["row"].items()}
+        outcomes = {(int(context), int(seed)): float(value) for context, seed, value in content["outcomes"]}
+        if (Path(folder) / "summary.json").exists() and any(row[name] is None for name in needed_when_done(row)):
+            raise ValueError("it has no successes")
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise RunDirectoryError(f"{path} is damaged ({type(error).__name__}: {error})") from error
+    if len(outcomes) < len(content["outcomes"]):
+        raise RunDirectoryError(f"{path} is damaged: an episode occurs twice")
+    return row, outcomes
+
+
+def cell_row(
+    root: Path, cell: Cell, *, label_unit: str, reason: str | None = None
+) -> tuple[dict[str, Any], dict[tuple[int, int], float]]:
+    """Reads a cell as a row of ``cells.csv``, and its outcomes, which are empty unless it is done.
 
     Args:
-        **options: of :class:`~torchrl_koap.studies.cell_options.CellOptions` and of a cell, None where left open.
-
-    Examples:
-        >>> from torchrl_koap.studies.cells import train_config
-        >>> train_config(out="cell", steps=20, denoiser="mlp").planner.network
-        'mlp'
-    """
-    content: dict[str, Any] = {}
-    for name, value in options.items():
-        section, dot, own = _NAMES.get(name, name).rpartition(".")
-        if value is not None:
-            (content.setdefault(section, {}) if dot else content)[own] = value
-    return from_json(TrainConfig, content, "options of a cell")
-
-
-def do_planner(*, folder: str, observations: float, settings: dict[str, Any]) -> None:
-    """Trains a planner on states alone: all actions are hidden before anything looks at the data.
-
-    Keyword Args:
-        folder (str): where to.
-        observations (float): share of the trajectories to use.
-        settings (dict): options of :class:`~torchrl_koap.training.TrainConfig`.
-    """
-    began = time.perf_counter()
-    resume = (Path(folder) / "config.json").exists()
-    config = train_config(out=folder, observation_fraction=observations, resume=resume, **settings)
-    losses = train(config, planner_only=True).results["planner"]
-    RunDirectory(folder).write_json(DONE, {"train_seconds": time.perf_counter() - began} | losses)
-
-
-def do_cell(
-    *,
-    folder: str,
-    cell: dict[str, Any],
-    planner: str | None,
-    settings: dict[str, Any],
-    evaluation: dict[str, Any],
-    label_fraction: float | None = None,
-) -> None:
-    """Trains and evaluates a cell, from where it was left.
-
-    Keyword Args:
-        folder (str): its run directory.
-        cell (dict): fields of :class:`Cell`.
-        planner (str, optional): folder of the planner to share.
-        settings (dict): options of :class:`~torchrl_koap.training.TrainConfig`.
-        evaluation (dict): options of :class:`~torchrl_koap.evaluation.EvalConfig`, without the seed: all cells with the
-            same training seed meet the same noise, those of the next one other noise, in the same contexts.
-        label_fraction (float, optional): share of the labels of the data at hand, where the cell's is a share of more.
-    """
-    path, this = Path(folder), Cell(**cell)
-    began = time.perf_counter()
-    if not _is_readable(RunDirectory(path), "summary.json"):
-        train(
-            train_config(
-                out=folder,
-                method=this.method,
-                label_fraction=this.fraction if label_fraction is None else label_fraction,
-                observation_fraction=this.observations,
-                seed=this.seed,
-                planner_from=planner,
-                resume=(path / "config.json").exists(),
-                **settings,
-            )
-        )
-    trained = time.perf_counter()
-    result = evaluate(path, EvalConfig(seed=EvalConfig.seed + NOISE_STEP * this.seed, **evaluation))
-    run = RunDirectory(path)
-    run.write_json(
-        DONE,
-        asdict(this)
-        | {
-            "labels": run.read_entry("summary.json", "labels"),
-            "train_seconds": trained - began,
-            "eval_seconds": time.perf_counter() - trained,
-            **_counts(result),
-        },
-    )
-
-
-def cell_row(root: Path, cell: Cell, *, task: str, label_unit: str, reason: str | None = None) -> dict[str, Any]:
-    """A cell as a row of ``cells.csv`` (:data:`~torchrl_koap.studies.table.CELL_COLUMNS`).
-
-    Args:
-        root (Path): folder of the curve.
+        root (Path): folder of the study.
         cell (Cell): the cell.
 
     Keyword Args:
-        task (str): name of the task.
-        label_unit (str): what the fraction is a share of.
+        label_unit (str): what the labels are a share of.
         reason (str, optional): why it failed.
     """
-    row: dict[str, Any] = {"task": task, **asdict(cell), "label_unit": label_unit, "run": cell.folder}
-    run = RunDirectory(root / cell.folder)
+    row = asdict(cell) | {"label_unit": label_unit, "run": cell.folder}
     try:
-        return row | {"status": "done"} | _results(run)
+        found = read_result(root / cell.folder)
     except RunDirectoryError as error:
-        if reason is None and (run.path / DONE).exists():  # it was done once
-            reason = str(error)
-    return row | ({"status": "missing"} if reason is None else {"status": "failed", "reason": reason})
+        found, reason = None, reason or str(error)
+    if found is None:
+        return row | ({"status": "failed", "reason": reason} if reason else {"status": "missing"}), {}
+    return row | {"status": "done"} | found[0], found[1]
 
 
-def _results(run: RunDirectory) -> dict[str, Any]:
-    """What a finished cell found.
-
-    Raises:
-        RunDirectoryError: if a file is not there, damaged or lacks something, or somebody evaluated the cell otherwise.
-    """
-    done, summary, result = (run.read_json(name) for name in (DONE, "summary.json", "eval.json"))
-    try:
-        columns = _columns(done, summary, result)
-        counts = _counts(result)
-        done.setdefault("episodes", counts["episodes"])  # a cell of before says nothing of them
-        same = all(done[name] == value for name, value in counts.items())
-    except (KeyError, TypeError, AttributeError) as error:
-        raise RunDirectoryError(f"{run.path}: its results are damaged ({type(error).__name__}: {error})") from error
-    if not same:
-        raise RunDirectoryError(f"{run.path / 'eval.json'} is another evaluation than the curve's")
-    return columns
-
-
-def _counts(result: dict[str, Any]) -> dict[str, Any]:
-    """What says whether an evaluation is the one that a cell was finished with."""
-    if result.get("kind") == KIND:
-        return {"episodes": None, "successes": None, **{name: result[name] for name in _ERRORS}}
-    return {"episodes": result["episodes"], "successes": round(result["success_rate"] * result["episodes"])}
-
-
-def _columns(done: dict[str, Any], summary: dict[str, Any], result: dict[str, Any]) -> dict[str, Any]:
-    labels = done["labels"]
-    errors: dict[str, Any] = next((value for name, value in summary.items() if name.startswith("action_error")), {})
+def row_of(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
+    """The columns of ``cells.csv`` that training and evaluation of a cell found."""
+    labels = summary["labels"]
+    errors: Mapping[str, Any] = next((value for name, value in summary.items() if name.startswith("action_error")), {})
     common = {
         "labelled_units": labels["selected_units"],
         "labelled_transitions": labels["labelled_transitions"],
         "trajectories_touched": labels["trajectories_touched"],
         "action_error": errors.get("controller"),
         "controller_updates": summary["controller_updates"],
-        "train_seconds": done["train_seconds"],
-        "eval_seconds": done["eval_seconds"],
     }
     if result.get("kind") == KIND:
-        return common | {"kind": KIND, "action_error": _own_error(result)} | {name: result[name] for name in _ERRORS}
+        names = ("relative_plan_error", "relative_action_error")
+        return common | {"kind": KIND, "action_error": _own_error(result)} | {name: result[name] for name in names}
     entropy = result["mode_entropy"]
-    return common | {
-        "episodes": result["episodes"],
-        "successes": done["successes"],
-        "success_rate": result["success_rate"],
-        "success_low": result["success_low"],
-        "success_high": result["success_high"],
-        "mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy,
-        "collisions": result["collisions"],
-        "mean_steps": result["mean_steps"],
-    }
+    names = ("episodes", "success_rate", "success_low", "success_high", "collisions", "mean_steps")
+    return (
+        common
+        | {name: result[name] for name in names}
+        | {
+            "successes": round(result["success_rate"] * result["episodes"]),
+            "mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy,
+        }
+    )
 
 
-def _own_error(result: dict[str, Any]) -> float | None:
+def _own_error(result: Mapping[str, Any]) -> float | None:
     """Error of the actions in the unit of the first column, as it is shown; None if nothing was measured."""
     split = result["action_errors_on"]
     if split is None:
         return None
     row = result["action_errors"][split]["unit"][0]
     return row["controller"] * thousandths(row["unit"])[1]
+
+
+def outcomes_of(result: Mapping[str, Any]) -> list[list[float]]:
+    """Success of every episode with its context and seed; without an environment the error of every trajectory.
+
+    An episode without a context is one of its own.
+    """
+    if result.get("kind") == KIND:
+        split = result["action_errors_on"]
+        rows = result["action_errors"][split]["trajectory"] if split else ()
+        return [[row["episode"], 0, row["relative_action_error"]] for row in rows]
+    return [
+        [row["seed"] if row.get("context") is None else row["context"], row["seed"], row["outcome"] == "success"]
+        for row in result["episode"]
+    ]

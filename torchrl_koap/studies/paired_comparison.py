@@ -7,25 +7,25 @@ are hard for both, and what is common to both falls out of the difference.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import permutation_test
 
 from torchrl_koap.evaluation.offline import KIND
+from torchrl_koap.studies.summary import group_of
 
-Outcomes = Mapping[int, Mapping[tuple[int, int], bool]]
-"""Successes of a method: training seed, then (context, evaluation seed)."""
+Outcome = Mapping[tuple[int, int], float]
+"""Successes of a cell by (context, evaluation seed); errors of one without an environment by (trajectory, 0)."""
 
 COMPARISON_COLUMNS = (
     "task",
     "label_unit",
-    "observations",
-    "fraction",
+    "demonstrations",
+    "labels",
     "reference",
     "method",
     "difference",
@@ -37,7 +37,6 @@ COMPARISON_COLUMNS = (
     "seeds",
     "n",
 )
-_EXACT = 16
 _FLIPS = 10_000
 _RESAMPLES = 4_000
 _CHUNK = 500
@@ -73,7 +72,9 @@ class Comparison:
     pairs: int
 
 
-def compare(first: Outcomes, second: Outcomes, *, level: float = 0.95, errors: bool = False) -> Comparison | None:
+def compare(
+    first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, level: float = 0.95, errors: bool = False
+) -> Comparison | None:
     r"""Compares two methods on what both have: equal training seed, context and evaluation seed.
 
     With :math:`d_{sc}` the difference of the successes for training seed s in context c, averaged over rollouts of that
@@ -96,7 +97,7 @@ def compare(first: Outcomes, second: Outcomes, *, level: float = 0.95, errors: b
     matter, but in 27 to 32 % where they do: then the interval is what to go by.
 
     Args:
-        first (mapping): training seed to ``{(context, evaluation seed): success}``, see :func:`read_outcomes`.
+        first (mapping): training seed to ``{(context, evaluation seed): success}``.
         second (mapping): the same of the other method.
         level (float): probability that the interval holds.
         errors (bool): the outcomes are errors, which have no bounds, instead of successes. Where nothing varies there
@@ -165,11 +166,11 @@ def _interval(difference: np.ndarray, there: np.ndarray, level: float) -> tuple[
 def sign_flip_p(differences: Sequence[float]) -> float:
     """Two-sided p-value of a mean of 0, from flipping the signs of independent differences.
 
-    Differences of 0 change nothing. Up to 16 others all flips are counted; beyond, 10,000 drawn ones, the same in every
-    call, and the observed one among them, so that the p-value is never below 1 / 10,001.
+    Up to 13 of them all flips are counted; beyond, 10,000 drawn ones, the same in every call, and the observed one
+    among them, so that the p-value is never below 2 / 10,001.
 
     Args:
-        differences (sequence of float): one per context.
+        differences (sequence of float): one per context; those of 0 change nothing.
 
     Examples:
         >>> from torchrl_koap.studies.paired_comparison import sign_flip_p
@@ -178,16 +179,10 @@ def sign_flip_p(differences: Sequence[float]) -> float:
     """
     values = np.asarray(differences, dtype=float)
     values = values[values != 0]
-    if not len(values):
+    if len(values) < 2:  # a single one may as well be turned round
         return 1.0
-    observed = abs(values.sum()) - 1e-9  # sums of thirds differ in their last digits
-    if len(values) <= _EXACT:
-        sums = np.zeros(1)
-        for value in values:
-            sums = np.concatenate([sums + value, sums - value])
-        return float((abs(sums) >= observed).mean())
-    signs = np.random.default_rng(0).choice((-1.0, 1.0), size=(_FLIPS, len(values)))
-    return float((1 + (abs(signs @ values) >= observed).sum()) / (1 + _FLIPS))
+    options = {"permutation_type": "samples", "n_resamples": _FLIPS, "vectorized": True, "random_state": 0}
+    return float(permutation_test((values,), np.mean, **options).pvalue)
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -210,109 +205,47 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return adjusted
 
 
-def read_outcomes(path: str | Path) -> dict[tuple[int, int], bool]:
-    """Successes of an evaluation by (context, evaluation seed); an episode without context is one of its own.
-
-    Args:
-        path (str or Path): an ``eval.json``.
-
-    Raises:
-        ValueError: if the file is damaged, has no list of episodes, or an episode twice; the message names the file.
-        FileNotFoundError: if it is not there.
-    """
-    path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    rows = content.get("episode") if isinstance(content, dict) else None
-    if not isinstance(rows, list) or not rows:
-        raise ValueError(f"{path} has no list of episodes under 'episode'")
-    outcomes: dict[tuple[int, int], bool] = {}
-    for number, row in enumerate(rows):
-        try:
-            seed = int(row["seed"])
-            key, success = (int(row.get("context", seed)), seed), str(row["outcome"]) == "success"
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ValueError(f"{path}, episode {number}: expected 'seed' and 'outcome', got {row!r}") from error
-        if key in outcomes:
-            raise ValueError(f"{path}, episode {number}: context {key[0]} with seed {seed} occurs twice")
-        outcomes[key] = success
-    return outcomes
-
-
-def read_errors(path: str | Path) -> dict[tuple[int, int], float] | None:
-    """Relative action errors by trajectory, of an evaluation without an environment; None for one in closed loop.
-
-    Args:
-        path (str or Path): an ``eval.json``.
-
-    Raises:
-        ValueError: if the file is damaged or lacks the errors; the message names it.
-        FileNotFoundError: if it is not there.
-    """
-    path = Path(path)
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    if not isinstance(content, dict) or content.get("kind") != KIND:
-        return None
-    try:
-        split = content["action_errors_on"]
-        rows = content["action_errors"][split]["trajectory"] if split else ()
-        return {(int(row["episode"]), 0): float(row["relative_action_error"]) for row in rows}
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: its action errors are damaged ({type(error).__name__}: {error})") from error
-
-
 def compare_cells(
-    folder: str | Path, rows: Sequence[Mapping[str, Any]], *, reference: str = "koap"
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Compares a method with every other one at every budget of a curve, from the episodes of the cells' evaluations.
+    rows: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome], *, reference: str = "koap"
+) -> list[dict[str, Any]]:
+    """Compares a method with every other one at every share of labels.
 
     Args:
-        folder (str or Path): the curve's folder; the cells' ``run`` is relative to it.
         rows (sequence of mapping): cells; those that are not done take no part.
+        outcomes (mapping): by the ``run`` of a cell its successes, or of a task without an environment its relative
+            action errors, by (context or trajectory, evaluation seed).
         reference (str): the method that all others are compared with.
 
     Returns:
-        tuple: a row of :data:`COMPARISON_COLUMNS` per other method and budget, where ``difference`` is the reference's
-        success minus the other's (of tasks without an environment: its relative action error, trajectory by trajectory
-        in place of contexts), ``p_holm`` is corrected over all rows, ``n`` counts paired rollouts and what cannot
-        be compared is None; and what was wrong with evaluations that could not be read.
+        list: a row of :data:`COMPARISON_COLUMNS` per other method and share, where ``difference`` is the reference's
+        success minus the other's (or error, trajectory by trajectory in place of contexts), ``p_holm`` is corrected
+        over all rows, ``n`` counts paired rollouts and what cannot be compared is None.
     """
-    groups: dict[tuple, dict[str, dict[int, dict]]] = {}
-    problems, offline = [], set()
+    groups: dict[tuple, dict[str, dict[int, Outcome]]] = {}
+    offline = set()
     for row in rows:
-        observations = row.get("observations")
-        key = (row["task"], row.get("label_unit") or "", 1.0 if observations is None else observations, row["fraction"])
-        outcomes = groups.setdefault(key, {}).setdefault(row["method"], {})
-        if row["status"] != "done":
-            continue
-        try:
-            path = Path(folder) / (row.get("run") or "") / "eval.json"
-            errors = read_errors(path)
-            if errors is not None:
+        key = (row["task"], *group_of(row))
+        found = groups.setdefault(key, {}).setdefault(row["method"], {})
+        if row["status"] == "done" and row.get("run") in outcomes:
+            found[row["seed"]] = outcomes[row["run"]]
+            if row.get("kind") == KIND:
                 offline.add(key)
-            outcomes[row["seed"]] = read_outcomes(path) if errors is None else errors
-        except (OSError, ValueError) as error:
-            problems.append(f"left out of the paired comparisons: {error}")
-    found = []
-    for key in groups:
-        for method in groups[key]:
-            if reference in groups[key] and method != reference:
-                result = compare(groups[key][reference], groups[key][method], errors=key in offline)
+    compared = []
+    for key, methods in groups.items():
+        for method in methods:
+            if reference in methods and method != reference:
+                result = compare(methods[reference], methods[method], errors=key in offline)
                 named = dict(zip(COMPARISON_COLUMNS, (*key, reference, method), strict=False))
-                numbers = {name: getattr(result, name, None) for name in COMPARISON_COLUMNS if name not in named}
+                known = {} if result is None else asdict(result) | {"n": result.pairs}
+                numbers = {name: known.get(name) for name in COMPARISON_COLUMNS if name not in named}
                 numbers = {name: None if value != value else value for name, value in numbers.items()}  # NaN
-                found.append(named | numbers | {"n": result.pairs if result else 0})
-    for row, adjusted in zip(found, holm([row["p"] for row in found]), strict=True):
+                compared.append(named | numbers | {"n": known.get("n", 0)})
+    for row, adjusted in zip(compared, holm([row["p"] for row in compared]), strict=True):
         row["p_holm"] = adjusted
     order = list(dict.fromkeys(row["method"] for row in rows))
     tasks = list(dict.fromkeys(row["task"] for row in rows))
-    found.sort(key=lambda row: (tasks.index(row["task"]), *list(row.values())[1:4], order.index(row["method"])))
-    return found, problems
+    compared.sort(key=lambda row: (tasks.index(row["task"]), *list(row.values())[1:4], order.index(row["method"])))
+    return compared
 
 
 def p_text(p: float | None) -> str:

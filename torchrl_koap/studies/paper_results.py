@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -56,11 +55,6 @@ def _content() -> dict[str, Any]:
     return json.loads(files("torchrl_koap.studies").joinpath("paper_results.json").read_text(encoding="utf-8"))
 
 
-def _task_entry(task: str) -> tuple[str, dict[str, Any]] | None:
-    """The paper's name of a task of ours, and what is known of it; None if the paper does not have the task."""
-    return next(((name, entry) for name, entry in _content()["tasks"].items() if task in entry["tasks"]), None)
-
-
 def paper_levels(task: str) -> tuple[float, ...]:
     """Shares of labels of the paper's levels, the fewest first; empty for a task that is not in the paper.
 
@@ -72,23 +66,8 @@ def paper_levels(task: str) -> tuple[float, ...]:
         >>> paper_levels("avoiding"), paper_levels("sorting_6")
         ((0.02, 0.05, 0.1, 0.25, 0.5), ())
     """
-    found = _task_entry(task)
-    return () if found is None else tuple(percent / 100 for percent in found[1]["label_percent"])
-
-
-def paper_share(task: str) -> float | None:
-    """Share of the demonstrations that the paper uses at all, by one reading of its text; None if it has no such task.
-
-    Args:
-        task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper_results import paper_share
-        >>> paper_share("avoiding"), paper_share("sorting")
-        (0.5, 0.25)
-    """
-    found = _task_entry(task)
-    return None if found is None else found[1]["used_share"]
+    entries = [entry for entry in _content()["tasks"].values() if task in entry["tasks"]]
+    return tuple(percent / 100 for entry in entries for percent in entry["label_percent"])
 
 
 def paper_cells(table: int) -> list[PaperCell]:
@@ -139,42 +118,28 @@ def _by_place() -> dict[tuple[str, str, int], PaperCell]:
     return {(cell.task, cell.method, cell.level): cell for cell in cells}
 
 
-def paper_success(task: str, method: str, level: int) -> float | None:
-    """Success rate that the paper gives in 0..1, None if it has no such cell (:func:`paper_cell`).
-
-    Args:
-        task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
-        method (str): name of the method.
-        level (int): label level, 1 for the fewest labels.
-    """
-    cell = paper_cell(task, method, level)
-    return None if cell is None else cell.success
-
-
-def paper_points(task: str, fractions: Sequence[float] | None = None) -> list[dict[str, Any]]:
+def paper_points(task: str) -> list[dict[str, Any]]:
     """The paper's figures of a task at its own shares of labels, for pictures and tables beside measured ones.
 
     Args:
         task (str): name of the task.
-        fractions (sequence of float, optional): only those at these shares. Default: all.
 
     Returns:
-        list: ``task``, ``method``, ``fraction``, ``success`` and ``spread`` in 0..1, as
-        :func:`~torchrl_koap.studies.report.write_curve_report` takes them.
+        list: ``task``, ``method``, ``labels``, ``success`` and ``spread`` in 0..1.
 
     Examples:
         >>> from torchrl_koap.studies.paper_results import paper_points
-        >>> [(row["method"], row["success"]) for row in paper_points("sorting", [0.25]) if row["method"] == "koap"]
-        [('koap', 0.6583)]
+        >>> [row["success"] for row in paper_points("sorting") if (row["method"], row["labels"]) == ("koap", 0.25)]
+        [0.6583]
     """
     return [
         {
             "task": task,
             "method": cell.method,
-            "fraction": cell.label_share,
+            "labels": cell.label_share,
             "success": cell.success,
             "spread": cell.spread,
         }
         for (name, _, _), cell in _by_place().items()
-        if name == task and (fractions is None or cell.label_share in fractions)
+        if name == task
     ]

@@ -1,220 +1,277 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pictures of a label-efficiency curve: success and action error against the labels, a line per method.
+"""Pictures of a study: a measure against the labels, a line per method; success averaged over tasks.
 
-Colours stay apart for colour-blind readers; markers and dashes tell the lines apart without any colour. Names stand
-beside the ends of the lines.
+Colours stay apart for colour-blind readers; markers and dashes tell the lines apart without any colour.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
 from torchrl_koap.reports.style import FAINT, INK, set_title, tidy
 from torchrl_koap.reports.writing import save_figure
-from torchrl_koap.studies.lines import DASHES, MARKERS, Line, draw_lines, method_styles, name_lines
 from torchrl_koap.studies.summary import Summary, percent
 
 AXES = {
-    "fraction": "labelled share",
+    "labels": "labelled share",
     "labelled_transitions": "distinct labelled transitions",
-    "observations": "trajectories used, share of all",
+    "demonstrations": "demonstrations used, share of all",
 }
+_SEEDS = "mean over seeds, from best to worst seed"
+MEASURES = {  # label of the vertical axis, title, factor
+    "success": ("success (%)", "success, 95 % interval", 100),
+    "mode_entropy": ("entropy of the modes", _SEEDS, 1),
+    "action_error": ("action error", _SEEDS, 1),
+    "relative_action_error": ("action error, share of the mean action's", _SEEDS, 1),
+}
+_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#56b4e9", "#882255", "#7a8b00")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
+DASHES = ("solid", (0, (5, 1.6)), (0, (1.2, 1.2)))
+_BANDS = 3  # more bands than these hide each other: whiskers instead
 
 
-def plot_success(
+@dataclass
+class Line:
+    """A named line: ``x``, values ``y`` with their intervals, the paper's values ``(x, y)``, and how it is drawn."""
+
+    name: str
+    style: Mapping[str, Any]
+    x: list[float] = field(default_factory=list)
+    y: list[float] = field(default_factory=list)
+    low: list[float] = field(default_factory=list)
+    high: list[float] = field(default_factory=list)
+    paper: list[tuple[float, float]] = field(default_factory=list)
+
+    def add(self, x: float, y: float, low: float, high: float) -> None:
+        """Adds a point with its interval."""
+        for part, value in zip((self.x, self.y, self.low, self.high), (x, y, low, high), strict=True):
+            part.append(value)
+
+
+def method_styles(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Colour, marker and linestyle of every method, by its place; no two of the first 27 look alike.
+
+    Examples:
+        >>> from torchrl_koap.studies.plots import method_styles
+        >>> styles = method_styles([f"method {index}" for index in range(27)])
+        >>> len({str(style) for style in styles.values()})
+        27
+    """
+    return {
+        method: {
+            "color": _COLORS[index % len(_COLORS)],
+            "marker": MARKERS[index % len(MARKERS)],
+            "linestyle": DASHES[index // len(_COLORS) % len(DASHES)],
+        }
+        for index, method in enumerate(methods)
+    }
+
+
+def plot_measure(
     summaries: Sequence[Summary],
     path: str | Path,
+    measure: str = "success",
     *,
-    by: Sequence[str] = ("fraction", "labelled_transitions"),
+    by: Sequence[str] = ("labels",),
     paper: Sequence[Mapping[str, Any]] = (),
     methods: Sequence[str] | None = None,
-    label: str = "",
+    unit: str = "",
+    label_unit: str = "",
 ) -> Path:
-    """Success of every method with its 95 % interval, a panel per entry of ``by``.
+    """Draws a measure of every method with its ends, a panel per entry of ``by``.
 
     Args:
         summaries (sequence of Summary): of one task, see :func:`~torchrl_koap.studies.summary.summarise`.
         path (str or Path): png to write.
+        measure (str): of :data:`MEASURES`.
 
     Keyword Args:
-        by (sequence of str): what the horizontal axes show, of :data:`AXES`. Along ``"observations"`` there is a line
-            per method and label budget that was run with several shares.
-        paper (sequence of mapping): the paper's figures, with ``method``, ``fraction`` and ``success`` in 0..1: hollow
-            and dashed, in the colour of the method. Drawn only along ``"fraction"``.
-        methods (sequence of str, optional): all methods in the order that gives the colours; without it those of the
-            summaries in theirs.
-        label (str): what the budget counts, as in the label of the axis: ``"windows"``.
+        by (sequence of str): what the horizontal axes show, of :data:`AXES`. Along ``"demonstrations"`` there is a line
+            per method and share of labels that was run with several of them.
+        paper (sequence of mapping): the paper's success, with ``method``, ``labels`` and ``success`` in 0..1: hollow
+            and dashed, in the colour of the method. Drawn only along ``"labels"``.
+        methods (sequence of str, optional): all methods in the order that gives the colours. Default: as they come.
+        unit (str): unit of the measure.
+        label_unit (str): what the labels are counted in, as in the label of the axis: ``"windows"``.
 
     Raises:
-        ValueError: if no cell of any method is done.
+        ValueError: if no cell has the measure, or an error is not above 0.
 
     Examples:
         >>> import tempfile
-        >>> from torchrl_koap.studies.plots import plot_success
+        >>> from torchrl_koap.studies.plots import plot_measure
         >>> from torchrl_koap.studies.summary import summarise
         >>> cell = {"task": "avoiding", "method": "koap", "seed": 0, "status": "done", "episodes": 9, "successes": 5}
-        >>> rows = [cell | {"fraction": fraction} for fraction in (0.01, 0.1)]
+        >>> rows = [cell | {"labels": labels} for labels in (0.01, 0.1)]
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     plot_success(summarise(rows), f"{folder}/success.png", by=["fraction"]).name
+        ...     plot_measure(summarise(rows), f"{folder}/success.png").name
         'success.png'
     """
-    panels = []
-    for name in by:
-        lines = _lines(summaries, name, ("success", "low", "high"), methods)
-        for line in lines.values():
-            if name == "fraction":
-                line.paper = [(row["fraction"], 100 * row["success"]) for row in paper if row["method"] == line.name]
-            line.y, line.low, line.high = ([100 * value for value in part] for part in (line.y, line.low, line.high))
-        panels.append((name, [line for line in lines.values() if line.x]))
-    panels = [panel for panel in panels if panel[1]]
-    if not panels:
-        raise ValueError("there is no success to draw: no cell is done")
+    head, title, factor = MEASURES[measure]
+    panels = {name: _lines(summaries, name, measure, factor, methods) for name in by}
+    panels = {name: lines for name, lines in panels.items() if lines}
+    error = measure.endswith("error")
+    if not panels or (error and min(min(line.low) for lines in panels.values() for line in lines) <= 0):
+        raise ValueError(f"there is no {measure} to draw: no cell is done" + (" with one above 0" if error else ""))
+    for line in panels.get("labels", ()) if measure == "success" else ():
+        line.paper = [(row["labels"], 100 * row["success"]) for row in paper if row["method"] == line.name]
+    if paper:
+        title += "\nhollow, dashed: the paper, whose demonstrations are others"
     figure = Figure(figsize=(1.9 + 4.1 * len(panels), 4.1), layout="constrained")
-    for index, (name, drawn) in enumerate(panels):
-        axes = figure.add_subplot(1, len(panels), index + 1)
-        draw_lines(axes, drawn)
-        axes.set_ylim(-3, 103)
-        axes.set_yticks(range(0, 101, 20))
-        axes.set_xlabel(AXES[name] + (f" ({label})" if label and name == "fraction" else ""))
-        if index == 0:
-            axes.set_ylabel("success (%)")
-        _log_x(axes, drawn, ticks=name != "labelled_transitions")
-        axes.grid(axis="y", color=FAINT, linewidth=0.5)
-        title = "success, 95 % interval"
-        if any(line.paper for line in drawn):
-            title += "\nhollow, dashed: the paper, whose demonstrations are others"
-        set_title(axes, title if index == 0 else "")
+    for place, (axes, (name, lines)) in enumerate(
+        zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True)
+    ):
+        draw_lines(axes, lines)
+        axes.set_xlabel(AXES[name] + (f" ({label_unit})" if label_unit and name == "labels" else ""))
+        _log_x(axes, lines, ticks=name != "labelled_transitions")
+        if place == 0:
+            axes.set_ylabel(f"{head} ({unit})" if unit else head)
+        set_title(axes, title if place == 0 else "")
+        (_scale_errors if error else _scale_shares)(axes, lines, measure)
         tidy(axes)
-        if index == len(panels) - 1 or {line.name for line in drawn} - {line.name for line in panels[-1][1]}:
-            name_lines(axes, drawn)
+    name_lines(figure, [line for lines in panels.values() for line in lines])
     return save_figure(figure, path)
 
 
-def plot_action_error(
-    summaries: Sequence[Summary],
+def plot_average(
+    averages: Mapping[str, Sequence[tuple[int, float, float, float]]],
+    paper: Mapping[str, Sequence[tuple[int, float]]],
+    tasks: Sequence[str],
     path: str | Path,
-    *,
-    unit: str = "",
-    methods: Sequence[str] | None = None,
-    label: str = "",
-    relative: bool = False,
 ) -> Path:
-    """Error of the predicted actions against the labelled share, both logarithmic; bands from best to worst seed.
+    """Draws success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
 
     Args:
-        summaries (sequence of Summary): of one task.
+        averages (mapping): by method level, mean and the ends of its interval, in 0..1.
+        paper (mapping): by method level and mean.
+        tasks (sequence of str): what it is the mean of.
         path (str or Path): png to write.
 
-    Keyword Args:
-        unit (str): unit of the error.
-        methods (sequence of str, optional): see :func:`plot_success`.
-        label (str): what the budget counts.
-        relative (bool): draw the share of the mean action's error instead, with a line at 1.
-
     Raises:
-        ValueError: if no cell has an action error above 0.
+        ValueError: if there is nothing to draw.
     """
-    wanted = tuple(f"{'relative_' if relative else ''}action_error{end}" for end in ("", "_low", "_high"))
-    lines = [line for line in _lines(summaries, "fraction", wanted, methods).values() if line.x]
-    if not lines or min(min(line.low) for line in lines) <= 0:
-        raise ValueError("there is no action error above 0 to draw")
-    head = "action error, share of the mean action's" if relative else "action error"
-    figure, axes = _from_best_to_worst(lines, label, f"{head} ({unit})" if unit else head)
-    if relative:
+    if not averages:
+        raise ValueError("there is nothing to average: no method is done at a level in every task")
+    lines, styles = [], method_styles(list(averages))
+    for method, points in averages.items():
+        line = Line(method, styles[method], paper=[(level, 100 * mean) for level, mean in paper.get(method, ())])
+        for level, *values in points:
+            line.add(level, *(100 * value for value in values))
+        lines.append(line)
+    figure = Figure(figsize=(7.4, 4.6), layout="constrained")
+    axes = figure.add_subplot()
+    draw_lines(axes, lines, beside=lambda x, step: x + 0.028 * step)
+    levels = sorted({level for line in lines for level in line.x})
+    axes.set(xlim=(levels[0] - 0.25, levels[-1] + 0.25), xticks=levels)
+    axes.set(xlabel="label level (1: fewest labels)", ylabel="success (%)")
+    _scale_shares(axes, lines, "success")
+    title = f"success, 95 % interval: {tasks[0]}" if len(tasks) == 1 else f"mean over {len(tasks)} tasks, 95 % interval"
+    hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
+    set_title(axes, title + hollow)
+    tidy(axes)
+    name_lines(figure, lines)
+    return save_figure(figure, path)
+
+
+def draw_lines(
+    axes: Axes, lines: Sequence[Line], *, beside: Callable[[float, float], float] = lambda x, step: x * 1.014**step
+) -> None:
+    """Draws lines with bands, or with whiskers where there are many or each has one point alone.
+
+    Args:
+        axes (Axes): where to.
+        lines (sequence of Line): what to draw; the first lies on top.
+
+    Keyword Args:
+        beside (callable): from a place and a number of steps to the place of a whisker that others would hide.
+            Defaults to a step on a logarithmic axis.
+    """
+    whiskers = len(lines) > _BANDS or all(len(line.x) == 1 for line in lines)
+    for index, line in enumerate(lines):
+        x, order = line.x, 3 + (len(lines) - index) / 100
+        color = line.style["color"]
+        if whiskers:  # beside each other
+            x = [beside(value, index - (len(lines) - 1) / 2) for value in x]
+            axes.vlines(x, line.low, line.high, color=color, linewidth=0.9, alpha=0.55, zorder=order - 1)
+        else:
+            axes.fill_between(x, line.low, line.high, color=color, alpha=0.13, linewidth=0, zorder=order - 1)
+            if len(x) == 1:  # a band needs two places
+                axes.vlines(x, line.low, line.high, color=color, linewidth=2.5, alpha=0.3, zorder=order - 1)
+        axes.plot(x, line.y, **line.style, markersize=5, linewidth=1.6, markeredgewidth=0, zorder=order)
+        if line.paper:
+            style = {**line.style, "linestyle": (0, (2, 2)), "markerfacecolor": "white", "markeredgewidth": 1.3}
+            axes.plot(*zip(*sorted(line.paper), strict=True), **style, markersize=6.5, linewidth=1, zorder=order + 0.5)
+
+
+def name_lines(figure: Figure, lines: Sequence[Line]) -> None:
+    """Names every line once, to the right of all panels."""
+    named = {line.name: Line2D([], [], **line.style, markersize=5, markeredgewidth=0) for line in lines}
+    figure.legend(named.values(), named.keys(), loc="outside right upper", frameon=False, fontsize=8.5)
+
+
+def _lines(
+    summaries: Sequence[Summary], by: str, measure: str, factor: float, methods: Sequence[str] | None
+) -> list[Line]:
+    """A line per method; along the demonstrations one per method and share of labels."""
+    methods = list(methods or dict.fromkeys(item.method for item in summaries))
+    shares = sorted({item.labels for item in summaries})
+    several = by == "demonstrations" and len(shares) > 1
+    styles, lines = method_styles(methods), {}
+    for method in methods:
+        for n, labels in enumerate(shares if several else [None]):  # colour tells the method, marker and dash the share
+            own = {"marker": MARKERS[n % 13], "linestyle": DASHES[n % 3]} if several else {}
+            name = f"{method}, {percent(labels)}" if several else method
+            lines[method, labels] = Line(name, styles[method] | own)
+    for item in sorted(summaries, key=lambda item: item.mean(by) or 0):
+        place = item.mean(by)
+        if item.method in methods and place is not None and measure in item.measures:
+            found = item.measures[measure]
+            values = (factor * value for value in (found.mean, found.low, found.high))
+            lines[item.method, item.labels if several else None].add(place, *values)
+    drawn = [line for line in lines.values() if line.x]
+    if by == "demonstrations" and any(len(set(line.x)) > 1 for line in drawn):
+        return [line for line in drawn if len(set(line.x)) > 1]  # the others do not scale anything
+    return drawn
+
+
+def _scale_shares(axes: Axes, lines: Sequence[Line], measure: str) -> None:
+    top = 100 if measure == "success" else 1
+    axes.set_ylim(-0.03 * top, 1.03 * top)
+    axes.set_yticks([top * part / 5 for part in range(6)])
+    axes.grid(axis="y", color=FAINT, linewidth=0.5)
+
+
+def _scale_errors(axes: Axes, lines: Sequence[Line], measure: str) -> None:
+    if measure == "relative_action_error":  # of a controller that always gives the mean action
         axes.axhline(1, color=INK, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)
     axes.set_yscale("log")
     low, high = min(min(line.low) for line in lines), max(max(line.high) for line in lines)
     wide = max(1.15, (2.2 * low / high) ** 0.5)  # at least a factor of two is shown, or chance looks like a trend
     axes.set_ylim(low / wide, high * wide)
-    _log_y_ticks(axes)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low * wide**2 < 100 else (1,)))
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.grid(axis="y", which="both", color=FAINT, linewidth=0.5)
-    name_lines(axes, lines)
-    return save_figure(figure, path)
-
-
-def plot_entropy(
-    summaries: Sequence[Summary], path: str | Path, *, methods: Sequence[str] | None = None, label: str = ""
-) -> Path:
-    """Entropy of the modes of successful rollouts against the labelled share; bands from best to worst seed.
-
-    Args:
-        summaries (sequence of Summary): of one task.
-        path (str or Path): png to write.
-
-    Keyword Args:
-        methods (sequence of str, optional): see :func:`plot_success`.
-        label (str): what the budget counts.
-
-    Raises:
-        ValueError: if no cell has an entropy.
-    """
-    wanted = ("entropy", "entropy_low", "entropy_high")
-    lines = [line for line in _lines(summaries, "fraction", wanted, methods).values() if line.x]
-    if not lines:
-        raise ValueError("there is no entropy to draw")
-    figure, axes = _from_best_to_worst(lines, label, "entropy of the modes")
-    axes.set_ylim(-0.03, 1.03)
-    axes.grid(axis="y", color=FAINT, linewidth=0.5)
-    name_lines(axes, lines)
-    return save_figure(figure, path)
-
-
-def _from_best_to_worst(lines: Sequence[Line], label: str, name: str) -> tuple[Figure, Axes]:
-    """A single panel along the labelled share, limits and grid of the other axis left to the caller."""
-    figure = Figure(figsize=(6, 4.1), layout="constrained")
-    axes = figure.add_subplot()
-    draw_lines(axes, lines)
-    axes.set_xlabel(AXES["fraction"] + (f" ({label})" if label else ""))
-    axes.set_ylabel(name)
-    _log_x(axes, lines, ticks=True)
-    set_title(axes, "mean over seeds, from best to worst seed")
-    tidy(axes)
-    return figure, axes
-
-
-def _lines(
-    summaries: Sequence[Summary], by: str, wanted: Sequence[str], methods: Sequence[str] | None
-) -> dict[Any, Line]:
-    """A line per method; along the trajectories used one per method and budget."""
-    methods = list(methods or dict.fromkeys(item.method for item in summaries))
-    fractions = sorted({item.fraction for item in summaries})
-    several = by == "observations" and len(fractions) > 1
-    keys = [(method, fraction) for method in methods for fraction in (fractions if several else [None])]
-    names = [f"{method}, {percent(fraction)}" if several else method for method, fraction in keys]
-    styles = method_styles(methods)
-    if several:  # colour tells the method, marker and dashes the budget
-        places = {fraction: {"marker": MARKERS[n % 13], "dash": DASHES[n % 3]} for n, fraction in enumerate(fractions)}
-        lines = {key: Line(name, **styles[key[0]] | places[key[1]]) for key, name in zip(keys, names, strict=True)}
-    else:
-        lines = {key: Line(name, **styles[name]) for key, name in zip(keys, names, strict=True)}
-    for item in sorted(summaries, key=lambda item: getattr(item, by) or 0):
-        values = [getattr(item, name) for name in (by, *wanted)]
-        if item.method not in methods or any(value is None for value in values):
-            continue
-        line = lines[item.method, item.fraction if several else None]
-        for part, value in zip((line.x, line.y, line.low, line.high), values, strict=True):
-            part.append(value)
-    if by == "observations" and any(len(set(line.x)) > 1 for line in lines.values()):
-        return {key: line for key, line in lines.items() if len(set(line.x)) > 1}  # the others do not scale anything
-    return lines
 
 
 def _log_x(axes: Axes, lines: Sequence[Line], *, ticks: bool) -> None:
     """Logarithmic axis that ends at the data; ``ticks`` at the places themselves, where there is room."""
     places = sorted({value for line in lines for value in [*line.x, *(place for place, _ in line.paper)]})
     positive = [place for place in places if place > 0] or [1.0]
-    low, high = positive[0], max(positive[-1], positive[0])
+    low, high = positive[0], positive[-1]
     margin = max(1.12, (high / low) ** 0.06) if len(positive) > 1 else 2.0
     if places[0] > 0:
         axes.set_xscale("log")
         axes.set_xlim(low / margin, high * margin)
-    else:  # a budget of nothing has its place left of the logarithmic part
+    else:  # no labels at all have their place left of the logarithmic part
         axes.set_xscale("symlog", linthresh=low, linscale=0.3)
         axes.set_xlim(-0.3 * low, high * margin)
     kept: list[float] = []
@@ -227,10 +284,3 @@ def _log_x(axes: Axes, lines: Sequence[Line], *, ticks: bool) -> None:
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(lambda value, _: percent(value) if ticks else f"{value:,.0f}")
-
-
-def _log_y_ticks(axes: Axes) -> None:
-    low, high = axes.get_ylim()
-    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low < 100 else (1,)))
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.yaxis.set_minor_formatter(NullFormatter())

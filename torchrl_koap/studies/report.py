@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The report of a label-efficiency curve: table, paired comparisons, pictures and a page that explains them."""
+"""The report of a study: table, paired comparisons, pictures and a page that explains them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from typing import Any
 
 from torchrl_koap.files import replacing_file
 from torchrl_koap.reports.html import duration, write_page
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
-from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, compare_cells, p_text
-from torchrl_koap.studies.plots import plot_action_error, plot_entropy, plot_success
+from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, Outcome, compare_cells, p_text
+from torchrl_koap.studies.plots import plot_measure
 from torchrl_koap.studies.summary import Summary, cell_name, percent, plural, summarise
 from torchrl_koap.studies.table import markdown_table, table_rows, why_not_done
 from torchrl_koap.tasks import get_task
@@ -30,7 +29,7 @@ _CAPTIONS = {
         " there are many methods, drawn a little beside each other) are 95 % Wilson intervals over all rollouts of all"
         " seeds.",
     ),
-    "entropy": (
+    "mode_entropy": (
         "Modes against the labels",
         "Entropy of the modes of successful rollouts, 1 if all are equally frequent: mean over seeds, with the best and"
         " the worst seed. Success alone can be had by playing one demonstration again, wherever episodes start alike;"
@@ -38,106 +37,93 @@ _CAPTIONS = {
     ),
     "action_error": (
         "Action error against the labels",
-        "Mean over seeds, with the best and the worst seed, of the error on recorded actions outside the budget. They"
+        "Mean over seeds, with the best and the worst seed, of the error on recorded actions without labels. They"
         " were read for this picture only; nothing was trained or selected with them. A smaller error need not mean"
         " more success: the planner has its own failures.",
     ),
     "relative_action_error": (
         "Action error against the labels",
         "Mean over seeds, with the best and the worst seed. There is no environment to succeed in, so actions decoded"
-        " from recorded states are compared with recorded ones: on labels outside the budget where the data have some"
-        " (read for this only), else inside it, a labelled trajectory left out at a time. 1 (dashed): no better than"
-        " always giving the mean action. Columns of every unit count alike.",
+        " from recorded states are compared with recorded ones: on hidden labels where the data have"
+        " some (read for this only), else on those seen, a labelled trajectory left out at a time. 1 (dashed): no"
+        " better than always giving the mean action. Columns of every unit count alike.",
     ),
-    "observations": (
-        "Success against the trajectories used",
-        "How much the trajectories without labels are worth: the same share of labels, but only part of all"
-        " trajectories known at all.",
+    "demonstrations": (
+        "Success against the demonstrations used",
+        "How much the demonstrations without labels are worth: the same share of labels, but only part of all"
+        " demonstrations known at all.",
     ),
 }
 
 
-def write_curve_report(
+def write_study_report(
     folder: str | Path,
     rows: Sequence[Mapping[str, Any]],
+    outcomes: Mapping[str, Outcome] | None = None,
     *,
     title: str,
-    paper: Sequence[Mapping[str, Any]] | None = None,
+    options: Mapping[str, Any] | None = None,
+    paper: Sequence[Mapping[str, Any]] = (),
     reference: str = "koap",
     layout: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Writes ``table.md``, ``comparisons.csv``, pictures and ``index.html`` into the folder of a curve.
+    """Writes ``table.md``, ``comparisons.csv``, pictures and ``index.html`` into the folder of a study.
 
     Args:
-        folder (str or Path): the curve's folder; made if it is not there. Read are ``curve.json`` (the options) and
-            every done cell's ``eval.json``, all optional: the page says what is absent or damaged.
+        folder (str or Path): the folder; made if it is not there.
         rows (sequence of mapping): cells, see :data:`~torchrl_koap.studies.table.CELL_COLUMNS`.
+        outcomes (mapping, optional): of :func:`~torchrl_koap.studies.paired_comparison.compare_cells`.
 
     Keyword Args:
-        title (str): heading of the page.
-        paper (sequence of mapping, optional): the paper's figures as of
-            :func:`~torchrl_koap.studies.paper_results.paper_points`: ``task``, ``method``, ``fraction``, ``success``
-            in 0..1 and, optionally, ``spread``.
-        reference (str): the method that all others are compared with.
-        layout (mapping, optional): the cells in the paper's layout, as
-            :func:`~torchrl_koap.studies.paper_layout.write_paper_layout` returns them: the page begins with them.
-
-    Returns:
-        Path: the page.
+        title (str): heading.
+        options (mapping, optional): of the study, for the page.
+        paper (sequence of mapping): the paper's figures, see :func:`~torchrl_koap.studies.paper_results.paper_points`.
+        reference (str): method that all others are compared with. Defaults to ``"koap"``.
+        layout (mapping, optional): of :func:`~torchrl_koap.studies.paper.write_paper_layout`, instead of the list of
+            the paper's figures.
 
     Raises:
         ValueError: if a cell occurs twice, or is done without its number of episodes and successes.
 
     Examples:
         >>> import tempfile
-        >>> from torchrl_koap.studies.report import write_curve_report
-        >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.02, "seed": 0, "status": "missing"}
+        >>> from torchrl_koap.studies.report import write_study_report
+        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.02, "seed": 0, "status": "missing"}
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     "failed: 0, missing: 1" in write_curve_report(folder, [cell], title="a curve").read_text()
+        ...     "failed: 0, missing: 1" in write_study_report(folder, [cell], title="a study").read_text()
         True
     """
     folder = Path(folder)
     summaries = summarise(rows)
-    compared, problems = compare_cells(folder, rows, reference=reference)
-    options, notes = _options(folder)
-    problems = notes + problems
+    compared = compare_cells(rows, outcomes or {}, reference=reference)
     with replacing_file(folder / "table.md") as aside:
         aside.write_text(markdown_table(rows), encoding="utf-8")
     with replacing_file(folder / "comparisons.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COMPARISON_COLUMNS)
         writer.writeheader()
         writer.writerows(compared)
-    points = paper or ()
     times, total = _times(rows)
+    offline = any(item.offline for item in summaries)
     return write_page(
         "curve.html",
         folder / "index.html",
         title=title,
         subtitle=str(folder),
-        notes=problems,
+        notes=[],
         **_what_was_run(rows),
-        options=options,
+        options=options or {},
         table=table_rows(summaries),
-        paper=[] if layout else _paper_rows(summaries, points),
+        paper=[] if layout else _paper_rows(summaries, paper),
         layout=layout,
-        offline=any(item.offline for item in summaries),
-        figures=_draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows)), points),
-        compared=_comparison_rows(compared, reference, offline=any(item.offline for item in summaries)),
+        offline=offline,
+        figures=_draw(folder, summaries, list(dict.fromkeys(row["method"] for row in rows)), paper),
+        compared=_comparison_rows(compared, reference, offline=offline),
         reference=reference,
         not_done=[f"{cell_name(row)}: {why_not_done(row)}" for row in rows if row["status"] != "done"],
         times=times,
         total_time=total,
         cells=[dict(zip(_CELL, _cell(row), strict=True)) for row in rows],
     )
-
-
-def _options(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    if not (folder / "curve.json").exists():
-        return {}, []
-    try:
-        return RunDirectory(folder).read_json("curve.json"), []
-    except (RunDirectoryError, OSError) as error:
-        return {}, [str(error)]
 
 
 def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -148,7 +134,7 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     text = ", ".join(
         (
             f"{', '.join(map(str, names['task']))}: methods {', '.join(map(str, names['method']))}",
-            f"labels on {', '.join(percent(share) for share in sorted({row['fraction'] for row in rows}))} of the"
+            f"labels on {', '.join(percent(share) for share in sorted({row['labels'] for row in rows}))} of the"
             f" {' / '.join(unit)}",
             f"training seeds {', '.join(map(str, sorted(names['seed'])))}",
         )
@@ -164,34 +150,33 @@ def _draw(
     """Draws the pictures of every task and unit of the labels; what the page needs to show them."""
     groups = list(dict.fromkeys((item.task, item.label_unit) for item in summaries))
     figures = []
-    for task, unit in groups:
-        items = [item for item in summaries if (item.task, item.label_unit) == (task, unit)]
-        shares = sorted({item.observations for item in items})
-        main = [item for item in items if item.observations == shares[-1]]
-        name = task if sum(task == other for other, _ in groups) == 1 else f"{task}_{unit}"
-        base = folder / FOLDER
-        common: dict[str, Any] = {"methods": methods, "label": plural(unit) if unit else ""}
+    for task, label_unit in groups:
+        items = [item for item in summaries if (item.task, item.label_unit) == (task, label_unit)]
+        shares = sorted({item.demonstrations for item in items})
+        main = [item for item in items if item.demonstrations == shares[-1]]
+        name = task if sum(task == other for other, _ in groups) == 1 else f"{task}_{label_unit}"
         points = [row for row in paper if row.get("task", task) == task]
-        if any(item.success is not None for item in main):
-            plot_success(main, base / f"{name}_success.png", paper=points, **common)
-            for by, what in (("fraction", "labels"), ("labelled_transitions", "transitions")):
-                if any(getattr(item, by) is not None and item.episodes for item in main):
-                    plot_success(main, base / f"{name}_success_{what}.png", by=[by], paper=points, **common)
-            used = f" All with {percent(shares[-1])} of the trajectories." if shares[-1] != 1 else ""
+        error = "relative_action_error"
+        if not any(item.mean(error) for item in main):
+            error = "action_error"
+        wanted: dict[str, dict[str, Any]] = {
+            "success": {"by": ("labels", "labelled_transitions"), "paper": points},
+            "mode_entropy": {},
+            error: {"unit": _error_unit(task) if error == "action_error" else ""},
+        }
+        known = [kind for kind in wanted if any(kind in item.measures for item in main)]
+        if error in known and min(item.measures[error].low for item in main if error in item.measures) <= 0:
+            known.remove(error)
+        for kind in known:
+            path = folder / FOLDER / f"{name}_{kind}.png"
+            counted = plural(label_unit) if label_unit else ""
+            plot_measure(main, path, kind, methods=methods, label_unit=counted, **wanted[kind])
+            used = f" All with {percent(shares[-1])} of the demonstrations." if shares[-1] != 1 else ""
             hollow = " Hollow, dashed: the paper, for its own demonstrations and planner." if points else ""
-            figures.append(_figure(name, "success", task, used + hollow))
-        if any(item.entropy is not None for item in main):
-            plot_entropy(main, base / f"{name}_entropy.png", **common)
-            figures.append(_figure(name, "entropy", task))
-        if any((item.relative_action_error_low or 0) > 0 for item in main):
-            plot_action_error(main, base / f"{name}_relative_action_error.png", relative=True, **common)
-            figures.append(_figure(name, "relative_action_error", task))
-        elif any((item.action_error_low or 0) > 0 for item in main):
-            plot_action_error(main, base / f"{name}_action_error.png", unit=_error_unit(task), **common)
-            figures.append(_figure(name, "action_error", task))
-        if len(shares) > 1 and any(item.success is not None for item in items):
-            plot_success(items, base / f"{name}_observations.png", by=["observations"], **common)
-            figures.append(_figure(name, "observations", task))
+            figures.append(_figure(name, kind, task, used + hollow if kind == "success" else ""))
+        if len(shares) > 1 and "success" in known:
+            plot_measure(items, folder / FOLDER / f"{name}_demonstrations.png", by=("demonstrations",), methods=methods)
+            figures.append(_figure(name, "demonstrations", task))
     return figures
 
 
@@ -210,12 +195,12 @@ def _figure(name: str, kind: str, task: str, more: str = "") -> dict[str, Any]:
 
 
 def _paper_rows(summaries: Sequence[Summary], paper: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    ours = {(item.task, item.method, item.fraction): item for item in summaries if item.success is not None}
+    ours = {(s.task, s.method, s.labels): s.measures["success"] for s in summaries if "success" in s.measures}
     rows = []
     for row in paper:
-        item = ours.get((row["task"], row["method"], row["fraction"])) if "task" in row else None
-        here = "not run" if item is None else f"{percent(item.success, 1)} ({100 * item.low:.1f}-{100 * item.high:.1f})"
-        names = {"task": row.get("task", ""), "method": row["method"], "labels": percent(row["fraction"])}
+        item = ours.get((row["task"], row["method"], row["labels"])) if "task" in row else None
+        here = "not run" if item is None else f"{percent(item.mean, 1)} ({100 * item.low:.1f}-{100 * item.high:.1f})"
+        names = {"task": row.get("task", ""), "method": row["method"], "labels": percent(row["labels"])}
         spread = f" +- {100 * row['spread']:.1f}" if row.get("spread") is not None else ""
         rows.append(names | {"paper (%)": f"{100 * row['success']:.1f}{spread}", "here (95 %)": here})
     return rows
@@ -229,12 +214,12 @@ def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str, *, o
         if offline:
             written, head, unit = _share, "difference of the relative action error", "trajectories"
         names = {"task": row["task"]} if len({other["task"] for other in compared}) > 1 else {}
-        if len({other["observations"] for other in compared}) > 1:
-            names["trajectories used"] = percent(row["observations"])
+        if len({other["demonstrations"] for other in compared}) > 1:
+            names["demonstrations used"] = percent(row["demonstrations"])
         rows.append(
             names
             | {
-                "labels": percent(row["fraction"]),
+                "labels": percent(row["labels"]),
                 f"{reference} against": row["method"],
                 head: written(row["difference"]) if known else "nothing in common",
                 "95 % interval": "–" if row["low"] is None else f"{written(row['low'])} to {written(row['high'])}",
@@ -277,7 +262,7 @@ def _cell(row: Mapping[str, Any]) -> list[str]:
     times = [row.get("train_seconds"), row.get("eval_seconds")]
     return [
         str(row["method"]),
-        percent(row["fraction"]),
+        percent(row["labels"]),
         str(row["seed"]),
         row["status"],
         f"{good} of {episodes}" if episodes else "–",

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Pooling the cells of a label-efficiency curve over training seeds; cells that are not done stay counted."""
+"""Cells of a study pooled over training seeds; cells that are not done stay counted."""
 
 from __future__ import annotations
 
@@ -14,110 +14,112 @@ from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.lookup import lookup
 
 STATUSES = ("done", "failed", "missing")
+MEASURES = (
+    "mode_entropy",
+    "action_error",
+    "relative_action_error",
+    "relative_plan_error",
+    "labelled_transitions",
+    "trajectories_touched",
+    "train_seconds",
+    "eval_seconds",
+)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A mean with its ends: of ``"success"`` the Wilson 95 % interval, of all others the least and greatest seed.
+
+    Args:
+        mean (float): over the cells that are done; of ``"success"`` over their rollouts.
+        low (float): lower end.
+        high (float): upper end.
+
+    Examples:
+        >>> from torchrl_koap.studies.summary import Measure
+        >>> Measure(0.5, 0.2, 0.8).high
+        0.8
+    """
+
+    mean: float
+    low: float
+    high: float
 
 
 @dataclass(frozen=True)
 class Summary:
-    """All seeds of a method at one budget; means are over the cells that are done, None where no cell has the value.
+    """All seeds of a method at one share of labels.
 
     Args:
         task (str): the task.
         method (str): the method.
-        fraction (float): share of the labels.
-        observations (float): share of the trajectories used at all.
-        label_unit (str): what the share is of.
+        labels (float): share of the labels.
+        demonstrations (float): share of the demonstrations that is known at all.
+        label_unit (str): what the labels are a share of.
         done (tuple of int): seeds whose cell is done.
         failed (tuple of int): seeds whose cell failed.
         missing (tuple of int): seeds whose cell is not there.
         successes (int): over all done cells.
         episodes (int): over all done cells.
-        success (float, optional): their ratio; ``low`` and ``high`` are its Wilson 95 % interval.
-        lowest (float, optional): success of the worst seed; ``highest`` that of the best.
-        entropy (float, optional): mean entropy of the modes; ``entropy_low`` and ``entropy_high`` are those of single
-            seeds.
-        action_error (float, optional): mean; ``action_error_low`` and ``action_error_high`` are those of single seeds.
-        relative_action_error (float, optional): mean error of the actions as a share of that of the mean action, of a
-            task without an environment; ``_low`` and ``_high`` as above.
-        relative_plan_error (float, optional): mean error of plans as a share of that of standing still, likewise.
-        labelled_transitions (float, optional): mean number of distinct transitions whose action was read.
-        trajectories_touched (float, optional): mean number of trajectories they lie in.
-        train_seconds (float, optional): mean time of training; ``eval_seconds`` that of evaluation.
+        measures (mapping): :class:`Measure` by name: ``"success"``, ``"seed_success"`` (worst and best seed) and
+            :data:`MEASURES`, those that no cell has left out.
 
     Examples:
         >>> from torchrl_koap.studies.summary import summarise
-        >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.02, "seed": 0, "status": "missing"}
+        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.02, "seed": 0, "status": "missing"}
         >>> summary = summarise([cell])[0]
-        >>> summary.missing, summary.success is None
+        >>> summary.missing, summary.mean("success") is None
         ((0,), True)
     """
 
     task: str
     method: str
-    fraction: float
-    observations: float
+    labels: float
+    demonstrations: float
     label_unit: str
     done: tuple[int, ...]
     failed: tuple[int, ...]
     missing: tuple[int, ...]
     successes: int
     episodes: int
-    success: float | None
-    low: float | None
-    high: float | None
-    lowest: float | None
-    highest: float | None
-    entropy: float | None
-    entropy_low: float | None
-    entropy_high: float | None
-    action_error: float | None
-    action_error_low: float | None
-    action_error_high: float | None
-    relative_action_error: float | None
-    relative_action_error_low: float | None
-    relative_action_error_high: float | None
-    relative_plan_error: float | None
-    labelled_transitions: float | None
-    trajectories_touched: float | None
-    train_seconds: float | None
-    eval_seconds: float | None
+    measures: Mapping[str, Measure]
 
     @property
     def offline(self) -> bool:
         """Whether cells are done and none was rolled out: a task without an environment."""
         return bool(self.done) and not self.episodes
 
+    def mean(self, name: str) -> float | None:
+        """The mean of a measure, or ``labels`` or ``demonstrations``; None where no cell has it."""
+        if name in ("labels", "demonstrations"):
+            return self.labels if name == "labels" else self.demonstrations
+        return self.measures[name].mean if name in self.measures else None
+
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
-    """Pools the seeds of every method and budget; methods and tasks keep their order, budgets ascend.
+    """Pools the seeds of every method and share of labels; methods and tasks keep their order, shares ascend.
 
     The Wilson interval takes every episode for independent. The same contexts recur for every seed, so it is too narrow
     where seeds differ more than chance: look at the range of the seeds beside it.
 
     Args:
-        rows (sequence of mapping): cells, with at least task, method, fraction, seed and status.
+        rows (sequence of mapping): cells, with at least task, method, labels, seed and status.
 
     Raises:
         ValueError: if a cell occurs twice, or is done without its number of episodes and successes.
 
     Examples:
         >>> from torchrl_koap.studies.summary import summarise
-        >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.02, "status": "done", "episodes": 30}
+        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.02, "status": "done", "episodes": 30}
         >>> pooled = summarise([cell | {"seed": 0, "successes": 30}, cell | {"seed": 1, "successes": 15}])[0]
-        >>> pooled.success, pooled.episodes, pooled.lowest, pooled.done
+        >>> pooled.mean("success"), pooled.episodes, pooled.measures["seed_success"].low, pooled.done
         (0.75, 60, 0.5, (0, 1))
     """
     groups: dict[tuple, dict[int, Mapping[str, Any]]] = {}
     tasks, methods = [list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method")]
     for row in rows:
         lookup(STATUSES, row["status"], "status of a cell")
-        observations = row.get("observations")
-        key = (
-            tasks.index(row["task"]),
-            row.get("label_unit") or "",
-            1.0 if observations is None else observations,
-            row["fraction"],
-            methods.index(row["method"]),
-        )
+        key = (tasks.index(row["task"]), *group_of(row), methods.index(row["method"]))
         cells = groups.setdefault(key, {})
         if row["seed"] in cells:
             raise ValueError(f"the cell {cell_name(row)} occurs twice")
@@ -126,55 +128,36 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
             raise ValueError(f"the cell {cell_name(row)} is done but has no 'episodes' or 'successes'")
         cells[row["seed"]] = row
     return [
-        _summary(tasks[task], methods[method], fraction, observations, unit, groups[key])
+        _summary(tasks[task], methods[method], labels, demonstrations, unit, groups[key])
         for key in sorted(groups)
-        for task, unit, observations, fraction, method in [key]
+        for task, unit, demonstrations, labels, method in [key]
     ]
 
 
-def _summary(task: str, method: str, fraction: float, observations: float, unit: str, cells: Mapping) -> Summary:
+def group_of(row: Mapping[str, Any]) -> tuple[str, float, float]:
+    """Unit of the labels, share of the demonstrations and share of the labels of a cell."""
+    demonstrations = row.get("demonstrations")
+    return row.get("label_unit") or "", 1.0 if demonstrations is None else demonstrations, row["labels"]
+
+
+def _summary(task: str, method: str, labels: float, demonstrations: float, unit: str, cells: Mapping) -> Summary:
     seeds = {status: tuple(sorted(s for s, row in cells.items() if row["status"] == status)) for status in STATUSES}
     done = [cells[seed] for seed in seeds["done"]]
     rolled_out = [row for row in done if row.get("episodes")]
     successes, episodes = (sum(row[name] for row in rolled_out) for name in ("successes", "episodes"))
-    low, high = wilson_interval(successes, episodes) if episodes else (None, None)
-    rates = [row["successes"] / row["episodes"] for row in rolled_out]
-    shares = _values(done, "relative_action_error")
-    errors, entropies = _values(done, "action_error"), _values(done, "mode_entropy")
-    return Summary(
-        task=task,
-        method=method,
-        fraction=fraction,
-        observations=observations,
-        label_unit=unit,
-        **seeds,
-        successes=successes,
-        episodes=episodes,
-        success=successes / episodes if episodes else None,
-        low=low,
-        high=high,
-        lowest=min(rates, default=None),
-        highest=max(rates, default=None),
-        entropy=_mean(done, "mode_entropy"),
-        entropy_low=min(entropies, default=None),
-        entropy_high=max(entropies, default=None),
-        action_error=_mean(done, "action_error"),
-        action_error_low=min(errors, default=None),
-        action_error_high=max(errors, default=None),
-        relative_action_error=_mean(done, "relative_action_error"),
-        relative_action_error_low=min(shares, default=None),
-        relative_action_error_high=max(shares, default=None),
-        relative_plan_error=_mean(done, "relative_plan_error"),
-        labelled_transitions=_mean(done, "labelled_transitions"),
-        trajectories_touched=_mean(done, "trajectories_touched"),
-        train_seconds=_mean(done, "train_seconds"),
-        eval_seconds=_mean(done, "eval_seconds"),
-    )
+    measures = {name: Measure(statistics.fmean(found), min(found), max(found)) for name, found in _values(done)}
+    if episodes:
+        rates = [row["successes"] / row["episodes"] for row in rolled_out]
+        rate = successes / episodes
+        measures["success"] = Measure(rate, *wilson_interval(successes, episodes))
+        measures["seed_success"] = Measure(rate, min(rates), max(rates))
+    return Summary(task, method, labels, demonstrations, unit, *seeds.values(), successes, episodes, measures)
 
 
-def _values(rows: Sequence[Mapping[str, Any]], name: str) -> list[float]:
-    values = [row.get(name) for row in rows]
-    return [value for value in values if value is not None and math.isfinite(value)]
+def _values(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
+    found = [(name, [row[name] for row in rows if row.get(name) is not None]) for name in MEASURES]
+    finite = [(name, [value for value in values if math.isfinite(value)]) for name, values in found]
+    return [(name, values) for name, values in finite if values]
 
 
 def needed_when_done(row: Mapping[str, Any]) -> tuple[str, ...]:
@@ -191,30 +174,21 @@ def needed_when_done(row: Mapping[str, Any]) -> tuple[str, ...]:
     return () if row.get("kind") == KIND else ("episodes", "successes")
 
 
-def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float | None:
-    values = _values(rows, name)
-    return statistics.fmean(values) if values else None
-
-
 def cell_name(row: Mapping[str, Any]) -> str:
     """A cell in words.
 
     Examples:
         >>> from torchrl_koap.studies.summary import cell_name
-        >>> cell_name({"task": "avoiding", "method": "koap", "fraction": 0.02, "seed": 1})
+        >>> cell_name({"task": "avoiding", "method": "koap", "labels": 0.02, "seed": 1})
         'avoiding, koap, 2 % labels, seed 1'
     """
-    observations = row.get("observations")
-    used = "" if observations in (None, 1.0) else f"{percent(observations)} of the trajectories, "
-    return f"{row['task']}, {row['method']}, {percent(row['fraction'])} labels, {used}seed {row['seed']}"
+    demonstrations = row.get("demonstrations")
+    used = "" if demonstrations in (None, 1.0) else f"{percent(demonstrations)} of the demonstrations, "
+    return f"{row['task']}, {row['method']}, {percent(row['labels'])} labels, {used}seed {row['seed']}"
 
 
 def percent(share: float | None, digits: int | None = None) -> str:
-    """A share in percent, with as few digits as it has if ``digits`` is not given.
-
-    Args:
-        share (float, optional): the share, 1 for the whole; None gives a dash.
-        digits (int, optional): digits after the point.
+    """A share in percent, with as few digits as it has if ``digits`` is not given; None gives a dash.
 
     Examples:
         >>> from torchrl_koap.studies.summary import percent
@@ -227,7 +201,7 @@ def percent(share: float | None, digits: int | None = None) -> str:
 
 
 def plural(unit: str) -> str:
-    """What a budget of labels counts, in words.
+    """What the labels are counted in, in words.
 
     Examples:
         >>> from torchrl_koap.studies.summary import plural

@@ -1,8 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The cells of a label-efficiency curve as a file and as a table.
-
-A cell is one method trained with one seed on one budget of labels, and evaluated.
-"""
+"""The cells of a study as a file and as a table."""
 
 from __future__ import annotations
 
@@ -12,14 +9,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchrl_koap.files import replacing_file
 from torchrl_koap.lookup import lookup
 from torchrl_koap.studies.summary import STATUSES, Summary, cell_name, needed_when_done, percent, plural, summarise
 
 _KINDS = {
     "task": str,
     "method": str,
-    "fraction": float,
-    "observations": float,
+    "labels": float,
+    "demonstrations": float,
     "seed": int,
     "label_unit": str,
     "status": str,
@@ -45,8 +43,7 @@ _KINDS = {
     "run": str,
 }
 CELL_COLUMNS = tuple(_KINDS)
-_ALWAYS = ("task", "method", "fraction", "observations", "seed", "status")
-_LATER = ("relative_action_error", "relative_plan_error", "kind")  # columns that files of before do not have
+_ALWAYS = ("task", "method", "labels", "demonstrations", "seed", "status")
 _WORDS = {int: "a whole number", float: "a finite number"}
 
 
@@ -63,14 +60,12 @@ def write_cells(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     Examples:
         >>> import tempfile
         >>> from torchrl_koap.studies.table import read_cells, write_cells
-        >>> row = {"task": "avoiding", "method": "koap", "fraction": 0.02, "observations": 1.0, "seed": 0}
+        >>> row = {"task": "avoiding", "method": "koap", "labels": 0.02, "demonstrations": 1.0, "seed": 0}
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = write_cells(f"{folder}/cells.csv", [row | {"status": "failed", "reason": "no memory"}])
-        ...     read_cells(path)[0]["fraction"], read_cells(path)[0]["episodes"]
+        ...     read_cells(path)[0]["labels"], read_cells(path)[0]["episodes"]
         (0.02, None)
     """
-    from torchrl_koap.files import replacing_file  # imports torch: only when something is written
-
     path = Path(path)
     for row in rows:
         for name in row:
@@ -108,14 +103,14 @@ def read_cells(path: str | Path) -> list[dict[str, Any]]:
     except (csv.Error, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     for name in CELL_COLUMNS:
-        if name not in names and name not in _LATER:
+        if name not in names:
             raise ValueError(f"{path} lacks the column {name!r}")
     rows = []
     for number, line in lines:
         where = f"{path}, line {number}"
         if line.get("") is not None:
             raise ValueError(f"{where}: more values than the {len(names)} columns")
-        row = {name: _read(line[name], name, where) if name in names else None for name in CELL_COLUMNS}
+        row = {name: _read(line[name], name, where) for name in CELL_COLUMNS}
         for name in _ALWAYS + (needed_when_done(row) if row["status"] == "done" else ()):
             if row[name] in (None, ""):
                 raise ValueError(f"{where}, column {name!r}: empty")
@@ -143,54 +138,57 @@ def _read(text: str | None, name: str, where: str) -> Any:
 
 
 def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
-    """The table as text, a mapping from heading to cell per method and budget; columns without any value are left out.
+    """The table as text, from heading to cell per method and share of labels; columns without any value are left out.
 
     Args:
         summaries (sequence of Summary): of :func:`summarise`.
     """
     units = {item.label_unit for item in summaries}
     labels = f"labels ({plural(*units)})" if len(units) == 1 and "" not in units else "labels"
-    rows = []
-    for item in summaries:
-        rows.append(
-            {
-                "task": item.task,
-                labels: percent(item.fraction) + (f" of {plural(item.label_unit)}" if len(units) > 1 else ""),
-                "trajectories used": percent(item.observations),
-                "method": item.method,
-                "success (95 %)": "–" if item.offline else _interval(item),
-                "n": "–" if item.offline else str(item.episodes),
-                "seeds": f"{len(item.done)} of {len(item.done) + len(item.failed) + len(item.missing)}",
-                "not done": _not_done(item),
-                "range of seeds": _range(item.lowest, item.highest, len(item.done)),
-                "mode entropy": _number(item.entropy, ".2f"),
-                "action error (of the mean action's)": _number(item.relative_action_error, ".3g"),
-                "plan error (of standing still's)": _number(item.relative_plan_error, ".3g"),
-                _error_heading(summaries): _number(item.action_error, ".3g"),
-                "labelled transitions": _number(item.labelled_transitions, ",.0f"),
-                "in trajectories": _number(item.trajectories_touched, ".4g"),
-            }
-        )
+    offline = any(item.offline for item in summaries)
+    error = "action error (unit of the first column)" if offline else "action error (mm, mrad)"
+    numbers = {  # heading to measure and form
+        "mode entropy": ("mode_entropy", ".2f"),
+        "action error (of the mean action's)": ("relative_action_error", ".3g"),
+        "plan error (of standing still's)": ("relative_plan_error", ".3g"),
+        error: ("action_error", ".3g"),
+        "labelled transitions": ("labelled_transitions", ",.0f"),
+        "in trajectories": ("trajectories_touched", ".4g"),
+    }
+    rows = [
+        {
+            "task": item.task,
+            labels: percent(item.labels) + (f" of {plural(item.label_unit)}" if len(units) > 1 else ""),
+            "demonstrations used": percent(item.demonstrations),
+            "method": item.method,
+            "success (95 %)": "–" if item.offline else _interval(item),
+            "n": "–" if item.offline else str(item.episodes),
+            "seeds": f"{len(item.done)} of {len(item.done) + len(item.failed) + len(item.missing)}",
+            "not done": _not_done(item),
+            "range of seeds": _range(item),
+        }
+        | {head: _number(item.mean(name), form) for head, (name, form) in numbers.items()}
+        for item in summaries
+    ]
     empty = {name for name in (rows[0] if rows else ()) if all(row[name] in ("", "–") for row in rows)}
-    for name, usual in (("task", None), ("trajectories used", "100 %")):
+    for name, usual in (("task", None), ("demonstrations used", "100 %")):
         values = {row[name] for row in rows}
         if len(values) == 1 and (usual is None or values == {usual}):
             empty.add(name)
     return [{name: text for name, text in row.items() if name not in empty} for row in rows]
 
 
-def _error_heading(summaries: Sequence[Summary]) -> str:
-    return "action error (unit of the first column)" if any(s.offline for s in summaries) else "action error (mm, mrad)"
-
-
 def _interval(item: Summary) -> str:
-    if item.success is None:
+    if "success" not in item.measures:
         return "no cell done"
-    return f"{percent(item.success, 1)} ({100 * item.low:.1f}-{100 * item.high:.1f})"
+    success = item.measures["success"]
+    return f"{percent(success.mean, 1)} ({100 * success.low:.1f}-{100 * success.high:.1f})"
 
 
-def _range(low: float | None, high: float | None, seeds: int) -> str:
-    return "–" if low is None or seeds < 2 else f"{100 * low:.0f}-{100 * high:.0f} %"
+def _range(item: Summary) -> str:
+    if "seed_success" not in item.measures or len(item.done) < 2:
+        return "–"
+    return f"{100 * item.measures['seed_success'].low:.0f}-{100 * item.measures['seed_success'].high:.0f} %"
 
 
 def _number(value: float | None, form: str) -> str:
@@ -202,6 +200,17 @@ def _not_done(item: Summary) -> str:
     return "; ".join(f"{word}: seed {', '.join(map(str, seeds))}" for word, seeds in parts if seeds)
 
 
+def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
+    """Rows of text with the same keys as a markdown table."""
+    if not table:
+        return "no cells\n"
+    lines = [
+        "| " + " | ".join(part.replace("|", "\\|") for part in line) + " |"
+        for line in [list(table[0]), *(list(row.values()) for row in table)]
+    ]
+    return "\n".join([lines[0], "|---" * len(table[0]) + "|", *lines[1:], ""])
+
+
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """The pooled table of all cells in markdown, and below it every cell that is not done with its reason.
 
@@ -210,7 +219,7 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
     Examples:
         >>> from torchrl_koap.studies.table import markdown_table
-        >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.02, "seed": 0, "status": "missing"}
+        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.02, "seed": 0, "status": "missing"}
         >>> print(markdown_table([cell]))
         | labels | method | success (95 %) | n | seeds | not done |
         |---|---|---|---|---|---|
@@ -221,14 +230,7 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
         - avoiding, koap, 2 % labels, seed 0: missing
         <BLANKLINE>
     """
-    table = table_rows(summarise(rows))
-    if not table:
-        return "no cells\n"
-    lines = [
-        "| " + " | ".join(part.replace("|", "\\|") for part in line) + " |"
-        for line in [table[0], *map(dict.values, table)]
-    ]
-    text = "\n".join([lines[0], "|---" * len(table[0]) + "|", *lines[1:], ""])
+    text = as_markdown(table_rows(summarise(rows)))
     open_cells = [row for row in rows if row["status"] != "done"]
     if open_cells:
         verb = "is" if len(open_cells) == 1 else "are"

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Measured cells in the layout of the paper's tables, the paper's cell beside each, and success averaged over tasks."""
+"""The paper's comparisons: presets of studies, and measured cells in the layout of its tables, its own beside them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,53 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
-
 from torchrl_koap.files import replacing_file
-from torchrl_koap.reports.style import FAINT, set_title, tidy
-from torchrl_koap.reports.writing import save_figure
-from torchrl_koap.studies.lines import Line, draw_lines, method_styles, name_lines
 from torchrl_koap.studies.paper_results import PaperCell, paper_cell, paper_levels
+from torchrl_koap.studies.plots import plot_average
 from torchrl_koap.studies.summary import Summary, percent, summarise
+from torchrl_koap.studies.table import as_markdown
 from torchrl_koap.tasks.registry import find_task
 
+PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")
+WIDE = {"network": "mlp", "width": 512, "batch_size": 256, "learning_rate": 1e-3}
+_TABLE = {
+    "tasks": PAPER_TASKS,
+    "methods": ("koap", "koap_paper", "koap_untrained", "linear_steps", "pca", "dd", "vae", "lapo", "dp"),
+    "levels": (1, 2, 3, 4, 5),
+    "label_unit": "window",
+    "planner": WIDE,
+    "controller": {"steps": 1000},
+    "run": {"precision": "auto"},
+}
+# fields of a study, and options of its sections, that stand for what is not given
+PRESETS: dict[str, dict[str, Any]] = {
+    "table1": _TABLE,
+    "table2": _TABLE
+    | {
+        "tasks": ("avoiding", "stacking_unobserved_joints"),
+        "methods": (
+            *("koap", "koap_paper", "koap_sgd", "koap_labelled_only", "koap_untrained", "nonlinear", "pretrain"),
+            "relabel",
+        ),
+    },
+    "demonstrations": {
+        "tasks": ("avoiding",),
+        "methods": ("koap", "koap_paper", "koap_untrained", "pca", "linear_steps", "dd"),
+        "labels": (0.01,),
+        "demonstrations": (0.1, 0.25, 0.5, 1.0),
+        "controller": {"steps": 1000},
+    },
+    # a table that can be read, not one to be cited
+    "quick": _TABLE
+    | {
+        "levels": (1,),
+        "record": 48,
+        "seeds": 1,
+        "planner": WIDE | {"steps": 2000, "width": 256, "batch_size": 128},
+        "controller": {"steps": 200},
+        "evaluation": {"episodes": 10},
+    },
+}
 AVERAGE = "plots/average.png"
 DEFAULT = "task's default"  # what pictures call the method that a task is trained with unless told otherwise
 
@@ -36,7 +73,7 @@ class Entry:
         paper (PaperCell, optional): the paper's cell.
 
     Examples:
-        >>> from torchrl_koap.studies.paper_layout import Entry
+        >>> from torchrl_koap.studies.paper import Entry
         >>> from torchrl_koap.studies.paper_results import paper_cell
         >>> Entry("avoiding", "koap", 1, 0.02, None, paper_cell("avoiding", "koap", 1)).text
         'not run [78.0 +- 8.6]'
@@ -52,7 +89,7 @@ class Entry:
     @property
     def success(self) -> float | None:
         """Measured success in 0..1, None if no seed is done."""
-        return None if self.measured is None else self.measured.success
+        return None if self.measured is None else self.measured.mean("success")
 
     @property
     def text(self) -> str:
@@ -60,9 +97,9 @@ class Entry:
         if self.success is None:
             here = "failed" if self.measured is not None and self.measured.failed else "not run"
         else:
-            low, high = 100 * self.measured.low, 100 * self.measured.high
+            interval = self.measured.measures["success"]
             lost = f", {len(self.measured.failed)} failed" if self.measured.failed else ""
-            here = f"{100 * self.success:.1f} ({low:.0f}-{high:.0f}){lost}"
+            here = f"{100 * self.success:.1f} ({100 * interval.low:.0f}-{100 * interval.high:.0f}){lost}"
         return here if self.paper is None else f"{here} [{self.paper.text}]"
 
 
@@ -76,16 +113,16 @@ def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
         ValueError: as :func:`~torchrl_koap.studies.summary.summarise`.
 
     Examples:
-        >>> from torchrl_koap.studies.paper_layout import paper_entries
-        >>> cell = {"task": "avoiding", "method": "koap", "fraction": 0.05, "seed": 0, "status": "missing"}
+        >>> from torchrl_koap.studies.paper import paper_entries
+        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.05, "seed": 0, "status": "missing"}
         >>> [(entry.level, entry.paper.success) for entry in paper_entries([cell])]
         [(2, 0.9805)]
     """
     found: dict[tuple[str, int, str], Summary] = {}
     for item in summarise(rows):
         levels = _levels_of(item.task)
-        if item.fraction in levels:
-            found[item.task, levels.index(item.fraction) + 1, item.method] = item
+        if item.labels in levels:
+            found[item.task, levels.index(item.labels) + 1, item.method] = item
     tasks = list(dict.fromkeys(task for task, _, _ in found))
     methods = list(dict.fromkeys(method for _, _, method in found))
     return [
@@ -138,50 +175,13 @@ def default_entries(entries: Sequence[Entry]) -> list[Entry]:
         list of Entry: with the method :data:`DEFAULT`; tasks that nobody registered have none.
 
     Examples:
-        >>> from torchrl_koap.studies.paper_layout import Entry, default_entries
+        >>> from torchrl_koap.studies.paper import Entry, default_entries
         >>> cells = [Entry("avoiding", method, 1, 0.02, None, None) for method in ("koap", "dp")]
         >>> [(entry.method, entry.text) for entry in default_entries(cells)]
         [("task's default", 'not run [78.0 +- 8.6]')]
     """
     own = [entry for entry in entries if (task := find_task(entry.task)) and entry.method == task.defaults.method]
     return [replace(entry, method=DEFAULT, paper=paper_cell(entry.task, "koap", entry.level)) for entry in own]
-
-
-def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Writes ``paper_table.md`` and the picture of success averaged over tasks into a folder.
-
-    Args:
-        folder (str or Path): the folder of the comparison.
-        rows (sequence of mapping): cells of all its tasks.
-
-    Returns:
-        dict: ``rows`` of the table, a ``sentence`` on KOAP and the paper's, and ``picture``, the path of the picture
-        below the folder, None if nothing is done that could be averaged.
-    """
-    folder, entries = Path(folder), paper_entries(rows)
-    table = layout_rows(entries)
-    above, both = above_the_paper(entries)
-    sentence = f"KOAP succeeds more often than the paper's KOAP in {above} of {both} cells." if both else ""
-    with replacing_file(folder / "paper_table.md") as aside:
-        aside.write_text(f"{as_markdown(table)}\n{sentence}\n", encoding="utf-8")
-    picture = None
-    if average_over_tasks(entries):
-        plot_average(entries, folder / AVERAGE)
-        picture = AVERAGE
-    return {"rows": table, "sentence": sentence, "picture": picture}
-
-
-def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
-    """Rows of text as a markdown table.
-
-    Args:
-        table (sequence of mapping): rows with the same keys.
-    """
-    if not table:
-        return "no cells\n"
-    lines = [list(table[0]), *(list(row.values()) for row in table)]
-    text = ["| " + " | ".join(line) + " |" for line in lines]
-    return "\n".join([text[0], "|---" * len(lines[0]) + "|", *text[1:], ""])
 
 
 def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, float, float, float]]]:
@@ -201,16 +201,15 @@ def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, fl
             if len(cells) < number or any(entry.success is None for entry in cells):
                 continue
             mean = sum(entry.success for entry in cells) / len(cells)
-            below = math.sqrt(sum((entry.success - entry.measured.low) ** 2 for entry in cells)) / len(cells)
-            above = math.sqrt(sum((entry.measured.high - entry.success) ** 2 for entry in cells)) / len(cells)
+            ends = [entry.measured.measures["success"] for entry in cells]
+            below = math.sqrt(sum((end.mean - end.low) ** 2 for end in ends)) / len(cells)
+            above = math.sqrt(sum((end.high - end.mean) ** 2 for end in ends)) / len(cells)
             lines.setdefault(method, []).append((level, mean, mean - below, mean + above))
     return lines
 
 
-def plot_average(entries: Sequence[Entry], path: str | Path) -> Path:
-    """Success averaged over tasks against the label level, a line per method; the paper's hollow and dashed.
-
-    Where tasks are trained with different methods by default, these together have a line of their own.
+def draw_average(entries: Sequence[Entry], path: str | Path) -> Path:
+    """Draws success averaged over tasks against the label level; tasks' default methods together have a line too.
 
     Args:
         entries (sequence of Entry): of :func:`paper_entries`.
@@ -222,39 +221,33 @@ def plot_average(entries: Sequence[Entry], path: str | Path) -> Path:
     if len({entry.method for entry in entries if default_entries([entry])}) > 1:  # the paper's line is koap's own
         entries = [*(replace(entry, paper=None) for entry in default_entries(entries)), *entries]
     averages = average_over_tasks(entries)
-    if not averages:
-        raise ValueError("there is nothing to average: no method is done at a level in every task")
-    methods = list(dict.fromkeys(entry.method for entry in entries))
-    lines = []
+    paper: dict[str, list[tuple[int, float]]] = {}
     for method, points in averages.items():
-        line = Line(method, **method_styles(methods)[method])
-        for level, *values in points:
-            line.x.append(level)
-            for part, value in zip((line.y, line.low, line.high), values, strict=True):
-                part.append(100 * value)
+        for level, *_ in points:
             cells = [entry.paper for entry in entries if (entry.method, entry.level) == (method, level)]
             if all(cells):
-                line.paper.append((level, 100 * sum(cell.success for cell in cells) / len(cells)))
-        lines.append(line)
-    figure = Figure(figsize=(7.4, 4.6), layout="constrained")
-    axes = figure.add_subplot()
-    draw_lines(axes, lines, beside=lambda x, step: x + 0.028 * step)
-    levels = sorted({level for line in lines for level in line.x})
-    axes.set_xlim(levels[0] - 0.25, levels[-1] + 0.25)
-    axes.set_xticks(levels)
-    axes.set_ylim(-3, 103)
-    axes.set_yticks(range(0, 101, 20))
-    axes.set_xlabel("label level (1: fewest labels)")
-    axes.set_ylabel("success (%)")
-    axes.grid(axis="y", color=FAINT, linewidth=0.5)
-    tasks = list(dict.fromkeys(entry.task for entry in entries))
-    title = (
-        f"success, 95 % interval: {', '.join(tasks)}"
-        if len(tasks) == 1
-        else f"mean over {len(tasks)} tasks, 95 % interval"
-    )
-    hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
-    set_title(axes, title + hollow)
-    tidy(axes)
-    name_lines(axes, lines)
-    return save_figure(figure, path)
+                paper.setdefault(method, []).append((level, sum(cell.success for cell in cells) / len(cells)))
+    return plot_average(averages, paper, list(dict.fromkeys(entry.task for entry in entries)), path)
+
+
+def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Writes ``paper_table.md`` and the picture of success averaged over tasks into a folder.
+
+    Args:
+        folder (str or Path): the folder of the study.
+        rows (sequence of mapping): its cells.
+
+    Returns:
+        dict: ``rows`` of the table, a ``sentence`` on KOAP and the paper's, and ``picture``, the path of the picture
+        below the folder, None if nothing is done that could be averaged.
+    """
+    folder, entries = Path(folder), paper_entries(rows)
+    table = layout_rows(entries)
+    above, both = above_the_paper(entries)
+    sentence = f"KOAP succeeds more often than the paper's KOAP in {above} of {both} cells." if both else ""
+    with replacing_file(folder / "paper_table.md") as aside:
+        aside.write_text(f"{as_markdown(table)}\n{sentence}\n", encoding="utf-8")
+    if average_over_tasks(entries):
+        draw_average(entries, folder / AVERAGE)
+        return {"rows": table, "sentence": sentence, "picture": AVERAGE}
+    return {"rows": table, "sentence": sentence, "picture": None}

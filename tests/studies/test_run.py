@@ -14,28 +14,40 @@ from pathlib import Path
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap.studies.label_efficiency import CurveConfig, run_curve
+from torchrl_koap import EvalConfig, PlannerConfig
+from torchrl_koap.studies import Machines, Study, run_study
+from torchrl_koap.studies import run as run_module
+from torchrl_koap.studies.cells import Cell
+from torchrl_koap.studies.run import _Table
 from torchrl_koap.studies.table import read_cells
 
-DP, LINEAR = "cells/dp-0.25-1-seed0", "cells/linear-0.25-1-seed0"
-
-
-def options_of(out, dataset, /, **options):
-    """Two methods, one of them without a planner, of which everything is over in seconds."""
-    tiny = {"methods": "linear,dp", "fractions": "0.25", "seeds": 1, "steps": 3, "episodes": 1, "workers": 2}
-    return {"out": Path(out), "dataset": str(dataset), **tiny, **options}
+DP, LINEAR = "cells/avoiding/dp-0.25-1-seed0", "cells/avoiding/linear-0.25-1-seed0"
+PLANNER = "planners/avoiding/1-seed0"
+# two methods, one of them without a planner, of which everything is over in seconds
+TINY = {"methods": ("linear", "dp"), "labels": (0.25,), "seeds": 1, "planner.steps": 3, "evaluation.episodes": 1}
+TINY |= {"evaluation.threads": 1}
 
 
 def run(out, dataset, /, **options):
-    return run_curve(CurveConfig(**options_of(out, dataset, **options)))
+    asked = TINY | options
+    tiny = {name: value for name, value in asked.items() if "." not in name}
+    tiny |= {"planner": PlannerConfig(steps=asked["planner.steps"])}
+    tiny |= {"evaluation": EvalConfig(episodes=asked["evaluation.episodes"], threads=1)}
+    data = {} if dataset is None else {"datasets": (str(dataset),)}
+    result = run_study(Study(out=Path(out), **data, **tiny), Machines(workers=2))
+    return {**result.counts, "report": str(result.report)}
 
 
 def command_of(out, dataset, /, **options):
-    return ["curve", *(f"--{name}={value}" for name, value in options_of(out, dataset, **options).items())]
+    asked = {"out": out, "workers": 2} | ({} if dataset is None else {"datasets": (dataset,)}) | TINY | options
+    words = ["curve"]
+    for name, value in asked.items():
+        words += [f"--{name}", *map(str, value if isinstance(value, tuple) else (value,))]
+    return words
 
 
 def marks(root):
-    return {str(file.relative_to(root)): file.stat().st_mtime_ns for file in Path(root).rglob("cell.json")}
+    return {str(file.relative_to(root)): file.stat().st_mtime_ns for file in Path(root).rglob("result.json")}
 
 
 def rows_of(root):
@@ -74,7 +86,7 @@ def fails(capsys, *arguments):
 
 def test_what_a_curve_writes(whole_curve):
     assert {path.name for path in whole_curve.iterdir()} == {
-        *("cells", "cells.csv", "comparisons.csv", "curve.json", "index.html", "lock", "planner-1", "plots", "table.md")
+        *("cells", "cells.csv", "comparisons.csv", "index.html", "lock", "planners", "plots", "study.json", "table.md")
     }
     rows = rows_of(whole_curve)
     assert set(rows) == {DP, LINEAR} and {row["status"] for row in rows.values()} == {"done"}
@@ -84,7 +96,7 @@ def test_what_a_curve_writes(whole_curve):
         assert row["successes"] == sum(episode["outcome"] == "success" for episode in episodes)
         assert (whole_curve / name / "log.txt").read_text()
     planner = "planner.safetensors"
-    assert (whole_curve / LINEAR / planner).read_bytes() == (whole_curve / "planner-1" / planner).read_bytes()
+    assert (whole_curve / LINEAR / planner).read_bytes() == (whole_curve / PLANNER / planner).read_bytes()
     assert not (whole_curve / DP / planner).exists()
     assert "| 25 % | linear |" in (whole_curve / "table.md").read_text()
     assert "Label efficiency on avoiding" in (whole_curve / "index.html").read_text()
@@ -100,35 +112,37 @@ def test_a_second_call_redoes_nothing(curve, demonstrations):
     assert (curve / "index.html").exists()
 
 
-def test_methods_fractions_and_seeds_may_be_added(curve, demonstrations):
+def test_methods_labels_and_seeds_may_be_added(curve, demonstrations):
     before = marks(curve)
-    assert run(curve, demonstrations, methods="dd", fractions="0.5", seeds=2)["done"] == 4
+    assert run(curve, demonstrations, methods=("dd",), labels=(0.5,), seeds=2)["done"] == 4
     after = marks(curve)
     assert {name: after[name] for name in before} == before
-    assert set(rows_of(curve)) == {DP, LINEAR, "cells/dd-0.5-1-seed0", "cells/dd-0.5-1-seed1"}
-    kept = json.loads((curve / "curve.json").read_text())
-    assert (kept["methods"], kept["fractions"], kept["seeds"]) == ("linear,dp,dd", "0.25,0.5", 2)
+    added = {f"cells/avoiding/dd-0.5-1-seed{seed}" for seed in (0, 1)}
+    assert set(rows_of(curve)) == {DP, LINEAR} | added
+    kept = json.loads((curve / "study.json").read_text())
+    assert (kept["methods"], kept["labels"], kept["seeds"]) == (["linear", "dp", "dd"], [0.25, 0.5], 2)
 
 
-def test_part_of_the_trajectories_has_a_planner_of_its_own(curve, demonstrations):
-    assert run(curve, demonstrations, methods="linear", observations="0.5")["done"] == 3
-    cell = curve / "cells/linear-0.25-0.5-seed0"
-    planners = [(folder / "planner.safetensors").read_bytes() for folder in (cell, curve / "planner-0.5")]
-    assert planners[0] == planners[1] != (curve / "planner-1" / "planner.safetensors").read_bytes()
+def test_part_of_the_demonstrations_has_a_planner_of_its_own(curve, demonstrations):
+    assert run(curve, demonstrations, methods=("linear",), demonstrations=(0.5,))["done"] == 3
+    cell = curve / "cells/avoiding/linear-0.25-0.5-seed0"
+    planners = [folder / "planner.safetensors" for folder in (cell, curve / "planners/avoiding/0.5-seed0")]
+    one, other = (file.read_bytes() for file in planners)
+    assert one == other != (curve / PLANNER / "planner.safetensors").read_bytes()
     assert json.loads((cell / "summary.json").read_text())["trajectories_used"] == 4
 
 
 def test_scripted_demonstrations_are_recorded_once_and_a_call_that_finds_too_few_may_be_repeated(
     tmp_path, capsys, monkeypatch
 ):
-    out, options = tmp_path / "curve", {"demonstrations": 4, "methods": "linear", "units": "window"}
-    assert koap(*command_of(out, "scripted", fractions="0.0001", **options)) == 1
+    out, options = tmp_path / "curve", {"record": 4, "methods": ("linear",), "label_unit": "window"}
+    assert koap(*command_of(out, None, **(options | {"labels": (0.0001,)}))) == 1
     assert "selects none of the" in capsys.readouterr().err.splitlines()[-1]
     assert {path.name for path in out.iterdir()} == {"demonstrations", "lock"}
     monkeypatch.setattr(
         "torchrl_koap.envs.experts.demonstrations.record_demonstrations", lambda *rest, **more: pytest.fail("again")
     )
-    assert run(out, "scripted", fractions="0.25", **options)["done"] == 1
+    assert run(out, None, **options)["done"] == 1
     (row,) = rows_of(out).values()
     assert row["label_unit"] == "window" and row["trajectories_touched"] == 4
 
@@ -136,15 +150,18 @@ def test_scripted_demonstrations_are_recorded_once_and_a_call_that_finds_too_few
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 4}, "holds a curve with another steps (3); choose another --out"),
-        ({"episodes": 2, "units": "window"}, "with another units (trajectory), episodes (1)"),
-        ({"dataset": "."}, "with another dataset ("),
+        ({"planner.steps": 4}, "holds a study with another planner.steps (3); choose another --out"),
+        (
+            {"evaluation.episodes": 2, "label_unit": "window"},
+            "label_unit (trajectory), evaluation.episodes (1)",
+        ),
+        ({"datasets": (".",)}, "with another datasets (avoiding="),
     ],
 )
 def test_other_settings_are_named(options, message, curve, demonstrations, capsys):
-    before = marks(curve), (curve / "curve.json").read_bytes()
+    before = marks(curve), (curve / "study.json").read_bytes()
     assert message in fails(capsys, *command_of(curve, demonstrations, **options))
-    assert (marks(curve), (curve / "curve.json").read_bytes()) == before
+    assert (marks(curve), (curve / "study.json").read_bytes()) == before
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, capsys):
@@ -157,26 +174,32 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path, demonstrations, caps
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"methods": "kaop"}, "unknown method 'kaop'; did you mean 'koap'?"),
-        ({"methods": " , "}, "methods must name at least one"),
-        ({"fractions": "0"}, "fractions must be in (0, 1], got 0"),
-        ({"fractions": "0.1,1.5"}, "fractions must be in (0, 1], got 1.5"),
-        ({"fractions": "nan"}, "fractions must be in (0, 1], got nan"),
-        ({"fractions": "abc"}, "fractions must be numbers with commas between, got 'abc'"),
-        ({"fractions": "0.25,0.01"}, "a label fraction of 0.01 selects none of the 8 trajectories"),
-        ({"observations": "0.05"}, "an observation fraction of 0.05 keeps 0 of 8 trajectories"),
-        ({"fractions": "0.5", "observations": "0.25"}, "keeps 2 of 8 trajectories, but 4 have labels"),
-        ({"units": "trajectories"}, "unknown unit 'trajectories'; did you mean 'trajectory'?"),
-        ({"task": "avoidin"}, "unknown task 'avoidin'; did you mean 'avoiding'?"),
-        ({"dataset": "nowhere"}, "nowhere' is neither 'scripted' nor a folder"),
+        ({"methods": ("kaop",)}, "unknown method 'kaop'; did you mean 'koap'?"),
+        ({"labels": (0,)}, "labels must be in (0, 1], got 0"),
+        ({"labels": (0.1, 1.5)}, "labels must be in (0, 1], got 1.5"),
+        ({"labels": ("nan",)}, "--labels must be a finite number, got nan"),
+        ({"labels": (0.25, 0.01)}, "a label fraction of 0.01 selects none of the 8 trajectories"),
+        ({"demonstrations": (0.05,)}, "an observation fraction of 0.05 keeps 0 of 8 trajectories"),
+        ({"labels": (0.5,), "demonstrations": (0.25,)}, "keeps 2 of 8 trajectories, but 4 have labels"),
+        ({"label_unit": "trajectories"}, "unknown unit of labels 'trajectories'; did you mean 'trajectory'?"),
+        ({"tasks": ("avoidin",)}, "unknown task 'avoidin'; did you mean 'avoiding'?"),
+        ({"datasets": ("nowhere",)}, "nowhere"),
         ({"seeds": 0}, "seeds must be >= 1, got 0"),
-        ({"episodes": 0}, "episodes must be >= 1, got 0"),
-        ({"steps": 0}, "steps must be >= 1, got 0"),
+        ({"evaluation.episodes": 0}, "episodes must be >= 1, got 0"),
+        ({"planner.steps": 0}, "planner.steps must be >= 1, got 0"),
         ({"workers": 0}, "workers must be >= 1, got 0"),
         ({"launcher": "lokal"}, "unknown launcher 'lokal'; did you mean 'local'?"),
         ({"address": "10.0.0.1:1"}, "launcher 'local' works on this machine alone"),
-        ({"dataset": "scripted", "demonstrations": 40, "fractions": "0.01"}, "selects none of the 40 trajectories"),
-        ({"dataset": "scripted", "units": "windows"}, "unknown unit 'windows'; did you mean 'window'?"),
+        ({"datasets": (), "record": 40, "labels": (0.01,)}, "selects none of the 40 trajectories"),
+        (
+            {"levels": (6,), "labels": ()},
+            "has no label level 6: its levels 1 to 5 are 2, 5, 10, 25, 50 %",
+        ),
+        ({"run.seed": 3}, "run.seed is not for a study: cells have the seeds 0, 1, ..., as many as --seeds says"),
+        ({"planner.source": "x"}, "planner.source is not for a study: name runs with --planners"),
+        ({"preset": "table3"}, "unknown preset 'table3'; did you mean 'table"),
+        ({"execution.strategy": "open_loop"}, "strategy 'open_loop' was asked of dp"),
+        ({"tasks": ("avoiding", "sorting")}, "datasets must be TASK=FOLDER where there are several tasks"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line_before_any_work(
@@ -191,7 +214,7 @@ def test_what_cannot_be_done_is_said_in_one_line_before_any_work(
 
 def test_windows_of_every_seed_must_lie_in_the_trajectories_used(tmp_path, demonstrations, capsys):
     """Of which a seed touches more than another: found before any work, and not by the cell."""
-    options = {"units": "window", "fractions": "0.02", "observations": "0.25", "seeds": 10}
+    options = {"label_unit": "window", "labels": (0.02,), "demonstrations": (0.25,), "seeds": 10}
     assert "keeps 2 of 8 trajectories, but" in fails(capsys, *command_of(tmp_path / "curve", demonstrations, **options))
     assert list(tmp_path.iterdir()) == []
 
@@ -213,47 +236,47 @@ def test_two_curves_do_not_work_in_one_folder(curve, demonstrations, capsys):
 
 def test_a_cell_that_fails_is_named_and_tried_again(curve, demonstrations):
     before = marks(curve)
-    blocked = curve / "cells/dd-0.25-1-seed0"
+    blocked = curve / "cells/avoiding/dd-0.25-1-seed0"
     blocked.write_text("in the way")
-    counts = run(curve, demonstrations, methods="linear,dp,dd,pretrain")
+    counts = run(curve, demonstrations, methods=("linear", "dp", "dd", "pretrain"))
     assert (counts["done"], counts["failed"], counts["missing"]) == (3, 1, 0)
     row = rows_of(curve)[str(blocked.relative_to(curve))]
     assert row["status"] == "failed" and "FileExistsError" in row["reason"]
     assert row["reason"] in (curve / "table.md").read_text()
     assert "FileExistsError" in (curve / "index.html").read_text()
     blocked.unlink()
-    assert run(curve, demonstrations, methods="linear,dp,dd,pretrain")["done"] == 4
+    assert run(curve, demonstrations, methods=("linear", "dp", "dd", "pretrain"))["done"] == 4
     after = marks(curve)
     assert {name: after[name] for name in before} == before and len(after) == 5
 
 
 def test_a_planner_that_fails_fails_the_cells_that_need_it_and_no_other(curve, demonstrations):
-    shutil.rmtree(curve / "planner-1")
+    shutil.rmtree(curve / PLANNER)
     shutil.rmtree(curve / LINEAR)
-    (curve / "planner-1").write_text("in the way")
+    (curve / PLANNER).write_text("in the way")
     counts = run(curve, demonstrations)
     assert (counts["done"], counts["failed"]) == (1, 1)
-    assert rows_of(curve)[LINEAR]["reason"].startswith("planner-1 failed: FileExistsError")
+    assert rows_of(curve)[LINEAR]["reason"].startswith("1-seed0 failed: ")
     assert rows_of(curve)[DP]["status"] == "done"
-    assert run(curve, demonstrations, methods="dp")["missing"] == 0  # what never began is not asked for now
-    (curve / "planner-1").unlink()
+    assert run(curve, demonstrations, methods=("dp",))["missing"] == 0  # what never began is not asked for now
+    (curve / PLANNER).unlink()
     assert run(curve, demonstrations)["done"] == 2
 
 
 def test_damaged_cells_are_made_again_and_those_not_asked_for_are_named(curve, demonstrations):
     before = {name: episodes_of(curve, name) for name in (DP, LINEAR)}
-    os.truncate(curve / DP / "eval.json", 20)
-    os.truncate(curve / LINEAR / "cell.json", 20)
-    counts = run(curve, demonstrations, methods="linear")
+    os.truncate(curve / DP / "result.json", 20)
+    os.truncate(curve / LINEAR / "result.json", 20)
+    counts = run(curve, demonstrations, methods=("linear",))
     assert (counts["done"], counts["failed"]) == (1, 1)
-    assert "eval.json is damaged" in rows_of(curve)[DP]["reason"]
+    assert "result.json is damaged" in rows_of(curve)[DP]["reason"]
     assert run(curve, demonstrations)["done"] == 2
     assert {name: episodes_of(curve, name) for name in before} == before
 
 
-def test_a_damaged_curve_json_is_named(curve, demonstrations, capsys):
-    os.truncate(curve / "curve.json", 20)
-    assert f"{curve / 'curve.json'} is damaged" in fails(capsys, *command_of(curve, demonstrations))
+def test_a_damaged_study_json_is_named(curve, demonstrations, capsys):
+    os.truncate(curve / "study.json", 20)
+    assert f"{curve / 'study.json'} is damaged" in fails(capsys, *command_of(curve, demonstrations))
 
 
 def wait_for(condition, seconds=120.0):
@@ -288,8 +311,8 @@ def test_a_curve_that_was_killed_goes_on_and_ends_like_one_that_was_not(whole_cu
         process.wait()
     wait_for(lambda: not living(process.pid))
     before = marks(out)
-    assert "planner-1/cell.json" in before and not (out / "index.html").exists()
-    assert not (out / LINEAR / "cell.json").exists()
+    assert f"{PLANNER}/result.json" in before and not (out / "index.html").exists()
+    assert not (out / LINEAR / "result.json").exists()
     assert run(out, demonstrations)["done"] == 2
     after = marks(out)
     assert {name: after[name] for name in before} == before
@@ -297,3 +320,51 @@ def test_a_curve_that_was_killed_goes_on_and_ends_like_one_that_was_not(whole_cu
         assert episodes_of(out, cell) == episodes_of(whole_curve, cell)
         name = "controller.safetensors"
         assert (out / cell / name).read_bytes() == (whole_curve / cell / name).read_bytes()
+
+
+LABELS = {"labelled_units": 1, "labelled_transitions": 20, "trajectories_touched": 1}
+ROW = {"episodes": 60, "successes": 30, "success_rate": 0.5, "mode_entropy": 0.3, "train_seconds": 1.0} | LABELS
+
+
+def finish(root, cell):
+    """The file of a cell that was trained and evaluated."""
+    folder = root / cell.folder
+    folder.mkdir(parents=True)
+    content = {"row": ROW, "outcomes": [[seed, seed, True] for seed in range(60)]}
+    (folder / "result.json").write_text(json.dumps(content))
+
+
+def cells(number):
+    return [Cell("avoiding", "linear", 0.5, 1.0, seed) for seed in range(number)]
+
+
+def test_each_finished_cell_is_read_once(tmp_path, monkeypatch):
+    """What was finished before, and what another cell ended after, is not read again; the table holds all of it."""
+    for cell in cells(30)[:25]:
+        finish(tmp_path, cell)
+    read, original = [], run_module.cell_row
+    monkeypatch.setattr(
+        run_module, "cell_row", lambda root, cell, **more: read.append(cell.seed) or original(root, cell, **more)
+    )
+    table = _Table(Study(out=tmp_path, label_unit="trajectory"), cells(30))
+    todo = [cell for cell in cells(30) if table.rows[cell]["status"] != "done"]
+    for cell in todo[:-1]:
+        finish(tmp_path, cell)
+        table.ended(cell, None)
+    table.ended(todo[-1], "no memory")
+    table.write()
+    assert read == [*range(30), *range(25, 30)] and len(table.outcomes) == 29
+    assert [row["status"] for row in read_cells(tmp_path / "cells.csv")] == [*29 * ["done"], "failed"]
+
+
+@pytest.mark.faults
+def test_two_thousand_cells(tmp_path):
+    for cell in cells(2000):
+        finish(tmp_path, cell)
+    began = time.process_time()
+    table = _Table(Study(out=tmp_path, label_unit="trajectory"), cells(2000))
+    assert all(row["status"] == "done" for row in table.rows.values())
+    for cell in cells(2000)[:50]:
+        table.ended(cell, None)
+    table.write()
+    assert time.process_time() - began < 10

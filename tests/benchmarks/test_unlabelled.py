@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import csv
-import sys
 
 import pytest
 import torch
@@ -17,7 +16,7 @@ from torchrl_koap.tasks import get_task
 
 @pytest.fixture(scope="module")
 def script(benchmark_script):
-    return benchmark_script("unlabelled_rollouts")
+    return benchmark_script("unlabelled")
 
 
 @pytest.fixture(scope="module")
@@ -75,74 +74,40 @@ def test_noise_is_that_of_the_seed_whatever_ran_before(script, demonstrations):
     assert first == second != other
 
 
-def test_rows_are_not_run_again(script, demonstrations, tmp_path, monkeypatch):
-    table = tmp_path / "rows.csv"
-    arguments = [
-        *("--dataset", str(demonstrations), "--regimes", "wide_64", "--methods", "linear_steps", "--labels", "1"),
-        *("--seeds", "0", "--judged", "2", "--table", str(table)),
-    ]
-    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", *arguments])
-    script.main()
-    with table.open(newline="") as file:
-        (row,) = csv.DictReader(file)
-    assert (row["regime"], row["method"], row["n"]) == ("wide_64", "linear_steps", "2")
-    monkeypatch.setattr(script, "follow", None)
-    script.main()
-    assert len(table.read_text().splitlines()) == 2
+def test_rows_are_not_run_again_and_of_two_tables_that_alone_which_lacks_some(
+    script, demonstrations, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(script, "JUDGED", 2)
+    asked = {"dataset": demonstrations, "observed": ("wide_64",), "methods": ("linear_steps",), "labels": (1, 2)}
+    asked |= {"seeds": (1,), "judged": 2, "folder": tmp_path}
+    script.main(**asked)
+    errors = (tmp_path / "unlabelled_data.csv").read_text()
+    assert len(errors.splitlines()) == 3 and not (tmp_path / "unlabelled_rollouts.csv").exists()
+    script.main(**asked, rollouts=True)
+    with (tmp_path / "unlabelled_rollouts.csv").open(newline="") as file:
+        first, _ = csv.DictReader(file)
+    assert (first["regime"], first["method"], first["labels"], first["n"]) == ("wide_64", "linear_steps", "1", "2")
+    assert (tmp_path / "unlabelled_data.csv").read_text() == errors
+    monkeypatch.setattr(script, "controllers", None)
+    script.main(**asked, rollouts=True)
+    monkeypatch.undo()
+    (tmp_path / "unlabelled_data.csv").unlink()
+    monkeypatch.setattr(script, "JUDGED", 2)
+    script.main(**asked)  # the same error, whatever else is measured
+    assert (tmp_path / "unlabelled_data.csv").read_text() == errors
 
 
-def test_errors_are_those_that_the_other_table_would_hold(script, demonstrations, tmp_path, monkeypatch):
-    study, tables = (
-        sys.modules["unlabelled_data"],
-        [tmp_path / name for name in ("rollouts.csv", "both.csv", "own.csv")],
-    )
-    common = ["--dataset", str(demonstrations), "--regimes", "noise", "--methods", "linear_steps", "--labels", "1", "2"]
-    common += ["--seeds", "1"]
-    both = [*common, "--judged", "2", "--table", str(tables[0]), "--errors", str(tables[1])]
-    monkeypatch.setattr(study, "JUDGED", 4)
-    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", *both])
-    script.main()
-    monkeypatch.setattr(sys, "argv", ["unlabelled_data.py", *common, "--trajectories", "6", "--table", str(tables[2])])
-    study.main()
-    assert tables[1].read_text() == tables[2].read_text()
-    assert [len(table.read_text().splitlines()) for table in tables] == [3, 3, 3]
-    tables[0].unlink()  # one of the two is missing: that alone is done again
-    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", *both])
-    script.main()
-    assert [len(table.read_text().splitlines()) for table in tables] == [3, 3, 3]
+def test_too_few_demonstrations_are_named(script, demonstrations):
+    with pytest.raises(ValueError, match="has fewer than 76 demonstrations"):
+        script.main(dataset=demonstrations, rollouts=True)
 
 
-def test_too_few_demonstrations_are_named(script, demonstrations, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", "--dataset", str(demonstrations)])
-    with pytest.raises(SystemExit):
-        script.main()
-    assert "fewer demonstrations than are judged and labelled" in capsys.readouterr().err
-
-
-def test_other_tasks_are_refused_before_their_data_are_read(script, tmp_path, monkeypatch, capsys):
+def test_other_tasks_are_refused_before_their_data_are_read(script, tmp_path, monkeypatch):
     folder = tmp_path / "aligning"
     assert koap("demos", "--out", folder, "--task", "aligning", "--episodes", 2, "--threads", 1, "--quiet") == 0
     monkeypatch.setattr(script, "load_positions", None)
-    monkeypatch.setattr(sys, "argv", ["unlabelled_rollouts.py", "--dataset", str(folder)])
-    with pytest.raises(SystemExit):
-        script.main()
-    assert "holds demonstrations of aligning" in capsys.readouterr().err
-
-
-def test_labels_from_play_are_of_no_demonstration(script, demonstrations):
-    study = sys.modules["unlabelled_data"]
-    data, _ = script.load_positions(str(demonstrations), 100)
-    both = study.add_play(data, str(demonstrations))
-    assert len(both["episode"].unique()) == 6 + study.PLAYED
-    torch.testing.assert_close(both["state"][: len(data)], data["state"])
-    full, _ = script.as_own_data(both)
-    for seed in range(3):
-        numbers = script.shuffled_trajectories(full, seed, study.PLAYED)
-        assert numbers[: study.PLAYED].min() >= 6 > numbers[study.PLAYED :].max()
-        assert numbers.unique().numel() == 6 + study.PLAYED
-        labelled = study.with_labels(full, numbers[:2])
-        known = labelled["episode"][labelled["has_action"].squeeze(-1)].unique()
-        assert known.tolist() == sorted(numbers[:2].tolist())
+    with pytest.raises(ValueError, match="holds demonstrations of aligning"):
+        script.main(dataset=folder, rollouts=True)
 
 
 def test_rollouts_of_all_seeds_are_counted_together(benchmark_script, monkeypatch):

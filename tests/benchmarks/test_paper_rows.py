@@ -18,9 +18,9 @@ def rows(benchmark_script, monkeypatch, tmp_path):
 
 
 def cell(method, fraction, successes, seconds=30.0):
-    done = {"task": "avoiding", "observations": 1.0, "seed": 0, "label_unit": "window", "status": "done"}
+    done = {"task": "avoiding", "demonstrations": 1.0, "seed": 0, "label_unit": "window", "status": "done"}
     times = {"train_seconds": seconds, "eval_seconds": 30.0}
-    return done | times | {"method": method, "fraction": fraction, "episodes": 60, "successes": successes}
+    return done | times | {"method": method, "labels": fraction, "episodes": 60, "successes": successes}
 
 
 def test_averages_have_the_interval_of_a_single_cell_and_need_all_levels(rows, tmp_path):
@@ -70,7 +70,7 @@ def test_cells_of_another_comparison_stand_beside(rows, tmp_path):
 
 
 def test_a_study_of_observations_has_a_row_per_share(rows, tmp_path):
-    few = cell("koap", 0.01, 30) | {"observations": 0.1}
+    few = cell("koap", 0.01, 30) | {"demonstrations": 0.1}
     write_cells(tmp_path / "made.csv", [cell("koap", 0.01, 60), cell("pca", 0.01, 15), few])
     head, _, first, second = rows.observation_table("made").splitlines()
     assert first.startswith("| 10 % | 50.0 %") and first.endswith("| not run |") and "`pca`" in head

@@ -1,0 +1,141 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Time of a whole policy on one core: exported in several ways, and in a control loop whose planner takes 100 ms.
+
+    python benchmarks/latency.py --write            # a policy of the default size, random weights
+    python benchmarks/latency.py --run runs/demo    # a trained one
+    python benchmarks/latency.py --loop-steps 800   # plans made between two steps, and in a thread
+
+Every way is called in turn, so that a busy machine slows all of them alike; before that its actions are compared with
+the eager ones. ``--write`` writes ``benchmarks/results/exported_policy.csv``. torch.compile and AOTInductor need a C++
+compiler, ONNX the extra ``onnx``; what is missing is named and left out.
+"""
+
+from __future__ import annotations
+
+import csv
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from torch import Tensor
+
+from torchrl_koap import load_policy
+from torchrl_koap.evaluation.latency import run_control_loop, time_calls
+from torchrl_koap.modules import (
+    Agent,
+    AsynchronousAgent,
+    PlanningPolicy,
+    StatePlanner,
+    TemporalUnet,
+    make_koopman_inverse_dynamics,
+    make_policy,
+)
+from torchrl_koap.modules.execution.export import SUFFIXES, Exportable, ExportError, export_part, exportable
+
+RESULTS = Path(__file__).resolve().parent / "results" / "exported_policy.csv"
+TOLERANCE = 1e-5
+
+
+class SlowPlanner(StatePlanner):
+    """Takes as long as a large planner does on a small computer."""
+
+    seconds = 0.1
+
+    def solve(self, *arguments, **options):
+        """Plans, and waits for the rest of the time."""
+        began = time.perf_counter()
+        plan = super().solve(*arguments, **options)
+        time.sleep(max(self.seconds - (time.perf_counter() - began), 0))
+        return plan
+
+
+def default_policy() -> tuple[PlanningPolicy, int]:
+    """A policy for seven joints and their goals, of the size that ``koap train`` gives it, and its observation."""
+    planner = StatePlanner(TemporalUnet(14, 28, channels=(64, 128)), state_dim=14, forecast=True, clip=1.2)
+    return make_policy(planner, make_koopman_inverse_dynamics(7, 7), state_of=range(14), columns=range(7)), 14
+
+
+def compiled(what: Exportable, expected: Tensor) -> Callable:
+    """The policy through torch.compile, compared with the eager one."""
+    try:
+        function = torch.compile(what.module, fullgraph=True, dynamic=False)
+        found = function(*what.inputs.values())
+    except Exception as error:  # the compiler is asked in many places
+        raise ExportError(f"torch.compile needs a C++ compiler such as g++: {str(error).splitlines()[0]}") from error
+    gap = float((found - expected).abs().max() / expected.abs().max().clamp_min(1))
+    if not gap <= TOLERANCE:
+        raise ExportError(f"torch.compile differs from the policy by {gap:.1e}, at most {TOLERANCE:.0e} is allowed")
+    return function
+
+
+def exported(run: Path | None, repeats: int) -> list[dict[str, str]]:
+    """A row per way to call a policy."""
+    policy, width = default_policy() if run is None else (load_policy(run), None)
+    what = exportable(policy, observation_dim=width or policy.description.task.observation_dim)
+    ways: dict[str, Callable] = {"eager": what.module}
+    seconds = {"eager": 0.0}
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        expected = what.module(*what.inputs.values())
+        for way in ("compile", *SUFFIXES):
+            began = time.perf_counter()
+            try:
+                if way == "compile":
+                    ways[way] = compiled(what, expected)
+                else:
+                    file = Path(folder) / f"policy{SUFFIXES[way]}"
+                    ways[way] = export_part(what, file, kind=way, tolerance=TOLERANCE)
+            except ExportError as error:
+                print(f"{way}: {error}")
+            seconds[way] = time.perf_counter() - began
+        times = time_calls(ways, tuple(what.inputs.values()), repeats=repeats)
+    rows = [{"way": way, "p50_ms": f"{row['p50']:.2f}", "p99_ms": f"{row['p99']:.2f}"} for way, row in times.items()]
+    more = [
+        {"over_eager": f"{times[row['way']]['ratio']:.2f}", "preparation_s": f"{seconds[row['way']]:.0f}"}
+        for row in rows
+    ]
+    return [row | other for row, other in zip(rows, more, strict=True)]
+
+
+def print_loops(steps: int, control_hz: float) -> None:
+    """Late steps of a control loop, with plans made between two steps and in a thread."""
+    planner = SlowPlanner(TemporalUnet(7, 14, channels=(16, 32)), state_dim=7, num_steps=4)
+    policy = make_policy(planner, make_koopman_inverse_dynamics(7, 7), state_of=range(7))
+    observations = np.random.default_rng(0).normal(size=(steps, 7)).cumsum(0) / 100
+    print("between steps", run_control_loop(Agent(policy), observations, control_hz=control_hz))
+    with AsynchronousAgent(policy, control_hz=control_hz) as agent:
+        print("in a thread  ", run_control_loop(agent, observations, control_hz=control_hz))
+
+
+def main(
+    *, run: Path | None = None, repeats: int = 200, write: bool = False, loop_steps: int = 0, control_hz: float = 30.0
+) -> None:
+    """Prints the table of exported policies, or the control loops.
+
+    Args:
+        run: run directory instead of random weights.
+        repeats: calls of every way.
+        write: write the table.
+        loop_steps: steps of a control loop, instead of the table.
+        control_hz: its rate.
+    """
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    if loop_steps:
+        print_loops(loop_steps, control_hz)
+        return
+    rows = exported(run, repeats)
+    for row in rows:
+        print(", ".join(f"{name} {value}" for name, value in row.items()))
+    if write:
+        with RESULTS.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

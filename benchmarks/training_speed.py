@@ -1,0 +1,138 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Speed of training and planning on one core, written to ``benchmarks/results``.
+
+    OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part controller planner
+    OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part precision
+
+Controller: every preset of KOAP, batches of 256 windows of 16 frames, sampling included. Planner: the default U-Net on
+256 windows, and one plan and 60. Precision: updates of wide MLPs with matrix products in float32 and bfloat16, which a
+processor without units for it emulates.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Literal
+
+import torch
+import tyro
+from resumable_table import open_table
+from tensordict import TensorDict
+from torchrl.objectives import LossModule
+
+from torchrl_koap.data import flatten_trajectories, make_window_buffer, select_state
+from torchrl_koap.modules import (
+    PRESETS,
+    MLPDenoiser,
+    Normalizer,
+    StatePlanner,
+    TemporalUnet,
+    make_koopman_inverse_dynamics,
+)
+from torchrl_koap.objectives import KOAPLoss, PlannerLoss
+from torchrl_koap.runs.device import has_bfloat16_units
+
+RESULTS = Path(__file__).parent / "results"
+SPEED = ("part", "variant", "parameters", "updates_per_second", "plan_1_ms", "plan_60_ms", "command")
+PRECISION = ("processor", "units", "width", "depth", "batch", "float32", "bfloat16", "ratio")
+COMMAND = "OMP_NUM_THREADS=1 python benchmarks/training_speed.py --part controller planner"
+SIZES = ((512, 4, 512), (512, 4, 256), (256, 3, 128))  # width, residual layers, batch
+
+
+def median_seconds(call: Callable[[], object], repeats: int, warm_up: int = 2) -> float:
+    """Median time of a call."""
+    times = []
+    for index in range(warm_up + repeats):
+        began = time.perf_counter()
+        call()
+        if index >= warm_up:
+            times.append(time.perf_counter() - began)
+    return sorted(times)[len(times) // 2]
+
+
+def update_of(loss: LossModule, batches: Callable[[], TensorDict]) -> Callable[[], None]:
+    """One update: loss, gradients, AdamW (fused)."""
+    optimizer = torch.optim.AdamW(loss.parameters(), lr=3e-4, fused=True)
+
+    def update() -> None:
+        losses = loss(batches())
+        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return update
+
+
+def size_of(module: torch.nn.Module) -> int:
+    """Number of parameters."""
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def controllers(repeats: int) -> Iterable[tuple[object, ...]]:
+    """A row per preset of KOAP, for states and actions of Avoiding."""
+    torch.manual_seed(0)
+    paths = [torch.randn(81, 4).cumsum(0) * 0.01 for _ in range(96)]
+    data = select_state(flatten_trajectories(paths, [path[1:, :2] - path[:-1, :2] for path in paths]), (2, 3))
+    normalizers = {f"{name}_normalizer": Normalizer.fit(data[name]) for name in ("state", "action")}
+    for preset in PRESETS:
+        model = make_koopman_inverse_dynamics(2, 2, preset=preset, **normalizers)
+        buffer = make_window_buffer(data, 16, 256, select=["state", "action", "has_action"], labelled_share=0.25)
+        seconds = median_seconds(update_of(KOAPLoss(model), buffer.sample), repeats)
+        yield "controller", preset, size_of(model), f"{1 / seconds:.2f}", "", "", COMMAND
+
+
+def planners(repeats: int) -> Iterable[tuple[object, ...]]:
+    """A row for the default planner of Avoiding."""
+    torch.manual_seed(0)
+    planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, num_steps=10, clip=1.2)
+    windows = TensorDict({"state": torch.randn(256, planner.history + planner.horizon, 2).cumsum(1)}, [256])
+    planner.fit_normalizers(windows["state"])
+    updates = 1 / median_seconds(update_of(PlannerLoss(planner), lambda: windows), repeats)
+    plans = []
+    for batch in (1, 60):
+        history = windows["state"][:batch, : planner.history]
+        with torch.no_grad():
+            seconds = median_seconds(lambda history=history: planner.plan(history), repeats)
+        plans.append(f"{1e3 * seconds:.2f}")
+    yield "planner", "default (10 DPM-Solver++ steps)", size_of(planner.denoiser), f"{updates:.2f}", *plans, COMMAND
+
+
+def wide_update(width: int, depth: int, batch: int, dtype: torch.dtype | None) -> Callable[[], None]:
+    """An update of a wide MLP planner for 19 columns, with matrix products of a number type."""
+    torch.manual_seed(0)
+    planner = StatePlanner(MLPDenoiser(19, 38, horizon=14, width=width, depth=depth), state_dim=19, horizon=14)
+    windows = TensorDict({"state": torch.randn(batch, 16, 19).cumsum(1)}, [batch])
+    planner.fit_normalizers(windows["state"])
+    return update_of(PlannerLoss(planner, dtype=dtype), lambda: windows)
+
+
+def main(*, part: tuple[Literal["controller", "planner", "precision"], ...], repeats: int = 40) -> None:
+    """Measures what the tables lack.
+
+    Args:
+        part: what to measure.
+        repeats: calls of which the median is taken.
+    """
+    torch.set_num_threads(1)
+    done, write = open_table(RESULTS / "training_speed.csv", SPEED, SPEED[:2])
+    for name, rows in (("controller", controllers), ("planner", planners)):
+        for row in rows(repeats) if name in part else ():
+            print(*row[:-1])
+            if tuple(map(str, row[:2])) not in done:
+                write(row)
+    if "precision" not in part:
+        return
+    known = (torch.cpu.get_capabilities()["cpu_name"], int(has_bfloat16_units()))
+    done, write = open_table(RESULTS / "planner_precision.csv", PRECISION, PRECISION[:5])
+    for size in SIZES:
+        if tuple(map(str, (*known, *size))) not in done:
+            rates = [1 / median_seconds(wide_update(*size, dtype), repeats) for dtype in (None, torch.bfloat16)]
+            row = (*known, *size, *(f"{rate:.2f}" for rate in rates), f"{rates[1] / rates[0]:.2f}")
+            print(*row)
+            write(row)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

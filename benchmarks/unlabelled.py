@@ -1,0 +1,305 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Where unlabelled data pay: controllers against labelled trajectories, by what is observed.
+
+    koap demos --out runs/avoiding96 --episodes 96 --seed 11
+    python benchmarks/unlabelled.py --dataset runs/avoiding96 --observed plain noise wide_64 --rollouts
+    python benchmarks/unlabelled.py --dataset runs/stacking --observed joints_hidden
+
+Every method sees the same observations (with noise in training and in the trajectories it is judged on) and the same
+labelled trajectories, and all other trajectories without labels. The error is that of one decoded action on 24
+other trajectories, whose actions are read for it alone. With ``--rollouts`` the same controllers drive the simulated
+robot of Avoiding along demonstrations not seen before: at every step the plan is what the demonstration did next, as
+the sensor showed it, bent towards the present observation as the library's policies do; what the controller sees of
+the robot goes through the same sensor, with fresh noise, the same for every controller of a seed.
+
+What is trained without labels is trained once for all numbers of labelled trajectories of a seed: the weights are those
+that separate trainings would give, for no label is read before the closed form at the end. Rows are appended to the
+tables as they are known; what is there already is not run again.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from itertools import product
+from pathlib import Path
+
+import torch
+import tyro
+from regimes import REGIMES, Regime, RegimeSensor
+from resumable_table import open_table
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.utils import step_mdp
+
+from torchrl_koap import fit
+from torchrl_koap.data import controller_view, make_demonstrations, select_state
+from torchrl_koap.envs.registry import make_env
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import Execution, InverseDynamics, Normalizer, blend_plan
+from torchrl_koap.runs.progress import progress_bar
+from torchrl_koap.tasks import Task
+from torchrl_koap.training.action_errors import first_actions, rmse
+from torchrl_koap.training.closed_form import axes_of, fit_closed_form
+from torchrl_koap.training.datasets import find_task_of, load_demonstrations
+
+RESULTS = Path(__file__).parent / "results"
+KEYS = ("dataset", "regime", "labels", "seed", "method")
+ERRORS = (*KEYS, "error", "unit", "choice", "updates")
+ROLLOUTS = (*KEYS, "blend_decay", "n", "successes", "collisions", "distance_mm")
+# what --methods calls them: method, preset, updates, does training read labels
+METHODS = {
+    "semi_supervised": ("koap", "semi_supervised", 1000, False),
+    "semi_supervised, untrained": ("koap_untrained", "semi_supervised", 0, False),
+    "semi_supervised, labelled only": ("koap_labelled_only", "semi_supervised", 1000, True),
+    "koap": ("koap", "default", 500, False),
+    "koap_untrained": ("koap_untrained", "default", 0, False),
+    "koap_labelled_only": ("koap_labelled_only", "default", 500, True),
+    "koap_paper": ("koap_paper", None, 500, True),
+    "pca": ("pca", None, 0, False),
+    "linear_steps": ("linear_steps", None, 0, False),
+    "dd_lookahead": ("dd_lookahead", None, 500, True),
+}
+OBSERVED = REGIMES | {"joints_hidden": Regime("joints_hidden", "Stacking, joints hidden", hidden=tuple(range(7)))}
+JUDGED = 24  # trajectories, the last of a seed's order, on which the error of controllers is measured
+HORIZON = 14
+NOISE_SEED = 2000  # plus the seed: noise of the rollouts, apart from that of the demonstrations
+SPARE = 40  # control steps that a rollout may take longer than its demonstration
+Cell = tuple[str, int]  # method, number of labelled trajectories
+
+
+def robot_view(data: TensorDictBase, task: Task) -> TensorDictBase:
+    """Flat data with the robot's own columns as ``state``."""
+    return controller_view(data, task.controller_columns("robot"), action_targets=task.targets)
+
+
+def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:
+    """Flat data with what the robot's controller could read as ``state``, and the unit of its actions."""
+    task = find_task_of(dataset)
+    data = load_demonstrations(dataset, task)
+    if task.source == "stacking":  # joints, gripper, tool; the gripper's action has no unit and is left out
+        data = data.copy().set("state", data["state"][:, :11]).set("action", data["action"][:, :7])
+    else:
+        data = robot_view(data, task)
+    return data[torch.isin(data["episode"], data["episode"].unique()[:most])], task.action_unit
+
+
+def as_own_data(data: TensorDictBase) -> tuple[TensorDictBase, Task]:
+    """The data as those of a robot about which nothing is known, with all labels."""
+    parts = [data[data["episode"] == number] for number in data["episode"].unique()]
+    states, actions = ([part[key].numpy() for part in parts] for key in ("state", "action"))
+    made, task = make_demonstrations(states, actions, control_hz=30)
+    return select_state(made, task.state_of), task
+
+
+def with_labels(data: TensorDictBase, episodes: torch.Tensor) -> TensorDictBase:
+    """The data with the actions of some trajectories alone."""
+    kept = data["has_action"] & torch.isin(data["episode"], episodes)[:, None]
+    return data.copy().set("has_action", kept).set("action", data["action"].where(kept, torch.nan))
+
+
+def refit(controller: InverseDynamics, data: TensorDictBase, task: Task) -> tuple[InverseDynamics, dict]:
+    """The closed form of a controller on other labels."""
+    controller = copy.deepcopy(controller)
+    mode = Normalizer.fit(data["action"], mode="rms", mask=data["has_action"])
+    controller.action_normalizer.load_state_dict(mode.state_dict())
+    return controller, fit_closed_form(controller, data, **axes_of(task, task.controller_columns("robot")))
+
+
+def choice_of(controller: InverseDynamics, found: dict) -> str:
+    """What the held-out labelled error chose."""
+    gate = getattr(controller, "gate", None)
+    return found.get("block", "") if gate is None else str(int(gate.sum()))
+
+
+def controllers(full: TensorDictBase, task: Task, numbers: torch.Tensor, seed: int, wanted: list[Cell]):
+    """Trained controllers by method and number of labelled trajectories, the first of ``numbers``.
+
+    Yields:
+        tuple: method, labelled trajectories, controller, what fitting it reported, updates.
+    """
+    last, trained = None, None
+    for method, labels in wanted:
+        kind, preset, updates, reads_labels = METHODS[method]
+        if preset == "semi_supervised" and full["state"].shape[-1] <= 8:
+            updates = 0  # the state is its own lifting: nothing that is trained would be read
+        part = with_labels(full, numbers[:labels])
+        if last != method or reads_labels:
+            options = {"steps": updates} | ({"preset": preset} if preset else {})
+            made = fit(part, task, method=kind, planner=False, controller=options, seed=seed, progress=False)
+            trained, last = made.controller, method
+            yield method, labels, trained, made.results["decoder_fit"], updates
+        else:
+            yield method, labels, *refit(trained, part, task), updates
+
+
+def shuffled_trajectories(data: TensorDictBase, seed: int) -> torch.Tensor:
+    """Numbers of the trajectories in the order of a seed: the first ones get labels, the last ones are judged."""
+    numbers, generator = data["episode"].unique(), torch.Generator().manual_seed(seed)
+    return numbers[torch.randperm(len(numbers), generator=generator)]
+
+
+def error_row(controller: InverseDynamics, full: TensorDictBase, numbers: torch.Tensor, unit: str) -> tuple[str, str]:
+    """Error of one decoded action, and its unit."""
+    predicted, true, _ = first_actions(controller, full, numbers[-JUDGED:])
+    return f"{rmse(predicted, true, unit):.4f}", {"m": "mm", "rad": "mrad"}[unit]
+
+
+def padded(paths: list[torch.Tensor], length: int) -> torch.Tensor:
+    """Paths as ``[E, length, ...]``, their last row repeated."""
+    return torch.stack([path[torch.arange(length).clamp_max(len(path) - 1)] for path in paths])
+
+
+@torch.no_grad()
+def follow(
+    controller: InverseDynamics,
+    sensor: RegimeSensor,
+    shown: TensorDictBase,
+    task: Task,
+    episodes: torch.Tensor,
+    decay: float,
+    seed: int,
+) -> dict[str, float]:
+    """Rolls out one episode per demonstration.
+
+    Args:
+        controller (InverseDynamics): reads windows of what the sensor shows.
+        sensor (RegimeSensor): of the regime.
+        shown (TensorDictBase): flat data with the recorded positions as ``observation``, what the sensor showed of them
+            as ``state``, and ``distractors`` where the regime has some.
+        task (Task): has the environment; the robot's position is what the sensor is asked for.
+        episodes (Tensor): numbers of the demonstrations.
+        decay (float): with which plans are bent towards the present observation.
+        seed (int): of the noise on what is observed.
+
+    Returns:
+        dict: successes, collisions, mean distance to the demonstration over the steps of running episodes (mm).
+    """
+    parts = [shown[shown["episode"] == number] for number in episodes]
+    steps = max(len(part) for part in parts) + SPARE
+    plans, paths = (padded([part[key] for part in parts], steps + HORIZON) for key in ("state", "observation"))
+    moving = padded([part["distractors"] for part in parts], steps + 1) if sensor.distractors is not None else None
+    columns = list(task.state_columns)[: paths.shape[-1]]
+    env = make_env(task, len(parts), max_steps=steps)
+    td, history = env.reset(), []
+    running, distances = torch.ones(len(parts), dtype=torch.bool), []
+    outcome = torch.zeros(2, len(parts), dtype=torch.bool)
+    noise = torch.Generator().manual_seed(seed)
+    for step in range(steps):
+        beside = None if moving is None else moving[:, max(step - 1, 0)]
+        seen = sensor.noisy(sensor.show(td["observation"][:, columns].to(paths), beside), noise).to(plans)
+        history = ([seen] * (controller.num_past + 1) if not history else [*history, seen])[-controller.num_past - 1 :]
+        observed = torch.stack(history, 1)
+        plan = blend_plan(observed, plans[:, step : step + HORIZON], decay)
+        window = TensorDict({"state": torch.cat([observed, plan], 1)}, [len(parts)])
+        td = env.step(td.set("action", controller(window)["action"][:, controller.num_past]))["next"]
+        ended = running & td["done"].squeeze(-1)
+        outcome[0] |= ended & td["success"].squeeze(-1)
+        outcome[1] |= ended & td["terminated"].squeeze(-1) & ~td["success"].squeeze(-1)
+        running &= ~ended
+        if not running.any():
+            break
+        distances.append((td["observation"][:, columns] - paths[:, step]).norm(dim=-1)[running])
+        td = step_mdp(TensorDict({"next": td}, td.batch_size))
+    env.close()
+    return {
+        "successes": int(outcome[0].sum()),
+        "collisions": int(outcome[1].sum()),
+        "distance_mm": 1e3 * float(torch.cat(distances).mean()),
+    }
+
+
+def run_seed(data, source: Task, unit: str, regime: Regime, seed: int, judges, follows, judged: int):
+    """Trains the controllers of one setting and seed, measures errors and rolls them out.
+
+    Args:
+        data (TensorDictBase): flat data with the recorded positions as ``state``.
+        source (Task): has the environment.
+        unit (str): of its actions.
+        regime (Regime): what is observed.
+        seed (int): of labels, noise and training.
+        judges (list of tuple): methods and numbers of labelled trajectories whose error is measured.
+        follows (list of tuple): those that are rolled out.
+        judged (int): demonstrations that are followed.
+
+    Yields:
+        tuple: the cell, its columns of the table of errors or None, what :func:`follow` found or None.
+    """
+    wanted = list(dict.fromkeys([*judges, *follows]))  # each is trained once
+    wanted.sort(key=lambda cell: (list(METHODS).index(cell[0]), cell[1]))
+    if not wanted:
+        return
+    sensor = RegimeSensor(data, regime, seed=seed)
+    seen = data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
+    full, task = as_own_data(seen)
+    numbers = shuffled_trajectories(full, seed)
+    places = torch.unique(data["episode"], return_inverse=True)[1]  # as data of one's own are numbered
+    shown = seen.copy().set("observation", data["state"]).set("episode", places)
+    if sensor.distractors is not None:
+        shown["distractors"] = sensor.distractors
+    for method, labels, controller, found, updates in controllers(full, task, numbers, seed, wanted):
+        cell, error, rolled = (method, labels), None, None
+        if cell in judges:
+            error = (*error_row(controller, full, numbers, unit), choice_of(controller, found), updates)
+        if cell in follows:
+            decay = Execution().blend
+            rolled = follow(controller, sensor, shown, source, numbers[-judged:], decay, NOISE_SEED + seed)
+            rolled |= {"distance_mm": f"{rolled['distance_mm']:.2f}"}
+        yield cell, error, rolled
+
+
+def main(
+    *,
+    dataset: Path,
+    observed: tuple[str, ...] = tuple(REGIMES),
+    methods: tuple[str, ...] = tuple(METHODS),
+    labels: tuple[int, ...] = (1, 2, 4, 8, 16),
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4),
+    rollouts: bool = False,
+    judged: int = 60,
+    trajectories: int = 96,
+    folder: Path = RESULTS,
+) -> None:
+    """Runs what the tables lack.
+
+    Args:
+        dataset: folder written by koap demos.
+        observed: what is observed, names of benchmarks/regimes.py or joints_hidden.
+        methods: what is compared.
+        labels: labelled trajectories.
+        seeds: of labels, noise and training.
+        rollouts: roll the controllers out as well.
+        judged: demonstrations followed per seed.
+        trajectories: demonstrations used at most.
+        folder: of the tables.
+    """
+    for name, known in ((name, METHODS) for name in methods):
+        lookup(known, name, "method")
+    regimes = [lookup(OBSERVED, name, "observation setting") for name in observed]
+    source = find_task_of(str(dataset))
+    if rollouts and source.name != "avoiding":
+        raise ValueError(f"{dataset} holds demonstrations of {source.name}: Avoiding's alone need no objects")
+    warnings.filterwarnings("ignore", category=UserWarning)
+    torch.set_num_threads(1)
+    data, unit = load_positions(str(dataset), trajectories)
+    needed = max(JUDGED, judged if rollouts else 0) + max(labels)
+    if len(data["episode"].unique()) < needed:
+        raise ValueError(f"{dataset} has fewer than {needed} demonstrations, those that are judged and labelled")
+    known, write_error = open_table(folder / "unlabelled_data.csv", ERRORS, KEYS)
+    done, write = open_table(folder / "unlabelled_rollouts.csv", ROLLOUTS, KEYS) if rollouts else (set(), None)
+    cells = list(product(methods, labels))
+    with progress_bar(len(regimes) * len(seeds) * len(cells), "cells") as bar:
+        for regime, seed in product(regimes, seeds):
+            keys = {cell: (source.name, regime.name, str(cell[1]), str(seed), cell[0]) for cell in cells}
+            judges = [cell for cell in cells if keys[cell] not in known]
+            follows = [cell for cell in cells if rollouts and keys[cell] not in done]
+            bar.update(len(cells) - len({*follows, *judges}))
+            for cell, error, rolled in run_seed(data, source, unit, regime, seed, judges, follows, judged):
+                if error is not None:
+                    write_error((*keys[cell], *error))
+                if rolled is not None:
+                    write((*keys[cell], Execution().blend, judged, *rolled.values()))
+                bar.update()
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,150 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The paper's tables as data, measured cells in their layout beside them, averages over whole rows of tasks alone."""
+
+from __future__ import annotations
+
+import pytest
+
+from torchrl_koap.studies import paper
+from torchrl_koap.studies.paper import (
+    DEFAULT,
+    above_the_paper,
+    average_over_tasks,
+    default_entries,
+    draw_average,
+    layout_rows,
+    paper_entries,
+    write_paper_layout,
+)
+from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels, paper_points
+from torchrl_koap.tasks import TASKS, get_task
+
+
+def test_both_tables_are_whole():
+    first, second = paper_cells(1), paper_cells(2)
+    tasks = ["avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints"]
+    places = {(cell.task, cell.method, cell.level) for cell in first if cell.task in tasks}
+    assert places == {(t, m, n) for t in tasks for m in ("dp", "dd", "vae", "lapo", "koap") for n in range(1, 6)}
+    places = {(cell.task, cell.method, cell.level) for cell in second if cell.task in tasks}
+    methods = ("koap", "nonlinear", "pretrain", "relabel")
+    assert places == {(t, m, n) for t in (tasks[0], tasks[4]) for m in methods for n in range(1, 6)}
+    assert all(0 <= cell.success <= 1 and 0 <= cell.spread < 0.25 for cell in first + second)
+
+
+@pytest.mark.parametrize(
+    ("task", "method", "level", "share", "text"),
+    [
+        ("avoiding", "koap", 1, 0.02, "78.0 +- 8.6"),
+        ("avoiding", "dp", 5, 0.5, "94.7 +- 1.8"),
+        ("aligning", "koap", 5, 0.5, "92.0 +- 5.4"),
+        ("sorting", "dd", 2, 0.02, "49.7 +- 7.6"),
+        ("po_sorting", "vae", 3, 0.05, "16.4 +- 1.9"),
+        ("stacking_unobserved_joints", "koap", 4, 0.1, "37.0 +- 10.8"),
+        ("stacking_1", "koap", 4, 0.1, "37.0 +- 10.8"),
+        ("avoiding", "relabel", 1, 0.02, "5.8 +- 11.0"),
+    ],
+)
+def test_single_cells(task, method, level, share, text):
+    cell = paper_cell(task, method, level)
+    assert (cell.label_share, cell.text) == (share, text)
+
+
+def test_koap_of_both_tables_is_the_same():
+    second = {(cell.task, cell.level): cell.text for cell in paper_cells(2) if cell.method == "koap"}
+    assert second and all(paper_cell(task, "koap", level).text == text for (task, level), text in second.items())
+
+
+def test_levels_are_those_of_the_tasks():
+    for name, task in TASKS.items():
+        if paper_levels(name):
+            assert paper_levels(name) == task.label_levels
+    assert get_task("aligning").label_levels == (0.02, 0.05, 0.1, 0.25, 0.5)
+    assert get_task("po_sorting").label_levels == (0.01, 0.02, 0.05, 0.1, 0.25)
+
+
+def test_what_the_paper_does_not_have_is_none():
+    assert paper_cell("aligning", "koap_untrained", 2) is None and paper_cell("sorting_2", "koap", 1) is None
+    assert paper_levels("stacking") == ()
+    assert paper_points("sorting_6") == []
+
+
+def test_points_lie_at_the_papers_shares():
+    rows = [row for row in paper_points("avoiding") if row["method"] == "koap"]
+    assert [(row["labels"], row["success"]) for row in rows] == [
+        (0.02, pytest.approx(0.7803)),
+        (0.05, pytest.approx(0.9805)),
+        (0.1, pytest.approx(0.9722)),
+        (0.25, pytest.approx(0.9833)),
+        (0.5, pytest.approx(0.975)),
+    ]
+
+
+def test_an_unknown_table_is_refused():
+    with pytest.raises(ValueError, match="unknown table of the paper '3'"):
+        paper_cells(3)
+
+
+def cell(task, method, labels, successes=None, seed=0):
+    row = {"task": task, "method": method, "labels": labels, "seed": seed, "status": "missing"}
+    return row if successes is None else row | {"status": "done", "episodes": 60, "successes": successes}
+
+
+ROWS = [
+    cell("avoiding", "koap", 0.02, 54),
+    cell("avoiding", "dp", 0.02, 6),
+    cell("avoiding", "koap", 0.5, 57),
+    cell("sorting", "koap", 0.01, 30),
+    cell("sorting", "koap", 0.01, 36, seed=1),
+    cell("sorting", "dp", 0.01),
+    cell("sorting", "koap", 0.03, 36),  # no level of the task
+]
+
+
+def test_cells_stand_at_their_levels_beside_the_papers():
+    assert layout_rows(paper_entries(ROWS)) == [
+        {
+            "task": "avoiding",
+            "level": "1 (2 %)",
+            "koap": "90.0 (80-95) [78.0 +- 8.6]",
+            "dp": "10.0 (5-20) [6.9 +- 4.5]",
+        },
+        {"task": "avoiding", "level": "5 (50 %)", "koap": "95.0 (86-98) [97.5 +- 1.6]", "dp": "not run [94.7 +- 1.8]"},
+        {"task": "sorting", "level": "1 (1 %)", "koap": "55.0 (46-64) [61.7 +- 5.6]", "dp": "not run [0.0 +- 0.0]"},
+    ]
+    assert above_the_paper(paper_entries(ROWS)) == (1, 3)
+
+
+def test_an_average_is_over_all_tasks_or_none():
+    averages = average_over_tasks(paper_entries(ROWS))
+    assert set(averages) == {"koap"}  # dp was not run on Sorting
+    ((level, mean, low, high),) = averages["koap"]  # nor anything at level 5 of it
+    assert level == 1 and mean == pytest.approx((0.9 + 0.55) / 2)
+    halves = [(0.9 - 0.79854, 0.95341 - 0.9), (0.55 - 0.46081, 0.63614 - 0.55)]  # of the cells' Wilson intervals
+    assert low == pytest.approx(mean - (halves[0][0] ** 2 + halves[1][0] ** 2) ** 0.5 / 2, abs=1e-3)
+    assert high == pytest.approx(mean + (halves[0][1] ** 2 + halves[1][1] ** 2) ** 0.5 / 2, abs=1e-3)
+
+
+def test_what_is_written(tmp_path):
+    made = write_paper_layout(tmp_path, ROWS)
+    assert made["sentence"] in (tmp_path / "paper_table.md").read_text()
+    assert (tmp_path / made["picture"]).stat().st_size > 1000
+    assert write_paper_layout(tmp_path, [cell("sorting", "koap", 0.01)])["picture"] is None
+    with pytest.raises(ValueError, match="nothing to average"):
+        draw_average(paper_entries([cell("sorting", "koap", 0.01)]), tmp_path / "a.png")
+
+
+def test_default_methods_are_one_line_where_tasks_differ(tmp_path, monkeypatch):
+    here = "stacking_unobserved_joints"
+    rows = [cell("avoiding", "koap", 0.02, 54), cell(here, "koap", 0.01, 0), cell(here, "command_regression", 0.01, 30)]
+    entries = paper_entries(rows)
+    assert {(entry.task, entry.success) for entry in default_entries(entries)} == {("avoiding", 0.9), (here, 0.5)}
+    ((level, mean, *_),) = average_over_tasks(default_entries(entries))[DEFAULT]
+    assert (level, mean) == (1, pytest.approx(0.7))
+    drawn = {}
+    note = lambda averages, points, tasks, path: drawn.update(averages=averages, points=points)  # noqa: E731
+    monkeypatch.setattr(paper, "plot_average", note)
+    draw_average(entries, tmp_path / "two.png")
+    means = {name: [mean for _, mean, *_ in points] for name, points in drawn["averages"].items()}
+    assert means == {DEFAULT: [pytest.approx(0.7)], "koap": [0.45]} and set(drawn["points"]) == {"koap"}
+    draw_average(paper_entries(ROWS), tmp_path / "one.png")  # both are trained with koap
+    assert set(drawn["averages"]) == {"koap"}

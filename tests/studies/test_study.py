@@ -1,0 +1,129 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""What a study asks of its cells: shared planners, defaults of methods, presets of the paper; nothing is trained."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+from tiny_runs import TINY, koap
+
+from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig, RunConfig
+from torchrl_koap.runs.pretrained import pretrained_folders
+from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.studies import Study, run_study
+from torchrl_koap.studies.paper import PRESETS
+from torchrl_koap.studies.study import cells_of, check_study, complete, eval_config, planner_folder, train_config
+from torchrl_koap.tasks import TASKS, get_task
+from torchrl_koap.training import resolve
+from torchrl_koap.training.methods import METHODS
+
+
+@pytest.fixture
+def asked(demonstrations, tmp_path):
+    """Completes a study of the demonstrations."""
+
+    def make(**options):
+        options = {"labels": (0.5,), "seeds": 2, "datasets": (str(demonstrations),)} | options
+        study = complete(Study(out=tmp_path / "study", **options))
+        return study, check_study(study)
+
+    return make
+
+
+def test_cells_of_all_seeds_share_a_planner_that_knows_no_seed(asked):
+    planner = PlannerConfig(network="mlp", width=64)
+    study, cells = asked(methods=("koap", "dp"), planner=planner, controller=ControllerConfig(steps=7))
+    assert [cell.folder for cell in cells] == [
+        f"cells/avoiding/{method}-0.5-1-seed{seed}" for seed in (0, 1) for method in ("koap", "dp")
+    ]
+    shared = study.out / "planners/avoiding/1-seed0"
+    alone = train_config(study, cells[0], planner=True)
+    assert (alone.out, alone.planner, alone.run.seed, alone.labels.fraction) == (shared, planner, 0, None)
+    for cell in cells:
+        config = train_config(study, cell)
+        assert (config.labels.fraction, config.run.seed, config.controller.steps) == (0.5, cell.seed, 7)
+        expected = planner if cell.method == "dp" else PlannerConfig(source=shared)
+        assert config.planner == expected and config.out == study.out / cell.folder
+
+
+def test_a_planner_per_seed_and_share_of_the_demonstrations(asked):
+    study, cells = asked(methods=("koap",), planner_seeds=2, demonstrations=(0.5, 1.0), seeds=3)
+    folders = {planner_folder(study, cell).name for cell in cells}
+    assert folders == {f"{share}-seed{seed}" for share in ("0.5", "1") for seed in (0, 1)}
+    last = train_config(study, cells[-2], planner=True)  # seed 2, half of the demonstrations
+    assert (last.labels.trajectories, last.run.seed) == (0.5, 0)
+
+
+def test_every_training_seed_meets_noise_of_its_own(asked):
+    study, cells = asked(methods=("koap", "dd"), seeds=3, evaluation=EvalConfig(episodes=2))
+    found = {(cell.method, cell.seed): eval_config(study, cell) for cell in cells}
+    assert [found["koap", seed].seed for seed in range(3)] == [EvalConfig.seed, 1100, 2100]
+    assert found["koap", 2] == found["dd", 2] and found["dd", 0].episodes == 2
+
+
+def test_koap_paper_is_measured_as_published_unless_told_otherwise(asked):
+    study, cells = asked(methods=("koap_paper", "koap"), seeds=1)
+    published, own = (train_config(replace(study, planners=()), cell) for cell in cells)
+    published, own = (resolve(replace(c, planner=study.planner), get_task("avoiding")) for c in (published, own))
+    assert (published.controller.columns, published.execution.strategy) == ("all", "open_loop")
+    assert (own.controller.columns, own.execution.strategy) == ("robot", "feedback")
+    study, (cell,) = asked(methods=("koap_paper",), seeds=1, execution=ExecutionConfig(strategy="feedback"))
+    config = replace(train_config(study, cell), planner=study.planner)
+    assert resolve(config, get_task("avoiding")).execution.strategy == "feedback"
+
+
+def test_a_planner_of_another_run_is_taken_over_or_refused(asked, demonstrations, tmp_path):
+    run = tmp_path / "run"
+    assert koap("train", "--out", run, "--dataset", demonstrations, "--method", "linear", *TINY) == 0
+    study, cells = asked(methods=("koap",), planners=(str(run),))
+    assert {planner_folder(study, cell) for cell in cells} == {run}
+    with pytest.raises(RunDirectoryError):
+        asked(methods=("koap",), planners=(str(tmp_path / "none"),))
+    assert not study.out.exists()
+    named, _ = asked(methods=("koap",), planners=("pretrained:avoiding",))
+    assert named.planners == (f"avoiding={pretrained_folders()['avoiding'].absolute()}",)
+
+
+def test_data_are_needed_where_there_is_no_environment(tmp_path):
+    from torchrl_koap.tasks import Action, Task, register_task
+
+    register_task(Task(name="bare_arm", observation_parts={"q": 2}, actions={"dq": Action("rad")}, position="q"))
+    try:
+        with pytest.raises(ValueError, match="task 'bare_arm' has no environment to record demonstrations in"):
+            run_study(Study(out=tmp_path / "out", tasks=("bare_arm",)))
+    finally:
+        del TASKS["bare_arm"]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+def test_presets_name_fields_methods_and_tasks_that_exist(preset):
+    assert set(preset) <= {field.name for field in fields(Study)}
+    assert set(preset["methods"]) <= set(METHODS) and set(preset["tasks"]) <= set(TASKS)
+
+
+def test_a_table_is_the_papers_tasks_at_its_levels(tmp_path):
+    study = complete(Study(out=tmp_path, preset="table1", tasks=("aligning", "sorting"), methods=("koap",), seeds=1))
+    assert (study.label_unit, study.labels, study.planner.width, study.run.precision) == ("window", (), 512, "auto")
+    shares = {task: [cell.labels for cell in cells_of(study) if cell.task == task] for task in study.tasks}
+    assert shares == {"aligning": [0.02, 0.05, 0.1, 0.25, 0.5], "sorting": [0.01, 0.02, 0.05, 0.1, 0.25]}
+    assert [config.split("=")[0] for config in study.datasets] == []
+
+
+def test_what_is_asked_for_wins_over_the_preset(tmp_path):
+    own = {"planner": PlannerConfig(width=99), "evaluation": EvalConfig(episodes=7), "labels": (0.3,)}
+    study = complete(Study(out=tmp_path, preset="quick", tasks=("avoiding",), run=RunConfig(threads=2), **own))
+    assert (study.planner.width, study.planner.steps, study.evaluation.episodes) == (99, 2000, 7)
+    assert (study.labels, study.levels, study.seeds, study.record) == ((0.3,), (), 1, 48)
+    assert (study.run.threads, study.run.precision, study.preset) == (2, "auto", None)
+
+
+def test_data_and_planners_are_named_by_task(tmp_path):
+    Path(tmp_path / "data").mkdir()
+    study = Study(out=tmp_path / "s", tasks=("avoiding", "sorting"), datasets=(f"sorting={tmp_path / 'data'}",))
+    assert complete(study).datasets == (f"sorting={tmp_path / 'data'}",)
+    for wrong, message in (("demos", "must be TASK=FOLDER"), ("sortin=x", "unknown task of datasets: 'sortin'")):
+        with pytest.raises(ValueError, match=message):
+            complete(replace(study, datasets=(wrong,)))

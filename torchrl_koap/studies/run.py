@@ -1,0 +1,250 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Does what is missing of a study, resumable at any moment, and writes its table and report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_koap.data import flatten_trajectories, save_ted, subsample_trajectories
+from torchrl_koap.runs.config_files import to_json
+from torchrl_koap.runs.progress import count_up_to, progress_bar
+from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result, run_cell
+from torchrl_koap.studies.launchers import Job, Machines, launch
+from torchrl_koap.studies.paper import write_paper_layout
+from torchrl_koap.studies.paper_results import paper_points
+from torchrl_koap.studies.report import write_study_report
+from torchrl_koap.studies.study import (
+    FILE,
+    Study,
+    cells_of,
+    check_folder,
+    check_study,
+    complete,
+    dataset_of,
+    eval_config,
+    of_task,
+    planner_folder,
+    task_of,
+    together,
+    train_config,
+)
+from torchrl_koap.studies.table import write_cells
+from torchrl_koap.tasks import Task, get_task
+from torchrl_koap.training.datasets import label_budget, load_demonstrations
+
+_EVERY, _SHARE = 1.0, 0.05  # least time (s) between two writes of the table, share of the time that writes may take
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """What a study found.
+
+    Args:
+        rows (list of dict): cells as in ``cells.csv``.
+        counts (mapping): how many cells are done, failed and missing.
+        report (Path): the page.
+    """
+
+    rows: list[dict[str, Any]]
+    counts: Mapping[str, int]
+    report: Path
+
+
+def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
+    """Does what is missing of a study and writes its report; ``koap curve`` calls this.
+
+    Args:
+        study (Study): what to compare on what, and where to write it.
+        machines (Machines, optional): where the cells are made.
+
+    Returns:
+        StudyResult: its cells, how many are done, failed and missing, and where the report is.
+
+    Raises:
+        ValueError: for unknown names, shares out of range or that select nothing; before any work.
+        RunDirectoryError: if the folder holds something else, a study with other settings, or one that is being worked
+            on.
+        PluginError: if a plugin cannot be imported.
+
+    Examples:
+        >>> from torchrl_koap import Study, run_study
+        >>> study = Study(out="study", methods=("koap", "linear"), labels=(0.01, 0.1), seeds=2)
+        >>> run_study(study).counts["done"]  # doctest: +SKIP
+        8
+        >>> run_study(Study(out="study", methods=("kaop",)))  # refused before anything is done
+        Traceback (most recent call last):
+        ...
+        ValueError: unknown method 'kaop'; did you mean 'koap'?
+    """
+    study = complete(study)
+    cells, root = check_study(study), RunDirectory(study.out)
+    for task in study.tasks:
+        check_labels(study, cells, task_of(study, task), _first_look(study, task_of(study, task)))
+    with root.locked("koap curve", "lock"):
+        check_folder(study)  # another one may have finished here in the meantime
+        for task in study.tasks:
+            recorded(study, cells, task_of(study, task))
+        whole = together(study)
+        root.write_json(FILE, to_json(replace(whole, out=Path())))
+        asked = set(cells)
+        earlier = [cell for cell in cells_of(whole) if cell not in asked and _began(study.out / cell.folder)]
+        table = _Table(study, [*cells, *earlier])
+        _work(study, cells, table, machines)
+        table.write()
+        report = _report(whole, table)
+    rows = list(table.rows.values())
+    counts = {status: sum(row["status"] == status for row in rows) for status in ("done", "failed", "missing")}
+    return StudyResult(rows, counts, report)
+
+
+def _report(study: Study, table: _Table) -> Path:
+    """Writes the page; label levels of windows stand beside the paper's figures."""
+    rows, paper, layout = list(table.rows.values()), [], None
+    if study.label_unit == "window":
+        paper = [point for task in study.tasks for point in paper_points(task)]
+        layout = write_paper_layout(study.out, rows) if study.levels else None
+    named = study.tasks[0] if len(study.tasks) == 1 else f"{len(study.tasks)} tasks"
+    options = {name: value for name, value in _flat(to_json(study)) if value not in (None, [])}
+    title = f"Label efficiency on {named}"
+    return write_study_report(study.out, rows, table.outcomes, title=title, options=options, paper=paper, layout=layout)
+
+
+def _flat(options: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    found: list[tuple[str, Any]] = []
+    for name, value in options.items():
+        found += _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else [(prefix + name, value)]
+    return found
+
+
+def _first_look(study: Study, task: Task) -> TensorDictBase | None:
+    """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
+    folder = dataset_of(study, task.name)
+    if of_task(study.datasets, task.name) is not None or (folder / "ted").exists():
+        return load_demonstrations(str(folder), task)
+    if task.env is None:
+        raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: name --datasets")
+    if study.label_unit != "trajectory":
+        return None
+    number = study.record or task.defaults.demonstrations
+    return flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number)
+
+
+def recorded(study: Study, cells: Sequence[Cell], task: Task) -> None:
+    """Records the demonstrations of a task, once for all cells, where none are given.
+
+    Raises:
+        ValueError: if a share of labels selects none of them.
+    """
+    folder = dataset_of(study, task.name)
+    if of_task(study.datasets, task.name) is not None or (folder / "ted").exists():
+        return
+    from torchrl_koap.envs.experts.demonstrations import record_demonstrations  # needs a simulator
+
+    episodes = study.record or task.defaults.demonstrations
+    with progress_bar(episodes, "demonstrations", unit="episode") as bar:
+        data, _ = record_demonstrations(task.name, episodes, 0, progress=count_up_to(bar))
+    save_ted(data, folder / "ted", get_task(task.source))
+    check_labels(study, cells, task, load_demonstrations(str(folder), task))
+
+
+def check_labels(study: Study, cells: Sequence[Cell], task: Task, data: TensorDictBase | None) -> None:
+    """Refuses before any work what would fail in a cell: labels that select nothing, shares below the labelled.
+
+    Raises:
+        ValueError: naming the share.
+    """
+    if data is None:
+        return
+    # windows of another seed lie in another number of trajectories
+    wanted = {(cell.labels, cell.demonstrations, cell.seed): cell for cell in cells if cell.task == task.name}
+    for cell in wanted.values():
+        labelled, _ = label_budget(train_config(study, cell)).apply(data)
+        subsample_trajectories(labelled, cell.demonstrations)
+
+
+class _Table:
+    """``cells.csv`` while cells come in: every finished cell is read once, not again after each other one."""
+
+    def __init__(self, study: Study, cells: Sequence[Cell]):
+        self.study = study
+        self.rows: dict[Cell, dict[str, Any]] = {}
+        self.outcomes: dict[str, Mapping[tuple[int, int], float]] = {}
+        self._next = 0.0
+        for cell in cells:
+            self._read(cell, None)
+
+    def _read(self, cell: Cell, reason: str | None) -> None:
+        row, outcomes = cell_row(self.study.out, cell, label_unit=self.study.label_unit, reason=reason)
+        self.rows[cell] = row
+        if outcomes:
+            self.outcomes[cell.folder] = outcomes
+
+    def ended(self, cell: Cell, reason: str | None) -> None:
+        """Reads a cell that has just ended; the file is written unless that was done a moment ago."""
+        self._read(cell, reason)
+        if time.monotonic() >= self._next:
+            self.write()
+
+    def write(self) -> None:
+        """Writes the file."""
+        began = time.monotonic()
+        write_cells(self.study.out / "cells.csv", list(self.rows.values()))
+        ended = time.monotonic()
+        self._next = ended + max(_EVERY, (ended - began) / _SHARE)
+
+
+def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines | None) -> None:
+    """Does the cells that are not done, and the planners that they share before."""
+    first: list[Job] = []
+    jobs: dict[Path, Job] = {}
+    for cell in cells:
+        if table.rows[cell]["status"] == "done":
+            continue
+        planner, needs = planner_folder(study, cell), None
+        if planner is not None and of_task(study.planners, cell.task) is None and not _is_trained(planner):
+            needs = planner
+            if planner not in {job.folder for job in first}:
+                first.append(Job(planner))
+                _prepare(planner, train_config(study, cell, planner=True), None)
+        folder = study.out / cell.folder
+        jobs[folder] = Job(folder, needs)
+        _prepare(folder, train_config(study, cell), eval_config(study, cell))
+    places = {study.out / cell.folder: cell for cell in cells}
+    alone = [job for job in jobs.values() if job.needs is None]  # they need not wait for a planner
+    ordered = [*first, *alone, *(job for job in jobs.values() if job.needs is not None)]
+    with progress_bar(len(ordered), "cells", unit="cell", smoothing=0.1) as bar:
+        with closing(launch(run_cell, ordered, machines)) as ended:
+            for job, reason in ended:
+                bar.update()
+                bar.set_postfix_str(job.folder.name + (" FAILED" if reason else ""))
+                if job.folder in places:
+                    table.ended(places[job.folder], reason)
+
+
+def _prepare(folder: Path, config: Any, evaluation: Any) -> None:
+    """Says what a cell is to do; where that cannot be written its own process will say why."""
+    try:
+        prepare_cell(folder, config, evaluation)
+    except OSError:
+        return
+
+
+def _began(folder: Path) -> bool:
+    return (folder / "log.txt").exists() or folder.is_file()
+
+
+def _is_trained(folder: Path) -> bool:
+    """Whether a shared planner was finished."""
+    try:
+        return read_result(folder) is not None and (folder / "planner.safetensors").is_file()
+    except RunDirectoryError:
+        return False
