@@ -192,7 +192,7 @@ def cells_of(study: Study) -> list[Cell]:
         for task in dict.fromkeys(study.tasks)
         for seed in range(study.seeds)
         for share in dict.fromkeys(study.demonstrations)
-        for labels in dict.fromkeys([*study.labels, *levels_of(get_task(task), study.levels)])
+        for labels in dict.fromkeys([*study.labels, *levels_of(task_of(study, task), study.levels)])
         for method in dict.fromkeys(study.methods)
     ]
 
