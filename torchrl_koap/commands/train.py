@@ -143,6 +143,7 @@ def show_help() -> None:
         " --help-all` shows every option, by section.",
     )
     for name, (_, kind, about) in SHORT.items():
-        page.add_argument(name, help=about, **({"metavar": kind} if kind else {"action": "store_true"}))
+        options: dict[str, Any] = {"metavar": kind} if kind else {"action": "store_true"}
+        page.add_argument(name, help=about, **options)
     page.print_help()
     sys.exit(0)

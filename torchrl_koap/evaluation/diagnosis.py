@@ -45,7 +45,8 @@ class RecordedFutures(TensorDictModuleBase):
 
     def __init__(self, futures: Tensor):
         super().__init__()
-        self.in_keys, self.out_keys = [], [RECORDED_FUTURE]
+        self.in_keys: list[str] = []
+        self.out_keys = [RECORDED_FUTURE]
         self.register_buffer("futures", futures, persistent=False)
         self.step = 0
 

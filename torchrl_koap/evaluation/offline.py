@@ -84,8 +84,8 @@ def _actions(trained: Trained, data: TensorDictBase, labelled: TensorDictBase, *
         hint = "; train it on fewer labels than there are (--labels): the others tell how good it is"
         return {"outside_budget": outside, "left_out": {"note": note + (hint if "note" in outside else "")}}
     if trained.method.fit is not None:
-        note = {"note": "the controller decodes no recorded states: it follows plans by the command that it gave"}
-        return {"outside_budget": note, "left_out": note}
+        note = "the controller decodes no recorded states: it follows plans by the command that it gave"
+        return {"outside_budget": {"note": note}, "left_out": {"note": note}}
     view, seen = (controller_view(part, trained.columns, targets=task.targets) for part in (data, labelled))
     controller = trained.controller.cpu()
     return {

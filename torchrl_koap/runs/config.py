@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
@@ -206,7 +207,8 @@ class TrainConfig:
 def _check(section: str, config: object, **ranges: tuple) -> None:
     """Refuses numbers out of range; a range is least, most (None: any), and whether each of them is allowed itself."""
     for name, limits in ranges.items():
-        least, most, from_least, to_most = (*limits, *(None, True, True)[len(limits) - 1 :])
+        given: list[Any] = [*limits, *(None, True, True)[len(limits) - 1 :]]
+        least, most, from_least, to_most = given
         value = getattr(config, name)
         if value is None:
             continue

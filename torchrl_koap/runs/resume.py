@@ -63,7 +63,7 @@ def check_resume(run: RunDirectory, config: TrainConfig) -> None:
         raise RunDirectoryError(f"{run.path} holds a run already; choose another --out, or --resume it")
     saved = read_config(run)
     # a folder that is gone was moved, probably together with this run: there is nothing to compare with
-    paths = {"dataset": saved.dataset, "planner.source": saved.planner.source}
+    paths: dict[str, Any] = {"dataset": saved.dataset, "planner.source": saved.planner.source}
     moved = {name for name, path in paths.items() if path is not None and not Path(path).exists()}
     if changed := [name for name in changed_options(config, saved) if name not in FREE | moved]:
         raise RunDirectoryError(f"{run.path} was started with another {', '.join(changed)}; it cannot be resumed so")

@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -61,15 +61,30 @@ def find_task_of(dataset: str | None, name: str | None = None) -> Task:
 def load_demonstrations(
     dataset: str, task: Task, *, progress: Callable[[int, int], None] | None = None
 ) -> TensorDictBase:
-    """Reads demonstrations as :func:`~torchrl_koap.data.open_dataset`, without their task."""
+    """Reads demonstrations whose task is known.
+
+    Args:
+        dataset (str): folder, as for :func:`~torchrl_koap.data.open_dataset`.
+        task (Task): the task.
+
+    Keyword Args:
+        progress (callable, optional): called with the number of files read and of all.
+
+    Returns:
+        TensorDictBase: flat data ``[N]`` with ``state``.
+
+    Examples:
+        >>> from torchrl_koap.training.datasets import load_demonstrations
+        >>> load_demonstrations("runs/demos", get_task("avoiding"))  # doctest: +SKIP
+    """
     return open_dataset(dataset, task=task, progress=progress)[0]
 
 
 def label_budget(config: TrainConfig) -> LabelBudget:
     """Makes the label budget that a resolved configuration asks for."""
     labels = config.labels
-    chosen = {"fraction": labels.fraction, "count": labels.count, "episodes": labels.episodes or None}
-    return LabelBudget(**chosen, unit=labels.unit, seed=config.run.seed)
+    chosen: dict[str, Any] = {"fraction": labels.fraction, "count": labels.count, "episodes": labels.episodes or None}
+    return LabelBudget(**chosen, unit=cast(Any, labels.unit), seed=config.run.seed)
 
 
 def fingerprint(data: TensorDictBase) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class Phase:
     """
 
     name: str
-    loss: Callable[[Any], LossModule]
+    loss: Callable[..., LossModule]
     windows: str = "all"
     share: float = 1.0
 

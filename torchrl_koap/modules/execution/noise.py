@@ -72,7 +72,8 @@ class StartNoise(TensorDictModuleBase):
 
     def __init__(self, streams: NoiseStreams, *, noise_key: NestedKey = NOISE):
         super().__init__()
-        self.in_keys, self.out_keys, self.streams = [], [noise_key], streams
+        self.in_keys: list[NestedKey] = []
+        self.out_keys, self.streams = [noise_key], streams
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the noise."""
