@@ -97,7 +97,7 @@ def planner_rollout(planner: StatePlanner, start: Tensor, *, interval: int, max_
         seed (int): seed of the planner's noise.
 
     Returns:
-        Tensor: imagined states ``[E, max_steps, d]`` (or a few more), the first one the start.
+        Tensor: planned states ``[E, max_steps, d]`` (or a few more), the first one the start.
     """
     generator = torch.Generator(start.device).manual_seed(seed)
     states = [start] * planner.history
@@ -292,17 +292,17 @@ def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase, *
     }
 
 
-def reaches_goal(task: Task, imagined: Tensor) -> list[bool]:
-    """Which imagined episodes reach the goal at any time.
+def reaches_goal(task: Task, states: Tensor) -> list[bool]:
+    """Tells which planned episodes reach the goal at any time.
 
     Args:
         task (Task): tells the goal.
-        imagined (Tensor): states ``[E, T, d]``.
+        states (Tensor): ``[E, T, d]``.
 
     Returns:
         list of bool: one per episode.
     """
-    return task.goal_reached(imagined).any(-1).tolist()
+    return task.goal_reached(states).any(-1).tolist()
 
 
 def executed_success(episodes: Sequence[TensorDict]) -> list[bool]:

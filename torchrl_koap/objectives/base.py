@@ -68,6 +68,12 @@ class NetworkLoss(LossModule):
 
     Raises:
         ValueError: for an unknown reduction.
+
+    Examples:
+        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
+        >>> from torchrl_koap.objectives import KOAPLoss  # a loss of this base
+        >>> KOAPLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8)).in_keys[:2]
+        ['state', 'action']
     """
 
     network: nn.Module

@@ -126,7 +126,13 @@ def versions() -> dict[str, str]:
 
 
 def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
-    """Returns the names of the options, with their sections, in which two configurations of one kind differ."""
+    """Returns the names of the options, with their sections, in which two configurations differ.
+
+    Args:
+        one (dataclass): a configuration.
+        other (dataclass): another of the same kind.
+        prefix (str): begins every name.
+    """
     changed = []
     for field in fields(one):
         a, b = getattr(one, field.name), getattr(other, field.name)

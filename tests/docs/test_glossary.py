@@ -1,0 +1,53 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""One word per concept: the glossary is short, and words that it replaced do not come back."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FILES = sorted((ROOT / "torchrl_koap").rglob("*.py"))
+OLD_NAMES = {
+    *("leash", "posture", "foresee", "foresight", "doubt", "doubts", "verdict", "joining", "exchange", "adopt"),
+    *("adopted", "whose", "regime", "dealt", "judge", "judged", "imagined", "recipe", "place", "places"),
+}
+OLD_WORDS = re.compile(
+    r"\b(leash|posture|fore(see|sees|seen|sight)|doubts?|verdict|in force|joining|adopt(s|ed)|dealt|judged?|imagined)\b"
+)
+
+
+def public_definitions(tree: ast.Module):
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            yield node
+
+
+def words_of(name: str) -> set[str]:
+    return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+", name)}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
+def test_old_words_are_no_public_names_and_open_no_docstring(file):
+    for node in public_definitions(ast.parse(file.read_text())):
+        names = [node.name]
+        if isinstance(node, ast.FunctionDef):
+            names += [argument.arg for argument in (*node.args.args, *node.args.kwonlyargs)]
+        for name in names:
+            assert not words_of(name) & OLD_NAMES, f"{node.name}: {name}"
+        first = (ast.get_docstring(node) or "").split("\n\n")[0]
+        assert not OLD_WORDS.search(first), f"{node.name}: {first}"
+
+
+def test_the_glossary_has_forty_terms_at_most_and_no_term_twice():
+    rows = re.findall(r"^\| ([^|]+) \|", (ROOT / "docs" / "glossary.md").read_text(), re.M)[1:]
+    assert 20 <= len(rows) <= 40 and len({*rows}) == len(rows)
+
+
+def test_old_words_are_found():
+    tree = ast.parse('def make_leash(lead):\n    """The verdict on a plan."""\n')
+    (node,) = public_definitions(tree)
+    assert words_of(node.name) & OLD_NAMES and OLD_WORDS.search(ast.get_docstring(node))

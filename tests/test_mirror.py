@@ -1,0 +1,91 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Every file of the package has its test file at the same place, or stands here beside the one that covers it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE, TESTS = ROOT / "torchrl_koap", ROOT / "tests"
+FILES = sorted(str(file.relative_to(PACKAGE)) for file in PACKAGE.rglob("*.py") if file.name != "__init__.py")
+
+# file of the package: what tests it from above
+COVERED_BY = {
+    "commands/command.py": "commands/test_cli.py",
+    "commands/doctor.py": "commands/test_cli.py",
+    "commands/embed.py": "faults/test_camera_data.py",
+    "commands/export.py": "modules/execution/test_export.py",
+    "commands/printing.py": "commands/test_cli.py",
+    "commands/run_commands.py": "commands/test_eval.py",
+    "commands/subcommands.py": "commands/test_cli.py",
+    "envs/base.py": "envs/test_avoiding.py",
+    "envs/experts/noise.py": "envs/experts/test_avoiding.py",
+    "envs/experts/recording.py": "envs/experts/test_demonstrations.py",
+    "envs/experts/recording_report.py": "envs/experts/test_demonstrations.py",
+    "envs/mujoco/inverse_kinematics.py": "envs/experts/test_stacking.py",
+    "envs/mujoco/kinematics.py": "envs/mujoco/test_controller.py",
+    "envs/mujoco/linear_algebra.py": "envs/mujoco/test_controller.py",
+    "envs/mujoco/mjcf.py": "envs/mujoco/test_panda.py",
+    "envs/mujoco/scene.py": "envs/mujoco/test_panda.py",
+    "envs/mujoco/simulation.py": "envs/mujoco/test_controller.py",
+    "envs/registry.py": "plugins/test_plugins.py",
+    "envs/scooping/expert.py": "envs/scooping/test_env.py",
+    "envs/scooping/kinematics.py": "envs/scooping/test_env.py",
+    "envs/scooping/recording.py": "envs/scooping/test_env.py",
+    "envs/scooping/scene.py": "envs/scooping/test_env.py",
+    "envs/scooping/simulation.py": "envs/scooping/test_env.py",
+    "evaluation/action_errors.py": "evaluation/test_offline.py",
+    "evaluation/closed_loop.py": "commands/test_eval.py",
+    "evaluation/config.py": "commands/test_eval.py",
+    "evaluation/environments.py": "evaluation/test_gymnasium.py",
+    "evaluation/inspection.py": "evaluation/test_diagnosis.py",
+    "evaluation/latency.py": "commands/test_eval.py",
+    "evaluation/policies.py": "evaluation/test_oracle.py",
+    "modules/execution/factory.py": "modules/execution/test_policy.py",
+    "modules/inverse_dynamics.py": "modules/koopman/test_inverse_dynamics.py",
+    "modules/planning/sampler.py": "modules/planning/test_planner.py",
+    "objectives/base.py": "objectives/test_koap.py",
+    "objectives/quantized.py": "modules/baselines/test_quantized.py",
+    "objectives/variational.py": "modules/baselines/test_variational.py",
+    "reports/html.py": "reports/test_run_report.py",
+    "reports/run_facts.py": "reports/test_run_report.py",
+    "reports/style.py": "reports/test_run_report.py",
+    "reports/tiles.py": "reports/test_run_report.py",
+    "reports/offline_plots.py": "reports/test_pictures.py",
+    "reports/writing.py": "reports/test_pictures.py",
+    "studies/paper_results.py": "studies/test_paper.py",
+    "studies/plots.py": "studies/test_report.py",
+    "studies/ray_launcher.py": "studies/test_ray_faults.py",
+    "studies/summary.py": "studies/test_table.py",
+    "tasks/aligning.py": "tasks/test_registry.py",
+    "tasks/avoiding.py": "tasks/test_registry.py",
+    "tasks/scooping.py": "tasks/test_registry.py",
+    "tasks/sorting.py": "tasks/test_registry.py",
+    "tasks/stacking.py": "tasks/test_registry.py",
+    "tasks/modes.py": "tasks/test_task.py",
+    "tasks/scene.py": "reports/test_scenes.py",
+    "tasks/units.py": "reports/test_pictures.py",
+    "training/controller.py": "training/test_methods.py",
+    "training/method.py": "training/test_methods.py",
+    "training/planner.py": "training/test_on_disk.py",
+    "training/policy_facts.py": "evaluation/test_oracle.py",
+    "vision/backbones.py": "vision/test_encoder.py",
+    "vision/projection.py": "vision/test_encoder.py",
+}
+
+
+def mirror_of(file: str) -> Path:
+    path = Path(file)
+    return TESTS / path.parent / f"test_{path.name}"
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_every_file_has_its_test_or_stands_in_the_list(file):
+    assert mirror_of(file).exists() != (file in COVERED_BY), "one of the two, not both"
+
+
+@pytest.mark.parametrize(("file", "cover"), COVERED_BY.items())
+def test_the_list_names_files_that_exist(file, cover):
+    assert (PACKAGE / file).exists() and (TESTS / cover).exists()
