@@ -173,7 +173,12 @@ def cell_row(
 
 
 def row_of(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
-    """The columns of ``cells.csv`` that training and evaluation of a cell found."""
+    """The columns of ``cells.csv`` that training and evaluation of a cell found.
+
+    Args:
+        summary (mapping): of its training.
+        result (mapping): of its evaluation.
+    """
     labels = summary["labels"]
     errors: Mapping[str, Any] = next((value for name, value in summary.items() if name.startswith("action_error")), {})
     common = {

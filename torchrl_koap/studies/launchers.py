@@ -216,6 +216,11 @@ class LocalPool:
     Args:
         function (callable): what jobs do.
         workers (int): jobs at a time.
+
+    Examples:
+        >>> from torchrl_koap.studies.launchers import LocalPool
+        >>> LocalPool(print, workers=2).workers
+        2
     """
 
     def __init__(self, function: Callable[[str], None], workers: int):

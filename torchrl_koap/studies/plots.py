@@ -40,7 +40,13 @@ _BANDS = 3  # more bands than these hide each other: whiskers instead
 
 @dataclass
 class Line:
-    """A named line: ``x``, values ``y`` with their intervals, the paper's values ``(x, y)``, and how it is drawn."""
+    """A named line: ``x``, values ``y`` with their intervals, the paper's values ``(x, y)``, and how it is drawn.
+
+    Examples:
+        >>> from torchrl_koap.studies.plots import Line
+        >>> Line("koap", {}, x=[0.1], y=[0.9]).paper
+        []
+    """
 
     name: str
     style: Mapping[str, Any]
@@ -212,7 +218,12 @@ def draw_lines(
 
 
 def name_lines(figure: Figure, lines: Sequence[Line]) -> None:
-    """Names every line once, to the right of all panels."""
+    """Names every line once, to the right of all panels.
+
+    Args:
+        figure (Figure): the figure.
+        lines (sequence of Line): the lines.
+    """
     named = {line.name: Line2D([], [], **line.style, markersize=5, markeredgewidth=0) for line in lines}
     figure.legend(named.values(), named.keys(), loc="outside right upper", frameon=False, fontsize=8.5)
 

@@ -25,6 +25,10 @@ class RayPool:
         function (callable): what jobs do.
         workers (int): jobs at a time of a cluster on this machine.
         address (str, optional): of a cluster that runs; it decides by itself how many, one CPU each.
+
+    Examples:
+        >>> from torchrl_koap.studies.ray_launcher import RayPool
+        >>> RayPool(print, 2, None)  # doctest: +SKIP
     """
 
     def __init__(self, function: Callable[[str], None], workers: int, address: str | None):

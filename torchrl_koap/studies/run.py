@@ -52,6 +52,12 @@ class StudyResult:
         rows (list of dict): cells as in ``cells.csv``.
         counts (mapping): how many cells are done, failed and missing.
         report (Path): the page.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from torchrl_koap.studies.run import StudyResult
+        >>> StudyResult([], {"done": 0}, Path("index.html")).counts
+        {'done': 0}
     """
 
     rows: list[dict[str, Any]]
@@ -141,6 +147,11 @@ def _first_look(study: Study, task: Task) -> TensorDictBase | None:
 def recorded(study: Study, cells: Sequence[Cell], task: Task) -> None:
     """Records the demonstrations of a task, once for all cells, where none are given.
 
+    Args:
+        study (Study): the study.
+        cells (sequence of Cell): its cells.
+        task (Task): the task.
+
     Raises:
         ValueError: if a share of labels selects none of them.
     """
@@ -158,6 +169,12 @@ def recorded(study: Study, cells: Sequence[Cell], task: Task) -> None:
 
 def check_labels(study: Study, cells: Sequence[Cell], task: Task, data: TensorDictBase | None) -> None:
     """Refuses before any work what would fail in a cell: labels that select nothing, shares below the labelled.
+
+    Args:
+        study (Study): the study.
+        cells (sequence of Cell): its cells.
+        task (Task): the task.
+        data (TensorDictBase, optional): its demonstrations; None where they are recorded later.
 
     Raises:
         ValueError: naming the share.

@@ -200,6 +200,10 @@ def cells_of(study: Study) -> list[Cell]:
 def levels_of(task: Task, levels: Sequence[int]) -> list[float]:
     """The shares of labels at some label levels of a task.
 
+    Args:
+        task (Task): the task.
+        levels (sequence of int): from 1 on.
+
     Raises:
         ValueError: for a level that the task does not have.
     """
@@ -212,18 +216,33 @@ def levels_of(task: Task, levels: Sequence[int]) -> list[float]:
 
 
 def task_of(study: Study, name: str) -> Task:
-    """The task of a name: registered, or the one that its data set holds."""
+    """The task of a name: registered, or the one that its data set holds.
+
+    Args:
+        study (Study): the study.
+        name (str): of the task.
+    """
     dataset = of_task(study.datasets, name)
     return get_task(name) if dataset is None else find_task_of(dataset, name)
 
 
 def of_task(values: Sequence[str], task: str) -> str | None:
-    """What ``TASK=VALUE`` among some values says for a task."""
+    """What ``TASK=VALUE`` among some values says for a task.
+
+    Args:
+        values (sequence of str): ``TASK=VALUE`` each.
+        task (str): name of the task.
+    """
     return next((text.partition("=")[2] for text in values if text.startswith(f"{task}=")), None)
 
 
 def planner_folder(study: Study, cell: Cell) -> Path | None:
-    """The run whose planner a cell takes over, None for a method without one."""
+    """The run whose planner a cell takes over, None for a method without one.
+
+    Args:
+        study (Study): the study.
+        cell (Cell): the cell.
+    """
     if not get_method(cell.method).plans:
         return None
     given = of_task(study.planners, cell.task)
@@ -232,7 +251,12 @@ def planner_folder(study: Study, cell: Cell) -> Path | None:
 
 
 def dataset_of(study: Study, task: str) -> Path:
-    """The folder of a task's demonstrations."""
+    """The folder of a task's demonstrations.
+
+    Args:
+        study (Study): the study.
+        task (str): name of the task.
+    """
     return Path(of_task(study.datasets, task) or study.out / "demonstrations" / task)
 
 
@@ -266,7 +290,12 @@ def train_config(study: Study, cell: Cell, *, planner: bool = False) -> TrainCon
 
 
 def eval_config(study: Study, cell: Cell) -> EvalConfig:
-    """How a cell is rolled out: cells with the next training seed meet other noise, in the same contexts."""
+    """How a cell is rolled out: cells with the next training seed meet other noise, in the same contexts.
+
+    Args:
+        study (Study): the study.
+        cell (Cell): the cell.
+    """
     seed = study.evaluation.seed + NOISE_STEP * cell.seed
     return replace(study.evaluation, seed=seed, threads=1, plugins=study.run.plugins)
 

@@ -190,6 +190,10 @@ def cell_name(row: Mapping[str, Any]) -> str:
 def percent(share: float | None, digits: int | None = None) -> str:
     """A share in percent, with as few digits as it has if ``digits`` is not given; None gives a dash.
 
+    Args:
+        share (float, optional): 0 to 1.
+        digits (int, optional): behind the point.
+
     Examples:
         >>> from torchrl_koap.studies.summary import percent
         >>> percent(0.02), percent(0.005), percent(2 / 3, 1), percent(None)
