@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Jobs as tasks of a Ray cluster (extra ``ray``); imported when it is asked for."""
+"""Jobs as tasks of a Ray cluster (extra ``ray``, imported with the first pool)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-
-import ray
 
 from torchrl_koap.studies.launchers import Job, in_words, run_logged
 
@@ -32,7 +30,9 @@ class RayPool:
     """
 
     def __init__(self, function: Callable[[str], None], workers: int, address: str | None):
-        self.function = function
+        import ray
+
+        self.ray, self.function = ray, function
         self.owned = not ray.is_initialized()
         self.left = contextlib.ExitStack()
         if self.owned:
@@ -58,21 +58,21 @@ class RayPool:
 
     def finished(self) -> list[tuple[Job, str | None]]:
         """Waits for a job to end; returns it with the reason if it failed."""
-        (reference,), _ = ray.wait(list(self.running), num_returns=1)
+        (reference,), _ = self.ray.wait(list(self.running), num_returns=1)
         job = self.running.pop(reference)
         try:
-            return [(job, ray.get(reference))]
-        except ray.exceptions.RayError as error:
+            return [(job, self.ray.get(reference))]
+        except self.ray.exceptions.RayError as error:
             # what a task raised is wrapped, with its traceback as the message
             return [(job, in_words(getattr(error, "cause", None) or error))]
 
     def stop(self) -> None:
         """Ends what is running, and the cluster if it was started here."""
         for reference in self.running:
-            ray.cancel(reference, force=True)
+            self.ray.cancel(reference, force=True)
         self.running.clear()
         if self.owned:
-            ray.shutdown()
+            self.ray.shutdown()
             self.left.close()
 
 
