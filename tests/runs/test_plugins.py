@@ -87,7 +87,8 @@ def test_a_curve_killed_goes_on_with_the_plugin_in_every_cell(tmp_path, demonstr
     out, env = tmp_path / "curve", {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(PLUGINS)])}
     arguments = (
         *("curve", "--out", out, "--datasets", demonstrations, "--methods", "nearest_neighbour", "linear"),
-        *("--labels", 0.25, "--seeds", 1, "--planner.steps", 3, "--evaluation.episodes", 1, "--workers", 1),
+        *("--labels", 0.25, "--seeds", 1, "--planner.steps", 3, "--controller.steps", 3),
+        *("--evaluation.episodes", 1, "--workers", 1),
     )
     command = [sys.executable, "-m", "torchrl_koap.commands.cli", *map(str, arguments)]
     first = subprocess.Popen(
