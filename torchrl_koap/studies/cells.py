@@ -192,10 +192,10 @@ def row_of(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, A
         names = ("relative_plan_error", "relative_action_error")
         return common | {"kind": KIND, "action_error": _own_error(result)} | {name: result[name] for name in names}
     entropy = result["mode_entropy"]
-    names = ("episodes", "success_rate", "success_low", "success_high", "collisions", "mean_steps")
+    counts = ("episodes", "success_rate", "success_low", "success_high", "collisions", "mean_steps")
     return (
         common
-        | {name: result[name] for name in names}
+        | {name: result[name] for name in counts}
         | {
             "successes": round(result["success_rate"] * result["episodes"]),
             "mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy,

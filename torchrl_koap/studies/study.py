@@ -122,7 +122,9 @@ def complete(study: Study) -> Study:
         study = replace(study, tasks=tuple(named or [DEFAULT_TASK if alone is None else find_task_of(alone).name]))
     for name in study.tasks:
         task_of(study, name)
-    paths = {name: _absolute(name, getattr(study, name), study.tasks) for name in ("datasets", "planners")}
+    paths: dict[str, Any] = {
+        name: _absolute(name, getattr(study, name), study.tasks) for name in ("datasets", "planners")
+    }
     return replace(study, out=study.out.absolute(), preset=None, **paths)
 
 
@@ -171,7 +173,9 @@ def together(study: Study) -> Study:
     earlier = read_study(study.out)
     if earlier is None:
         return study
-    grown = {name: tuple(dict.fromkeys([*getattr(earlier, name), *getattr(study, name)])) for name in GROWS}
+    grown: dict[str, Any] = {
+        name: tuple(dict.fromkeys([*getattr(earlier, name), *getattr(study, name)])) for name in GROWS
+    }
     return replace(study, seeds=max(study.seeds, earlier.seeds), **grown)
 
 
@@ -271,7 +275,7 @@ def train_config(study: Study, cell: Cell, *, planner: bool = False) -> TrainCon
         planner (bool): the planner alone; it knows no label.
     """
     folder = planner_folder(study, cell)
-    common = {"dataset": str(dataset_of(study, cell.task)), "task": cell.task}
+    common: dict[str, Any] = {"dataset": str(dataset_of(study, cell.task)), "task": cell.task}
     if planner:
         seed, labels = cell.seed % study.planner_seeds, LabelConfig(trajectories=cell.demonstrations)
         run = replace(study.run, seed=seed)

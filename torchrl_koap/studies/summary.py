@@ -151,7 +151,9 @@ def _summary(task: str, method: str, labels: float, demonstrations: float, unit:
         rate = successes / episodes
         measures["success"] = Measure(rate, *wilson_interval(successes, episodes))
         measures["seed_success"] = Measure(rate, min(rates), max(rates))
-    return Summary(task, method, labels, demonstrations, unit, *seeds.values(), successes, episodes, measures)
+    return Summary(
+        task, method, labels, demonstrations, unit, **seeds, successes=successes, episodes=episodes, measures=measures
+    )
 
 
 def _values(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
