@@ -69,7 +69,7 @@ Cell = tuple[str, int]  # method, number of labelled trajectories
 
 def robot_view(data: TensorDictBase, task: Task) -> TensorDictBase:
     """Flat data with the robot's own columns as ``state``."""
-    return controller_view(data, task.controller_columns("robot"), action_targets=task.targets)
+    return controller_view(data, task.controller_columns("robot"), targets=task.targets)
 
 
 def load_positions(dataset: str, most: int) -> tuple[TensorDictBase, str]:

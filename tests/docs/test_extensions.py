@@ -107,7 +107,7 @@ def test_a_tutorial_that_prints_something_else_is_an_error(tmp_path, monkeypatch
 def test_rooms_stand_on_what_they_import():
     allowed = design_page.may_import()
     level = design_page.floors(allowed)
-    assert level["keys"] == 0 and level["commands"] == max(level.values())
+    assert level["files"] == 0 and level["commands"] == max(level.values())
     for room, others in allowed.items():
         assert all(level[other] < level[room] for other in others - {room, "__version__"})
     drawing = design_page.drawing(allowed)
