@@ -16,8 +16,10 @@ from torchrl_koap.evaluation import EvalConfig, InspectConfig, SuggestConfig, ev
 from torchrl_koap.evaluation.action_errors import summarise_errors
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.reports.run_report import write_report
+from torchrl_koap.runs.config import LabelConfig
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.tasks import Action, Task
+from torchrl_koap.training import Trained
 
 FEW = EvalConfig(samples=4, threads=1)
 
@@ -43,7 +45,7 @@ def test_a_run_of_seven_joints(run):
     left_out = result["action_errors"]["left_out"]
     assert left_out["trajectories"] == 3 and [row["name"] for row in left_out["column"]] == [f"dq{n}" for n in range(7)]
     assert result["action_errors_on"] == "left_out" and 0 < result["relative_action_error"] == left_out["relative"]
-    held_out = json.loads((run / "config.json").read_text())["validation_episodes"]
+    held_out = json.loads((run / "config.json").read_text())["held_out_episodes"]
     assert [row["episode"] for row in result["trajectory"] if row["judged"] == "plans"] == held_out
     assert result["control_hz"] > 0 and not (run / "rollouts.safetensors").exists()
     # 20 updates make no planner, and it is said
@@ -54,7 +56,7 @@ def test_a_forecast_is_the_default_and_carries_over(tmp_path):
     """To the validation trajectories, whose goals the planner has not seen; after 20 updates already."""
     arm = save_arm(tmp_path / "arm", count=30, joints=2)
     run = train_arm(tmp_path / "run", arm, method="linear")
-    assert json.loads((run / "config.json").read_text())["planner"]["forecast"] is True
+    assert Trained.load(run).planner.forecast is not None
     result = evaluate(run, FEW)
     assert result["relative_plan_error"] < 0.1
     assert not any(fault.startswith("plans") for fault in result["faults"])
@@ -89,7 +91,7 @@ def test_the_command_says_it_in_words(run, capsys):
 
 def test_a_single_column_with_labels_outside_the_budget(tmp_path):
     arm = save_arm(tmp_path / "one", labelled=10, joints=1, units="")
-    run = train_arm(tmp_path / "run", arm, label_count=2, method="linear")
+    run = train_arm(tmp_path / "run", arm, labels=LabelConfig(count=2), method="linear")
     result = evaluate(run, FEW)
     outside = result["action_errors"]["outside_budget"]
     assert result["action_errors_on"] == "outside_budget" and outside["trajectories"] == 8
@@ -113,7 +115,7 @@ def test_columns_of_several_units_and_a_method_without_a_closed_form(tmp_path):
 
 def test_a_policy_of_its_own_is_judged_by_its_chunks(tmp_path, capsys):
     arm = save_arm(tmp_path / "arm", labelled=6, joints=2)
-    run = train_arm(tmp_path / "run", arm, method="dp", label_count=3, steps=30)
+    run = train_arm(tmp_path / "run", arm, method="dp", labels=LabelConfig(count=3), planner={"steps": 30})
     assert main(["eval", str(run), "--samples", "3", "--threads", "1"]) == 0
     assert "whole chunks of actions, energy score (mrad): policy" in capsys.readouterr().out
     result = json.loads((run / "eval.json").read_text())
@@ -136,7 +138,7 @@ def test_all_trajectories_labelled(tmp_path):
 
 def test_a_single_trajectory(tmp_path):
     arm = save_arm(tmp_path / "arm", count=1, labelled=1, joints=2)
-    run = train_arm(tmp_path / "run", arm, label_fraction=1.0, method="linear")
+    run = train_arm(tmp_path / "run", arm, labels=LabelConfig(fraction=1.0), method="linear")
     result = evaluate(run, FEW)
     assert result["plan_errors"]["note"].startswith("no trajectory was held out from the planner")
     assert result["action_errors"]["left_out"]["note"] == "only one trajectory has labels: none can be left out"

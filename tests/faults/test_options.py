@@ -55,6 +55,7 @@ RIGHT = {
         *("--planner.held-out 0", "--execution.blend 0", "--execution.lead 0"),
     ),
 }
+RIGHT["curve"] = RIGHT["bench"] = RIGHT["train"]
 EMPTY = ("--action-units", "--state-units")  # of a number without a unit
 # where the message has another word for the option
 SAYS = {
@@ -62,6 +63,7 @@ SAYS = {
     "--action-kind": "kind of action|action-kind",
     "--to": "unknown format|--to",
     "--tasks": "task",
+    "--datasets": "dataset",
     "--methods": "method",
     "--units": "unit",
     "--planners": "planners|n0nsense",
@@ -101,7 +103,7 @@ def faults() -> Iterator[Fault]:
                 if call in RIGHT.get(name, ()) or option in RIGHT.get(name, ()) or option in EMPTY:
                     continue
                 words = (name, *BASE[name], option, value)
-                says = SAYS.get(option, re.escape(option.removeprefix("--")).replace("\\-", "[-_ ]"))
+                says = SAYS.get(option, re.escape(option.removeprefix("--").rpartition(".")[2]).replace("\\-", "[-_ ]"))
                 if kind is bool:
                     says = value
                 yield Fault(f"{option} {value or 'empty'}", words, says, status=(1, 2))

@@ -36,7 +36,7 @@ def planner(tmp_path_factory, demonstrations):
     return folder
 
 
-def train_tiny(out, demonstrations, planner, method, **options):
+def train_tiny(out, demonstrations, planner, method, /, **options):
     options = {**TINY, **options}
     if METHODS[method].plans:
         options["planner"] = PlannerConfig(source=planner)

@@ -120,14 +120,15 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
         >>> import tempfile
         >>> from pathlib import Path
         >>> import numpy as np
-        >>> from torchrl_koap import TrainConfig, train
+        >>> from torchrl_koap import ControllerConfig, PlannerConfig, TrainConfig, train
         >>> from torchrl_koap.data import save_demonstrations
         >>> from torchrl_koap.evaluation import InspectConfig, inspect
         >>> states = [np.random.default_rng(i).normal(size=(30, 4)).cumsum(0) for i in range(6)]
         >>> actions = [np.diff(frames[:, :2], axis=0) if i < 2 else None for i, frames in enumerate(states)]
         >>> with tempfile.TemporaryDirectory() as root:
         ...     arm = save_demonstrations(root + "/arm", states, actions, control_hz=30, robot=[0, 1])
-        ...     _ = train(TrainConfig(dataset=str(arm), out=Path(root) / "run", steps=2, controller_steps=2, threads=1))
+        ...     few = {"planner": PlannerConfig(steps=2), "controller": ControllerConfig(steps=2)}
+        ...     _ = train(TrainConfig(dataset=str(arm), out=Path(root) / "run", **few))
         ...     found = inspect(root + "/run", InspectConfig(latent_only=True, threads=1))
         >>> sorted(found.result)
         ['findings', 'latent']

@@ -96,6 +96,13 @@ class Machines:
             raise ValueError(f"workers must be >= 1, got {self.workers}")
         if self.launcher == "local" and self.address is not None:
             raise ValueError("an address was given, but launcher 'local' works on this machine alone")
+
+    def check(self) -> None:
+        """Refuses a launcher that is not installed.
+
+        Raises:
+            ValueError: naming the extra.
+        """
         if self.launcher == "ray" and importlib.util.find_spec("ray") is None:
             raise ValueError("launcher 'ray' needs an extra: pip install 'torchrl_koap[ray]'")
 

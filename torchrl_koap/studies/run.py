@@ -91,6 +91,8 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         ...
         ValueError: unknown method 'kaop'; did you mean 'koap'?
     """
+    machines = Machines() if machines is None else machines
+    machines.check()
     study = complete(study)
     cells, root = check_study(study), RunDirectory(study.out)
     for task in study.tasks:

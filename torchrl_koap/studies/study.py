@@ -322,6 +322,9 @@ def check_study(study: Study) -> list[Cell]:
         if _option(study, name) != _option(Study(out=study.out), name):
             raise ValueError(f"{name} is not for a study: {said}")
     check_options(study.evaluation)
+    contexts = study.evaluation.contexts_file
+    if contexts is not None and not Path(contexts).is_file():
+        raise ValueError(f"contexts_file: there is no file {contexts}")
     cells = cells_of(study)
     sampling = [name for name in study.methods if not get_method(name).plans]
     if study.execution.strategy == "open_loop" and sampling:

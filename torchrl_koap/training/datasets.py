@@ -132,7 +132,7 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
         >>> from torchrl_koap.data import LabelBudget, flatten_trajectories
         >>> from torchrl_koap.training.datasets import choose_held_out
         >>> data = flatten_trajectories([torch.zeros(5, 2)] * 10, [torch.zeros(4, 1)] * 10)
-        >>> labelled, _ = LabelBudget.of_episodes([1, 2, 3, 4, 5, 6, 7, 8, 9]).apply(data)
+        >>> labelled, _ = LabelBudget(episodes=range(1, 10)).apply(data)
         >>> choose_held_out(labelled, 0.1)
         [0]
     """

@@ -50,7 +50,7 @@ class Trained:
         >>> from torchrl_koap import Trained
         >>> trained = Trained.load("pretrained:avoiding")  # or the folder of a run of yours
         >>> trained.task.name, trained.method.name, trained.planner.horizon
-        ('avoiding', 'koap', 14)
+        ('avoiding', 'mpc', 14)
     """
 
     task: Task
