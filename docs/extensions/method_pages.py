@@ -44,7 +44,7 @@ def write_method_pages() -> None:
     """Writes ``generated/methods``: an index and a page per method."""
     for method in METHODS.values():
         write_method(method)
-    rows = [(f":doc:`{method.name}`", escape(method.title), method.kind) for method in METHODS.values()]
+    rows = [(f":doc:`{method.name}`", escape(method.title), "controller" if method.plans else "policy") for method in METHODS.values()]
     write_page(
         "methods/index",
         heading("Every method in numbers"),
@@ -139,9 +139,6 @@ def measured(method: Method) -> str:
         data = f"{row['data']}, {row['demonstrations']}"
         rows.append((row["task"], data, f"{100 * float(row['label_fraction']):g} %", rate, row["entropy"], error))
     head = ("task", "demonstrations", "labelled", "success (95 %)", "entropy", "action error")
-    earlier = getattr(method, "earlier", "")
-    if rows and earlier:
-        return f"The committed curves were measured when ``{method.name}`` was what is :doc:`{earlier}` now."
     return table(head, rows) or planned(method) or "No figure of it is committed."
 
 
