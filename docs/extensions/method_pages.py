@@ -44,7 +44,10 @@ def write_method_pages() -> None:
     """Writes ``generated/methods``: an index and a page per method."""
     for method in METHODS.values():
         write_method(method)
-    rows = [(f":doc:`{method.name}`", escape(method.title), "controller" if method.plans else "policy") for method in METHODS.values()]
+    rows = [
+        (f":doc:`{method.name}`", escape(method.title), "controller" if method.plans else "policy")
+        for method in METHODS.values()
+    ]
     write_page(
         "methods/index",
         heading("Every method in numbers"),
