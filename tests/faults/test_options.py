@@ -103,7 +103,10 @@ def faults() -> Iterator[Fault]:
                 if call in RIGHT.get(name, ()) or option in RIGHT.get(name, ()) or option in EMPTY:
                     continue
                 words = (name, *BASE[name], option, value)
-                says = SAYS.get(option, re.escape(option.removeprefix("--").rpartition(".")[2]).replace("\\-", "[-_ ]"))
+                word = option.removeprefix("--")
+                if name != "train":  # a study says the name of an option without its section
+                    word = word.rpartition(".")[2]
+                says = SAYS.get(option, re.escape(word).replace("\\-", "[-_ ]"))
                 if kind is bool:
                     says = value
                 yield Fault(f"{option} {value or 'empty'}", words, says, status=(1, 2))
