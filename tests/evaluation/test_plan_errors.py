@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from torchrl_koap.data import flatten_trajectories
-from torchrl_koap.evaluation.plan_errors import energy_score, plan_errors
+from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.tasks import Action, Task
 
 TASK = Task(
@@ -46,16 +46,6 @@ def forked(count=20, steps=30):
 def data():
     flat = forked()
     return flat.set("state", flat["observation"])
-
-
-def test_the_energy_score_is_least_for_the_true_distribution():
-    generator = torch.Generator().manual_seed(0)
-    true = torch.randn(4000, 3, generator=generator)
-    scores = [energy_score(scale * torch.randn(16, 4000, 3, generator=generator), true).mean() for scale in (1, 0, 2)]
-    assert scores[0] < scores[1] and scores[0] < scores[2]
-    torch.testing.assert_close(energy_score(torch.zeros(16, 4000, 3), true), true.norm(dim=-1))
-    with pytest.raises(ValueError, match=r"wanted samples \[S, \*B, d\] and true \[\*B, d\], got \[3, 2\], \[3, 2\]"):
-        energy_score(torch.zeros(3, 2), torch.zeros(3, 2))
 
 
 def test_both_ways_of_a_fork_are_no_mistake_and_units_stay_apart():

@@ -13,8 +13,9 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
-from torchrl_koap.evaluation.plan_errors import SAMPLES, sample_sequences, score_sequences
+from torchrl_koap.evaluation.plan_errors import SAMPLES, score_sequences
 from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics
+from torchrl_koap.modules.planning.energy_score import sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.units import unit_groups
@@ -160,7 +161,7 @@ def errors_of_chunks(
 
     past, true = windows["state"][:, :history].float(), moved(windows)
     device = next(iter(policy.state_dict().values())).device
-    sampled = sample_sequences(policy.sample, policy.noise_shape, past.to(device), samples=samples, seed=seed).cpu()
+    sampled = sample_sequences(policy, past.to(device), samples=samples, seed=seed).cpu()
     sampled = sampled - past[:, now : now + 1, targets] if targets else sampled
     seen = moved(known)[:, 0]
     mean = seen.mean(0)

@@ -7,7 +7,7 @@ another way than the demonstrator is no mistake. Scores of the whole distributio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -16,48 +16,12 @@ from torch import Tensor
 
 from torchrl_koap.data import cut_windows
 from torchrl_koap.modules import StatePlanner
+from torchrl_koap.modules.planning.energy_score import energy_score, sample_sequences
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.units import unit_groups
 
 SAMPLES = 16
 BASELINES = ("standing_still", "constant_velocity")
-_BATCH = 512  # plans that are sampled at a time
-
-
-def energy_score(samples: Tensor, true: Tensor) -> Tensor:
-    r"""Energy score of a sampled distribution, smaller is better, in the unit of the samples.
-
-    .. math:: \mathrm{ES} = \mathbb{E}\,\|X - y\| - \tfrac{1}{2}\, \mathbb{E}\,\|X - X'\|
-
-    It is least, on average, for samples of the true distribution, with all its modes; of a single certain sample it is
-    the distance. The second mean is over pairs of different samples, so that its expectation does not depend on how
-    many there are.
-
-    Args:
-        samples (Tensor): ``[S, *B, d]``.
-        true (Tensor): ``[*B, d]``.
-
-    Returns:
-        Tensor: ``[*B]``.
-
-    Raises:
-        ValueError: if shapes disagree.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.evaluation.plan_errors import energy_score
-        >>> left_or_right = torch.tensor([[-1.0], [1.0], [-1.0], [1.0]])
-        >>> energy_score(left_or_right, torch.tensor([1.0])), energy_score(torch.zeros(4, 1), torch.tensor([1.0]))
-        (tensor(0.3333), tensor(1.))
-    """
-    if samples.ndim < 2 or samples.shape[1:] != true.shape:
-        raise ValueError(f"wanted samples [S, *B, d] and true [*B, d], got {list(samples.shape)}, {list(true.shape)}")
-    count = len(samples)
-    score = (samples - true).norm(dim=-1).mean(0)
-    if count > 1:
-        apart = sum((samples - sample).norm(dim=-1).sum(0) for sample in samples)
-        score = score - 0.5 * apart / (count * (count - 1))
-    return score
 
 
 def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
@@ -82,51 +46,6 @@ def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
         "standing_still": now.expand(*now.shape[:-2], horizon, -1),
         "constant_velocity": now + ahead * (now - before),
     }
-
-
-@torch.no_grad()
-def sample_plans(planner: StatePlanner, history: Tensor, *, samples: int = SAMPLES, seed: int = 0) -> Tensor:
-    """Several plans for each history.
-
-    Args:
-        planner (StatePlanner): the planner.
-        history (Tensor): ``[N, h, d]``.
-
-    Keyword Args:
-        samples (int): plans ``S`` per history.
-        seed (int): seed of their noise.
-
-    Returns:
-        Tensor: ``[S, N, H, d]``.
-    """
-    return sample_sequences(planner.sample, planner.noise_shape, history, samples=samples, seed=seed)
-
-
-@torch.no_grad()
-def sample_sequences(
-    sample: Callable[[Tensor, Tensor], Tensor], noise_shape: Sequence[int], history: Tensor, *, samples: int, seed: int
-) -> Tensor:
-    """Several sampled sequences for each history.
-
-    Args:
-        sample (callable): ``sample(history [n, h, d], noise [n, *noise_shape]) -> [n, H, w]``.
-        noise_shape (sequence of int): of one draw.
-        history (Tensor): ``[N, h, d]``.
-
-    Keyword Args:
-        samples (int): sequences ``S`` per history.
-        seed (int): seed of their noise.
-
-    Returns:
-        Tensor: ``[S, N, H, w]``.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    drawn = []
-    for _ in range(samples):
-        noise = torch.randn(len(history), *noise_shape, generator=generator).to(history)
-        parts = zip(history.split(_BATCH), noise.split(_BATCH), strict=True)
-        drawn.append(torch.cat([sample(part, start) for part, start in parts]))
-    return torch.stack(drawn)
 
 
 def plan_errors(
@@ -158,7 +77,7 @@ def plan_errors(
     past, future = planner.split_window(windows["state"].float())
     episode = windows["episode"][:, -1].cpu()
     device = next(iter(planner.state_dict().values())).device
-    models = {"planner": sample_plans(planner, past.to(device), samples=samples, seed=seed).cpu()}
+    models = {"planner": sample_sequences(planner, past.to(device), samples=samples, seed=seed).cpu()}
     past, future = past.cpu(), future.cpu()
     models |= {name: plan[None] for name, plan in baseline_plans(past, horizon).items()}
     rows, scores = score_sequences(models, future, task.state_names, task.state_units)

@@ -33,6 +33,7 @@ TERMS = {
     "loss_reconstruction": "reconstruction",
     "loss_koopman": "linear latent dynamics",
     "loss_action": "action decoder (labelled steps)",
+    "held_out_score": "plan error, held-out demonstrations",
 }
 
 
@@ -40,8 +41,9 @@ TERMS = {
     "losses.png",
     source="metrics.csv",
     title="Losses",
-    caption="Pale: logged values; line: running mean, its last value in the corner. Logarithmic. A planner's loss says"
-    " little about its rollouts: look at the pictures above.",
+    caption="Pale: logged values; line: running mean, its last value in the corner. Logarithmic. Of the plan error,"
+    " standing still has 1; the weights with the least one are kept. A planner's loss says little about its rollouts:"
+    " look at the pictures above.",
     order=100,
 )
 def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:

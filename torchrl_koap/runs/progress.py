@@ -121,7 +121,8 @@ def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
     def update(step: int, values: dict[str, float]) -> None:
         bar.update(step - bar.n)
         if values and step % 50 == 0:
-            losses = {key.removeprefix("loss_"): f"{value:.4f}" for key, value in values.items() if "loss" in key}
+            shown = {key: value for key, value in values.items() if "loss" in key or key == "held_out_score"}
+            losses = {key.removeprefix("loss_"): f"{value:.4f}" for key, value in shown.items()}
             bar.set_postfix(losses, refresh=False)  # shown when the bar is drawn next
 
     return update

@@ -18,18 +18,18 @@ _MOMENTS = {"step", "exp_avg", "exp_avg_sq"}  # what AdamW keeps of a parameter
 
 
 def save_training_state(
-    path: str | Path, loss: nn.Module, optimizer: torch.optim.Optimizer, about: Mapping[str, Any]
+    path: str | Path, module: nn.Module, optimizer: torch.optim.Optimizer, about: Mapping[str, Any]
 ) -> None:
     """Writes everything a training loop needs to go on: parameters (targets included), optimiser, random state.
 
     Args:
         path (str or Path): file to write.
-        loss (nn.Module): the loss module, which holds the networks.
+        module (nn.Module): the loss, and what else has a state.
         optimizer (Optimizer): its moments are kept.
         about (mapping): facts, for example ``{"phase": "planner", "step": 500}``.
     """
     state = optimizer.state_dict()
-    tensors = {f"loss.{name}": value for name, value in loss.state_dict().items() if isinstance(value, Tensor)}
+    tensors = {f"module.{name}": value for name, value in module.state_dict().items() if isinstance(value, Tensor)}
     for index, moments in state["state"].items():
         tensors |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
     tensors["rng.cpu"] = torch.get_rng_state()
@@ -38,12 +38,12 @@ def save_training_state(
     save_tensors(path, tensors, {**about, "param_groups": state["param_groups"], "moments": len(state["state"])})
 
 
-def load_training_state(path: str | Path, loss: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     """Restores what :func:`save_training_state` wrote, the global random state included.
 
     Args:
         path (str or Path): the file.
-        loss (nn.Module): loss module, built as it was; receives its parameters and averages.
+        module (nn.Module): built as it was; receives its state.
         optimizer (torch.optim.Optimizer): optimiser of the same parameters; receives its moments.
 
     Returns:
@@ -51,7 +51,7 @@ def load_training_state(path: str | Path, loss: nn.Module, optimizer: torch.opti
 
     Raises:
         CheckpointError: if the file is damaged, no training state, lacks that of the optimiser, or does not fit the
-            loss module or the optimiser. Nothing has been changed then.
+            module or the optimiser. Nothing has been changed then.
     """
     tensors, about = load_tensors(path)
     if "rng.cpu" not in tensors or "param_groups" not in about:
@@ -60,8 +60,8 @@ def load_training_state(path: str | Path, loss: nn.Module, optimizer: torch.opti
         raise CheckpointError(
             f"{path} is damaged: its step must be a whole number from 0 on, got {about.get('step')!r}"
         )
-    wanted = {name: value for name, value in loss.state_dict().items() if isinstance(value, Tensor)}
-    saved = {name.removeprefix("loss."): value for name, value in tensors.items() if name.startswith("loss.")}
+    wanted = {name: value for name, value in module.state_dict().items() if isinstance(value, Tensor)}
+    saved = {name.removeprefix("module."): value for name, value in tensors.items() if name.startswith("module.")}
     if wanted.keys() != saved.keys() or any(wanted[name].shape != saved[name].shape for name in wanted):
         raise CheckpointError(f"{path} holds the state of another model")
     for name, value in saved.items():

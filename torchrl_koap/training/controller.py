@@ -23,7 +23,7 @@ from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.method import LABELLED_SHARES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller
-from torchrl_koap.training.planner import WEIGHT_DECAY, augmentation
+from torchrl_koap.training.planner import augmentation
 
 BATCH_SIZE, LEARNING_RATE = 256, 1e-3
 _KEYS = ["state", "action", "has_action"]
@@ -161,7 +161,9 @@ def _train_sampler(
         pad_after=HORIZON - 1,
         labelled_share=LABELLED_SHARES[phase.windows],
     )
-    loss = phase.loss(sampler, dtype=training_dtype(config.run.precision, config.run.device))
+    loss = phase.loss(
+        sampler, condition_noise=section.noise, dtype=training_dtype(config.run.precision, config.run.device)
+    )
     augment = augmentation(task, actions=True)
     num_steps = max(round(section.steps * phase.share), 1)
     losses = loop(
@@ -170,7 +172,7 @@ def _train_sampler(
         lambda: augment(buffer.sample()),
         num_steps=num_steps,
         learning_rate=section.learning_rate,
-        weight_decay=WEIGHT_DECAY,
+        weight_decay=section.weight_decay,
         target_update=moving_average(loss, num_steps),
     )
     loss.target_network_params.to_module(sampler)

@@ -17,6 +17,7 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError
+from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.checkpoints import load_training_state, save_training_state
 from torchrl_koap.training.outlier_gradients import limit_outlier
 
@@ -70,6 +71,7 @@ def train_phase(
     warmup: int = 100,
     decay: bool = True,
     target_update: SoftUpdate | None = None,
+    best: BestWeights | None = None,
     run: RunDirectory | None = None,
     logger: Any = None,
     log_every: int = 50,
@@ -94,6 +96,7 @@ def train_phase(
         warmup (int): updates of warm-up.
         decay (bool): let the learning rate fall to 0 after the warm-up; otherwise it stays. Defaults to True.
         target_update (SoftUpdate, optional): moving average of the parameters, stepped after every update.
+        best (BestWeights, optional): scores the averages, keeps the best and ends the training early.
         run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
         logger (optional): a TorchRL logger; scalars are named ``phase/term``.
         log_every (int): updates per row of the log.
@@ -118,16 +121,20 @@ def train_phase(
     # fused AdamW is the quickest on CPU and on CUDA, and its state is plain tensors
     optimizer = torch.optim.AdamW(loss_module.parameters(), learning_rate, weight_decay=weight_decay, fused=True)
     checkpoint = None if run is None else run.path / "checkpoints" / f"{phase}.safetensors"
+    state = nn.ModuleDict({"loss": loss_module} if best is None else {"loss": loss_module, "best": best})
     start = 0
     if resume and checkpoint is not None:
         if checkpoint.exists():
-            start = load_training_state(checkpoint, loss_module, optimizer)["step"]
+            start = load_training_state(checkpoint, state, optimizer)["step"]
             if start > num_steps:
                 raise CheckpointError(f"{checkpoint} is at step {start}, this training has {num_steps}")
         run.rewind_metrics(phase, start)
     values: dict[str, float] = run.last_metrics(phase) if start else {}
+    done = start
     began, mark, marked = time.perf_counter(), time.perf_counter(), start
     for step in range(start, num_steps):
+        if best is not None and best.finished(step):
+            break
         rate = learning_rate * (
             warmup_cosine(step, num_steps, warmup) if decay else min(1.0, (step + 1) / max(warmup, 1))
         )
@@ -144,13 +151,17 @@ def train_phase(
             target_update.step()
 
         done = step + 1
-        if done % log_every == 0 or done == num_steps:
+        scores: dict[str, float] = {}
+        if best is not None and (done % best.every == 0 or done == num_steps):
+            scores = best.check(done)
+        if scores or done % log_every == 0 or done == num_steps:
             values = {key: value.item() for key, value in terms.items()}
             bad = [key for key, value in values.items() if not math.isfinite(value)]
             if bad:
                 raise DivergedError(f"{phase}: {', '.join(bad)} is not finite at step {done}; lower the learning rate")
             now = time.perf_counter()
             values |= {"learning_rate": rate, "iterations_per_second": (done - marked) / max(now - mark, 1e-9)}
+            values |= scores
             mark, marked = now, done
             if run is not None:
                 run.log(phase, done, values)
@@ -162,10 +173,9 @@ def train_phase(
         if checkpoint is not None and (done % checkpoint_every == 0 or done == num_steps):
             if not all(parameter.isfinite().all() for parameter in loss_module.parameters()):
                 raise DivergedError(f"{phase}: parameters are not finite at step {done}; lower the learning rate")
-            save_training_state(checkpoint, loss_module, optimizer, {"phase": phase, "step": done})
-    elapsed = time.perf_counter() - began
-    if num_steps > start:
-        values["iterations_per_second"] = (num_steps - start) / elapsed
+            save_training_state(checkpoint, state, optimizer, {"phase": phase, "step": done})
+    if done > start:
+        values["iterations_per_second"] = (done - start) / (time.perf_counter() - began)
     return values
 
 

@@ -31,6 +31,7 @@ from torchrl_koap.training.datasets import (
     held_out_by,
     label_budget,
     load_demonstrations,
+    only,
     without_held_out,
 )
 from torchrl_koap.training.defaults import resolve
@@ -99,7 +100,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             WindowTable.build(data, frames[0], pad_before=frames[1])
             if get_method(config.method).plans:
                 WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
-        for_planner = without_held_out(data, held_out)
+        for_planner, unseen = without_held_out(data, held_out), only(data, held_out)
         data = data if planner_only else without_held_out(data, held_out, keep_labelled=True)
         if not mine:
             held.enter_context(run.locked("koap train"))
@@ -115,7 +116,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             torch.manual_seed(config.run.seed)
             planner, losses = None, dict[str, float]()
             if get_method(config.method).plans:
-                planner, losses = _planner(run, task, config, for_planner, logger)
+                planner, losses = _planner(run, task, config, for_planner, unseen, logger)
             planned = time.perf_counter()
             if planner_only:
                 return Trained(task, config, planner, None, {"planner": losses}, tuple(held_out), run.path)
@@ -180,7 +181,12 @@ def _read_data(
 
 
 def _planner(
-    run: RunDirectory, task: Task, config: TrainConfig, data: TensorDictBase, logger: Any
+    run: RunDirectory,
+    task: Task,
+    config: TrainConfig,
+    data: TensorDictBase,
+    held_out: TensorDictBase | None,
+    logger: Any,
 ) -> tuple[StatePlanner, dict[str, float]]:
     """The planner: trained, taken over from another run, or loaded where that is done."""
     path, facts = run.path / "planner.safetensors", facts_of("planner", task, config)
@@ -192,6 +198,6 @@ def _planner(
         planner, losses = build_planner(task, config.planner).to(config.run.device), dict[str, float]()
         load_weights(config.planner.source / "planner.safetensors", planner, facts)
     else:
-        planner, losses = learn_planner(task, config, data, run=run, logger=logger)
+        planner, losses = learn_planner(task, config, data, held_out=held_out, run=run, logger=logger)
     save_weights(path, planner, facts)
     return planner, losses

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 
@@ -19,16 +21,19 @@ from torchrl_koap.data import (
     make_window_buffer,
 )
 from torchrl_koap.modules import StatePlanner
+from torchrl_koap.modules.planning.energy_score import relative_score, sample_sequences
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.device import training_dtype
 from torchrl_koap.runs.progress import progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks import HISTORY, Task
+from torchrl_koap.tasks.units import unit_groups
+from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.networks import build_planner
 
-WEIGHT_DECAY = 1e-4  # of a planner, or of a network that samples actions
+SITUATIONS, SAMPLES = 256, 4  # held out, and plans in each, that weights are chosen by
 
 
 def learn_planner(
@@ -36,6 +41,7 @@ def learn_planner(
     config: TrainConfig,
     data: TensorDictBase,
     *,
+    held_out: TensorDictBase | None = None,
     run: RunDirectory | None = None,
     logger: Any = None,
 ) -> tuple[StatePlanner, dict[str, float]]:
@@ -47,6 +53,7 @@ def learn_planner(
         data (TensorDictBase): flat data ``[N]`` with the whole ``state``; no action is looked at.
 
     Keyword Args:
+        held_out (TensorDictBase, optional): trajectories that the weights are chosen by, laid out like ``data``.
         run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
         logger (optional): a TorchRL logger.
 
@@ -70,7 +77,10 @@ def learn_planner(
     def draw() -> TensorDictBase:
         return augment(buffer.sample())[:, unseen:]
 
-    loss = PlannerLoss(planner, dtype=training_dtype(config.run.precision, config.run.device))
+    loss = PlannerLoss(
+        planner, condition_noise=section.noise, dtype=training_dtype(config.run.precision, config.run.device)
+    )
+    best = None if held_out is None else BestWeights(loss, plan_score(planner, held_out, task), section.steps)
     with progress_bar(section.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
         values = train_phase(
             "planner",
@@ -78,15 +88,43 @@ def learn_planner(
             draw,
             num_steps=section.steps,
             learning_rate=section.learning_rate,
-            weight_decay=WEIGHT_DECAY,
+            weight_decay=section.weight_decay,
             target_update=moving_average(loss, section.steps),
+            best=best,
             run=run,
             logger=logger,
             resume=config.run.resume,
             progress=show_losses(bar),
         )
     loss.target_network_params.to_module(planner)
+    if best is not None:
+        planner.load_state_dict(best.network.state_dict())
+        values |= {
+            "held_out_score": best.best.item(),
+            "kept_update": best.step.item(),
+            "held_out_seconds": best.seconds,
+        }
     return planner, values
+
+
+def plan_score(planner: StatePlanner, data: TensorDictBase, task: Task) -> Callable[[StatePlanner], float]:
+    """Makes the score of planners on trajectories: the energy score as a share of that of standing still.
+
+    Args:
+        planner (StatePlanner): a planner with the same frames.
+        data (TensorDictBase): flat data ``[N]`` with ``state``, which it does not learn from.
+        task (Task): names the units of the columns.
+    """
+    length = planner.history + planner.horizon
+    states = cut_windows(data, length, select=["state"], pad_before=planner.history - 1)["state"]
+    chosen = torch.linspace(0, len(states) - 1, min(SITUATIONS, len(states)), device=states.device).round().long()
+    history, future = planner.split_window(states[chosen])
+    still, groups = history[:, -1:].expand_as(future), list(unit_groups(task.state_units).values())
+
+    def score(planner: StatePlanner) -> float:
+        return relative_score(sample_sequences(planner, history, samples=SAMPLES), future, still, groups)
+
+    return score
 
 
 def augmentation(task: Task, *, actions: bool = False) -> TensorDictSequential:

@@ -1,0 +1,92 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The weights that score best on held-out trajectories are kept, and a training ends when they are found."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+
+from torchrl_koap.modules import MLPDenoiser, StatePlanner
+from torchrl_koap.objectives import PlannerLoss
+from torchrl_koap.runs.run_directory import RunDirectory
+from torchrl_koap.training import best_weights
+from torchrl_koap.training.best_weights import BestWeights
+from torchrl_koap.training.loop import train_phase
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch):
+    monkeypatch.setattr(best_weights, "LEAST", 10)
+
+
+def sample():
+    return TensorDict({"state": torch.randn(4, 8, 2).cumsum(1)}, [4])
+
+
+def training(path, score, *, stop=None, num_steps=100, **options):
+    """A small planner, checked every 10 updates; killed after ``stop`` updates."""
+    torch.manual_seed(0)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=6, width=8, depth=1), state_dim=2, horizon=6)
+    planner.fit_normalizers(torch.randn(64, 8, 2).cumsum(1))
+    loss = PlannerLoss(planner)
+    average, best = SoftUpdate(loss, eps=0.9), BestWeights(loss, score, num_steps)
+
+    def progress(done, values):
+        if done == stop:
+            raise KeyboardInterrupt
+
+    run = RunDirectory(path)
+    options = {"num_steps": num_steps, "learning_rate": 1e-2, "checkpoint_every": 15, "progress": progress, **options}
+    train_phase("planner", loss, sample, target_update=average, best=best, run=run, **options)
+    return loss, best, run
+
+
+class Curve:
+    """Scores that are known beforehand; remembers the weights that it was shown."""
+
+    def __init__(self, *scores):
+        self.scores, self.seen = list(scores), []
+
+    def __call__(self, network):
+        self.seen.append({name: value.clone() for name, value in network.state_dict().items()})
+        return self.scores[len(self.seen) - 1]
+
+
+def test_the_best_averaged_weights_are_kept_and_training_ends(tmp_path):
+    curve = Curve(0.9, 0.5, *[0.6] * 8)
+    loss, best, run = training(tmp_path, curve)
+    assert (best.best.item(), best.step.item()) == (0.5, 20)
+    scores = [float(row["held_out_score"]) for row in run.read_metrics() if row["held_out_score"]]
+    assert scores == [0.9, 0.5, *[0.6] * 5], "1.5 times 20 updates and four more scores"
+    kept = best.network.state_dict()
+    assert all(torch.equal(value, kept[name]) for name, value in curve.seen[1].items())
+    average = loss.target_network_params.flatten_keys(".")
+    assert not torch.equal(average["denoiser.last.weight"], kept["denoiser.last.weight"])
+
+
+def test_a_score_that_still_falls_ends_nothing(tmp_path):
+    _, best, run = training(tmp_path, Curve(*torch.linspace(1, 0.1, 10).tolist()))
+    assert best.step.item() == 100 and run.read_metrics()[-1]["step"] == "100"
+
+
+@pytest.mark.parametrize("stop", [16, 33, 61])
+def test_a_resumed_training_keeps_the_same_weights_bit_for_bit(tmp_path, stop):
+    def score(network):  # of the weights alone
+        return (network.denoiser.last.weight.abs().mean() - 0.12).abs().item()
+
+    _, whole, _ = training(tmp_path / "whole", score)
+    with pytest.raises(KeyboardInterrupt):
+        training(tmp_path / "cut", score, stop=stop)
+    _, cut, _ = training(tmp_path / "cut", score, resume=True)
+    assert cut.state_dict().keys() == whole.state_dict().keys()
+    assert all(torch.equal(value, cut.state_dict()[name]) for name, value in whole.state_dict().items())
+
+
+def test_noise_on_the_condition_changes_the_loss_alone():
+    torch.manual_seed(0)
+    planner = StatePlanner(MLPDenoiser(2, 4, horizon=6, width=8, depth=1), state_dim=2, horizon=6)
+    batch = sample().update({"planner_noise": torch.randn(4, 6, 2), "planner_time": torch.rand(4)})
+    plain, none, noisy = (PlannerLoss(planner, condition_noise=size)(batch)["loss_planner"] for size in (0, 0, 0.5))
+    assert torch.equal(plain, none) and not torch.equal(plain, noisy)

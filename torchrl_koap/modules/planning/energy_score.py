@@ -1,0 +1,92 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The energy score, which compares sampled sequences with the one that was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchrl_koap.modules.planning.sampler import ConditionalSampler
+
+_BATCH = 512  # sequences that are sampled at a time
+
+
+def energy_score(samples: Tensor, true: Tensor) -> Tensor:
+    r"""Computes the energy score of sampled distributions; smaller is better, in the unit of the samples.
+
+    .. math:: \mathrm{ES} = \mathbb{E}\,\|X - y\| - \tfrac{1}{2}\, \mathbb{E}\,\|X - X'\|
+
+    Its mean is least for samples of the true distribution with all its modes. The second mean is over pairs of
+    different samples. Of a single sample the score is the distance.
+
+    Args:
+        samples (Tensor): ``[S, *B, d]``.
+        true (Tensor): ``[*B, d]``.
+
+    Returns:
+        Tensor: ``[*B]``.
+
+    Raises:
+        ValueError: if shapes disagree.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules.planning.energy_score import energy_score
+        >>> left_or_right = torch.tensor([[-1.0], [1.0], [-1.0], [1.0]])
+        >>> energy_score(left_or_right, torch.tensor([1.0])), energy_score(torch.zeros(4, 1), torch.tensor([1.0]))
+        (tensor(0.3333), tensor(1.))
+    """
+    if samples.ndim < 2 or samples.shape[1:] != true.shape:
+        raise ValueError(f"wanted samples [S, *B, d] and true [*B, d], got {list(samples.shape)}, {list(true.shape)}")
+    count = len(samples)
+    score = (samples - true).norm(dim=-1).mean(0)
+    if count > 1:
+        apart = sum((samples - sample).norm(dim=-1).sum(0) for sample in samples)
+        score = score - 0.5 * apart / (count * (count - 1))
+    return score
+
+
+@torch.no_grad()
+def sample_sequences(sampler: ConditionalSampler, history: Tensor, *, samples: int, seed: int = 0) -> Tensor:
+    """Samples several sequences for each history.
+
+    Args:
+        sampler (ConditionalSampler): a planner, or a Diffusion Policy.
+        history (Tensor): ``[N, h, d]``.
+
+    Keyword Args:
+        samples (int): sequences ``S`` per history.
+        seed (int): seed of their noise; torch's global generator is not used.
+
+    Returns:
+        Tensor: ``[S, N, H, width]``.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    drawn = []
+    for _ in range(samples):
+        noise = torch.randn(len(history), *sampler.noise_shape, generator=generator).to(history)
+        parts = zip(history.split(_BATCH), noise.split(_BATCH), strict=True)
+        drawn.append(torch.cat([sampler.sample(part, start) for part, start in parts]))
+    return torch.stack(drawn)
+
+
+def relative_score(samples: Tensor, true: Tensor, reference: Tensor, groups: Sequence[Sequence[int]]) -> float:
+    """Computes the energy score as a share of that of a reference, the mean over groups of columns.
+
+    Args:
+        samples (Tensor): ``[S, N, H, d]``.
+        true (Tensor): ``[N, H, d]``.
+        reference (Tensor): what is compared with, such as standing still, ``[N, H, d]``.
+        groups (sequence): columns of one unit each; those in which the reference makes no error are left out.
+
+    Returns:
+        float: 1 for samples as good as the reference, NaN if nothing moves.
+    """
+    shares = []
+    for columns in map(list, groups):
+        still = (reference - true)[..., columns].norm(dim=-1).mean()
+        if still > 0:
+            shares.append(energy_score(samples[..., columns], true[..., columns]).mean() / still)
+    return torch.stack(shares).mean().item() if shares else float("nan")

@@ -1,0 +1,75 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The averaged weights with the best score on held-out trajectories."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+
+import torch
+from torch import nn
+from torchrl.objectives import LossModule
+
+CHECKS = 40  # scores in the longest training
+LEAST = 100  # updates between two scores
+PATIENCE = 1.5  # a training ends after that many times the updates of the best score
+
+
+class BestWeights(nn.Module):
+    """Scores the averaged weights of a loss now and then, and keeps the best of them.
+
+    Its state dict holds everything that a resumed training needs.
+
+    Args:
+        loss (LossModule): a loss of ``network`` with ``target_network_params``.
+        score (callable): ``score(network)`` on held-out trajectories; smaller is better.
+        num_steps (int): updates of the training at most.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
+        >>> from torchrl_koap.objectives import PlannerLoss
+        >>> from torchrl_koap.training.best_weights import BestWeights
+        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
+        >>> best = BestWeights(PlannerLoss(planner), lambda network: 0.5, 1000)
+        >>> best.every, best.check(100), best.step.item()
+        (100, {'held_out_score': 0.5}, 100)
+    """
+
+    best: torch.Tensor
+    step: torch.Tensor
+
+    def __init__(self, loss: LossModule, score: Callable[[nn.Module], float], num_steps: int):
+        super().__init__()
+        self._loss, self._score = (loss,), score  # a tuple: the loss is no part of this module
+        self._now = (copy.deepcopy(loss.network),)
+        self.network = copy.deepcopy(loss.network)
+        self.every = min(max(num_steps // CHECKS, LEAST), num_steps)
+        self.seconds = 0.0
+        self.register_buffer("best", torch.tensor(math.inf, dtype=torch.float64))
+        self.register_buffer("step", torch.tensor(0))
+
+    def check(self, step: int) -> dict[str, float]:
+        """Scores the averaged weights after an update and keeps them if they are the best so far.
+
+        Args:
+            step (int): updates done.
+
+        Returns:
+            dict: ``held_out_score``, for the log.
+        """
+        began, (loss,), (now,) = time.perf_counter(), self._loss, self._now
+        now.load_state_dict(loss.target_network_params.flatten_keys(".").to_dict())
+        score = self._score(now)
+        if score < self.best:
+            self.network.load_state_dict(now.state_dict())
+            self.best.fill_(score)
+            self.step.fill_(step)
+        self.seconds += time.perf_counter() - began
+        return {"held_out_score": score}
+
+    def finished(self, step: int) -> bool:
+        """Whether a better score is no longer to be expected after that many updates."""
+        return step >= PATIENCE * self.step.item() + 4 * self.every
