@@ -270,7 +270,7 @@ def facts_of(part: str, task: Task, config: TrainConfig) -> dict[str, Any]:
         task (Task): the task.
         config (TrainConfig): nothing left open.
     """
-    planner = {f"planner.{name}": getattr(config.planner, name) for name in ("network", "width", "octaves", "frames")}
+    planner = {f"planner.{name}": getattr(config.planner, name) for name in ("network", "width", "frames")}
     if part == "planner":
         return {"task": task.name} | planner
     facts: dict[str, Any] = {"task": task.name, "method": config.method}
