@@ -228,7 +228,7 @@ def test_divergence_is_found_and_the_last_good_checkpoint_kept(tmp_path, log_eve
             run=RunDirectory(tmp_path),
         )
     tensors, about = load_tensors(tmp_path / "checkpoints" / "phase.safetensors")
-    assert about["step"] == 5 and tensors["module.loss.x"].isfinite().all()
+    assert about["step"] == 5 and tensors["loss.x"].isfinite().all()
 
 
 def test_a_phase_is_finished_when_its_weights_are_there(tmp_path):

@@ -29,7 +29,7 @@ def save_training_state(
         about (mapping): facts, for example ``{"phase": "planner", "step": 500}``.
     """
     state = optimizer.state_dict()
-    tensors = {f"module.{name}": value for name, value in module.state_dict().items() if isinstance(value, Tensor)}
+    tensors = {name: value for name, value in module.state_dict().items() if isinstance(value, Tensor)}
     for index, moments in state["state"].items():
         tensors |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
     tensors["rng.cpu"] = torch.get_rng_state()
@@ -61,7 +61,7 @@ def load_training_state(path: str | Path, module: nn.Module, optimizer: torch.op
             f"{path} is damaged: its step must be a whole number from 0 on, got {about.get('step')!r}"
         )
     wanted = {name: value for name, value in module.state_dict().items() if isinstance(value, Tensor)}
-    saved = {name.removeprefix("module."): value for name, value in tensors.items() if name.startswith("module.")}
+    saved = {name: value for name, value in tensors.items() if not name.startswith(("optimizer.", "rng."))}
     if wanted.keys() != saved.keys() or any(wanted[name].shape != saved[name].shape for name in wanted):
         raise CheckpointError(f"{path} holds the state of another model")
     for name, value in saved.items():
