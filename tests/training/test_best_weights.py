@@ -71,6 +71,19 @@ def test_a_score_that_still_falls_ends_nothing(tmp_path):
     assert best.step.item() == 100 and run.read_metrics()[-1]["step"] == "100"
 
 
+def test_without_a_score_the_last_weights_are_kept(tmp_path):
+    """Where nothing moves on the held-out trajectories there is none: weights of before the training must not stay."""
+    curve = Curve(*[float("nan")] * 10)
+    _, best, _ = training(tmp_path, curve)
+    assert len(curve.seen) == 10 and best.step.item() == 100
+    assert all(torch.equal(value, best.network.state_dict()[name]) for name, value in curve.seen[-1].items())
+
+
+def test_a_missing_score_replaces_no_score(tmp_path):
+    _, best, _ = training(tmp_path, Curve(0.5, *[float("nan")] * 9))
+    assert (best.best.item(), best.step.item()) == (0.5, 10)
+
+
 @pytest.mark.parametrize("stop", [16, 33, 61])
 def test_a_resumed_training_keeps_the_same_weights_bit_for_bit(tmp_path, stop):
     def score(network):  # of the weights alone
@@ -82,6 +95,8 @@ def test_a_resumed_training_keeps_the_same_weights_bit_for_bit(tmp_path, stop):
     _, cut, _ = training(tmp_path / "cut", score, resume=True)
     assert cut.state_dict().keys() == whole.state_dict().keys()
     assert all(torch.equal(value, cut.state_dict()[name]) for name, value in whole.state_dict().items())
+    last = [RunDirectory(tmp_path / name).last_metrics("planner") for name in ("whole", "cut")]
+    assert last[0]["kept_update"] == whole.step.item() == last[1]["kept_update"]
 
 
 def test_noise_on_the_condition_changes_the_loss_alone():

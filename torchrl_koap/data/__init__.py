@@ -15,6 +15,7 @@ from torchrl_koap.data.trajectories import (
     flatten_trajectories,
     mark_labels,
     select_state,
+    select_trajectories,
     trajectory_lengths,
 )
 from torchrl_koap.data.window_sampler import WindowSampler, WindowUnit
@@ -51,6 +52,7 @@ __all__ = [
     "save_demonstrations",
     "save_ted",
     "select_state",
+    "select_trajectories",
     "stored_task",
     "subsample_trajectories",
     "trajectory_lengths",

@@ -151,6 +151,27 @@ def trajectory_lengths(data: TensorDictBase) -> torch.Tensor:
     return torch.unique_consecutive(data.get(keys.EPISODE), return_counts=True)[1]
 
 
+def select_trajectories(data: TensorDictBase, episodes: Sequence[int]) -> TensorDictBase:
+    """Selects the steps of some trajectories.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]``.
+        episodes (sequence of int): numbers of the trajectories.
+
+    Returns:
+        TensorDictBase: flat data ``[M]``, in the order of ``data``.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import flatten_trajectories, select_trajectories
+        >>> data = flatten_trajectories([torch.zeros(5, 2)] * 3, [torch.zeros(4, 1)] * 3)
+        >>> select_trajectories(data, [0, 2])["episode"].unique()
+        tensor([0, 2])
+    """
+    episode = data[keys.EPISODE]
+    return data[torch.isin(episode, torch.as_tensor(list(episodes), device=episode.device))]
+
+
 def select_state(
     data: TensorDictBase, columns: Iterable[int] | Callable[[torch.Tensor], torch.Tensor]
 ) -> TensorDictBase:

@@ -6,10 +6,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import controller_view
+from torchrl_koap.data import controller_view, select_trajectories
 from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chunks, errors_outside_budget
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.plan_errors import plan_errors
@@ -72,7 +71,7 @@ def _plans(trained: Trained, data: TensorDictBase, **options: Any) -> dict[str, 
         return {"note": f"method {trained.config.method!r} is a policy of its own: it makes no plans"}
     if not trained.held_out:
         return {"note": "no trajectory was held out from the planner (--planner.held-out; two trajectories at least)"}
-    unseen = data[torch.isin(data["episode"], torch.tensor(trained.held_out))]
+    unseen = select_trajectories(data, trained.held_out)
     return {"trajectories": len(trained.held_out)} | plan_errors(trained.planner, unseen, trained.task, **options)
 
 

@@ -73,7 +73,8 @@ class PlannerConfig:
         noise: largest standard deviation of the noise on what it sees, as a share of half the range of each entry.
         frames: frames that it sees, 1 or 2.
         held_out: share of the trajectories that it never learns from, those without labels first. Training keeps the
-            weights that plan them best, and `koap eval` evaluates plans on them (default: 0.1).
+            weights that plan them best, and `koap eval` evaluates plans on them (default: 0.1 for a task without an
+            environment, else 0).
         source: run whose planner is taken over instead of training one, or pretrained:NAME.
 
     Raises:

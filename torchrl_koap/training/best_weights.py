@@ -35,7 +35,7 @@ class BestWeights(nn.Module):
         >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
         >>> best = BestWeights(PlannerLoss(planner), lambda network: 0.5, 1000)
         >>> best.every, best.check(100), best.step.item()
-        (100, {'held_out_score': 0.5}, 100)
+        (100, {'held_out_score': 0.5, 'best_held_out_score': 0.5, 'kept_update': 100}, 100)
     """
 
     best: torch.Tensor
@@ -58,17 +58,21 @@ class BestWeights(nn.Module):
             step (int): updates done.
 
         Returns:
-            dict: ``held_out_score``, for the log.
+            dict: ``held_out_score``, and :meth:`kept`, for the log.
         """
         began, (loss,), (now,) = time.perf_counter(), self._loss, self._now
         now.load_state_dict(loss.target_network_params.flatten_keys(".").to_dict())
         score = self._score(now)
-        if score < self.best:
+        if score < self.best or not self.best.isfinite():  # where nothing moves there is no score: the last are kept
             self.network.load_state_dict(now.state_dict())
             self.best.fill_(score)
             self.step.fill_(step)
         self.seconds += time.perf_counter() - began
-        return {"held_out_score": score}
+        return {"held_out_score": score} | self.kept()
+
+    def kept(self) -> dict[str, float]:
+        """The best score and the update that it belongs to."""
+        return {"best_held_out_score": self.best.item(), "kept_update": self.step.item()}
 
     def finished(self, step: int) -> bool:
         """Whether a better score is no longer to be expected after that many updates."""

@@ -187,15 +187,3 @@ def without_held_out(data: TensorDictBase, episodes: Sequence[int], *, keep_labe
             " train on; lower planner.held_out or raise labels.trajectories"
         )
     return data[~held_out]
-
-
-def only(data: TensorDictBase, episodes: Sequence[int]) -> TensorDictBase | None:
-    """Selects the data of some trajectories; None if there are none.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]``.
-        episodes (sequence of int): the trajectories.
-    """
-    episode = data["episode"]
-    chosen = torch.isin(episode, torch.as_tensor(list(episodes), device=episode.device))
-    return data[chosen] if chosen.any() else None

@@ -17,14 +17,14 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap import keys
-from torchrl_koap.data import mark_labels, select_state
+from torchrl_koap.data import mark_labels, select_state, select_trajectories
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import ControllerConfig, PlannerConfig, RunConfig, TrainConfig
 from torchrl_koap.runs.progress import without_progress_bars
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.training.controller import learn_controller
-from torchrl_koap.training.datasets import choose_held_out, only, without_held_out
+from torchrl_koap.training.datasets import choose_held_out, without_held_out
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import sizes_of
@@ -120,9 +120,8 @@ def fit(
         raise ValueError(f"planner: method {config.method!r} samples actions and has no planner")
     with _seeded(seed, device, progress):
         if plans and shared is None and planner is not False:
-            shared, results["planner"] = learn_planner(
-                task, config, without_held_out(data, held_out), held_out=only(data, held_out)
-            )
+            seen, unseen = without_held_out(data, held_out), select_trajectories(data, held_out) if held_out else None
+            shared, results["planner"] = learn_planner(task, config, seen, held_out=unseen)
         torch.manual_seed(seed)
         data = without_held_out(data, held_out, keep_labelled=True)
         module, found = learn_controller(task, config, data)

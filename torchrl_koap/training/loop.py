@@ -151,10 +151,9 @@ def train_phase(
             target_update.step()
 
         done = step + 1
-        scores: dict[str, float] = {}
-        if best is not None and (done % best.every == 0 or done == num_steps):
-            scores = best.check(done)
-        if scores or done % log_every == 0 or done == num_steps:
+        scored = best is not None and (done % best.every == 0 or done == num_steps)
+        scores = {} if best is None else best.check(done) if scored else best.kept()
+        if scored or done % log_every == 0 or done == num_steps:
             values = {key: value.item() for key, value in terms.items()}
             bad = [key for key, value in values.items() if not math.isfinite(value)]
             if bad:

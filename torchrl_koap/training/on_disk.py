@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 
-from torchrl_koap.data import LabelReport, WindowTable, subsample_trajectories
+from torchrl_koap.data import LabelReport, WindowTable, select_trajectories, subsample_trajectories
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import to_json, versions
@@ -31,7 +31,6 @@ from torchrl_koap.training.datasets import (
     held_out_by,
     label_budget,
     load_demonstrations,
-    only,
     without_held_out,
 )
 from torchrl_koap.training.defaults import resolve
@@ -100,7 +99,10 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             WindowTable.build(data, frames[0], pad_before=frames[1])
             if get_method(config.method).plans:
                 WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
-        for_planner, unseen = without_held_out(data, held_out), only(data, held_out)
+        for_planner, unseen = (
+            without_held_out(data, held_out),
+            select_trajectories(data, held_out) if held_out else None,
+        )
         data = data if planner_only else without_held_out(data, held_out, keep_labelled=True)
         if not mine:
             held.enter_context(run.locked("koap train"))

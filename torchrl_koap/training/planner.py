@@ -99,11 +99,7 @@ def learn_planner(
     loss.target_network_params.to_module(planner)
     if best is not None:
         planner.load_state_dict(best.network.state_dict())
-        values |= {
-            "held_out_score": best.best.item(),
-            "kept_update": best.step.item(),
-            "held_out_seconds": best.seconds,
-        }
+        values["held_out_seconds"] = best.seconds
     return planner, values
 
 
