@@ -8,7 +8,6 @@ import os
 import stat
 import subprocess
 import sys
-import threading
 
 import pytest
 
@@ -17,7 +16,7 @@ from torchrl_koap.files import DataError, LockedError, one_at_a_time, replacing_
 HOLD = """
 import sys
 from torchrl_koap.files import one_at_a_time
-with one_at_a_time(sys.argv[1]):
+with one_at_a_time(sys.argv[1], busy=""):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -35,23 +34,6 @@ def test_another_process_is_refused_until_the_first_one_is_gone(tmp_path):
         holder.communicate()
     with one_at_a_time(lock, busy="somebody works here"):
         pass
-
-
-def test_without_a_message_the_others_wait(tmp_path):
-    order = []
-
-    def second():
-        with one_at_a_time(tmp_path / "lock"):
-            order.append("second")
-
-    with one_at_a_time(tmp_path / "lock"):
-        thread = threading.Thread(target=second)
-        thread.start()
-        thread.join(0.3)
-        assert thread.is_alive()
-        order.append("first")
-    thread.join(10)
-    assert order == ["first", "second"]
 
 
 def test_a_file_that_cannot_be_written_leaves_the_earlier_one(tmp_path):

@@ -1,8 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Saving that never damages an earlier result (write aside, then rename), and reading that always comes to an end.
-
-A full disk or an interrupt in the middle of a save leaves what was there before, and no half-written rest.
-"""
+"""Saving that never damages an earlier result (write aside, then rename), and reading that always comes to an end."""
 
 from __future__ import annotations
 
@@ -26,11 +23,11 @@ LARGEST = 1 << 28  # bytes of a file that is read as a whole: hundreds of times 
 
 
 class DataError(ValueError):
-    """Data that cannot be used.
+    """Data that cannot be used, with every fault that was found.
 
     Args:
         source (str or Path): what cannot be used: a file, a folder, or what the caller calls the whole.
-        problems (str or sequence of str): every fault that was found.
+        problems (str or sequence of str): the faults.
 
     Examples:
         >>> from torchrl_koap.files import DataError
@@ -46,24 +43,14 @@ class DataError(ValueError):
 
 
 def check_file(path: str | Path, *, largest: int = LARGEST) -> None:
-    """Refuses what is no plain file (a pipe never ends, nor does a device), and files beyond all measure.
+    """Refuses what is no plain file (a pipe never ends, nor does a device), and files of more than ``largest`` bytes.
 
     Args:
         path (str or Path): the file; a link is followed.
-
-    Keyword Args:
         largest (int): bytes it may have.
 
     Raises:
         OSError: naming the file and what it is.
-
-    Examples:
-        >>> from torchrl_koap.files import check_file
-        >>> try:
-        ...     check_file("/dev/null")
-        ... except OSError as error:
-        ...     str(error)
-        '/dev/null is no plain file'
     """
     about = os.stat(path)
     if not stat.S_ISREG(about.st_mode):
@@ -73,45 +60,21 @@ def check_file(path: str | Path, *, largest: int = LARGEST) -> None:
 
 
 def read_bytes(path: str | Path, *, largest: int = LARGEST) -> bytes:
-    """The content of a plain file.
+    """Reads a plain file.
 
     Args:
         path (str or Path): the file.
-
-    Keyword Args:
         largest (int): bytes it may have.
 
     Raises:
         OSError: as :func:`check_file`, or if it cannot be read.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from torchrl_koap.files import read_bytes
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = (Path(folder) / "a").write_bytes(b"content")
-        ...     read_bytes(f"{folder}/a")
-        b'content'
     """
     check_file(path, largest=largest)
     return Path(path).read_bytes()
 
 
 def sha256_of(path: str | Path) -> str:
-    """Checksum of a file of any size, in hexadecimal.
-
-    Args:
-        path (str or Path): the file.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from torchrl_koap.files import sha256_of
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = (Path(folder) / "empty").write_bytes(b"")
-        ...     sha256_of(f"{folder}/empty")[:12]
-        'e3b0c44298fc'
-    """
+    """Computes the checksum of a file of any size, in hexadecimal."""
     check_file(path, largest=1 << 40)
     digest = hashlib.sha256()
     with open(path, "rb") as file:
@@ -161,25 +124,7 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def replacing_folder(path: str | Path) -> Iterator[Path]:
-    """Gives a folder to write into; it takes the place of ``path`` when the block ends without an error.
-
-    Args:
-        path (str or Path): the folder to create or replace. Missing parent folders are created.
-
-    Yields:
-        Path: a new, empty folder beside it.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from torchrl_koap.files import replacing_folder
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "result"
-        ...     with replacing_folder(path) as aside:
-        ...         _ = (aside / "part").write_text("complete")
-        ...     [entry.name for entry in path.iterdir()]
-        ['part']
-    """
+    """Gives a folder to write into, beside ``path``, whose place it takes when the block ends without an error."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent))
@@ -209,39 +154,26 @@ class LockedError(RuntimeError):
 
 
 @contextlib.contextmanager
-def one_at_a_time(path: str | Path, *, busy: str | None = None) -> Iterator[None]:
-    """Lets one process, or thread, at a time into the block; the others wait, or are refused.
+def one_at_a_time(path: str | Path, *, busy: str) -> Iterator[None]:
+    """Lets one process, or thread, at a time into the block and refuses the others.
 
     The lock is the system's: it is free again however its process ends.
 
     Args:
         path (str or Path): the lock file; it stays. Missing parent folders are created.
-
-    Keyword Args:
-        busy (str, optional): refuse with this message instead of waiting.
+        busy (str): message of the refusal.
 
     Raises:
-        LockedError: if somebody else is in the block and ``busy`` was given.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_koap.files import one_at_a_time
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     with one_at_a_time(f"{folder}/.lock"):
-        ...         "alone"
-        'alone'
+        LockedError: if somebody else is in the block.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    lock = filelock.FileLock(path, timeout=-1 if busy is None else 0, thread_local=False)
     try:
-        lock.acquire()
+        held = filelock.FileLock(path, timeout=0, thread_local=False).acquire()
     except filelock.Timeout:
         raise LockedError(busy) from None
-    try:
+    with held:
         yield
-    finally:
-        lock.release()
 
 
 def _exchange(new: Path, path: Path) -> None:
@@ -289,10 +221,6 @@ def dataclass_from_json(kind: type[_Made], entries: object, what: str) -> _Made:
         >>> from torchrl_koap.tasks import Body
         >>> dataclass_from_json(Body, {"name": "mug", "position": "mug_xy", "half": [0.1, 0.2]}, "body").half
         (0.1, 0.2)
-        >>> dataclass_from_json(Body, {"name": "mug", "colour": "red"}, "body")  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        ValueError: body: unknown entry 'colour'; known: color, ...
     """
     if not isinstance(entries, dict):
         raise ValueError(f"{what}: wanted an object, got {type(entries).__name__}")

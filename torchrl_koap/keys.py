@@ -57,17 +57,10 @@ COLLISION = "collision"
 MODE = "mode"
 CONTEXT = "context"
 
-REQUIRED = (
-    OBSERVATION,
-    ACTION,
-    HAS_ACTION,
-    EPISODE,
-    STEP_COUNT,
-    NEXT_OBSERVATION,
-    NEXT_DONE,
-    NEXT_TERMINATED,
-    NEXT_TRUNCATED,
-)
+_FLOATS = (OBSERVATION, STATE, ACTION, NEXT_OBSERVATION, NEXT_REWARD)
+_FLAGS = (HAS_ACTION, NEXT_DONE, NEXT_TERMINATED, NEXT_TRUNCATED)
+_COUNTS = (EPISODE, STEP_COUNT)
+REQUIRED = (OBSERVATION, ACTION, *_FLAGS, *_COUNTS, NEXT_OBSERVATION)
 
 
 class LayoutError(DataError):
@@ -86,9 +79,9 @@ def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDic
             :func:`~torchrl_koap.data.hide_commands` blanked them. Default: none.
 
     Raises:
-        LayoutError: with *all* problems found: missing keys, wrong dtypes or shapes, non-finite states,
-            labels that are NaN although ``has_action`` says they are there (or the reverse: a leak), step
-            counts that do not restart with the trajectory, trajectories that are not contiguous.
+        LayoutError: with *all* problems: missing keys, wrong dtypes or shapes, non-finite states, labels that are NaN
+            although ``has_action`` says they are there (or the reverse: a leak), step counts that do not restart with
+            the trajectory, trajectories that are not contiguous.
 
     Examples:
         >>> import torch
@@ -115,22 +108,16 @@ def validate(data: TensorDictBase, *, command: slice | None = None) -> TensorDic
 
 
 def _shape_problems(data: TensorDictBase, present: set) -> list[str]:
-    problems = []
-    for key in (OBSERVATION, STATE, ACTION, NEXT_OBSERVATION, NEXT_REWARD):
-        if key in present:
-            value = data.get(key)
-            if value.ndim != 2 or not value.is_floating_point():
-                problems.append(f"{key!r} must be a float tensor [N, d], got {value.dtype} {list(value.shape)}")
-    for key in (HAS_ACTION, NEXT_DONE, NEXT_TERMINATED, NEXT_TRUNCATED):
-        if key in present:
-            value = data.get(key)
-            if value.dtype != torch.bool or value.shape != (data.shape[0], 1):
-                problems.append(f"{key!r} must be a bool tensor [N, 1], got {value.dtype} {list(value.shape)}")
-    for key in (EPISODE, STEP_COUNT):
-        if key in present:
-            value = data.get(key)
-            if value.dtype != torch.int64 or value.shape != (data.shape[0],):
-                problems.append(f"{key!r} must be an int64 tensor [N], got {value.dtype} {list(value.shape)}")
+    steps, problems = data.shape[0], []
+    kinds = (
+        ("a float tensor [N, d]", _FLOATS, lambda value: value.ndim == 2 and value.is_floating_point()),
+        ("a bool tensor [N, 1]", _FLAGS, lambda value: value.dtype == torch.bool and value.shape == (steps, 1)),
+        ("an int64 tensor [N]", _COUNTS, lambda value: value.dtype == torch.int64 and value.shape == (steps,)),
+    )
+    for wanted, names, fits in kinds:
+        for key in names:
+            if key in present and not fits(value := data.get(key)):
+                problems.append(f"{key!r} must be {wanted}, got {value.dtype} {list(value.shape)}")
     if not problems and {OBSERVATION, NEXT_OBSERVATION} <= present:
         width, next_width = data.get(OBSERVATION).shape[-1], data.get(NEXT_OBSERVATION).shape[-1]
         if width != next_width:

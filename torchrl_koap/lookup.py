@@ -23,8 +23,6 @@ def lookup(table: Mapping[str, Any] | Collection[str], name: object, what: str) 
 
     Examples:
         >>> from torchrl_koap.lookup import lookup
-        >>> lookup({"dense": 1, "diagonal": 2}, "dense", "structure")
-        1
         >>> lookup({"dense": 1, "diagonal": 2}, "diagnoal", "structure")
         Traceback (most recent call last):
         ...
@@ -45,16 +43,11 @@ def resolve(reference: Any, what: str) -> Any:
         reference (str or object): ``"package.module:name"``, dots in ``name`` reach into a class.
         what (str): what the object is for; the error begins with it.
 
-    Returns:
-        object: what the string names.
-
     Raises:
         ValueError: if the string has no colon, the module cannot be imported, or it has no such name.
 
     Examples:
         >>> from torchrl_koap.lookup import resolve
-        >>> resolve("math:hypot", "goal of task 'toy'")(3, 4)
-        5.0
         >>> resolve("math:hypotenuse", "goal of task 'toy'")
         Traceback (most recent call last):
         ...
@@ -76,16 +69,11 @@ def resolve(reference: Any, what: str) -> Any:
 
 
 def exports(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """The ``__getattr__`` of a package whose public names are imported when they are first asked for.
+    """Makes the ``__getattr__`` of a package whose public names are imported when they are first asked for.
 
     Args:
         package (str): its name.
         modules (mapping): public name to the module that defines it.
-
-    Examples:
-        >>> from torchrl_koap.lookup import exports
-        >>> exports("my_package", {"sqrt": "math"})("sqrt")(4)
-        2.0
     """
 
     def get(name: str) -> Any:

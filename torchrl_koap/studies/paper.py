@@ -14,7 +14,7 @@ from torchrl_koap.studies.paper_results import PaperCell, paper_cell, paper_leve
 from torchrl_koap.studies.plots import plot_average
 from torchrl_koap.studies.summary import Summary, percent, summarise
 from torchrl_koap.studies.table import as_markdown
-from torchrl_koap.tasks.registry import find_task
+from torchrl_koap.tasks import TASKS
 
 PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")
 WIDE = {"network": "mlp", "width": 512, "batch_size": 256, "learning_rate": 1e-3}
@@ -135,8 +135,7 @@ def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
 
 
 def _levels_of(task: str) -> tuple[float, ...]:
-    facts = find_task(task)
-    return paper_levels(task) if facts is None else facts.label_levels
+    return TASKS[task].label_levels if task in TASKS else paper_levels(task)
 
 
 def layout_rows(entries: Sequence[Entry]) -> list[dict[str, str]]:
@@ -180,7 +179,7 @@ def default_entries(entries: Sequence[Entry]) -> list[Entry]:
         >>> [(entry.method, entry.text) for entry in default_entries(cells)]
         [("task's default", 'not run [78.0 +- 8.6]')]
     """
-    own = [entry for entry in entries if (task := find_task(entry.task)) and entry.method == task.defaults.method]
+    own = [entry for entry in entries if (task := TASKS.get(entry.task)) and entry.method == task.defaults.method]
     return [replace(entry, method=DEFAULT, paper=paper_cell(entry.task, "koap", entry.level)) for entry in own]
 
 

@@ -52,7 +52,7 @@ class ActionRule:
 
     Args:
         gripper (tuple of int, optional): action column and state column of a gripper whose command is read off the
-            widths (:func:`command_gripper`).
+            widths (:func:`gripper_command`).
         targets (sequence of int): for absolute actions the state column that each is the target of: the controller has
             decoded the distance to it.
 
@@ -68,11 +68,13 @@ class ActionRule:
     targets: Sequence[int] = ()
 
     def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
-        """The actions ``[*B, T, act]`` in states ``[*B, T, d]``."""
+        """Returns the actions ``[*B, T, act]`` in states ``[*B, T, d]``."""
         if self.targets:
             actions = actions + states[..., list(self.targets)]
         if self.gripper is not None:
-            actions = command_gripper(states, actions, entry=self.gripper[0], column=self.gripper[1])
+            entry, column = self.gripper
+            actions = actions.clone()  # the last frame, which nothing follows, stays as it is
+            actions[..., :-1, entry] = gripper_command(states[..., column], open_above=PLANNED_OPEN_ABOVE)
         return actions
 
 
@@ -81,40 +83,13 @@ def gripper_command(width: Tensor, *, open_above: float = OPEN_ABOVE) -> Tensor:
 
     Args:
         width (Tensor): ``[*B, T]`` (m).
-
-    Keyword Args:
         open_above (float): widths above it count as open (m).
 
     Returns:
         Tensor: ``[*B, T - 1]`` (m), for all steps but the last: above 0.075 opens, anything else closes.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.tasks.action_rules import gripper_command
-        >>> gripper_command(torch.tensor([0.0, 0.03, 0.06, 0.08, 0.08, 0.07, 0.06, 0.06]))
-        tensor([0.0800, 0.0800, 0.0800, 0.0800, 0.0700, 0.0600, 0.0600])
     """
     now, following = width[..., :-1], width[..., 1:]
     padded = torch.cat([following, width[..., -1:].expand(*width.shape[:-1], OPENING - 1)], -1)
     soon = padded.unfold(-1, OPENING, 1).amax(-1)
     opening = (following > now + _MOVES) & (soon > open_above)
     return torch.where(opening | (following > open_above), following.clamp_min(OPEN), following)
-
-
-def command_gripper(states: Tensor, actions: Tensor, *, entry: int, column: int) -> Tensor:
-    """Replaces the gripper's entry of actions by the command read off the planned widths.
-
-    Args:
-        states (Tensor): observed and planned states ``[*B, T, d]``.
-        actions (Tensor): actions of the same frames ``[*B, T, act]``; not changed.
-
-    Keyword Args:
-        entry (int): the gripper's entry of an action.
-        column (int): the state column of its width (m).
-
-    Returns:
-        Tensor: ``[*B, T, act]``; the last frame, which nothing follows, stays as it is.
-    """
-    actions = actions.clone()
-    actions[..., :-1, entry] = gripper_command(states[..., column], open_above=PLANNED_OPEN_ABOVE)
-    return actions

@@ -20,11 +20,14 @@ ROTATION_TOLERANCE = 0.048  # of half a turn
 ALIGNED_DISTANCE = 0.0155  # m; horizontal part of 18 mm when tray and target centres differ by 9.1 mm in height
 COMMAND_LEAD = 0.1  # m; scripted demonstrations keep the command within 0.066 of the robot
 BASE_HALF = 0.05  # half width of the tray (m)
+_HALF = (BASE_HALF, BASE_HALF)
 REGIONS = (((0.4, 0.6), (-0.25, -0.1)), ((0.4, 0.6), (0.2, 0.35)))  # of the centres of tray and target: x, y (m)
+_BOX, _TARGET = ("box_position", "box_quaternion"), ("target_position", "target_quaternion")
+_POSES = dict(zip((*_BOX, *_TARGET), (3, 4, 3, 4), strict=True))  # their columns
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether the tray lies in the target pose, bool ``[*B]`` of states ``[*B, 11]``.
+    """Says whether the tray lies in the target pose, bool ``[*B]``.
 
     Within :data:`ALIGNED_DISTANCE` of the target, and the quaternions' cosine above that of
     :data:`ROTATION_TOLERANCE` half turns.
@@ -40,7 +43,7 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
 
 
 def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
-    """D3IL's figure ``d3il_score``, the mean of success and entropy; none where no context had two rollouts."""
+    """Computes D3IL's figure ``d3il_score``, mean of success and entropy; none where no context had two rollouts."""
     if result["mode_entropy"] is None:
         return {}
     return {"d3il_score": 0.5 * (result["success_rate"] + result["mode_entropy"])}
@@ -49,31 +52,19 @@ def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
 register_task(
     Task(
         name="aligning",
-        observation_parts={
-            "desired_xyz": 3,
-            "measured_xyz": 3,
-            "box_position": 3,
-            "box_quaternion": 4,
-            "target_position": 3,
-            "target_quaternion": 4,
-        },
+        observation_parts={"desired_xyz": 3, "measured_xyz": 3, **_POSES},
         command="desired_xyz",
         position="measured_xyz",
         actions={axis: Action("m", column=column) for column, axis in enumerate("xyz")},
         max_steps=400,
         robot=(0, 1, 2),
-        state={
-            "measured_xyz": "plain",
-            "box_position": "plane",
-            "box_quaternion": "quaternion",
-            "target_position": "plane",
-            "target_quaternion": "quaternion",
-        },
-        planar_parts=("measured_xyz", "box_position", "box_quaternion", "target_position", "target_quaternion"),
+        state={"measured_xyz": "plain"}
+        | {part: "plane" if size == 3 else "quaternion" for part, size in _POSES.items()},
+        planar_parts=("measured_xyz", *_POSES),
         relative_positions=(
-            ("measured_xyz", "box_position", "box_quaternion"),
-            ("target_position", "box_position", "box_quaternion", "target_quaternion"),
-            ("measured_xyz", "target_position", "target_quaternion"),
+            ("measured_xyz", *_BOX),
+            ("target_position", *_BOX, "target_quaternion"),
+            ("measured_xyz", *_TARGET),
         ),
         goal="torchrl_koap.tasks.aligning:goal_reached",
         modes=Modes(
@@ -87,26 +78,8 @@ register_task(
         scene=Scene(
             shapes=tuple(Shape.over(region, "region") for region in REGIONS),
             bodies=(
-                Body(
-                    "box",
-                    "box_position",
-                    "box_quaternion",
-                    (REGIONS[0],),
-                    "tray",
-                    "#9a5b13",
-                    (BASE_HALF, BASE_HALF),
-                    front=True,
-                ),
-                Body(
-                    "target",
-                    "target_position",
-                    "target_quaternion",
-                    (REGIONS[1],),
-                    color="#0a7f7f",
-                    half=(BASE_HALF, BASE_HALF),
-                    front=True,
-                    still=True,
-                ),
+                Body("box", *_BOX, REGIONS[:1], "tray", "#9a5b13", _HALF, front=True),
+                Body("target", *_TARGET, REGIONS[1:], color="#0a7f7f", half=_HALF, front=True, still=True),
             ),
             x=(0.21, 0.79),
             y=(-0.39, 0.47),

@@ -30,7 +30,7 @@ OBSTACLES = (
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether the tool is behind the finish line, bool ``[*B]`` of its positions ``[*B, 2]`` (m).
+    """Says whether the tool is behind the finish line, bool ``[*B]``.
 
     Args:
         task (Task): the task.
@@ -62,7 +62,7 @@ def mode_of_path(path: np.ndarray) -> int:
 
 
 def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
-    """D3IL's figure ``d3il_score``: 0.8 success + 0.2 entropy."""
+    """Computes D3IL's figure ``d3il_score``: 0.8 success + 0.2 entropy."""
     return {"d3il_score": 0.8 * result["success_rate"] + 0.2 * result["mode_entropy"]}
 
 

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Whether the facts of a task fit each other; every fault is collected, one error tells them all."""
+"""Whether the facts of a task fit each other."""
 
 from __future__ import annotations
 
@@ -17,9 +17,6 @@ ENTROPIES = ("all", "contexts", "solved_contexts")
 
 def check_task(task: Task) -> None:
     """Checks a task.
-
-    Args:
-        task (Task): the task.
 
     Raises:
         ValueError: with all faults, one a line, each naming the field.

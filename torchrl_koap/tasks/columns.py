@@ -105,22 +105,10 @@ class Columns:
         return tuple(units)
 
     def state_of(self, observation: Tensor) -> Tensor:
-        """Selects the state that planner and controller see.
-
-        Args:
-            observation (Tensor): ``[*B, obs]``.
-
-        Returns:
-            Tensor: ``[*B, d]``.
+        """Selects the state ``[*B, d]`` that planner and controller see from observations ``[*B, obs]``.
 
         Raises:
             ValueError: if the last axis has another size than the task's observation.
-
-        Examples:
-            >>> import torch
-            >>> from torchrl_koap.tasks import get_task
-            >>> get_task("avoiding").state_of(torch.tensor([[1.0, 2.0, 3.0, 4.0]]))
-            tensor([[3., 4.]])
         """
         if observation.shape[-1] != self.observation_dim:
             raise ValueError(

@@ -38,16 +38,7 @@ class Modes:
         return math.prod(len(names) for _, names in self.choices)
 
     def name_of(self, index: int) -> str:
-        """Names a mode by its choices, the slowest first; ``"no mode"`` where the number is none of them.
-
-        Args:
-            index (int): number of the mode.
-
-        Examples:
-            >>> from torchrl_koap.tasks import get_task
-            >>> get_task("avoiding").modes.name_of(23), get_task("sorting").modes.name_of(1)
-            ('right, right, gap 4', 'red, blue, red, blue')
-        """
+        """Names a mode by its choices, the slowest first; ``"no mode"`` where the number is none of them."""
         if not 0 <= index < self.number:
             return "no mode"
         words = []

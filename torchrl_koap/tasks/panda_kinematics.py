@@ -20,13 +20,7 @@ _FLANGE_TO_TOOL = 0.212  # m along the last joint's axis
 
 
 def tool_position(joints: Tensor) -> Tensor:
-    """Position of the tool centre point.
-
-    Args:
-        joints (Tensor): arm joints ``[*B, 7]`` (rad).
-
-    Returns:
-        Tensor: ``[*B, 3]`` (m), robot base at the origin.
+    """Computes the position of the tool ``[*B, 3]`` (m, robot base at the origin) from arm joints ``[*B, 7]`` (rad).
 
     Raises:
         ValueError: if there are not seven joints on the last axis.

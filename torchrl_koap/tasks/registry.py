@@ -41,19 +41,14 @@ def register_task(task: Task) -> Task:
     """
     if not isinstance(task, Task):
         raise TypeError(f"wanted a Task, got {type(task).__name__}")
-    known = TASKS.get(task.name)
-    if known is not None and known != task:
+    known = TASKS.setdefault(task.name, task)
+    if known != task:
         raise ValueError(f"another task named {task.name!r} is registered already; choose another name")
-    if known is None:
-        TASKS[task.name] = task
-    return TASKS[task.name]
+    return known
 
 
 def get_task(name: str) -> Task:
     """Looks a task up by name; installed packages are asked for theirs if it is not known yet.
-
-    Args:
-        name (str): the name.
 
     Returns:
         Task: the registered task.
@@ -71,27 +66,8 @@ def get_task(name: str) -> Task:
     return lookup(TASKS, name, "task")
 
 
-def find_task(name: object) -> Task | None:
-    """The task of that name, None where there is none: for pictures of data whose task may be unknown.
-
-    Args:
-        name (object): the name; anything that is no name of a task gives None.
-
-    Examples:
-        >>> from torchrl_koap.tasks.registry import find_task
-        >>> find_task("avoiding").num_modes, find_task(None)
-        (24, None)
-    """
-    if isinstance(name, str) and name not in TASKS:
-        load_entry_points()
-    return TASKS.get(name) if isinstance(name, str) else None
-
-
 def task_from_config(config: Mapping[str, Any]) -> Task:
-    """Finds the task of a run by its ``config.json``: the one that it holds, or a registered one.
-
-    Args:
-        config (mapping): content of ``config.json``.
+    """Finds the task of a run by the content of its ``config.json``.
 
     Returns:
         Task: the one that the mapping defines, else the registered one of that name.
@@ -105,29 +81,16 @@ def task_from_config(config: Mapping[str, Any]) -> Task:
         2
     """
     definition = config.get("task_definition")
-    if definition is None:
-        return get_task(config["task"])
-    return plain_task(definition)
+    return get_task(config["task"]) if definition is None else plain_task(definition)
 
 
 def plain_task(entries: object) -> Task:
-    """Reads the task that a data set or run brings along: plain facts, no code.
+    """Reads the task that a data set or run brings along, as :meth:`Task.to_json` wrote it.
 
     A folder that somebody sent must not decide what is run.
 
-    Args:
-        entries (dict): as :meth:`Task.to_json` wrote them.
-
     Raises:
         ValueError: if the entries are damaged, or name code to import.
-
-    Examples:
-        >>> from torchrl_koap.tasks import get_task
-        >>> from torchrl_koap.tasks.registry import plain_task
-        >>> plain_task(get_task("avoiding").to_json())  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        ValueError: task 'avoiding' names code in env, expert, ...; register it by --plugin instead
     """
     try:
         task = Task.from_json(entries)
@@ -140,11 +103,7 @@ def plain_task(entries: object) -> Task:
 
 
 def load_entry_points() -> None:
-    """Imports what installed packages name in the entry-point group ``torchrl_koap.tasks``, once.
-
-    Raises:
-        RuntimeError: if one of them cannot be imported; the message names it.
-    """
+    """Imports what installed packages name in the entry-point group ``torchrl_koap.tasks``, once."""
     global _loaded
     if _loaded:
         return

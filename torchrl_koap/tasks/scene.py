@@ -1,8 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How a task looks from above, in plain numbers: what stands still, and the bodies that a context places.
-
-Only sizes, places and the names of roles and colours; :mod:`torchrl_koap.reports.scenes` draws them.
-"""
+"""How a task looks from above, in plain numbers: what stands still, and the bodies that a context places."""
 
 from __future__ import annotations
 

@@ -33,14 +33,7 @@ IMAGE_SIZE = 96  # pixels, both ways
 
 
 def start_of(context: np.ndarray) -> int:
-    """Number of the start position that a context ``[bodies, 3]`` was drawn around, in the order of :data:`STARTS`.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.tasks.scooping import start_of
-        >>> start_of(np.array([[0.34, 0.01, 0.5]]))
-        1
-    """
+    """Returns the number of the start position that a context ``[bodies, 3]`` was drawn around (:data:`STARTS`)."""
     x, y = context[0][:2]
     distances = [(x - a) ** 2 + (y - b) ** 2 for a, b in STARTS.values()]
     return distances.index(min(distances))

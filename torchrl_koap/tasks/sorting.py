@@ -1,8 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Sorting: push red and blue cubes over the far edge of a platform into bins of their colour.
 
-With two, four or six boxes, and with four boxes whose yaws are hidden and whose tool is measured with noise
-(PO-Sorting).
+With two, four or six boxes; PO-Sorting has four, whose yaws are hidden, and noise on the tool's position.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ _CAPTION = (
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether every box is in the bin of its colour, bool ``[*B]`` of states ``[*B, d]``.
+    """Says whether every box is in the bin of its colour, bool ``[*B]``.
 
     Args:
         task (Task): the task.
@@ -65,7 +64,7 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
 
 
 def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
-    """D3IL's figure ``d3il_score``: success minus the divergence of the modes from equally frequent ones.
+    """Computes D3IL's figure ``d3il_score``: success minus the divergence of the modes from equally frequent ones.
 
     Equally frequent modes are those of our demonstrations. None where no context had two rollouts.
     """
@@ -76,10 +75,7 @@ def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
 
 @functools.cache
 def arrival_orders(num_boxes: int) -> tuple[tuple[int, ...], ...]:
-    """Every order in which the colours (0 red, 1 blue) can arrive, in lexicographic order: the modes.
-
-    Args:
-        num_boxes (int): number of boxes, half of them red.
+    """Lists every order in which the colours (0 red, 1 blue) can arrive, in lexicographic order: the modes.
 
     Examples:
         >>> from torchrl_koap.tasks.sorting import arrival_orders
@@ -166,10 +162,7 @@ register_task(
 
 
 def sorting_task(num_boxes: int) -> Task:
-    """The task with so many boxes.
-
-    Args:
-        num_boxes (int): 2, 4 or 6.
+    """Returns the task with 2, 4 or 6 boxes.
 
     Raises:
         ValueError: for another number.

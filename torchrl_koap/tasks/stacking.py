@@ -34,7 +34,7 @@ def _boxes_of(task: Task, state: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def goal_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether all boxes are piled in the zone, bool ``[*B]`` of states ``[*B, d]``.
+    """Says whether all boxes are piled in the zone, bool ``[*B]``.
 
     All within :data:`ZONE_RADIUS` of its centre, heights more than :data:`HEIGHT_GAP` apart.
 
@@ -48,7 +48,7 @@ def goal_reached(task: Task, state: Tensor) -> Tensor:
 
 
 def first_box_reached(task: Task, state: Tensor) -> Tensor:
-    """Whether any box is in the zone, bool ``[*B]`` of states ``[*B, d]``.
+    """Says whether any box is in the zone, bool ``[*B]``.
 
     Args:
         task (Task): the task.

@@ -1,9 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """What a task *is*: observation and action columns, goal, modes, how it looks, and which code simulates it.
 
-Environments, readers of recorded data, training and reports share these facts, so they live in none of them. Code is
-named by import strings (``"package.module:name"``), so that a task is plain data, which can be written to JSON beside a
-data set, and no simulator is imported before it is used.
+Code is named by import strings (``"package.module:name"``), so that a task is plain data, which can be written to JSON
+beside a data set, and no simulator is imported before it is used.
 """
 
 from __future__ import annotations
@@ -159,17 +158,12 @@ class Task(Columns):
 
     @property
     def action_unit(self) -> str:
-        """Unit of the first action column: that of the columns :meth:`action_columns` returns by default."""
+        """Unit of the first action column."""
         return self.action_units[0]
 
-    def action_columns(self, unit: str | None = None) -> list[int]:
-        """Action columns in one unit, whose errors may be averaged.
-
-        Args:
-            unit (str, optional): the unit. Default: that of the first column.
-        """
-        unit = self.action_unit if unit is None else unit
-        return [index for index, own in enumerate(self.action_units) if own == unit]
+    def action_columns(self) -> list[int]:
+        """Returns the action columns in the unit of the first one, whose errors may be averaged."""
+        return [index for index, unit in enumerate(self.action_units) if unit == self.action_unit]
 
     @cached_property
     def delta_actions(self) -> tuple[int, ...]:
@@ -192,9 +186,9 @@ class Task(Columns):
         return None
 
     def moved_columns(self, *, or_robot: bool = False) -> tuple[int, ...]:
-        """State column that each action moves, by the same filter for all; empty where one of them names none.
+        """Returns the state column that each action moves; empty where one of them names none.
 
-        Keyword Args:
+        Args:
             or_robot (bool): take the first columns of the robot instead, one for each change of a command, where the
                 actions name none.
         """
@@ -247,7 +241,7 @@ class Task(Columns):
         return next(iter(self.state_parts.items())) == (self.position, "plain")
 
     def controller_columns(self, part: str) -> tuple[int, ...]:
-        """State columns that a controller reads.
+        """Returns the state columns that a controller reads.
 
         Args:
             part (str): ``"robot"``: the robot's own, whose motion the actions command; ``"all"``: the whole state, as
@@ -260,11 +254,11 @@ class Task(Columns):
         return lookup({"robot": self.robot or everything, "all": everything}, part, "part of the state")
 
     def relative_columns(self) -> list[tuple[slice, ...]]:
-        """State columns of ``relative_positions``: a position, the one it is seen from, a yaw and another one."""
+        """Returns the state columns of ``relative_positions``: a position, another, a yaw, another yaw."""
         return [tuple(self.state_slices[name] for name in names) for names in self.relative_positions]
 
     def interchangeable_columns(self) -> list[list[list[int]]]:
-        """State columns of the bodies that may be permuted, by group and body."""
+        """Returns the state columns of the bodies that may be permuted, by group and body."""
         return [
             [
                 [
@@ -280,32 +274,17 @@ class Task(Columns):
         ]
 
     def planar_columns(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-        """State columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` that move together."""
+        """Returns the state columns of the positions ``(x, y)`` and yaws ``(cos, sin)`` that move together."""
         columns = self.state_slices
         pairs = {name: (columns[name].start, columns[name].start + 1) for name in self.planar_parts}
         yaws = [name for name in self.planar_parts if self.state_parts[name] == "quaternion"]
         return [pair for name, pair in pairs.items() if name not in yaws], [pairs[name] for name in yaws]
 
     def goal_reached(self, state: Tensor) -> Tensor:
-        """Says which states, planned or recorded, are ones in which the task is done.
-
-        Environments judge the physics; this judges states as planner and controller see them, so that a plan can be
-        judged without executing it.
-
-        Args:
-            state (Tensor): ``[*B, d]``, see :meth:`state_of`.
-
-        Returns:
-            Tensor: bool ``[*B]``.
+        """Says in which states, planned or recorded, the task is done: bool ``[*B]`` of states ``[*B, d]``.
 
         Raises:
             ValueError: if the task has no goal, or the state has another number of columns.
-
-        Examples:
-            >>> import torch
-            >>> from torchrl_koap.tasks import get_task
-            >>> get_task("avoiding").goal_reached(torch.tensor([[0.5, 0.36], [0.5, 0.2]]))
-            tensor([ True, False])
         """
         if self.goal is None:
             raise ValueError(f"task {self.name!r} has no goal: give it one, or judge no states")
@@ -314,28 +293,24 @@ class Task(Columns):
         return resolve(self.goal, f"goal of task {self.name!r}")(self, state)
 
     def import_strings(self) -> dict[str, str]:
-        """Import strings by the field that has them: the code that using the task may run."""
+        """Returns the import strings by the field that has them: the code that using the task may run."""
         named = {field: getattr(self, field) for field in ("env", "expert", "goal", "score")}
         named |= {"tool_kinematics": self.tool_kinematics, "modes.index": self.modes.index}
+        named["modes.of_path"] = self.modes.of_path
         named |= {f"state.{part}": kind for part, kind in self.state.items() if ":" in kind}
         return {place: value for place, value in named.items() if value}
 
     def to_json(self) -> dict[str, Any]:
-        """The task as dictionaries, lists, strings and numbers.
+        """Returns the task as dictionaries, lists, strings and numbers.
 
         Raises:
             TypeError: if a field holds an object instead of its import string.
-
-        Examples:
-            >>> from torchrl_koap.tasks import get_task
-            >>> get_task("avoiding").to_json()["actions"]["y"]
-            {'unit': 'm', 'kind': 'delta', 'column': 1}
         """
         return {name: _plain(value, name) for name, value in asdict(self).items()}
 
     @classmethod
     def from_json(cls, entries: object) -> Task:
-        """The task that :meth:`to_json` wrote.
+        """Reads the task that :meth:`to_json` wrote.
 
         Raises:
             ValueError: for an unknown or missing entry, or facts that do not fit each other.

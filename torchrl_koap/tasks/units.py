@@ -9,13 +9,7 @@ _THOUSANDTHS = {"m": "mm", "rad": "mrad", "s": "ms", "N": "mN"}
 
 
 def thousandths(unit: str) -> tuple[str, float]:
-    """Unit in which small values are shown, and the factor to it: the one place where metres become millimetres.
-
-    Args:
-        unit (str): unit of the data; one that has no thousandth of its own is shown as it is.
-
-    Returns:
-        tuple: the unit shown, and what values are multiplied with.
+    """Returns the unit in which small values are shown, and the factor to it; metres become millimetres here.
 
     Examples:
         >>> from torchrl_koap.tasks.units import thousandths
@@ -26,10 +20,7 @@ def thousandths(unit: str) -> tuple[str, float]:
 
 
 def unit_groups(units: Sequence[str]) -> dict[str, list[int]]:
-    """Columns by unit, in the order in which the units come.
-
-    Args:
-        units (sequence of str): unit of every column.
+    """Groups columns by their units, in the order in which the units come.
 
     Examples:
         >>> from torchrl_koap.tasks.units import unit_groups
