@@ -24,13 +24,10 @@ WALLS = (
 
 
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
-    """Number of the mode: 0 if the tray was pushed from inside at the last instant, 1 from outside.
+    """Returns the number of the mode ``[*B]``: 0 if the tray was last pushed from inside, 1 from outside.
 
     Args:
-        mode (torch.Tensor): leaf ``mode`` of :class:`AligningEnv`, int64 ``[*B, 1]``.
-
-    Returns:
-        torch.Tensor: int64 ``[*B]``; -1 before the first step.
+        mode (torch.Tensor): leaf ``mode`` of :class:`AligningEnv`, int64 ``[*B, 1]``; -1 before the first step.
     """
     return mode.squeeze(-1).to(torch.int64)
 
@@ -98,7 +95,7 @@ class AligningEnv(ManipulationEnv):
         return poses_of(self._contexts[:, 1], height=0.0)
 
     def errors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Distance of tray and target centres (m), height included, and their angle over pi; both [n]."""
+        """Returns the distance of tray and target centres (m), height included, and their angle over pi; both [n]."""
         tray, target = self.sims.object_poses[:, 0], self.targets
         distance = np.linalg.norm(tray[:, :3] - target[:, :3], axis=1)
         same = np.abs((tray[:, 3:] * target[:, 3:]).sum(1))
@@ -117,8 +114,8 @@ class AligningEnv(ManipulationEnv):
         """Poses of tray and target as D3IL's recorder logs them."""
         return super().raw_objects() | {"target": self.targets}
 
-    def _scene(self, arm_alpha: float) -> Any:
-        return scene(rod=True, arm_alpha=arm_alpha, add_objects=_add_tray_and_target)
+    def _scene(self) -> Any:
+        return scene(add_objects=_add_tray_and_target)
 
 
 def _add_tray_and_target(root) -> None:

@@ -16,15 +16,13 @@ ROW_REACH = 0.03
 
 
 def mode_index(flags: torch.Tensor) -> torch.Tensor:
-    """Number of the mode, 0 to 23, from the nine flags; -1 while a row of obstacles has not been passed.
-
-    ``12 * row1 + 4 * row2 + row3``, each counted from small x to large x.
+    """Returns the number of the mode, ``12 * row1 + 4 * row2 + row3``, each counted from small x to large x.
 
     Args:
         flags (torch.Tensor): leaf ``mode`` of :class:`AvoidingEnv`, bool or int ``[*B, 9]``.
 
     Returns:
-        torch.Tensor: int64 ``[*B]``.
+        torch.Tensor: int64 ``[*B]``, 0 to 23; -1 while a row of obstacles has not been passed.
 
     Raises:
         ValueError: if the last axis does not hold nine flags.
@@ -64,15 +62,11 @@ class AvoidingEnv(ManipulationEnv):
     Kept from the original because policies experience it: the measured xy is one control step old (the first step
     repeats the reset's), ``success``, ``collision`` and ``done`` come one step after the state that caused them,
     collisions are looked at once per control step (a graze in between is missed), and crossing the line while touching
-    is a success. The outcome is latched: ``success`` and ``collision`` are never both True and the last frame of an
-    episode tells which it was (neither: out of time). Unlike the original, collisions are seen in every environment,
-    not only in the first one of the process.
+    is a success. Unlike the original, collisions are seen in every environment, not only in the first one.
 
-    The commanded height is held at the TCP height after the reset, the orientation at (0, 1, 0, 0). Commands are
-    accumulated in float64. Every episode starts in the same state; nothing is random.
-
-    Human demonstrators move the command by at most 0.012 m per axis and step. The action spec has this range for
-    random actions; larger actions are executed as they are, never clipped.
+    The commanded height is held at the TCP height after the reset, the orientation at (0, 1, 0, 0). Every episode
+    starts in the same state. Human demonstrators move the command by at most 0.012 m per axis and step, the range of
+    the action spec; larger actions are executed as they are.
 
     Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`.
 
@@ -115,7 +109,7 @@ class AvoidingEnv(ManipulationEnv):
         return crossed, touching
 
     def obstacle_contacts(self) -> np.ndarray:
-        """Which cylinders the rod touches in the present state, bool [n, 6] in the order of ``OBSTACLES``."""
+        """Returns which cylinders the rod touches in the present state, bool [n, 6] in the order of ``OBSTACLES``."""
         return np.stack([self.sims.contacts(row, self._rod, self._obstacles) for row in range(len(self.sims))])
 
     def _update_mode(self, rows: np.ndarray) -> None:
@@ -136,8 +130,8 @@ class AvoidingEnv(ManipulationEnv):
         mode[:, 8] |= at & (x > 0.35) & ~mode[:, 5:8].any(1)
         self._mode[rows] = mode
 
-    def _scene(self, arm_alpha: float) -> Any:
-        root = scene(rod=True, image_size=1024, arm_alpha=arm_alpha)
+    def _scene(self) -> Any:
+        root = scene()
         for name, x, y, radius, half_height in OBSTACLES:
             body = root.worldbody.add("body", name=name, pos=(x, y, 0))
             body.add("geom", name=name, type="cylinder", size=(radius, half_height), rgba=(1, 0, 0, 1))

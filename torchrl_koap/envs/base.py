@@ -36,15 +36,12 @@ class ManipulationEnv(EpisodeState, EnvBase):
     """Simulates a batch of episodes of a D3IL task, with partial resets and partial steps.
 
     A task declares the class attributes and implements the hooks :meth:`_scene`, :meth:`_command`, :meth:`_observe`,
-    :meth:`_check`, :meth:`_update_mode` and, with objects, :meth:`_place`. Hooks receive ``rows``, the indices of the
-    environments concerned.
+    :meth:`_check`, :meth:`_update_mode` and, with objects, :meth:`_place`; ``rows`` are indices of environments.
 
-    A task with objects has *contexts*, the poses in which an episode starts
-    (:mod:`torchrl_koap.envs.contexts`): drawn at random at every reset, taken from a table in turn, or handed over
-    by ``reset(contexts=...)``. The leaf ``context`` ``[n, objects, 3]`` holds them (x, y in m, yaw in rad).
+    A task with objects has *contexts*, where they are when an episode starts (:mod:`torchrl_koap.envs.contexts`): drawn
+    at random at every reset, taken from a table in turn, or handed over by ``reset(contexts=...)``.
 
-    Success and collision are *latched*: whichever is seen first is the outcome, becomes True in the frame that also
-    carries ``terminated``, and stays until the reset. The other one stays False.
+    Success and collision are *latched*: the first that is seen is the outcome and stays until the reset.
 
     Args:
         num_envs (int): number of environments, the batch size.
@@ -57,7 +54,6 @@ class ManipulationEnv(EpisodeState, EnvBase):
     Keyword Args:
         contexts (array, optional): table ``[C, objects, 3]``; the ``j``-th reset of environment ``i`` takes row
             ``(i + j num_envs) mod C``. Default: random ones.
-        arm_alpha (float, optional): opacity of the arm in pictures.
         task (Task, optional): a variant of the class's own task.
 
     Raises:
@@ -73,7 +69,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
 
     TASK: str  # name of the task
     START_JOINTS: tuple[float, ...] = (0.0,) * 7  # after a reset (rad)
-    ACTION_BOUND: Any = 0.012  # half range of random actions, or least and greatest values; others are executed too
+    ACTION_BOUND: Any = (-0.012, 0.012)  # least and greatest values of random actions; others are executed too
     MODE_ENTRIES: int | None = 1  # of the leaf ``mode``; None: one per object
     MODE_VALUES: int | None = None  # its entries are -1 (undecided) to this - 1, int64; None: flags, bool
     COLLIDES = False  # an episode can end by a collision
@@ -81,7 +77,6 @@ class ManipulationEnv(EpisodeState, EnvBase):
     SUBSTEPS = 35  # physics steps (1 ms) per control step
     COMMAND_DIM = 7  # numbers that make up a command
     RESET_WIDTH = controller.FINGER_RESET  # finger target during the reset's substep (m)
-    ARM_ALPHA = 0.3  # opacity of the arm in pictures
 
     def __init__(
         self,
@@ -93,7 +88,6 @@ class ManipulationEnv(EpisodeState, EnvBase):
         dtype: torch.dtype = torch.float32,
         *,
         contexts=None,
-        arm_alpha: float | None = None,
         task: Task | None = None,
     ):
         max_steps = self.MAX_STEPS if max_steps is None else max_steps
@@ -105,7 +99,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         super().__init__(device=device, batch_size=[num_envs])
         self.task = get_task(self.TASK) if task is None else task
         self.max_steps = max_steps
-        self.sims: Any = self._simulations(num_envs, num_threads, self.ARM_ALPHA if arm_alpha is None else arm_alpha)
+        self.sims: Any = self._simulations(num_envs, num_threads)
         self._dtype = dtype
         self._context_table = None if contexts is None else check_contexts(self.task, contexts)
         self._num_resets = np.zeros(num_envs, dtype=np.int64)
@@ -117,9 +111,9 @@ class ManipulationEnv(EpisodeState, EnvBase):
         self._make_specs()
         self._set_seed(seed)
 
-    def _simulations(self, num_envs: int, num_threads: int, arm_alpha: float) -> Any:
+    def _simulations(self, num_envs: int, num_threads: int) -> Any:
         """What is simulated; differs where another arm than D3IL's moves."""
-        return SimulationBatch(compile_scene(self._scene(arm_alpha)), num_envs, num_threads)
+        return SimulationBatch(compile_scene(self._scene()), num_envs, num_threads)
 
     def _episode_arrays(self, num_envs: int) -> dict[str, np.ndarray]:
         """What an episode in progress consists of beside the simulation, a row per environment."""
@@ -155,9 +149,8 @@ class ManipulationEnv(EpisodeState, EnvBase):
             leaves[keys.CONTEXT] = Unbounded(size, device=device, dtype=self._dtype)
         self.observation_spec = Composite(leaves, shape=shape)
         size = (*shape, self.task.action_dim)
-        bound = self.ACTION_BOUND
-        bounds = bound if isinstance(bound, tuple) else (-bound, bound)
-        low, high = (torch.as_tensor(bound, dtype=self._dtype, device=device).expand(size) for bound in bounds)
+        bounds = (torch.as_tensor(bound, dtype=self._dtype, device=device) for bound in self.ACTION_BOUND)
+        low, high = (bound.expand(size) for bound in bounds)
         self.action_spec = Bounded(low, high, size, device=device, dtype=self._dtype)
         self.reward_spec = Bounded(0.0, 1.0, (*shape, 1), device=device, dtype=self._dtype)
         done = Categorical(2, (*shape, 1), device=device, dtype=torch.bool)
@@ -168,7 +161,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         self._commands[rows, :3] = self.sims.tcp_position[rows]
         self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
 
-    def _scene(self, arm_alpha: float) -> Any:
+    def _scene(self) -> Any:
         """Scene of the task, an ``mjcf.RootElement``."""
         raise NotImplementedError
 
@@ -211,7 +204,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         self.sims.reset(rows, np.asarray(self.START_JOINTS), self._place(rows), width=self.RESET_WIDTH)
         self.sims.widths[rows] = controller.FINGER_OPEN
         self._begin_episode(rows)
-        return self._leaves(np.zeros(self.batch_size[0], dtype=bool))
+        return self._leaves()
 
     def _draw_contexts(self, rows: np.ndarray, contexts) -> None:
         if contexts is not None:
@@ -239,9 +232,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         rows = self._rows(tensordict, "_step")
-        action = self._checked_action(tensordict, rows)
-        self._command(rows, action)
-
+        self._command(rows, self._checked_action(tensordict, rows))
         success, failure = self._seen[rows].T
         undecided = ~(self._success[rows] | self._collision[rows])
         self._success[rows] |= undecided & success
@@ -252,11 +243,12 @@ class ManipulationEnv(EpisodeState, EnvBase):
         self._steps[rows] += 1
         self._update_mode(rows)
         self._seen[rows] = np.stack(self._check(rows), axis=1)
-        stepped = np.zeros(self.batch_size[0], dtype=bool)
-        stepped[rows] = True
-        out = self._leaves(stepped)
-        out.set("reward", self._tensor((self._success & stepped)[:, None], self._dtype))
-        return out
+        return self._stepped(rows)
+
+    def _stepped(self, rows: np.ndarray) -> TensorDictBase:
+        reward = np.zeros_like(self._success)
+        reward[rows] = self._success[rows]
+        return self._leaves().set("reward", self._tensor(reward[:, None], self._dtype))
 
     def _checked_action(self, tensordict: TensorDictBase, rows: np.ndarray) -> np.ndarray:
         action = tensordict.get(keys.ACTION, None)
@@ -276,7 +268,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
             raise RuntimeError("step() before the first reset() of these environments")
         return action
 
-    def _leaves(self, stepped: np.ndarray) -> TensorDictBase:
+    def _leaves(self) -> TensorDictBase:
         terminated = self._success | self._collision
         truncated = self._steps >= self.max_steps
         leaves = {
@@ -307,16 +299,13 @@ class ManipulationEnv(EpisodeState, EnvBase):
         return self._success | self._collision | (self._steps >= self.max_steps)
 
     def render(self, index: int = 0, width: int = 480, height: int = 480, camera: str = "cage") -> np.ndarray:
-        """Draws one environment.
+        """Draws one environment, uint8 [height, width, 3].
 
         Args:
             index (int): which environment.
             width (int): width in pixels.
             height (int): height in pixels.
             camera (str): ``"front"`` (whole scene), ``"cage"`` (D3IL's view) or ``"wrist"``.
-
-        Returns:
-            np.ndarray: uint8 [height, width, 3], RGB.
 
         Raises:
             RuntimeError: if no OpenGL library can be used.
@@ -342,11 +331,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
         """Returns what D3IL's recorder logs for the last control step (docs/d3il.md, Recordings).
 
         It looks after the *first* substep: ``c_pos`` (m) is the TCP when the step begins, ``des_c_pos`` its command.
-        Joints in rad, velocities in rad/s and m/s, ``time_stamp`` in s.
-
-        Returns:
-            dict: ``j_pos, j_vel, des_j_pos, des_j_vel, des_j_acc`` [n, 7], ``c_pos, c_vel, des_c_pos`` [n, 3],
-            ``c_quat, des_c_quat`` [n, 4], ``gripper_width, sim_step, time_stamp`` [n].
+        Joints in rad, velocities in rad/s and m/s, ``time_stamp`` in s; an array ``[n, ...]`` each.
         """
         row = {name: self.sims.log[:, columns].copy() for name, columns in controller.LOG_COLUMNS.items()}
         row["gripper_width"] = row["gripper_width"][:, 0]
@@ -356,10 +341,10 @@ class ManipulationEnv(EpisodeState, EnvBase):
         return row
 
     def logged_command(self) -> dict[str, np.ndarray]:
-        """The command as the recorder names it, where the controller's log does not hold it."""
+        """Returns the command as the recorder names it, where the controller's log does not hold it."""
         return {"des_c_pos": self.commands[:, :3], "des_c_quat": self.commands[:, 3:7]}
 
     def raw_objects(self) -> dict[str, np.ndarray]:
-        """Poses [n, 7] (m, quaternion) of the task's objects by name, as D3IL's recorder logs them."""
+        """Returns the poses [n, 7] (m, quaternion) of the task's objects by name, as D3IL's recorder logs them."""
         poses = self.sims.log[:, controller.LOG_WIDTH :].reshape(len(self.sims), -1, 7)
         return {name: poses[:, index].copy() for index, name in enumerate(self.task.objects[: poses.shape[1]])}

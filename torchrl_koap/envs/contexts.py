@@ -1,9 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Contexts: where the objects of a task lie when an episode begins.
 
-A context is ``[objects, 3]``: x, y (m) and yaw (rad) of every object of ``Task.objects``. They come from a seeded
-generator (:func:`draw_contexts`), from the fixed table on which methods are compared (:func:`evaluation_contexts`), or
-from D3IL's own files (:func:`load_contexts`).
+A context is ``[objects, 3]``: x, y (m) and yaw (rad) of every object of ``Task.objects``.
 """
 
 from __future__ import annotations
@@ -31,15 +29,12 @@ def _scene(task: Task) -> Scene:
 
 
 def draw_contexts(task: Task | str, num: int, generator: np.random.Generator | int | None = None) -> np.ndarray:
-    """Random contexts from the ranges of a task.
+    """Draws random contexts from the ranges of a task, float64 ``[num, objects, 3]``.
 
     Args:
         task (Task or str): the task.
         num (int): number of contexts.
         generator (np.random.Generator or int, optional): random generator or seed.
-
-    Returns:
-        np.ndarray: float64 ``[num, objects, 3]``: x, y (m), yaw (rad).
 
     Raises:
         ValueError: if the task is unknown or has no contexts, or the number is below 1.
@@ -73,25 +68,17 @@ def _table() -> dict:
 
 
 def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) -> np.ndarray:
-    """The first contexts of the fixed table on which two methods meet the same situations.
+    """Returns the first contexts of the fixed table on which methods are compared, float64 ``[num, objects, 3]``.
 
-    The table (``evaluation_contexts.json``, with a version number) never changes; a new one gets a new number. Contexts
-    of a task that is not in it are drawn with a seed that its name alone decides.
+    The table (``evaluation_contexts.json``) never changes. Contexts of a task that is not in it are drawn with a seed
+    that its name alone decides.
 
     Args:
         task (Task or str): the task.
         num (int): how many, at most 60.
 
-    Returns:
-        np.ndarray: float64 ``[num, objects, 3]``.
-
     Raises:
         ValueError: if the task is unknown or has no contexts, or more are asked for than the table holds.
-
-    Examples:
-        >>> from torchrl_koap.envs.contexts import evaluation_contexts
-        >>> evaluation_contexts("aligning").shape
-        (60, 2, 3)
     """
     task = get_task(task) if isinstance(task, str) else task
     _scene(task)
@@ -105,14 +92,11 @@ def evaluation_contexts(task: Task | str, num: int = NUM_EVALUATION_CONTEXTS) ->
 
 
 def check_contexts(task: Task, contexts) -> np.ndarray:
-    """Contexts as an array, or an error that names what is wrong with them.
+    """Returns contexts as an array, or an error that names what is wrong with them.
 
     Args:
         task (Task): tells the objects and where each may start.
         contexts (array): ``[C, objects, 3]``: x, y (m) and yaw (rad).
-
-    Returns:
-        np.ndarray: the contexts, float64.
 
     Raises:
         ValueError: if the task has none, the shape is not ``[C, objects, 3]``, or an object lies where the task never
@@ -140,14 +124,13 @@ def check_contexts(task: Task, contexts) -> np.ndarray:
 
 
 def load_contexts(file: str | Path, task: Task | str) -> np.ndarray:
-    """Reads D3IL's own context file: a pickled list of contexts.
+    """Reads D3IL's own context file, a pickled list of contexts, as float64 ``[C, objects, 3]``.
+
+    D3IL's degrees become rad, its further entries are left out.
 
     Args:
         file (str or Path): the pickle; read by the restricted unpickler.
         task (Task or str): the task.
-
-    Returns:
-        np.ndarray: float64 ``[C, objects, 3]``; D3IL's degrees become rad, its further entries are left out.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -182,20 +165,17 @@ def _arrays(nested) -> list[np.ndarray]:
 
 
 def yaw_quaternions(yaw: np.ndarray) -> np.ndarray:
-    """Quaternions ``[..., 4]`` (w, x, y, z) of rotations about z by ``yaw`` (rad)."""
+    """Computes quaternions ``[..., 4]`` (w, x, y, z) of rotations about z by ``yaw`` (rad)."""
     half, zero = np.asarray(yaw) / 2, np.zeros(np.shape(yaw))
     return np.stack([np.cos(half), zero, zero, np.sin(half)], -1)
 
 
 def poses_of(contexts: np.ndarray, height: float) -> np.ndarray:
-    """Poses of the objects that contexts place on a level.
+    """Computes positions (m) and quaternions (w, x, y, z), ``[..., objects, 7]``, of objects on a level.
 
     Args:
         contexts (np.ndarray): x, y (m) and yaw (rad), ``[..., objects, 3]``.
         height (float): z of all objects (m).
-
-    Returns:
-        np.ndarray: positions (m) and quaternions (w, x, y, z), ``[..., objects, 7]``.
     """
     level = np.full((*contexts.shape[:-1], 1), height)
     return np.concatenate([contexts[..., :2], level, yaw_quaternions(contexts[..., 2])], -1)

@@ -47,33 +47,21 @@ class EpisodeState(abc.ABC):
     def _observe(self, rows: np.ndarray) -> np.ndarray: ...
 
     def get_state(self, index: int) -> dict:
-        """Full state of one environment: simulation, controller, command, mode, outcome and step count.
-
-        Args:
-            index (int): which environment.
-
-        Returns:
-            dict: arrays for :meth:`set_state`; also valid in another environment of the same task.
-        """
+        """Returns the full state of one environment, for :meth:`set_state` of any environment of the same task."""
         rows = {name: array[index].copy() for name, array in self._episode.items()}
         return {"simulation": self.sims.get_state(index)} | rows
 
     def set_state(self, index: int, state: dict) -> None:
-        """Restores what :meth:`get_state` returned; the episode then continues bit for bit.
-
-        Args:
-            index (int): which environment.
-            state (dict): from :meth:`get_state`, of any environment of the same task.
-        """
+        """Restores what :meth:`get_state` returned; the episode then continues bit for bit."""
         self.sims.set_state(index, state["simulation"])
         for name, array in self._episode.items():
             array[index] = state[name]
 
     def set_physics(self, index: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
-        """Starts a fresh episode of one environment from a given physics state.
+        """Starts a fresh episode of one environment from a given physics state; its context stays.
 
         Args:
-            index (int): which environment; its context stays.
+            index (int): which environment.
             qpos (array): positions [nq] (m, rad).
             qvel (array, optional): velocities [nv]; zero if not given.
             qacc_warmstart (array, optional): warm start of the solver [nv].

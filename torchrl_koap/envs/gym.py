@@ -22,9 +22,7 @@ IDS |= {"Sorting4-v0": "sorting", "Sorting2-v0": "sorting_2", "Sorting6-v0": "so
 class ManipulationGymEnv(gymnasium.Env):
     """One environment of a task behind Gymnasium's interface.
 
-    Observation and action are those of the batched environment (:class:`~torchrl_koap.envs.AvoidingEnv` and so on) in
-    float32; the action space is the range of human demonstrators, larger actions are executed unchanged. Reward 1 in
-    the step that reports success, else 0. ``info`` holds
+    Observation and action are those of the batched environment in float32, and ``info`` holds
 
     ============== ============================ ====================================================================
     key            type                         meaning
@@ -87,8 +85,7 @@ class ManipulationGymEnv(gymnasium.Env):
 
         Args:
             seed (int, optional): seed of the contexts drawn from now on.
-            options (dict, optional): ``"context"``: where the objects start, ``[objects, 3]``: x, y (m), yaw (rad).
-                Random by default; a task without objects starts every episode in the same state.
+            options (dict, optional): ``"context"``: where the objects start, ``[objects, 3]``. Default: random.
 
         Raises:
             ValueError: for another option, or a context of a wrong shape, out of range, or of a task without objects.
@@ -113,7 +110,7 @@ class ManipulationGymEnv(gymnasium.Env):
         return observation, data["reward"].item(), data["terminated"].item(), data["truncated"].item(), info
 
     def render(self) -> np.ndarray | None:
-        """Picture of the scene, uint8 [height, width, 3], or None without ``render_mode``."""
+        """Draws the scene, uint8 [height, width, 3]; None without ``render_mode``."""
         return self.batched.render(**self._picture) if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
@@ -134,7 +131,7 @@ class ManipulationGymEnv(gymnasium.Env):
 
 
 def register(env_id: str, task: str) -> None:
-    """Registers a task with Gymnasium, unless the id is taken; importing ``torchrl_koap.envs`` does so for D3IL's.
+    """Registers a task with Gymnasium, unless the id is taken.
 
     Args:
         env_id (str): name with Gymnasium, such as ``"torchrl_koap/Avoiding-v0"``; the prefix

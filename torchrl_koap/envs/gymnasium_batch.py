@@ -30,8 +30,6 @@ class GymnasiumBatch(EnvBase):
         env_id (str): id of the environment, such as ``"my_package:Reach-v0"``, which imports ``my_package`` first.
         task (Task): the task that the policy was trained on: its numbers of observation and action columns.
         num_envs (int): number of episodes.
-
-    Keyword Args:
         success_key (str, optional): the entry of ``info`` that says whether the task is done.
         max_steps (int, optional): steps after which an episode is truncated. Default: the environment's own limit, or
             the task's where it has none.
@@ -45,7 +43,6 @@ class GymnasiumBatch(EnvBase):
         >>> from torchrl_koap.tasks import Action, Task
         >>> task = Task(name="swing", observation_parts={"pole": 3}, actions={"torque": Action("N m")}, position="pole")
         >>> env = GymnasiumBatch("Pendulum-v1", task, 2)
-        >>> env.seed_episodes([7, 8])
         >>> env.reset()["observation"].shape, env.max_steps
         (torch.Size([2, 3]), 200)
     """

@@ -31,7 +31,7 @@ from torchrl_koap.tasks import Task, get_task
 
 
 def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
-    """The task's environment.
+    """Makes the task's environment.
 
     Args:
         task (Task or str): the task.
@@ -60,12 +60,10 @@ def make_env(task: Task | str, num_envs: int = 1, **options: Any) -> EnvBase:
 
 
 def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
-    """A function that makes an environment of the task with a given number of parallel episodes, as policies meet it.
+    """Returns a function from a number of parallel episodes to the task's environment as policies meet it.
 
     Args:
         task (Task): the task; with ``Task.noise`` the measured end effector is disturbed.
-
-    Keyword Args:
         num_threads (int): threads that advance the physics.
 
     Raises:
@@ -82,7 +80,7 @@ def make_env_of(task: Task, *, num_threads: int = 1) -> Callable[[int], Any]:
 
 
 def mode_index_of(task: Task | str) -> Callable[[torch.Tensor], torch.Tensor]:
-    """The function that turns a task's leaf ``mode`` into a number.
+    """Returns the function that turns a task's leaf ``mode`` into a number.
 
     Args:
         task (Task or str): the task.
@@ -90,9 +88,6 @@ def mode_index_of(task: Task | str) -> Callable[[torch.Tensor], torch.Tensor]:
     Returns:
         callable: leaf ``mode`` ``[*B, ...]`` to the number of the mode ``[*B]``, int64, -1 while it is not decided; 0
         for a task without modes.
-
-    Raises:
-        ValueError: if the task is unknown.
 
     Examples:
         >>> import torch

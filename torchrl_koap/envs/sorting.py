@@ -31,37 +31,24 @@ _COLOURS = {RED: (1, 0, 0, 1), BLUE: (0, 0, 1, 1)}
 
 
 def box_colours(num_boxes: int) -> np.ndarray:
-    """Colours of the boxes in the order of state and observation: red ones (0), then blue ones (1), int64 [num_boxes].
+    """Returns the colours of the boxes in the order of the state: red ones (0), then blue ones (1), int64 [num_boxes].
 
     Raises:
         ValueError: if there is no such task.
-
-    Examples:
-        >>> from torchrl_koap.envs.sorting import box_colours
-        >>> box_colours(4)
-        array([0, 0, 1, 1])
     """
     sorting_task(num_boxes)  # refuses other numbers
     return np.repeat((RED, BLUE), num_boxes // 2)
 
 
 def mode_colours(mode: int, num_boxes: int = 4) -> tuple[int, ...]:
-    """The colours, in order of arrival, of a mode.
+    """Returns the colours (0 red, 1 blue), in order of arrival, of a mode.
 
     Args:
         mode (int): number of the mode: 0 to 5 with four boxes, 0 to 1 with two, 0 to 19 with six.
         num_boxes (int): number of boxes.
 
-    Returns:
-        tuple of int: 0 (red) or 1 (blue) per box.
-
     Raises:
         ValueError: if there is no such mode or number of boxes.
-
-    Examples:
-        >>> from torchrl_koap.envs.sorting import mode_colours
-        >>> mode_colours(0), mode_colours(1)
-        ((0, 0, 1, 1), (0, 1, 0, 1))
     """
     sequences = arrival_orders(len(box_colours(num_boxes)))
     if not 0 <= mode < len(sequences):
@@ -70,22 +57,16 @@ def mode_colours(mode: int, num_boxes: int = 4) -> tuple[int, ...]:
 
 
 def mode_index(mode: torch.Tensor) -> torch.Tensor:
-    """Number of the order in which the colours arrived, in lexicographic order (red before blue).
+    """Returns the number of the order in which the colours arrived, in lexicographic order (red before blue).
 
     Args:
         mode (torch.Tensor): leaf ``mode`` of :class:`SortingEnv`, int64 ``[*B, num_boxes]``.
 
     Returns:
-        torch.Tensor: int64 ``[*B]``: 0 to 5 with four boxes, 0 to 1 with two, 0 to 19 with six; -1 if one is missing.
+        torch.Tensor: int64 ``[*B]``; -1 if a box is missing.
 
     Raises:
         ValueError: if the last axis fits no number of boxes.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.envs.sorting import mode_index
-        >>> mode_index(torch.tensor([[0, 1, 0, 1], [1, 1, 0, 0], [0, 1, -1, -1]]))
-        tensor([ 1,  5, -1])
     """
     sequences = torch.tensor(arrival_orders(len(box_colours(mode.shape[-1]))), device=mode.device)
     same = (mode.unsqueeze(-2) == sequences).all(-1)
@@ -194,14 +175,14 @@ class SortingEnv(ManipulationEnv):
                 noted[count] = nearest
                 self._mode[rows[index], count] = self._colours[nearest]
 
-    def _scene(self, arm_alpha: float) -> Any:
+    def _scene(self) -> Any:
         def add_boxes(root) -> None:
             for name, colour in zip(self.task.objects, self._colours.tolist(), strict=True):
                 box = root.worldbody.add("body", name=name)
                 box.add("freejoint", name=name)
                 box.add("geom", name=name, type="box", size=(BOX_HALF,) * 3, mass=0.05, rgba=_COLOURS[colour])
 
-        root = scene(rod=True, arm_alpha=arm_alpha, link_collisions=True, add_objects=add_boxes)
+        root = scene(link_collisions=True, add_objects=add_boxes)
         # bodies of their own, after the boxes: contacts are listed in the order of bodies, as in the original
         platform = root.worldbody.add("body", name="platform", pos=((PLATFORM_X[0] + PLATFORM_X[1]) / 2, -0.1, 0))
         size, friction = (0.3, 0.3, PLATFORM_TOP), (0.3, 0.001, 0.0001)

@@ -23,7 +23,7 @@ GRIPPER_BOUND = 0.08  # m
 
 
 def mode_index(mode: torch.Tensor, num_boxes: int = 3) -> torch.Tensor:
-    """Number of the order in which the boxes arrived: rgb 0, rbg 1, grb 2, gbr 3, brg 4, bgr 5.
+    """Returns the number of the order in which the boxes arrived: rgb 0, rbg 1, grb 2, gbr 3, brg 4, bgr 5.
 
     Args:
         mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 ``[*B, 3]``: 0 red, 1 green, 2 blue, -1 none.
@@ -40,8 +40,6 @@ def mode_index(mode: torch.Tensor, num_boxes: int = 3) -> torch.Tensor:
         >>> from torchrl_koap.envs.stacking import mode_index
         >>> mode_index(torch.tensor([[0, 1, 2], [2, 1, 0], [1, 2, -1]])).tolist()
         [0, 5, -1]
-        >>> mode_index(torch.tensor([[1, 2, -1]]), num_boxes=2).tolist()
-        [3]
     """
     _check_num_boxes(num_boxes)
     if mode.shape[-1] != 3:
@@ -53,14 +51,7 @@ def mode_index(mode: torch.Tensor, num_boxes: int = 3) -> torch.Tensor:
 
 
 def first_box(mode: torch.Tensor) -> torch.Tensor:
-    """Mode of Stacking-1, which is over with the first box: that box.
-
-    Args:
-        mode (torch.Tensor): leaf ``mode`` of :class:`StackingEnv`, int64 ``[*B, 3]``.
-
-    Returns:
-        torch.Tensor: int64 ``[*B]``: 0 red, 1 green, 2 blue, -1 none yet.
-    """
+    """Returns the mode of Stacking-1, the first box of a leaf ``mode`` ``[*B, 3]``; -1 while there is none."""
     return mode[..., 0].long()
 
 
@@ -114,7 +105,7 @@ class StackingEnv(ManipulationEnv):
     )
     ACTION_BOUND = ((-JOINT_BOUND,) * 7 + (0.0,), (JOINT_BOUND,) * 7 + (GRIPPER_BOUND,))
     MODE_ENTRIES, MODE_VALUES = None, 3
-    COMMAND_DIM, RESET_WIDTH, ARM_ALPHA = 8, controller.FINGER_OPEN, 1.0
+    COMMAND_DIM, RESET_WIDTH = 8, controller.FINGER_OPEN
 
     def __init__(self, *args: Any, num_boxes: int = 3, **options: Any):
         _check_num_boxes(num_boxes)
@@ -171,8 +162,8 @@ class StackingEnv(ManipulationEnv):
         """Nothing: joints are commanded."""
         return {}  # the log holds them already
 
-    def _scene(self, arm_alpha: float) -> Any:
-        return scene(rod=False, arm_alpha=arm_alpha, link_collisions=True, add_objects=_add_boxes_and_target)
+    def _scene(self) -> Any:
+        return scene(rod=False, arm_alpha=1.0, link_collisions=True, add_objects=_add_boxes_and_target)
 
 
 def _add_boxes_and_target(root) -> None:

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Partial observability as TorchRL transforms; on Sorting they make PO-Sorting, on any other task they work as well."""
+"""Partial observability as TorchRL transforms: what makes PO-Sorting of Sorting."""
 
 from __future__ import annotations
 
@@ -17,8 +17,6 @@ from torchrl_koap.tasks import Task, get_task
 
 class PartialObservation(ObservationTransform):
     """Drops parts of the observation: by default what ``Task.state_of`` leaves out, the command and the hidden parts.
-
-    Of PO-Sorting 10 of 16 columns remain, as in KOAP's partially observable variant.
 
     Args:
         task (Task or str): the task whose parts are named.

@@ -48,7 +48,7 @@ class Backbone(nn.Module):
         return super().train(False)
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Feature maps ``[B, C, h, w]`` of pictures ``[B, 3, H, W]`` in 0 to 1."""
+        """Returns feature maps ``[B, C, h, w]`` of pictures ``[B, 3, H, W]`` in 0 to 1."""
         mean = pictures.new_tensor(MEAN)[:, None, None]
         return self.stages((pictures - mean) / pictures.new_tensor(STD)[:, None, None])
 
@@ -82,8 +82,6 @@ def load_backbone(network: str | Path | None = None, *, stride: int = 8) -> Back
         network (str or Path, optional): file with the ``state_dict`` of EfficientNet-Lite0, or the import string
             ``"module:function"`` of a function that returns a network of one's own. Default: the ImageNet weights of
             EfficientNet-Lite0 in the extra ``vision``.
-
-    Keyword Args:
         stride (int): pixels per cell of EfficientNet's feature maps: 8, 16 or 32.
 
     Returns:

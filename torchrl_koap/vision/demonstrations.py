@@ -45,14 +45,12 @@ class Source:
 def fit_projection(
     encoder: FrozenImageEncoder, sources: Sequence[Source], dim: int, *, most: int = 3000, seed: int = 0
 ) -> Projection:
-    """Principal components of the pooled features of unlabelled frames.
+    """Fits principal components of the pooled features of unlabelled frames.
 
     Args:
         encoder (FrozenImageEncoder): its pooled features are taken; a projection that it has is not used.
         sources (sequence of Source): the frames.
         dim (int): number of components.
-
-    Keyword Args:
         most (int): frames that are used, drawn by the seed, the same number of every source.
         seed (int): of that choice.
     """
@@ -74,16 +72,11 @@ def embed_demonstrations(
     """Writes demonstrations as embeddings; an embodiment without actions has no labels.
 
     Args:
-        out (str or Path): folder to write, for ``koap train --dataset``.
+        out (str or Path): folder to write, for ``koap train --dataset``; it is returned.
         sources (sequence of Source): the demonstrations, in the order in which the data set has them.
         encoder (FrozenImageEncoder): what embeds the frames.
-
-    Keyword Args:
         mixed (bool): the data set may hold several embodiments; its notes name that of every episode.
         task (Task or str): the task, whose observation is the embedding and what the recordings hold besides.
-
-    Returns:
-        Path: the folder.
 
     Raises:
         DataError: if embodiments are mixed without saying so, or a data set is unfinished.

@@ -70,7 +70,7 @@ class FrozenImageEncoder(ObservationTransform):
 
     @torch.no_grad()
     def features(self, frames: Tensor) -> Tensor:
-        """Pooled features ``[*B, F]`` of frames, uint8 ``[*B, size, size, 3]``.
+        """Computes pooled features ``[*B, F]`` of frames, uint8 ``[*B, size, size, 3]``.
 
         Raises:
             ValueError: for frames of another dtype or size.
@@ -84,7 +84,7 @@ class FrozenImageEncoder(ObservationTransform):
         return torch.cat([F.adaptive_avg_pool2d(part, GRID).flatten(1) for part in maps]).reshape(*batch, -1)
 
     def embed(self, frames: Tensor) -> Tensor:
-        """Embeddings ``[*B, d]`` of frames, uint8 ``[*B, size, size, 3]``."""
+        """Computes embeddings ``[*B, d]`` of frames, uint8 ``[*B, size, size, 3]``."""
         features = self.features(frames.cpu())
         return (features if self.projection is None else self.projection(features)).to(frames.device)
 

@@ -46,11 +46,7 @@ class Projection(nn.Module):
 
     @classmethod
     def fit(cls, features: Tensor, dim: int) -> Projection:
-        """Fits the components.
-
-        Args:
-            features (Tensor): ``[N, F]``.
-            dim (int): number of components.
+        """Fits ``dim`` components to features ``[N, F]``.
 
         Raises:
             ValueError: if there are fewer frames or features than components.
@@ -77,7 +73,7 @@ class Projection(nn.Module):
         return self.components.shape[1]
 
     def forward(self, features: Tensor) -> Tensor:
-        """Components ``[*B, d]`` of features ``[*B, F]``.
+        """Computes components ``[*B, d]`` of features ``[*B, F]``.
 
         Raises:
             ValueError: if the features are of another size.
@@ -92,9 +88,6 @@ class Projection(nn.Module):
 
 def projection_of(task: str) -> Path:
     """Returns the file of a task's projection that comes with the package.
-
-    Args:
-        task (str): name of the task, ``"scooping"`` or ``"scooping_moving_bowl"``.
 
     Returns:
         Path: the file.
@@ -120,8 +113,6 @@ def save_encoder(encoder: FrozenImageEncoder, path: str | Path, *, stride: int, 
     Args:
         encoder (FrozenImageEncoder): with a :class:`Projection`.
         path (str or Path): file to write.
-
-    Keyword Args:
         stride (int): of the network's stage.
         fitted_on (str): which frames it was fitted on, in words.
 

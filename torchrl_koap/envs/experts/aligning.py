@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scripted expert of Aligning: a joystick player that pushes the tray into the target pose, from inside or outside.
 
-The player looks at the scene, picks the contact (a corner inside the tray, or a place on one of its walls) from which
-one smooth push leads to the target, and then
+The player picks the contact (a corner inside the tray, or a place on one of its walls) from which one smooth push leads
+to the target, and then
 
     1. travels     with the rod above the tray to the place where it comes down
     2. lowers      the rod, inside the tray (mode 0) or beside a wall (mode 1)
@@ -11,11 +11,8 @@ one smooth push leads to the target, and then
     4. lets go     when nothing more can be reached from this contact, and picks another one: through the middle of the
                    tray (mode 0), or over its walls (mode 1)
 
-until the tray lies in the target pose. From inside, a corner holds the rod best and serves for the way; the last few
-centimetres are pushed at a wall, where the rod is nearer to the centre.
-
-All randomness of an episode is drawn when the player is made, from its own seed: an episode does not depend on the
-others in the batch, and nothing touches a global generator.
+From inside, a corner holds the rod best and serves for the way; the last few centimetres are pushed at a wall. All
+randomness of an episode is drawn from its own seed.
 """
 
 from __future__ import annotations
@@ -111,13 +108,7 @@ class AligningExpert(Expert):
         return np.array([player.finished for player in self._players])
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step of every episode.
-
-        Args:
-            observation (array): [n, 20], as :class:`~torchrl_koap.envs.AligningEnv` gives it.
-
-        Returns:
-            np.ndarray: change of the commanded TCP position [n, 3] (m), float64.
+        """Decides the next control step: change of the commanded TCP position [n, 3] (m) under observations [n, 20].
 
         Raises:
             ValueError: if the shape is wrong.

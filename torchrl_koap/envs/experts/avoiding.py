@@ -1,8 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scripted expert of Avoiding: a simulated joystick player that takes any of the 24 ways to the finish line.
 
-The player is modelled after the human demonstrations, who held a stick per axis: pauses, pushes that are held and let
-go, saturation at full deflection, and a dead zone below which nothing moves. In one control step it
+The player is modelled after the human demonstrators: pauses, pushes that are held and let go, saturation at full
+deflection, and a dead zone. In one control step it
 
     1. looks       at the measured position of a moment ago, adds what it has pushed since, and errs by some millimetres
     2. decides     sideways: push towards the gap of the next row, hold, let go when there;
@@ -11,8 +11,7 @@ go, saturation at full deflection, and a dead zone below which nothing moves. In
     3. moves the   stick, whose deflection follows the decision over about five control steps, with a slowly
        stick       drifting hand
 
-All randomness of an episode is drawn when the player is made, from its own seed: an episode does not depend on the
-others in the batch, and nothing touches a global generator.
+All randomness of an episode is drawn from its own seed.
 """
 
 from __future__ import annotations
@@ -52,10 +51,7 @@ _HAND_REST = 1 - np.cumsum(_HAND)  # share of a decision that is still to come a
 
 
 def mode_gaps(mode: int) -> tuple[int, int, int]:
-    """Which gap of each row a mode takes, counted from small x.
-
-    Args:
-        mode (int): 0 to 23, see :func:`~torchrl_koap.envs.avoiding.mode_index`.
+    """Returns which gap of each row a mode (0 to 23) takes, counted from small x.
 
     Raises:
         ValueError: if there is no such mode.
@@ -71,7 +67,7 @@ def mode_gaps(mode: int) -> tuple[int, int, int]:
 
 
 def clearance(frames: np.ndarray) -> float:
-    """Least distance of a recording ``[T, 4]`` between the rod, taken as upright, and any cylinder (m)."""
+    """Computes the least distance of a recording ``[T, 4]`` between the rod, taken as upright, and any cylinder (m)."""
     path = frames[:, 2:]
     gaps = [np.linalg.norm(path - (x, y), axis=1).min() - radius for _, x, y, radius, _ in OBSTACLES]
     return min(gaps) - ROD_RADIUS
@@ -131,13 +127,7 @@ class AvoidingExpert(Expert):
         return (self._crossed >= 0) & (self._time >= self._crossed + self._habits.linger)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step of every episode.
-
-        Args:
-            observation (array): commanded and measured xy [n, 4] (m), as :class:`~torchrl_koap.envs.AvoidingEnv` gives.
-
-        Returns:
-            np.ndarray: change of the commanded xy [n, 2] (m), float64.
+        """Decides the next control step: change of the commanded xy [n, 2] (m) under observations [n, 4].
 
         Raises:
             ValueError: if the shape is wrong.

@@ -6,8 +6,6 @@
     folder/
       ted/          all demonstrations as one data set (see torchrl_koap.data.ted)
       unfinished/   while recording: what was asked for, a line on every demonstration so far, and its file
-
-Memory holds one batch of episodes, and at the end the data set itself in single precision.
 """
 
 from __future__ import annotations
@@ -48,31 +46,14 @@ def record_to_folder(
     Args:
         folder (str or Path): where ``ted`` shall lie.
         task (Task): the task.
-        episodes (int): number of demonstrations.
-        seed (int): seed of modes and players.
-        num_threads (int): threads that advance the physics.
-        progress (callable, optional): called with the number of demonstrations recorded and wanted.
-
-    Keyword Args:
-        batch_size (int): episodes played at once. The demonstrations do not depend on it.
-        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
-            the task.
+        episodes (int): and the other arguments, see
+            :func:`~torchrl_koap.envs.experts.demonstrations.record_demonstrations`.
 
     Raises:
         FileExistsError: if the folder holds demonstrations already, or an unfinished recording of other ones.
         LockedError: if another process records into the folder.
         ValueError: if the task has no expert, or a number is out of range.
         RecordingError: if an episode fails again and again.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
-        >>> from torchrl_koap.tasks import get_task
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     report = record_to_folder(folder, get_task("avoiding"), 2)
-        ...     sorted(path.name for path in Path(folder).iterdir()), len(report.rows)
-        (['ted'], 2)
     """
     start, disturbance = time.perf_counter(), share_disturbed(task, disturbance)
     task = get_task(task.source)

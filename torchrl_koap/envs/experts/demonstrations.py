@@ -3,8 +3,7 @@
 
 An attempt that touches what it must not, takes another mode than asked for, does not finish, or is unlike any human one
 (all but touches, takes too long) is played again with other random draws, after four attempts from another context;
-nothing else is selected, and every discarded attempt is counted in the report. A batch is finished before the next one
-begins, so demonstrations come in their order, and an operator that never succeeds is found out by the first batch.
+nothing else is selected, and every discarded attempt is counted in the report.
 """
 
 from __future__ import annotations
@@ -103,19 +102,10 @@ def iterate_takes(
     disturbance: float | None = None,
     done: Collection[int] = (),
 ) -> Iterator[Take]:
-    """Demonstrations one after the other, in their order; no more than a batch of them is held in memory.
+    """Plays demonstrations one after the other, in their order; memory holds no more than a batch of them.
 
     Args:
-        task (Task or str): the task.
-        episodes (int): number of demonstrations.
-        seed (int): seed of modes and players.
-        num_threads (int): threads that advance the physics.
-        progress (callable, optional): called with the number of demonstrations recorded and wanted.
-
-    Keyword Args:
-        batch_size (int): episodes played at once: what memory holds. The demonstrations do not depend on it.
-        disturbance (float, optional): share of the demonstrations in which the operator is disturbed. Default: that of
-            the task.
+        task (Task or str): and the other arguments, see :func:`record_demonstrations`.
         done (collection of int): numbers of demonstrations that are there already and left out.
 
     Yields:
@@ -150,20 +140,12 @@ def iterate_takes(
 
 
 def balanced_modes(episodes: int, num_modes: int, seed: int) -> list[int]:
-    """Modes of a recording: each as often as any other, a remainder drawn without repetition.
+    """Returns the mode of every demonstration: each as often as any other, a remainder drawn without repetition.
 
     Args:
         episodes (int): number of demonstrations.
         num_modes (int): modes of the task.
         seed (int): seed of the remainder.
-
-    Returns:
-        list of int: mode of every demonstration.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.demonstrations import balanced_modes
-        >>> balanced_modes(6, 3, seed=0)
-        [0, 1, 2, 0, 1, 2]
     """
     full, rest = divmod(episodes, num_modes)
     extra = np.random.default_rng(seed).permutation(num_modes)[:rest]
@@ -213,7 +195,6 @@ def _play_batches(
                 results = play(
                     env,
                     task,
-                    np.arange(len(rows)),
                     [modes[row] for row in rows],
                     None if contexts is None else contexts[np.resize(rows, size)],  # the rest of the batch idles
                     seeds,

@@ -1,10 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Disturbances while a scripted operator plays, so that demonstrations show how mistakes are corrected.
 
-Noise injected into the actions of whoever demonstrates takes it to states that it would not visit by itself, and
-what it does there is what a learner needs to see (Laskey et al., "DART: Noise Injection for Robust Imitation Learning",
-2017). A disturbed step changes the command that is executed, and that command is what the recording holds: the label of
-a state is always the action that was done in it::
+After Laskey et al., "DART: Noise Injection for Robust Imitation Learning", 2017. A disturbed step changes the command
+that is executed, and that command is what the recording holds::
 
     impulse      for a few control steps the command is pushed in a direction of its own
     slip         for a while the command runs off to the side of the way that the operator wants
@@ -36,33 +34,25 @@ _MEMORY = 0.98  # of the size of the operator's own steps
 
 
 def share_disturbed(task: Task, share: float | None) -> float:
-    """The share of the demonstrations in which the operator is disturbed.
+    """Returns the share of the demonstrations in which the operator is disturbed.
 
     Args:
-        task (Task): the task, whose own share (``Defaults.disturbance``) is taken where none was asked for.
+        task (Task): the task, whose own share is taken where none was asked for.
         share (float, optional): what was asked for.
     """
     return task.defaults.disturbance if share is None else share
 
 
 def choose_disturbed(episodes: int, share: float, seed: int) -> np.ndarray:
-    """Which episodes of a recording are disturbed.
+    """Draws which episodes of a recording are disturbed, bool ``[episodes]``.
 
     Args:
         episodes (int): number of demonstrations.
         share (float): share of them that is disturbed, 0 to 1.
         seed (int): seed of the recording. Whether an episode is disturbed does not depend on how many there are.
 
-    Returns:
-        np.ndarray: bool ``[episodes]``.
-
     Raises:
         ValueError: if the share is not between 0 and 1.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.disturbances import choose_disturbed
-        >>> int(choose_disturbed(1000, 0.5, seed=0).sum())
-        514
     """
     if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 <= share <= 1:
         raise ValueError(f"disturbance must be the share of the episodes that are disturbed, 0 to 1, got {share!r}")
@@ -70,11 +60,10 @@ def choose_disturbed(episodes: int, share: float, seed: int) -> np.ndarray:
 
 
 class Disturbances:
-    """Disturbs the actions of a batch of operators.
+    """Disturbs the actions of a batch of operators, by amounts that follow from the operator's own steps so far.
 
-    How far an action is changed follows from the operator's own steps so far, so one class serves every task. Entries
-    that are no change of a command (the gripper) are left alone. The height of a tool that is pushed about only drifts:
-    where demonstrations never lift it, nothing tells a controller how that is done.
+    Entries that are no change of a command (the gripper) are left alone. The height of a tool that is pushed about only
+    drifts: where demonstrations never lift it, nothing tells a controller how that is done.
 
     Args:
         task (Task): tells which actions are changes of commands.
@@ -105,14 +94,7 @@ class Disturbances:
         ]
 
     def disturb(self, action: np.ndarray) -> np.ndarray:
-        """The actions that are executed in the next control step.
-
-        Args:
-            action (np.ndarray): what the operators want, ``[n, act]``.
-
-        Returns:
-            np.ndarray: ``[n, act]``, a new array.
-        """
+        """Returns the actions ``[n, act]`` that are executed where the operators want ``action`` ``[n, act]``."""
         done = action.copy()
         for row, hand in enumerate(self._hands):
             if hand is not None:
@@ -132,19 +114,10 @@ class Disturbances:
 
 
 def disturbed_columns(task: Task) -> np.ndarray:
-    """Columns of the actions that are disturbed: changes of a command, of a tool on the table only sideways ones.
-
-    Args:
-        task (Task): the task.
+    """Returns the action columns that are disturbed: changes of a command, of a tool on the table only sideways.
 
     Raises:
         ValueError: if no action of the task is a change of a command.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.disturbances import disturbed_columns
-        >>> from torchrl_koap.tasks import get_task
-        >>> [len(disturbed_columns(get_task(name))) for name in ("avoiding", "aligning", "stacking")]
-        [2, 2, 7]
     """
     changes = task.delta_actions
     if not changes:
@@ -154,32 +127,13 @@ def disturbed_columns(task: Task) -> np.ndarray:
 
 
 def height_column(task: Task) -> int | None:
-    """Column of the action that changes the height of a tool on the table, None where no action does.
-
-    Args:
-        task (Task): the task.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.disturbances import height_column
-        >>> from torchrl_koap.tasks import get_task
-        >>> [height_column(get_task(name)) for name in ("avoiding", "aligning", "stacking")]
-        [None, 2, None]
-    """
+    """Returns the action column that changes the height of a tool on the table, None where none does."""
     lengths = [index for index, unit in enumerate(task.action_units) if unit == "m"]
     return lengths[2] if len(lengths) == 3 and list(disturbed_columns(task)) == lengths[:2] else None
 
 
 def count_spells(spells: Sequence[Sequence[tuple[int, int, str]]]) -> dict[str, int]:
-    """How often each kind of disturbance happened.
-
-    Args:
-        spells (sequence): disturbances of every episode, as :attr:`Disturbances.spells` gives them.
-
-    Examples:
-        >>> from torchrl_koap.envs.experts.disturbances import count_spells
-        >>> count_spells([[(20, 23, "slip")], []])
-        {'impulse': 0, 'slip': 1, 'late_turn': 0, 'drift': 0}
-    """
+    """Counts the disturbances of all episodes (:attr:`Disturbances.spells`) by kind."""
     counts = Counter(kind for episode in spells for _, _, kind in episode)
     return {kind: counts[kind] for kind in KINDS}
 

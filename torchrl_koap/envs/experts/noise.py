@@ -9,16 +9,13 @@ import numpy as np
 def ar1_noise(
     generator: np.random.Generator, memory: float, deviation: float, size: int | tuple[int, ...]
 ) -> np.ndarray:
-    """Noise of an autoregressive process of order one in its steady state, with a correlation time of ``memory`` steps.
+    """Draws noise ``[*size]`` of an autoregressive process of order one in its steady state.
 
     Args:
         generator (np.random.Generator): where the draws come from.
         memory (float): steps after which a share 1/e remains.
         deviation (float): standard deviation.
         size (int or tuple of int): number of steps, or a shape that begins with it.
-
-    Returns:
-        np.ndarray: ``[*size]``.
 
     Examples:
         >>> import numpy as np

@@ -20,16 +20,13 @@ FAR = 1e3  # cost of a place that is not reached
 
 @njit(cache=True)
 def square_distance(x, y, square, half):
-    """Signed distance (m) of a point to a square of half width ``half``; negative inside.
+    """Computes the signed distance (m) of a point to a square; negative inside.
 
     Args:
         x (float): x of the point (m).
         y (float): y of the point (m).
         square (np.ndarray): centre x, y (m), cosine and sine of the yaw [4].
         half (float): half the width (m).
-
-    Returns:
-        float: the distance.
     """
     x, y = x - square[0], y - square[1]
     along = abs(square[2] * x + square[3] * y) - half
@@ -41,23 +38,12 @@ def square_distance(x, y, square, half):
 
 @njit(cache=True)
 def solve_eikonal(slowness, cost, sweeps=2):
-    """Cheapest cost to the sources, everywhere on the grid.
+    """Solves for the cheapest cost to the sources, everywhere on the grid.
 
     Args:
         slowness (np.ndarray): cost per metre [X, Y], positive.
-        cost (np.ndarray): [X, Y]: cost at the sources, :data:`FAR` elsewhere; overwritten by the result.
+        cost (np.ndarray): [X, Y]: cost at the sources, :data:`FAR` elsewhere; overwritten and returned.
         sweeps (int): rounds of four passes.
-
-    Returns:
-        np.ndarray: ``cost``.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.path_planning import FAR, SHAPE, STEP, solve_eikonal
-        >>> cost = np.full(SHAPE, FAR)
-        >>> cost[0] = 0.0
-        >>> bool(np.isclose(solve_eikonal(np.ones(SHAPE), cost)[5, 40], 5 * STEP))
-        True
     """
     width, height = cost.shape
     for sweep in range(4 * sweeps):
@@ -79,15 +65,12 @@ def solve_eikonal(slowness, cost, sweeps=2):
 
 @njit(cache=True)
 def value_at(field, x, y):
-    """Bilinear interpolation of a field, constant beyond the border of the grid.
+    """Interpolates a field bilinearly, constant beyond the border of the grid, NaN for a point that is NaN.
 
     Args:
         field (np.ndarray): values on the grid [X, Y].
         x (float): x of the point (m).
         y (float): y of the point (m).
-
-    Returns:
-        float: the value, NaN for a point that is NaN.
     """
     if np.isnan(x + y):
         return np.nan
@@ -102,7 +85,7 @@ def value_at(field, x, y):
 
 @njit(cache=True)
 def descent(field, x, y, reach=0.016, softness=0.002):
-    """Direction in which a field is least at a distance from a point.
+    """Finds the direction, a unit vector [2], in which a field is least at a distance from a point.
 
     Values within about ``softness`` of the least one count too, which smooths the direction; a mere gradient would
     shiver between the walls of narrow passages.
@@ -113,9 +96,6 @@ def descent(field, x, y, reach=0.016, softness=0.002):
         y (float): y of the point (m).
         reach (float): the distance (m).
         softness (float): how much above the least one a value still counts, in the unit of the field.
-
-    Returns:
-        np.ndarray: unit vector [2].
     """
     values = np.empty(32)
     for k in range(32):

@@ -38,7 +38,7 @@ _SHORTEST, _LONGEST = math.log(0.002), math.log(1.2)
 
 @njit(cache=True)
 def motion(contact, share):
-    """Motion of tray and rod, per metre of the rod's way, in the tray's frame.
+    """Computes the motion of tray and rod, per metre of the rod's way, in the tray's frame.
 
     Args:
         contact (np.ndarray): the contact [8].
@@ -46,13 +46,6 @@ def motion(contact, share):
 
     Returns:
         tuple of float: ``vx, vy`` of the tray's centre, its turn (rad/m), ``ux, uy`` of the rod.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.push_planning import motion
-        >>> through_the_centre = np.array([-0.055, 0.0, 0.0, 0.5, -0.065, 0.0, 0.07, 0.01])
-        >>> [round(abs(value), 6) for value in motion(through_the_centre, 0.0)]
-        [1.0, 0.0, 0.0, 1.0, 0.0]
     """
     angle = contact[2] + contact[3] * share
     fx, fy = math.cos(angle), math.sin(angle)
@@ -65,15 +58,12 @@ def motion(contact, share):
 
 @njit(cache=True)
 def arrive(pose, contact, plan):
-    """Pose of the tray at the end of a plan.
+    """Computes the pose of the tray, x, y (m), yaw (rad), at the end of a plan.
 
     Args:
-        pose (np.ndarray): x, y (m), yaw (rad) of the tray at the beginning [3].
+        pose (np.ndarray): pose at the beginning [3].
         contact (np.ndarray): the contact [8].
         plan (np.ndarray): the plan [4].
-
-    Returns:
-        tuple of float: x, y (m), yaw (rad).
     """
     x, y, yaw = pose[0], pose[1], pose[2]
     step = math.exp(plan[LENGTH]) / _PIECES
@@ -161,16 +151,13 @@ def improve(pose, target, contact, plan, iterations):
 
 @njit(cache=True)
 def search(pose, target, contact, plan):
-    """Searches the best plan for one contact, from 18 first guesses.
+    """Searches the best plan for one contact, from 18 first guesses; returns its cost.
 
     Args:
         pose (np.ndarray): x, y (m), yaw (rad) of the tray now [3].
         target (np.ndarray): where it should come to lie [3].
         contact (np.ndarray): the contact [8].
         plan (np.ndarray): receives the plan [4].
-
-    Returns:
-        float: its cost (:func:`improve`).
     """
     least = 1e300
     distance = max(math.hypot(target[0] - pose[0], target[1] - pose[1]), 0.01)

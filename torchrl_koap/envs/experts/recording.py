@@ -1,9 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """One attempt of a scripted expert at a batch of episodes, and what is kept of it.
 
-What an environment has to offer is told in :mod:`torchrl_koap.envs.registry`. One of a task of D3IL with ``raw_log()``
-is recorded as D3IL's recorder does it: after the first substep of a control step, so that positions are 1 ms newer than
-those that were observed. Any other one is recorded as what it observed and what was done.
+An environment of D3IL's is recorded as D3IL's recorder does it: after the first substep of a control step, so that
+positions are 1 ms newer than those that were observed. Any other one is recorded as what it observed and what was done.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +27,7 @@ from torchrl_koap.tasks import Task
 FAULTS = ("collision", "unfinished", "mode", "close", "slow")
 
 
-@dataclass(frozen=True)
-class Attempt:
+class Attempt(NamedTuple):
     """What is kept of one attempt.
 
     Args:
@@ -38,12 +36,6 @@ class Attempt:
         steps (int): control steps that were played; one more than actions where D3IL's log was recorded, whose first
             row is the state after the first of them.
         fault (str): what went wrong, one of ``FAULTS``; empty if nothing did.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.envs.experts.recording import Attempt
-        >>> Attempt(np.zeros((40, 4)), np.zeros((39, 2)), steps=40, fault="slow").fault
-        'slow'
     """
 
     frames: np.ndarray
@@ -105,14 +97,11 @@ class Expert(abc.ABC):
 
     @abc.abstractmethod
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Actions ``[n, act]`` under observations, float64 ``[n, obs]``; called once per control step."""
+        """Decides actions ``[n, act]`` under observations, float64 ``[n, obs]``; called once per control step."""
 
 
 def expert_of(task: Task) -> type[Expert]:
-    """The task's scripted expert.
-
-    Args:
-        task (Task): the task.
+    """Returns the task's scripted expert.
 
     Raises:
         ValueError: if it has none.
@@ -125,49 +114,39 @@ def expert_of(task: Task) -> type[Expert]:
 def play(
     env: Any,
     task: Task,
-    rows: np.ndarray,
     modes: Sequence[int],
     contexts: np.ndarray | None,
     seeds: Sequence,
     progress: Callable[[int], None],
     *,
-    rules: RecordingRules | None = None,
     disturbances: Disturbances | None = None,
 ) -> list[Attempt]:
-    """Plays one attempt of the episodes ``rows``.
+    """Plays one attempt at as many episodes as there are modes, in the first environments of a batch; the others idle.
 
     Args:
-        env (EnvBase): one environment per episode of the recording.
+        env (EnvBase): the batch.
         task (Task): the task.
-        rows (np.ndarray): episodes to play.
-        modes (sequence of int): mode asked for in each of them.
-        contexts (np.ndarray, optional): contexts of all episodes of the environment.
-        seeds (sequence): seed of each episode that is played.
+        modes (sequence of int): mode asked for in each episode.
+        contexts (np.ndarray, optional): contexts of all environments.
+        seeds (sequence): seed of each episode.
         progress (callable): called with the number of episodes that are over.
-
-    Keyword Args:
-        rules (RecordingRules, optional): what is discarded. Default: the expert's own.
-        disturbances (Disturbances, optional): what changes the actions of the episodes that are played.
-
-    Returns:
-        list of Attempt: one per episode that was played.
+        disturbances (Disturbances, optional): what changes the actions.
     """
-    count, make = env.batch_size[0], expert_of(task)
-    rules = rules or make.rules
-    placed = None if contexts is None else contexts[rows]
-    expert = make(modes=modes, contexts=placed, seeds=seeds)
+    count, playing = env.batch_size[0], len(modes)
+    placed = None if contexts is None else contexts[:playing]
+    expert = expert_of(task)(modes=modes, contexts=placed, seeds=seeds)
+    rules = expert.rules
     converter = CONVERTERS.get(task.source) if isinstance(env, ManipulationEnv) else None
     recorder = _PlainRecorder() if converter is None else _RawRecorder(converter)
-    active = np.zeros(count, dtype=bool)
-    active[rows] = True
+    active = np.arange(count) < playing
     data = env.reset() if contexts is None else env.reset(contexts=contexts)
     index_of, touched, lengths = mode_index_of(task), np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
     success, reached = np.zeros(count, dtype=bool), np.full(count, -1)
     for _ in range(env.max_steps):
         observation = data[keys.OBSERVATION].numpy()
         action = np.zeros((count, task.action_dim))
-        wanted = expert.act(observation[rows])
-        action[rows] = wanted if disturbances is None else disturbances.disturb(wanted)
+        wanted = expert.act(observation[:playing])
+        action[:playing] = wanted if disturbances is None else disturbances.disturb(wanted)
         # an environment may leave alone those that are over; what it does with them is not looked at
         step = data.set(keys.ACTION, torch.from_numpy(action)).set("_step", torch.from_numpy(active[:, None].copy()))
         data = env.step(step)["next"].clone()
@@ -177,18 +156,18 @@ def play(
         reached = np.where(active, index_of(data[keys.MODE]).numpy(), reached)
         if rules.touching is not None:
             touched |= active & rules.touching(env)
-        active[rows] &= ~expert.finished
+        active[:playing] &= ~expert.finished
         active &= ~touched
-        progress(int(len(rows) - active[rows].sum() - touched.sum()))
+        progress(int(playing - active.sum() - touched.sum()))
         if not active.any():
             break
     results = []
-    for index, row in enumerate(rows):
+    for row in range(playing):
         frames, actions = recorder.episode(row, lengths[row])
         faults = {
             "collision": touched[row],
             "unfinished": active[row] or not success[row],
-            "mode": reached[row] != modes[index],
+            "mode": reached[row] != modes[row],
             "close": rules.clearance is not None and rules.clearance(frames) < rules.least_clearance,
             "slow": rules.most_rows is not None and lengths[row] > rules.most_rows,
         }

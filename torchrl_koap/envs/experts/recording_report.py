@@ -54,22 +54,19 @@ class RecordingReport:
     Args:
         task (str): name of the task.
         seed (int): seed of the recording.
-        modes (list of int): mode of each demonstration as the environment saw it.
-        rows (list of int): control steps of each demonstration.
-        attempts (list of int): attempts each demonstration took, 1 if the first one was good.
+        modes, rows, attempts (list of int): of each demonstration, as :class:`Take` has them.
         failures (dict): number of discarded attempts by reason: ``collision``, ``mode``, ``unfinished``,
             ``close`` (nearly touched a cylinder), ``slow``.
-        num_modes (int): modes the task has.
         seconds (float): wall-clock time.
+        num_modes (int): modes the task has.
         disturbance (float): share of the demonstrations that was to be disturbed.
-        disturbed (list of bool): which demonstrations were.
-        spells (list): disturbances of each demonstration: first control step, the one after the last, kind.
+        disturbed, spells (list): of each demonstration.
 
     Examples:
         >>> from torchrl_koap.envs.experts.demonstrations import RecordingReport
         >>> report = RecordingReport("avoiding", 0, modes=[3, 7], rows=[80, 95], attempts=[1, 2], failures={"mode": 1})
-        >>> report.failed_attempts
-        1
+        >>> str(report)[:38]
+        '2 demonstrations of avoiding in 2 modes'
     """
 
     task: str
@@ -86,7 +83,7 @@ class RecordingReport:
 
     @classmethod
     def of(cls, task: Task, seed: int, takes: Sequence[Take | dict], seconds: float, disturbance: float = 0.0):
-        """The account of all demonstrations of a recording.
+        """Sums up all demonstrations of a recording.
 
         Args:
             task (Task): the task.
@@ -128,11 +125,6 @@ class RecordingReport:
                 "spells": [[list(spell) for spell in spells] for spells in self.spells],
             }
         }
-
-    @property
-    def failed_attempts(self) -> int:
-        """Number of attempts that were discarded."""
-        return sum(self.failures.values())
 
     def __str__(self) -> str:
         discarded = ", ".join(f"{count} {reason}" for reason, count in self.failures.items() if count) or "none"

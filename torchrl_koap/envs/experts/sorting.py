@@ -95,17 +95,11 @@ class SortingExpert(Expert):
 
     @property
     def finished(self) -> np.ndarray:
-        """Which players have nothing left to do and would stop recording, a few control steps later, bool [n]."""
+        """Which players have had nothing left to do for a few control steps, bool [n]."""
         return self._rest > _LINGER
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step of every episode.
-
-        Args:
-            observation (array): [n, 4 + 3 num_boxes] as :class:`~torchrl_koap.envs.SortingEnv` gives.
-
-        Returns:
-            np.ndarray: change of the commanded xy [n, 2] (m), float64.
+        """Decides the next control step: change of the commanded xy [n, 2] (m) under observations [n, 4 + 3 num_boxes].
 
         Raises:
             ValueError: if the shape is wrong or something is NaN.

@@ -207,15 +207,10 @@ def decide(boxes, yaws, present, target, lane, rod, ahead, pushing, held):
 
 @njit(cache=True)
 def pushing_cost(boxes, yaws, present, target, lane, rod):
-    """Cost (m of way) of leading a box to its bin, the rod's own way to it included.
+    """Computes the cost (m of way) of leading a box to its bin, the rod's own way to it included.
 
     Args:
-        boxes (np.ndarray): positions [B, 2] (m).
-        yaws (np.ndarray): their yaws [B] (rad).
-        present (np.ndarray): boxes that are on the platform, bool [B].
-        target (int): the box.
-        lane (float): x (m) of the middle of its bin.
-        rod (np.ndarray): position of the rod [2] (m).
+        boxes (np.ndarray): and the other arguments, see :func:`decide`.
     """
     others = present.copy()
     others[target] = False

@@ -94,16 +94,10 @@ class StackingExpert(Expert):
         return np.array([person.finished for person in self._people])
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Decides the next control step of every episode.
-
-        Args:
-            observation (array): [n, 31] as :class:`~torchrl_koap.envs.StackingEnv` gives it.
-
-        Returns:
-            np.ndarray: change of the commanded joints (rad) and gripper command (m) [n, 8], float64.
+        """Decides the next control step: change of the commanded joints (rad) and gripper command (m) [n, 8].
 
         Raises:
-            ValueError: if the shape is wrong.
+            ValueError: if the observation is not [n, 31].
         """
         observation = np.asarray(observation, dtype=np.float64)
         if observation.shape != (len(self._people), 31):

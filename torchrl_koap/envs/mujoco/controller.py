@@ -49,7 +49,7 @@ LOG_WIDTH = 46
 
 @functools.cache
 def step_address() -> int:
-    """Address of ``mj_step`` in the MuJoCo library that the Python package has loaded.
+    """Returns the address of ``mj_step`` in the MuJoCo library that the Python package has loaded.
 
     Raises:
         OSError: if the library is not found beside the ``mujoco`` package.
@@ -180,16 +180,8 @@ def track_joints(step, model, data, pointers, rows, commands, widths, grasping, 
     """Holds joint targets for ``substeps`` physics steps in each of the simulations ``rows``.
 
     Args:
-        step (int): address of ``mj_step``.
-        model (int): address of the shared mjModel.
-        data (np.ndarray): addresses of the mjData [n], int64.
-        pointers (np.ndarray): addresses of their arrays [n, NUM_POINTERS], int64.
-        rows (np.ndarray): indices of the simulations to advance, int64.
+        step (int): and the other arguments, see :func:`track_pose`.
         commands (np.ndarray): joint angles [n, 7] (rad), float64.
-        widths (np.ndarray): finger targets [n] (m).
-        grasping (np.ndarray): whether the fingers press [n], bool.
-        substeps (int): physics steps per control step.
-        log (np.ndarray): receives one row per simulation after the first substep, as in :func:`track_pose`.
     """
     zero = np.zeros(7)
     for row in rows:

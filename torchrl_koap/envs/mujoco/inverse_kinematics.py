@@ -1,8 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Poses of the tool centre point (TCP) as joint commands, by the controller that the Cartesian tasks use.
+"""Poses of the tool centre point (TCP) as joint commands.
 
-D3IL's Stacking data were recorded like this: a person commanded poses, the inverse kinematics turned them into joint
-targets, and the joint targets became the commands that policies learn.
+D3IL's Stacking data were recorded so: a person commanded poses, policies learn the joint targets that followed.
 """
 
 from __future__ import annotations
@@ -33,20 +32,7 @@ def _follow(joints, poses, iterations):
 
 
 def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the TCP is for given joint angles.
-
-    Args:
-        joints (np.ndarray): angles [n, 7] (rad).
-
-    Returns:
-        tuple: positions [n, 3] (m) and quaternions [n, 4] (w, x, y, z).
-
-    Examples:
-        >>> from torchrl_koap.envs.mujoco.inverse_kinematics import tcp_pose
-        >>> from torchrl_koap.envs import StackingEnv
-        >>> abs(tcp_pose([StackingEnv.START_JOINTS])[0]).round(3).tolist()
-        [[0.525, 0.0, 0.302]]
-    """
+    """Computes positions [n, 3] (m) and quaternions [n, 4] (w, x, y, z) of the TCP for joint angles [n, 7] (rad)."""
     joints = _rows(joints, "joints")
     positions, quaternions = np.empty((len(joints), 3)), np.empty((len(joints), 4))
     _poses(joints, positions, quaternions)
@@ -54,16 +40,13 @@ def tcp_pose(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def follow_pose(joints: np.ndarray, poses: np.ndarray, substeps: int = 30) -> np.ndarray:
-    """Joint targets that the controller reaches when it tracks poses for one control step.
+    """Computes the joint targets [n, 7] that the controller reaches when it tracks poses for one control step.
 
     Args:
         joints (np.ndarray): present joint targets [n, 7] (rad).
         poses (np.ndarray): wanted TCP position (m) and unit quaternion [n, 7]. In 30 ms positions some centimetres
             away are reached, and turns for about three quarters.
         substeps (int): milliseconds of tracking.
-
-    Returns:
-        np.ndarray: new joint targets [n, 7]; among those of equal pose the ones nearest to a posture of rest.
 
     Raises:
         ValueError: if a shape is wrong.

@@ -50,7 +50,7 @@ def _rotate(axes, index, angle):
 
 @njit(cache=True)
 def forward_kinematics(q, axes, origins, tcp, quat):
-    """Forward kinematics of the arm: frames of its joints and pose of the TCP, in the frame of its base.
+    """Computes the frames of the arm's joints and the pose of the TCP, in the frame of its base.
 
     Args:
         q (np.ndarray): joint angles [7] (rad).
@@ -117,21 +117,13 @@ def _quaternion(axes, quat):
 
 @njit(cache=True)
 def inverse_kinematics(target, q, axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors):
-    """Inverse kinematics: moves joint angles in place, by three damped steps, towards a pose of the TCP.
+    """Moves joint angles in place, by three damped steps, towards a pose of the TCP.
 
     Args:
         target (np.ndarray): position (m) and unit quaternion (w, x, y, z) [7].
         q (np.ndarray): joint angles [7] (rad), overwritten.
-        axes (np.ndarray): scratch space [8, 3, 3].
-        origins (np.ndarray): scratch space [8, 3].
-        tcp (np.ndarray): scratch space [3].
-        quat (np.ndarray): scratch space [4].
-        jacobian (np.ndarray): scratch space [6, 7].
-        matrix (np.ndarray): scratch space [6, 6].
-        task (np.ndarray): scratch space [6].
-        null (np.ndarray): scratch space [7].
-        factor (np.ndarray): scratch space [6, 6].
-        vectors (np.ndarray): scratch space [6, 6].
+        axes, origins, tcp, quat, jacobian, matrix, task, null, factor, vectors (np.ndarray): scratch space [8, 3, 3],
+            [8, 3], [3], [4], [6, 7], [6, 6], [6], [7], [6, 6], [6, 6].
     """
     for _ in range(IK_ITERATIONS):
         forward_kinematics(q, axes, origins, tcp, quat)

@@ -14,7 +14,7 @@ EIGENVALUE_MIN, EIGENVALUE_MAX = 0.01, 100.0
 
 @njit(cache=True)
 def clip(value, low, high):
-    """The value, or the bound that it lies beyond.
+    """Returns the value, or the bound that it lies beyond.
 
     Args:
         value (float): the value.

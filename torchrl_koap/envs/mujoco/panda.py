@@ -23,97 +23,40 @@ _TO_X = (_TURN, _TURN, 0.0, 0.0)  # +90 deg about x
 _FROM_X = (_TURN, -_TURN, 0.0, 0.0)  # -90 deg about x
 _NONE = (1.0, 0.0, 0.0, 0.0)
 
-# offset, rotation, mass, centre of mass, principal inertia, inertia frame
-_LINKS = (
-    (
-        (0.0, 0.0, 0.0),
-        _NONE,
-        3.01399,
-        (-0.0291898, -0.000879465, 0.0566032),
-        (0.0126801, 0.0117603, 0.00856656),
-        (0.00411744, 0.564916, 0.0132875, 0.825031),
-    ),
-    (
-        (0.0, 0.0, 0.333),
-        _NONE,
-        2.77281,
-        (1.1399e-5, -0.0312655, -0.0693733),
-        (0.0164224, 0.0153969, 0.00546286),
-        (0.98466, 0.174481, -0.000101815, 0.000347662),
-    ),
-    (
-        (0.0, 0.0, 0.0),
-        _FROM_X,
-        2.7996,
-        (-1.31766e-5, -0.0703216, 0.0311782),
-        (0.016787, 0.0157415, 0.00553027),
-        (0.57484, 0.818266, -6.05764e-5, -6.61626e-5),
-    ),
-    (
-        (0.0, -0.316, 0.0),
-        _TO_X,
-        2.14603,
-        (0.0443483, 0.0249283, -0.03813),
-        (0.00915257, 0.00896477, 0.00384742),
-        (0.0615263, 0.349824, 0.234291, 0.904956),
-    ),
-    (
-        (0.0825, 0.0, 0.0),
-        _TO_X,
-        2.18807,
-        (-0.0385503, 0.0395256, 0.0247162),
-        (0.00946899, 0.00928491, 0.00396694),
-        (0.813566, 0.465041, 0.309792, 0.160858),
-    ),
-    (
-        (-0.0825, 0.384, 0.0),
-        _FROM_X,
-        3.19545,
-        (-6.36776e-5, 0.0384124, -0.10997),
-        (0.0278873, 0.0268823, 0.00569569),
-        (0.990767, -0.135571, 0.000963106, 0.000694406),
-    ),
-    (
-        (0.0, 0.0, 0.0),
-        _TO_X,
-        1.35761,
-        (0.0510023, 0.00693267, 0.00616899),
-        (0.00412168, 0.0033698, 0.00213304),
-        (-0.0460841, 0.754362, 0.044494, 0.653325),
-    ),
-    (
-        (0.088, 0.0, 0.0),
-        _TO_X,
-        0.417345,
-        (0.0103614, 0.0103596, 0.0791078),
-        (0.000637671, 0.000528056, 0.000279577),
-        (0.63547, 0.278021, -0.670462, 0.263369),
-    ),
+# offset, rotation, mass, centre of mass of the links, by which they hang on each other
+_LINKS: tuple[tuple, ...] = (
+    ((0.0, 0.0, 0.0), _NONE, 3.01399, (-0.0291898, -0.000879465, 0.0566032)),
+    ((0.0, 0.0, 0.333), _NONE, 2.77281, (1.1399e-05, -0.0312655, -0.0693733)),
+    ((0.0, 0.0, 0.0), _FROM_X, 2.7996, (-1.31766e-05, -0.0703216, 0.0311782)),
+    ((0.0, -0.316, 0.0), _TO_X, 2.14603, (0.0443483, 0.0249283, -0.03813)),
+    ((0.0825, 0.0, 0.0), _TO_X, 2.18807, (-0.0385503, 0.0395256, 0.0247162)),
+    ((-0.0825, 0.384, 0.0), _FROM_X, 3.19545, (-6.36776e-05, 0.0384124, -0.10997)),
+    ((0.0, 0.0, 0.0), _TO_X, 1.35761, (0.0510023, 0.00693267, 0.00616899)),
+    ((0.088, 0.0, 0.0), _TO_X, 0.417345, (0.0103614, 0.0103596, 0.0791078)),
 )
-_JOINT_RANGES = (
-    (-2.9671, 2.9671),
-    (-1.8326, 1.8326),
-    (-2.9671, 2.9671),
-    (-3.1416, 0.0873),
-    (-2.9671, 2.9671),
-    (-0.0873, 3.8223),
-    (-2.9671, 2.9671),
+# their principal inertia and its frame
+_INERTIA = (
+    ((0.0126801, 0.0117603, 0.00856656), (0.00411744, 0.564916, 0.0132875, 0.825031)),
+    ((0.0164224, 0.0153969, 0.00546286), (0.98466, 0.174481, -0.000101815, 0.000347662)),
+    ((0.016787, 0.0157415, 0.00553027), (0.57484, 0.818266, -6.05764e-05, -6.61626e-05)),
+    ((0.00915257, 0.00896477, 0.00384742), (0.0615263, 0.349824, 0.234291, 0.904956)),
+    ((0.00946899, 0.00928491, 0.00396694), (0.813566, 0.465041, 0.309792, 0.160858)),
+    ((0.0278873, 0.0268823, 0.00569569), (0.990767, -0.135571, 0.000963106, 0.000694406)),
+    ((0.00412168, 0.0033698, 0.00213304), (-0.0460841, 0.754362, 0.044494, 0.653325)),
+    ((0.000637671, 0.000528056, 0.000279577), (0.63547, 0.278021, -0.670462, 0.263369)),
 )
+_LOW = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)  # of the joints
+_HIGH = (2.9671, 1.8326, 2.9671, 0.0873, 2.9671, 3.8223, 2.9671)
 _MOTOR_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 _FINGER_LIMIT = 70.0
 
 
 def mesh_folder() -> Path:
-    """Folder with the ten detailed Panda meshes of the installed ``gymnasium-robotics`` package.
+    """Finds the ten detailed Panda meshes of the installed ``gymnasium-robotics`` package.
 
     Raises:
         ImportError: if the package is not installed.
         FileNotFoundError: if this version of the package has no such meshes.
-
-    Examples:
-        >>> from torchrl_koap.envs.mujoco.panda import mesh_folder
-        >>> (mesh_folder() / "hand.stl").exists()
-        True
     """
     spec = importlib.util.find_spec("gymnasium_robotics")
     if spec is None or spec.origin is None:
@@ -133,12 +76,9 @@ def mesh_folder() -> Path:
 def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0) -> mjcf.RootElement:
     """Builds the arm: 7 hinge joints, 2 finger slides, 9 motors, TCP body, wrist camera, optionally a rod in the hand.
 
-    What can touch something always collides: rod, fingers, finger pads and the hand (which comes down on a cylinder
-    when the rod is pressed against it). Links 0-7 are drawn only, unless ``link_collisions`` is set: commands all over
-    the table never brought one into contact, and leaving them out saves time.
-
-    Names: joints ``joint1`` ... ``joint7``, ``finger_left``, ``finger_right`` (motors alike), bodies ``link0`` ...
-    ``link8``, ``hand``, ``tcp``, geom ``rod``, camera ``wrist``.
+    What can touch something always collides: rod, fingers, finger pads and hand. Names: joints ``joint1`` ...
+    ``joint7``, ``finger_left``, ``finger_right`` (motors alike), bodies ``link0`` ... ``link8``, ``hand``, ``tcp``,
+    geom ``rod``, camera ``wrist``.
 
     Args:
         rod (bool): the hand holds a rod (Avoiding, Aligning, Sorting) or nothing (Stacking).
@@ -148,12 +88,6 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
 
     Raises:
         ImportError: if ``gymnasium-robotics``, which holds the meshes, is not installed.
-
-    Examples:
-        >>> from torchrl_koap.envs.mujoco.panda import panda
-        >>> arm = panda(rod=True)
-        >>> len(arm.find_all("joint")), len(arm.find_all("actuator"))
-        (9, 9)
     """
     folder = mesh_folder()
     root = mjcf.RootElement(model="panda")
@@ -164,11 +98,11 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
     hull = {"contype": int(link_collisions), "conaffinity": 0}  # a conaffinity would let links meet each other
 
     body = root.worldbody
-    for index, (offset, quat, mass, com, inertia, frame) in enumerate(_LINKS):
+    for index, ((offset, quat, mass, com), (inertia, frame)) in enumerate(zip(_LINKS, _INERTIA, strict=True)):
         body = body.add("body", name=f"link{index}", pos=offset, quat=quat)
         body.add("inertial", mass=mass, pos=com, diaginertia=inertia, quat=frame)
         if index:
-            joint = {"type": "hinge", "axis": (0, 0, 1), "limited": True, "range": _JOINT_RANGES[index - 1]}
+            joint = {"type": "hinge", "axis": (0, 0, 1), "limited": True, "range": (_LOW[index - 1], _HIGH[index - 1])}
             body.add("joint", name=f"joint{index}", **joint)
         wrist = {"solimp": (1.998, 1.999, 0.0)} if index == 7 else {}
         body.add("geom", name=f"link{index}", type="mesh", mesh=f"link{index}", rgba=colour, **hull, **wrist)

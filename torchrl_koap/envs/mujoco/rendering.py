@@ -21,7 +21,7 @@ _INSTALL = (
 
 
 def backends() -> list[str]:
-    """OpenGL back ends to try, in order: the one named by ``MUJOCO_GL``, else what suits this machine.
+    """Lists the OpenGL back ends to try, in order: the one named by ``MUJOCO_GL``, else what suits this machine.
 
     Raises:
         RuntimeError: if ``MUJOCO_GL`` switches rendering off or names a back end that does not exist.
@@ -91,14 +91,11 @@ class Renderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gpu)
 
     def render(self, data: mujoco.MjData, camera: str = "cage") -> np.ndarray:
-        """Draws one simulation.
+        """Draws one simulation, uint8 [height, width, 3].
 
         Args:
             data (mujoco.MjData): its state.
             camera (str): name of a camera of the scene; the prefix of the arm may be left out.
-
-        Returns:
-            np.ndarray: uint8 [height, width, 3], RGB.
 
         Raises:
             ValueError: if the scene has no such camera.

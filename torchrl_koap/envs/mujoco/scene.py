@@ -23,8 +23,7 @@ _DRAWN = {"contype": 0, "conaffinity": 0}
 def scene(
     *,
     rod: bool = True,
-    image_size: int = 96,
-    arm_alpha: float = 0.1,
+    arm_alpha: float = 0.3,
     link_collisions: bool = False,
     add_objects: Callable[[mjcf.RootElement], None] | None = None,
 ):
@@ -34,7 +33,6 @@ def scene(
 
     Args:
         rod (bool): the hand holds a rod.
-        image_size (int): width and height in pixels of the off-screen picture buffer's default.
         arm_alpha (float): opacity of the arm when drawn.
         link_collisions (bool): links 0-7 collide too, see :func:`~torchrl_koap.envs.mujoco.panda.panda`.
         add_objects (callable, optional): adds the free bodies of the task; called before the arm is attached, so that
@@ -64,7 +62,7 @@ def scene(
         gravity=(0, 0, -9.81),
     )
     visual = root.visual
-    getattr(visual, "global").set_attributes(offwidth=max(1024, image_size), offheight=max(1024, image_size))
+    getattr(visual, "global").set_attributes(offwidth=1024, offheight=1024)
     visual.headlight.set_attributes(ambient=(0.35, 0.35, 0.35), diffuse=(0.4, 0.4, 0.4), specular=(0.1, 0.1, 0.1))
     visual.map.set_attributes(znear=0.02, zfar=30)
     root.asset.add("texture", name="sky", type="skybox", builtin="gradient", rgb1=(0.9,) * 3, rgb2=(0.6,) * 3, width=32)
@@ -89,12 +87,5 @@ def scene(
 
 
 def compile_scene(root: mjcf.RootElement) -> mujoco.MjModel:
-    """Compiles a scene into a MuJoCo model.
-
-    Args:
-        root (mjcf.RootElement): a scene, see :func:`scene`.
-
-    Returns:
-        mujoco.MjModel: the model; it may be shared by any number of simulations.
-    """
+    """Compiles a scene into a MuJoCo model, which any number of simulations may share."""
     return mujoco.MjModel.from_xml_string(root.to_xml_string(), root.get_assets())

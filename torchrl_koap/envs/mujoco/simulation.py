@@ -133,25 +133,13 @@ class SimulationBatch:
         self.track_joints(rows, commands, substeps=1)
 
     def track_pose(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
-        """Advances simulations by ``substeps`` while the TCP follows ``commands``.
-
-        Args:
-            rows (np.ndarray): indices of the simulations.
-            commands (np.ndarray): TCP positions (m) and quaternions [n, 7]; rows not advanced are ignored.
-            substeps (int): physics steps.
-        """
+        """Advances simulations by ``substeps`` while the TCP follows ``commands`` [n, 7] (position, quaternion)."""
         commands = np.ascontiguousarray(commands, dtype=np.float64)
         state = (self.joint_targets, self.joint_speeds, self.started, self.log)
         self._run(controller.track_pose, rows, (commands, self.widths, self.grasping, substeps, *state))
 
     def track_joints(self, rows: np.ndarray, commands: np.ndarray, substeps: int) -> None:
-        """Advances simulations by ``substeps`` while the joints are held at ``commands``.
-
-        Args:
-            rows (np.ndarray): indices of the simulations.
-            commands (np.ndarray): joint angles [n, 7] (rad); rows not advanced are ignored.
-            substeps (int): physics steps.
-        """
+        """Advances simulations by ``substeps`` while the joints are held at ``commands`` [n, 7] (rad)."""
         commands = np.ascontiguousarray(commands, dtype=np.float64)
         self._run(controller.track_joints, rows, (commands, self.widths, self.grasping, substeps, self.log))
 
@@ -186,14 +174,7 @@ class SimulationBatch:
             self._executor = None
 
     def get_state(self, row: int) -> dict[str, np.ndarray]:
-        """Everything that decides the future of one simulation, controller included.
-
-        Args:
-            row (int): index of the simulation.
-
-        Returns:
-            dict: physics state (``mjSTATE_INTEGRATION``), force bias, TCP pose, joint targets, finger targets.
-        """
+        """Returns everything that decides the future of one simulation, controller included."""
         data, spec = self.data[row], mujoco.mjtState.mjSTATE_INTEGRATION.value
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
         mujoco.mj_getState(self.model, data, physics, spec)
@@ -210,12 +191,7 @@ class SimulationBatch:
         }
 
     def set_state(self, row: int, state: dict[str, np.ndarray]) -> None:
-        """Restores what :meth:`get_state` returned; the simulation then continues bit for bit.
-
-        Args:
-            row (int): index of the simulation.
-            state (dict): from :meth:`get_state`, of any simulation of the same model.
-        """
+        """Restores what :meth:`get_state` returned; the simulation then continues bit for bit."""
         data = self.data[row]
         mujoco.mj_resetData(self.model, data)
         spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -232,14 +208,6 @@ class SimulationBatch:
 
     def set_physics(self, row: int, qpos, qvel=None, *, qacc_warmstart=None, ctrl=None, time: float = 0.001) -> None:
         """Puts one simulation into a physics state and forgets the controller's past.
-
-        Args:
-            row (int): index of the simulation.
-            qpos (array): positions [nq] (m, rad).
-            qvel (array, optional): velocities [nv].
-            qacc_warmstart (array, optional): warm start of the solver [nv].
-            ctrl (array, optional): motor commands [nu] (N m, N).
-            time (float): clock (s).
 
         Raises:
             ValueError: if a size is wrong or a number is not finite.
@@ -261,16 +229,7 @@ class SimulationBatch:
         self.started[row] = False
 
     def contacts(self, row: int, geom: int, others: Sequence[int]) -> np.ndarray:
-        """Which geoms touched another one in the last substep.
-
-        Args:
-            row (int): index of the simulation.
-            geom (int): id of the one geom.
-            others (sequence of int): ids of the others.
-
-        Returns:
-            np.ndarray: bool [len(others)].
-        """
+        """Returns which of the geoms ``others`` touched ``geom`` in the last substep, bool [len(others)]."""
         data = self.data[row]
         if not data.ncon:
             return np.zeros(len(others), dtype=bool)

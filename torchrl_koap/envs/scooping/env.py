@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,25 +48,17 @@ class ScoopingEnv(ManipulationEnv):
     failure, and what is observed is the present frame, unlike in D3IL's tasks. Where the bowl moves, columns 99 and 100
     and a second row of the context are its position (m).
 
-    Args:
-        num_envs (int): number of environments, the batch size.
-        num_threads (int): threads that advance the physics; frames are drawn one after the other.
-        max_steps (int): steps after which an episode is truncated.
-        seed (int, optional): seed of the random contexts.
-        device (torch.device, optional): device of the tensors handed out.
-        dtype (torch.dtype): floating type of observation, action and reward.
+    Args and errors are those of :class:`~torchrl_koap.envs.base.ManipulationEnv`, and
 
     Keyword Args:
         task (str): ``"scooping"``, or ``"scooping_moving_bowl"``, whose bowl stands somewhere else in every episode.
-        contexts (array, optional): table of contexts [C, bodies, 3] to take in turn; random ones by default.
         encoder (FrozenImageEncoder, str or Path, optional): what embeds the frames, or the file of its projection.
             Default: EfficientNet-Lite0 and the projection of the task that comes with the package.
         embed (bool): embed the frames. Without, the embedding is zero and neither OpenGL nor weights are needed.
         pixels (bool): hand the frames out too.
 
     Raises:
-        ValueError: for sizes below 1, contexts out of range, an embedding of another size than the task's, actions of
-            a wrong shape or that are not finite.
+        ValueError: for an embedding of another size than the task's.
         RuntimeError: if there is no OpenGL library.
         WeightsError: if there are no weights, or others than those of the projection.
 
@@ -80,38 +73,31 @@ class ScoopingEnv(ManipulationEnv):
 
     def __init__(
         self,
-        num_envs: int = 1,
-        num_threads: int = 1,
-        max_steps: int | None = None,
-        seed: int | None = None,
-        device: torch.device | str | None = None,
-        dtype: torch.dtype = torch.float32,
-        *,
+        *args: Any,
         task: str = "scooping",
-        contexts=None,
         encoder: FrozenImageEncoder | str | Path | None = None,
         embed: bool = True,
         pixels: bool = False,
+        **options: Any,
     ):
         self._arm = SpoonKinematics()
         chosen = None
         if embed:
-            if isinstance(encoder, FrozenImageEncoder):
-                chosen = encoder
-            else:
-                chosen = load_encoder(projection_of(task) if encoder is None else encoder)
+            chosen = (
+                encoder if isinstance(encoder, FrozenImageEncoder) else load_encoder(encoder or projection_of(task))
+            )
             dim = 0 if chosen.projection is None else chosen.projection.dim
             if dim != EMBEDDING_DIM:
                 raise ValueError(f"the encoder's projection must have {EMBEDDING_DIM} components, got {dim}")
-        self._bowl_moves = "bowl" in get_task(task).observation
-        self._pixels = np.zeros((num_envs, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8) if embed or pixels else None
+        super().__init__(*args, task=get_task(task), **options)
+        self._encoder = chosen
+        self._bowl_moves = "bowl" in self.task.observation
+        self._pixels = np.zeros((*self.batch_size, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         self._hand_out = pixels
         self._camera: Renderer | None = None
-        super().__init__(num_envs, num_threads, max_steps, seed, device, dtype, contexts=contexts, task=get_task(task))
-        self._encoder = chosen
         if pixels:
             self.observation_spec[PIXELS] = Unbounded(self._pixels.shape, dtype=torch.uint8, device=self.device)
-        if self._pixels is not None:
+        if embed or pixels:
             self._camera = Renderer(self.sims.model, IMAGE_SIZE, IMAGE_SIZE, shadows=False)
 
     @property
@@ -119,7 +105,7 @@ class ScoopingEnv(ManipulationEnv):
         """Range of the joints (rad)."""
         return tuple(self._arm.low), tuple(self._arm.high)
 
-    def _simulations(self, num_envs: int, num_threads: int, arm_alpha: float) -> ScoopingSimulations:
+    def _simulations(self, num_envs: int, num_threads: int) -> ScoopingSimulations:
         return ScoopingSimulations("robot", num_envs, num_threads)
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, contexts=None, **kwargs) -> TensorDictBase:
@@ -129,7 +115,7 @@ class ScoopingEnv(ManipulationEnv):
         bowls = self._contexts[rows, 1, :2] if self._bowl_moves else None
         self.sims.reset(rows, joints, self._contexts[rows, 0, 2], bowls)
         self._begin_episode(rows)
-        return self._leaves(np.zeros(self.batch_size[0], dtype=bool))
+        return self._leaves()
 
     def _begin(self, rows: np.ndarray) -> None:
         self._commands[rows] = self.sims.commands[rows]
@@ -168,14 +154,10 @@ class ScoopingEnv(ManipulationEnv):
         self._update_mode(rows)
         self._success[rows] = self._check(rows)[0]
         self._observation[rows] = self._observe(rows)
-        stepped = np.zeros(self.batch_size[0], dtype=bool)
-        stepped[rows] = True
-        out = self._leaves(stepped)
-        out.set("reward", self._tensor((self._success & stepped)[:, None], self._dtype))
-        return out
+        return self._stepped(rows)
 
-    def _leaves(self, stepped: np.ndarray) -> TensorDictBase:
-        leaves = super()._leaves(stepped)
+    def _leaves(self) -> TensorDictBase:
+        leaves = super()._leaves()
         if self._hand_out:
             leaves.set(PIXELS, self._tensor(self._pixels))
         return leaves

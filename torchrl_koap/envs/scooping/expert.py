@@ -119,7 +119,7 @@ class ScoopingExpert:
         self.attempts += 1
 
     def target(self) -> np.ndarray:
-        """The joint targets of the next frame ``[nu]``: joints (rad), or position (m) and angles (rad) of the hand."""
+        """Decides the targets of the next frame ``[nu]``: joints (rad), or place (m) and angles (rad) of the hand."""
         if self._segment is None and not self._next():
             self.finished = True
         if self._segment is not None:
@@ -153,16 +153,12 @@ class ScoopingExpert:
 
 
 def start_joints(context: np.ndarray, embodiment: str, arm: SpoonKinematics | None = None) -> np.ndarray:
-    """Joints with which an episode begins.
+    """Returns the joints with which an episode begins: ``[7]`` (rad), of the hand ``[6]`` (m, rad).
 
     Args:
-        context (np.ndarray): context ``[bodies, 3]``; its first row says where the spoon is, x, y (m). Nothing else is
-            looked at.
+        context (np.ndarray): context ``[bodies, 3]``; its first row says where the spoon is, x, y (m).
         embodiment (str): ``"robot"`` or ``"hand"``.
         arm (SpoonKinematics, optional): where there is one already.
-
-    Returns:
-        np.ndarray: ``[7]`` (rad), of the hand ``[6]`` (m, rad).
     """
     position = np.array([context[0, 0], context[0, 1], START_HEIGHT])
     if embodiment == "hand":

@@ -13,17 +13,12 @@ _DAMPING, _PULL = 1e-4, 0.05
 
 
 def rotation_of(yaw: float, pitch: float, roll: float = 0.0) -> np.ndarray:
-    """Axes of a spoon ``[3, 3]``, in columns, turned by yaw, then pitch (nose down), then roll.
+    """Computes the axes of a spoon ``[3, 3]``, in columns, turned by yaw, then pitch (nose down), then roll.
 
     Args:
         yaw (float): about z (rad).
         pitch (float): about the turned y, positive nose down (rad).
         roll (float): about the turned x (rad).
-
-    Examples:
-        >>> from torchrl_koap.envs.scooping.kinematics import rotation_of
-        >>> rotation_of(0.0, 0.3)[2, 0] < 0
-        np.True_
     """
     (cy, sy), (cp, sp), (cr, sr) = ((np.cos(angle), np.sin(angle)) for angle in (yaw, pitch, roll))
     about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
@@ -57,14 +52,14 @@ class SpoonKinematics:
         mujoco.mj_comPos(self._model, self._data)
 
     def position(self, joints: np.ndarray) -> np.ndarray:
-        """Position of the spoon ``[3]`` (m) with joints ``[7]`` (rad)."""
+        """Computes the position of the spoon ``[3]`` (m) with joints ``[7]`` (rad)."""
         self._forward(joints)
         return self._data.site_xpos[self._site].copy()
 
     def solve(
         self, position: np.ndarray, rotation: np.ndarray, joints: np.ndarray | None = None, iterations: int = 40
     ) -> np.ndarray:
-        """Joints ``[7]`` (rad) at which the spoon has a pose.
+        """Finds joints ``[7]`` (rad) at which the spoon has a pose.
 
         Args:
             position (np.ndarray): of the spoon ``[3]`` (m).

@@ -54,9 +54,9 @@ class VideoReport:
 
 
 def play_episodes(
-    embodiment: str, episodes: int, seed: int = 0, *, size: int = IMAGE_SIZE, task: str = "scooping", first: int = 0
+    embodiment: str, episodes: int, seed: int = 0, *, task: str = "scooping"
 ) -> Iterator[tuple[ImageEpisode, int, int]]:
-    """Demonstrations in their order; one that does not succeed is played again, from another place.
+    """Plays demonstrations in their order; one that does not succeed is played again, from another place.
 
     They begin at the start positions in turn, so that the first few of them have seen them all.
 
@@ -64,11 +64,7 @@ def play_episodes(
         embodiment (str): ``"robot"`` or ``"hand"``.
         episodes (int): number of demonstrations.
         seed (int): of starts and players.
-
-    Keyword Args:
-        size (int): pixels of the frames, both ways.
         task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
-        first (int): number of the first demonstration that is played; none depends on those before.
 
     Yields:
         tuple: the demonstration, how often it was played, and how often the spoon went into the bowl.
@@ -79,10 +75,10 @@ def play_episodes(
     """
     _check(embodiment, episodes, seed)
     sims, arm = ScoopingSimulations(embodiment, 1), SpoonKinematics()
-    renderer = Renderer(sims.model, size, size, shadows=False)
+    renderer = Renderer(sims.model, IMAGE_SIZE, IMAGE_SIZE, shadows=False)
     stream, rows = sorted(HABITS).index(embodiment), np.zeros(1, dtype=np.int64)
     try:
-        for number in range(first, episodes):
+        for number in range(episodes):
             for attempt in range(MAX_ATTEMPTS):
                 own = (seed, stream, number, attempt)
                 context = _context_at(task, number % len(STARTS), np.random.default_rng((*own, 1)))
@@ -156,8 +152,6 @@ def record_videos(
         episodes (int): number of demonstrations.
         seed (int): of starts and players; the two embodiments never share a start.
         progress (callable, optional): called with the number of demonstrations recorded and wanted.
-
-    Keyword Args:
         task (Task or str): ``"scooping"`` or ``"scooping_moving_bowl"``.
 
     Raises:

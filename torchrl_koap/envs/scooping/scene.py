@@ -1,9 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """Scene of Scooping: table, bowl, free pieces, a camera, and what holds the spoon: a Panda of capsules, or a hand.
 
-Everything is a primitive shape. The arm's capsules have the links' places and rough thicknesses, at a small part of the
-cost of detailed meshes in software rendering. Their outline is only roughly that of the meshes
-(``docs/results/scooping.md``).
+Everything is a primitive shape, at a small part of the cost of detailed meshes in software rendering; the arm's outline
+is only roughly that of the meshes (``docs/results/scooping.md``).
 """
 
 from __future__ import annotations
@@ -134,30 +133,19 @@ def _spoon() -> str:
 <site name="spoon" size="0.002" rgba="0 0 0 0"/>"""
 
 
-# offset (m), quarter turn about x, range of the joint (rad) and capsules (from, to, radius, dark) of the links
+# offset (m), quarter turn about x, and capsules (from, to, radius, dark) of the links
 _LINKS: tuple[tuple[Any, ...], ...] = (
-    ((0, 0, 0.333), 0, 2.8973, [((0, 0, -0.19), (0, 0, -0.03), 0.06, False)]),
-    ((0, 0, 0), -1, 1.7628, [((0, -0.06, 0), (0, 0.06, 0), 0.06, False), ((0, 0, 0), (0, -0.13, 0), 0.06, False)]),
-    (
-        (0, -0.316, 0),
-        1,
-        2.8973,
-        [((0, 0, -0.13), (0, 0, -0.03), 0.055, False), ((0.0, 0, 0), (0.08, 0, 0), 0.05, True)],
-    ),
-    (
-        (0.0825, 0, 0),
-        1,
-        3.0718,
-        [((0, 0, -0.04), (0, 0, 0.04), 0.055, False), ((0, 0, 0), (-0.08, 0.09, 0), 0.055, False)],
-    ),
+    ((0, 0, 0.333), 0, [((0, 0, -0.19), (0, 0, -0.03), 0.06, False)]),
+    ((0, 0, 0), -1, [((0, -0.06, 0), (0, 0.06, 0), 0.06, False), ((0, 0, 0), (0, -0.13, 0), 0.06, False)]),
+    ((0, -0.316, 0), 1, [((0, 0, -0.13), (0, 0, -0.03), 0.055, False), ((0.0, 0, 0), (0.08, 0, 0), 0.05, True)]),
+    ((0.0825, 0, 0), 1, [((0, 0, -0.04), (0, 0, 0.04), 0.055, False), ((0, 0, 0), (-0.08, 0.09, 0), 0.055, False)]),
     (
         (-0.0825, 0.384, 0),
         -1,
-        2.8973,
         [((0, 0, -0.26), (0, 0.03, -0.14), 0.05, False), ((0, 0.05, -0.12), (0, 0.03, 0), 0.04, False)],
     ),
-    ((0, 0, 0), 1, 3.7525, [((0, 0, -0.03), (0, 0, 0.03), 0.05, True), ((0, 0, 0), (0.088, 0, 0), 0.04, False)]),
-    ((0.088, 0, 0), 1, 2.8973, [((0, 0, 0.0), (0, 0, 0.08), 0.045, False)]),
+    ((0, 0, 0), 1, [((0, 0, -0.03), (0, 0, 0.03), 0.05, True), ((0, 0, 0), (0.088, 0, 0), 0.04, False)]),
+    ((0.088, 0, 0), 1, [((0, 0, 0.0), (0, 0, 0.08), 0.045, False)]),
 )
 _LOW = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)
 _HIGH = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
@@ -169,7 +157,7 @@ FLANGE = 0.107  # m, along the last joint's axis
 
 def _arm() -> str:
     xml, closing = '<geom type="capsule" size="0.07" fromto="-0.06 0 0.06 0 0 0.06" rgba="0.93 0.93 0.93 1"/>', ""
-    for index, (offset, turn, _, capsules) in enumerate(_LINKS, 1):
+    for index, (offset, turn, capsules) in enumerate(_LINKS, 1):
         quat = {0: "1 0 0 0", -1: "0.707107 -0.707107 0 0", 1: "0.707107 0.707107 0 0"}[turn]
         place = " ".join(str(v) for v in offset)
         armature = 0.6 if index <= 4 else 0.25

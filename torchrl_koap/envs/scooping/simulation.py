@@ -95,7 +95,7 @@ class ScoopingSimulations:
         return self.held >= HELD_TICKS
 
     def pieces_on_spoon(self, rows=None) -> np.ndarray:
-        """Number of pieces that lie on the spoon, int64 ``[len(rows)]``, of all simulations by default."""
+        """Counts the pieces that lie on the spoon, int64 ``[len(rows)]``, of all simulations by default."""
         return np.array([self._on_spoon(self.data[row]) for row in (range(len(self)) if rows is None else rows)])
 
     def _on_spoon(self, data: mujoco.MjData) -> int:
@@ -132,11 +132,7 @@ class ScoopingSimulations:
         self.held[rows] = 0
 
     def advance(self, rows: np.ndarray, targets: np.ndarray) -> None:
-        """One frame: the commands go from the last target to the new one in equal parts.
-
-        Args:
-            rows (np.ndarray): indices of the simulations.
-            targets (np.ndarray): joint targets ``[n, nu]``; rows not advanced are ignored.
+        """Advances by one frame: the commands go from the last target to the new one ``[n, nu]`` in equal parts.
 
         Raises:
             RuntimeError: if a simulation becomes unstable.
@@ -172,7 +168,7 @@ class ScoopingSimulations:
             self.held[row] = self.held[row] + 1 if left and self._on_spoon(data) else 0
 
     def get_state(self, row: int) -> dict[str, np.ndarray]:
-        """Everything that decides the future of one simulation."""
+        """Returns everything that decides the future of one simulation."""
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
         mujoco.mj_getState(self.model, self.data[row], physics, _PHYSICS)
         return {"physics": physics} | {name: array[row].copy() for name, array in self._episode.items()}
@@ -206,7 +202,7 @@ def _turned(layout: np.ndarray, angle: float) -> np.ndarray:
 
 @functools.cache
 def settled_layouts() -> np.ndarray:
-    """Pieces at rest in the bowl ``[layouts, pieces, 3]`` (m), dropped there once per process, always the same."""
+    """Returns pieces at rest in the bowl ``[layouts, pieces, 3]`` (m), always the same, dropped once per process."""
     model = scooping_model("hand")
     data = mujoco.MjData(model)
     layouts = []
