@@ -43,6 +43,9 @@ def resolve(reference: Any, what: str) -> Any:
         reference (str or object): ``"package.module:name"``, dots in ``name`` reach into a class.
         what (str): what the object is for; the error begins with it.
 
+    Returns:
+        object: what the string names.
+
     Raises:
         ValueError: if the string has no colon, the module cannot be imported, or it has no such name.
 

@@ -166,14 +166,6 @@ class ManipulationEnv(EpisodeState, EnvBase):
         raise NotImplementedError
 
     @abc.abstractmethod
-    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
-        """Turns actions [len(rows), act] into new commands ``self._commands[rows]``."""
-
-    @abc.abstractmethod
-    def _observe(self, rows: np.ndarray) -> np.ndarray:
-        """Observation [len(rows), obs] of the present state and command."""
-
-    @abc.abstractmethod
     def _check(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whether the present state is a success, and whether it is a failure, each bool [len(rows)]."""
 

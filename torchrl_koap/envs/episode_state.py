@@ -38,13 +38,15 @@ class EpisodeState(abc.ABC):
     def _begin_episode(self, rows: np.ndarray) -> None: ...
 
     @abc.abstractmethod
-    def _command(self, rows: np.ndarray, action: np.ndarray) -> None: ...
+    def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
+        """Turns actions [len(rows), act] into new commands ``self._commands[rows]``."""
 
     @abc.abstractmethod
     def _advance(self, rows: np.ndarray) -> None: ...
 
     @abc.abstractmethod
-    def _observe(self, rows: np.ndarray) -> np.ndarray: ...
+    def _observe(self, rows: np.ndarray) -> np.ndarray:
+        """Observation [len(rows), obs] of the present state and command."""
 
     def get_state(self, index: int) -> dict:
         """Returns the full state of one environment, for :meth:`set_state` of any environment of the same task."""

@@ -65,7 +65,7 @@ class RecordingReport:
     Examples:
         >>> from torchrl_koap.envs.experts.demonstrations import RecordingReport
         >>> report = RecordingReport("avoiding", 0, modes=[3, 7], rows=[80, 95], attempts=[1, 2], failures={"mode": 1})
-        >>> str(report)[:38]
+        >>> str(report)[:39]
         '2 demonstrations of avoiding in 2 modes'
     """
 
