@@ -1,11 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The simulated player: takes the asked mode, repeats itself from its seed, and moves like the human ones."""
+"""The simulated player: takes the asked mode, and moves like the human ones."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from expert_test_base import ExpertTestBase, play
 from human_likeness import ridge_error, statistics
 from shared_data import HUMAN
 
@@ -15,16 +16,8 @@ from torchrl_koap.envs.experts.avoiding import _HAND, _HAND_REST, FULL_PUSH, GAP
 from torchrl_koap.envs.experts.demonstrations import iterate_takes
 
 
-def play(expert, count, steps=150):
-    env = AvoidingEnv(count, dtype=torch.float64)
-    actions = []
-
-    def policy(td):
-        actions.append(expert.act(td["observation"].numpy()))
-        return td.set("action", torch.from_numpy(actions[-1]))
-
-    data = env.rollout(steps, policy, break_when_any_done=False, break_when_all_done=True)
-    return data["next"], np.stack(actions, axis=1)
+class TestAvoidingExpert(ExpertTestBase):
+    TASK, EXPERT, MODES, TOLERANCE = "avoiding", AvoidingExpert, (20, 7), 1e-12
 
 
 def test_mode_gaps_count_like_the_environment():
@@ -41,22 +34,9 @@ def test_gaps_lie_between_the_cylinders():
 
 
 def test_most_first_attempts_take_the_asked_mode():
-    modes = list(range(24)) * 2
-    data, _ = play(AvoidingExpert(modes, [(11, index) for index in range(48)]), 48)
-    good = data["success"][:, -1, 0] & (mode_index(data["mode"][:, -1]) == torch.tensor(modes))
-    assert good.sum() >= 42
-
-
-def test_an_episode_depends_on_its_seed_alone():
-    torch.manual_seed(0)
-    np.random.seed(0)  # noqa: NPY002
-    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    _, alone = play(AvoidingExpert([7], [(3, 1)]), 1, 60)
-    _, batch = play(AvoidingExpert([20, 7, 7], [5, (3, 1), (3, 2)]), 3, 60)
-    assert np.allclose(alone[0], batch[1, : alone.shape[1]], atol=1e-12)
-    assert np.abs(alone[0] - batch[2, : alone.shape[1]]).max() > 1e-3
-    assert torch.equal(torch.random.get_rng_state(), before[0])
-    assert np.array_equal(np.random.get_state()[1], before[1])  # noqa: NPY002
+    modes, env = list(range(24)) * 2, AvoidingEnv(48, dtype=torch.float64)
+    episodes = play(env, AvoidingExpert(modes, [(11, index) for index in range(48)]), steps=150)
+    assert (episodes.success & (mode_index(episodes.out["mode"]).numpy() == modes)).sum() >= 42
 
 
 def test_the_hand_ends_where_the_decision_wants():

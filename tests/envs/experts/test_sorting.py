@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The simulated player of Sorting: brings the boxes in the asked order, repeats itself from its seed."""
+"""The simulated player of Sorting: brings the boxes in the asked order."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
+from expert_test_base import ExpertTestBase, play
 
 from torchrl_koap.envs import SortingEnv
 from torchrl_koap.envs.contexts import draw_contexts, evaluation_contexts
@@ -19,52 +19,24 @@ from torchrl_koap.evaluation.statistics import wilson_interval
 TASKS = {2: "sorting_2", 4: "sorting", 6: "sorting_6"}
 
 
-def play(modes, contexts, seeds, num_boxes=4, steps=500):
-    """Actions [T, n, 2], success [n], mode number [n] and control steps [n]; a finished episode stands still."""
-    count = len(modes)
-    env = SortingEnv(count, max_steps=steps, num_boxes=num_boxes, contexts=contexts, dtype=torch.float64)
-    expert = SortingExpert(modes, contexts, seeds)
-    out, actions, lengths = env.reset(), [], np.zeros(count, dtype=int)
-    running = np.ones(count, dtype=bool)
-    while running.any():
-        actions.append(expert.act(out["observation"].numpy()))
-        step = {"action": torch.from_numpy(actions[-1]), "_step": torch.from_numpy(running)[:, None]}
-        out = env.step(TensorDict(step, [count]))["next"]
-        lengths += running
-        running &= ~(out["done"][:, 0].numpy() | expert.finished)
-    return np.stack(actions), out["success"][:, 0].numpy(), mode_index(out["mode"]).numpy(), lengths
+class TestSortingExpert(ExpertTestBase):
+    TASK, EXPERT, MODES = "sorting", SortingExpert, (1, 4)
 
 
-def test_first_attempts_arrive_in_the_asked_order():
-    contexts = draw_contexts("sorting", 12, 21)
-    modes = np.arange(12) % 6
-    actions, success, took, lengths = play(modes, contexts, [(5, index) for index in range(12)])
-    good = success & (took == modes)
-    assert good.sum() >= 9
-    assert set(took[good]) == set(range(6))
-    assert np.abs(actions).max() <= _STICK
-    assert np.median(lengths[good]) < 400
+def played(modes, contexts, seeds):
+    """Episodes, and which were solved in the order asked for."""
+    env = SortingEnv(len(modes), max_steps=700, num_boxes=contexts.shape[1], dtype=torch.float64)
+    episodes = play(env, SortingExpert(modes, contexts, seeds), contexts)
+    return episodes, episodes.success & (mode_index(episodes.out["mode"]).numpy() == modes)
 
 
-@pytest.mark.parametrize("num_boxes", [2, 6])
-def test_other_numbers_of_boxes(num_boxes):
-    modes = np.array([0, math.comb(num_boxes, num_boxes // 2) - 1])
-    contexts = evaluation_contexts(TASKS[num_boxes], 2)
-    _, success, took, _ = play(modes, contexts, [(0,), (1,)], num_boxes, steps=700)
-    assert (success & (took == modes)).sum() >= 1
-
-
-def test_an_episode_depends_on_its_seed_alone():
-    torch.manual_seed(0)
-    np.random.seed(0)  # noqa: NPY002
-    before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    contexts = np.repeat(draw_contexts("sorting", 1, 2), 3, axis=0)
-    alone = play([4], contexts[:1], [(3, 1)], steps=60)[0]
-    batch = play([1, 4, 4], contexts, [(5,), (3, 1), (3, 2)], steps=60)[0]
-    np.testing.assert_array_equal(alone[:, 0], batch[:, 1])
-    assert np.abs(alone[:, 0] - batch[:, 2]).max() > 1e-4
-    assert torch.equal(torch.random.get_rng_state(), before[0])
-    assert np.array_equal(np.random.get_state()[1], before[1])  # noqa: NPY002
+@pytest.mark.parametrize(("num_boxes", "modes"), [(2, [0, 1]), (4, [0, 2, 5]), (6, [19])])
+def test_first_attempts_arrive_in_the_asked_order(num_boxes, modes):
+    contexts = draw_contexts(TASKS[num_boxes], len(modes), 21)
+    episodes, good = played(modes, contexts, [(5, index) for index in range(len(modes))])
+    assert good.all()
+    assert np.abs(episodes.actions).max() <= _STICK
+    assert episodes.lengths.max() < 100 * num_boxes + 50
 
 
 def observation(rod, boxes):
@@ -131,7 +103,6 @@ def test_success_over_the_evaluation_contexts(num_boxes, least):
     contexts = evaluation_contexts(TASKS[num_boxes])
     modes = np.arange(len(contexts)) % math.comb(num_boxes, num_boxes // 2)
     seeds = [(9, index) for index in range(len(contexts))]
-    _, success, took, _ = play(modes, contexts, seeds, num_boxes, steps=700)
-    good = success & (took == modes)
+    _, good = played(modes, contexts, seeds)
     assert good.mean() >= least, wilson_interval(int(good.sum()), len(good))
-    assert set(took[good]) == set(modes.tolist())
+    assert set(modes[good]) == set(modes.tolist())

@@ -1,11 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""StackingExpert: takes the wanted order, plays through the environment alone, repeatable, independent of the batch."""
+"""StackingExpert: takes the wanted order and plays through the environment alone."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from expert_test_base import ExpertTestBase, play
 from tensordict import TensorDict
 
 from torchrl_koap.envs import StackingEnv
@@ -17,32 +18,26 @@ from torchrl_koap.envs.stacking import mode_index
 LIMIT = 1000
 
 
-def play(modes, contexts, seeds, steps=LIMIT):
-    """Whole episodes: outcome, order, control steps until success, and all actions [n, T, 8]."""
-    count = len(modes)
-    env, expert = StackingEnv(count, max_steps=LIMIT, dtype=torch.float64), StackingExpert(modes, contexts, seeds)
-    out, actions, length = env.reset(contexts=contexts), [], np.full(count, -1)
-    for step in range(steps):
-        action = expert.act(out["observation"].numpy())
-        actions.append(action)
-        if expert.finished.all():
-            break
-        mask = torch.as_tensor(~expert.finished)[:, None]
-        out = env.step(TensorDict({"action": torch.as_tensor(action), "_step": mask}, [count]))["next"]
-        length[(length < 0) & out["success"][:, 0].numpy()] = step + 1
-    return out["success"][:, 0].numpy(), mode_index(out["mode"]).numpy(), length, np.stack(actions, 1), env, expert
+class TestStackingExpert(ExpertTestBase):
+    TASK, EXPERT, MODES = "stacking", StackingExpert, (4, 0)
+
+
+def stack(modes, contexts, seeds):
+    """Episodes played until the expert has drawn back, and which took the order asked for; environment and expert."""
+    env, expert = StackingEnv(len(modes), max_steps=LIMIT, dtype=torch.float64), StackingExpert(modes, contexts, seeds)
+    episodes = play(env, expert, contexts, LIMIT, to_the_end=True)
+    return episodes, episodes.success & (mode_index(episodes.out["mode"]).numpy() == modes), env, expert
 
 
 @pytest.fixture(scope="module")
 def played():
-    return play(range(6), evaluation_contexts("stacking", 6), [(1, mode) for mode in range(6)])
+    return stack(range(6), evaluation_contexts("stacking", 6), [(1, mode) for mode in range(6)])
 
 
 def test_every_order_is_stacked(played):
-    success, modes, length, _, env, expert = played
-    right = success & (modes == np.arange(6))
+    episodes, right, env, expert = played
     assert right.sum() >= 5
-    assert ((length[right] > 250) & (length[right] < 650)).all()
+    assert ((episodes.told[right] > 250) & (episodes.told[right] < 650)).all()
     assert expert.finished[right].all()
     for row in np.flatnonzero(right & expert.finished):  # let go, and the pile stands
         boxes = env.sims.object_poses[row, list(ORDERS[row])]
@@ -52,23 +47,13 @@ def test_every_order_is_stacked(played):
 
 
 def test_motion_is_smooth(played):
-    actions = played[3]
+    actions = np.swapaxes(played[0].actions, 0, 1)
     opens = actions[..., 7] > 0.075
     assert (np.diff(opens, axis=1).sum(1) == 6).all()  # closed on every box once, opened once
     assert set(np.unique(actions[..., 7])) == {0.06, 0.08}
     assert np.abs(actions[..., :7]).max() < 0.08
     assert np.quantile(np.abs(actions[..., :7]), 0.99) < 0.04
     assert np.quantile(np.abs(np.diff(actions[..., :7], axis=1)), 0.99) < 0.01
-
-
-def test_same_seed_same_episode_in_any_batch():
-    contexts = draw_contexts("stacking", 3, 5)
-    modes, seeds = [4, 0, 2], [(7, 0), (7, 1), (7, 2)]
-    together = play(modes, contexts, seeds, steps=150)[3]
-    np.testing.assert_array_equal(play(modes, contexts, seeds, steps=150)[3], together)
-    np.testing.assert_array_equal(play(modes[1:2], contexts[1:2], seeds[1:2], steps=150)[3], together[1:2])
-    other = play(modes[1:2], contexts[1:2], [(7, 9)], steps=150)[3]
-    assert np.abs(other - together[1:2]).max() > 1e-3
 
 
 def test_a_box_that_was_taken_away_is_fetched_again():
@@ -118,9 +103,6 @@ def test_inverse_kinematics_reaches_poses():
 def test_bad_arguments_are_named(modes, contexts, seeds, message):
     with pytest.raises(ValueError, match=message):
         StackingExpert(modes, contexts, seeds)
-
-
-def test_observation_of_a_wrong_shape_is_refused():
     with pytest.raises(ValueError, match=r"\[1, 31\], got \[1, 20\]"):
         StackingExpert([0], np.zeros((1, 3, 3)), [0]).act(np.zeros((1, 20)))
 
@@ -128,10 +110,8 @@ def test_observation_of_a_wrong_shape_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("contexts", [evaluation_contexts("stacking"), draw_contexts("stacking", 60, 11)])
 def test_success_in_many_contexts(contexts):
-    count = len(contexts)
-    wanted = np.arange(count) % 6
-    success, modes, length, _, _, _ = play(wanted, contexts, [(2, row) for row in range(count)])
-    right = success & (modes == wanted)
+    wanted = np.arange(len(contexts)) % 6
+    episodes, right, _, _ = stack(wanted, contexts, [(2, row) for row in range(len(contexts))])
     assert right.mean() > 0.9
     assert all(right[wanted == mode].mean() > 0.7 for mode in range(6))
-    assert np.median(length[right]) < 600
+    assert np.median(episodes.told[right]) < 600
