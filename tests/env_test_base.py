@@ -46,8 +46,7 @@ class EnvTestBase:
     def contexts(self, env):
         return {"contexts": draw_contexts(env.task, 5, 3)[: env.batch_size[0]]} if env.task.objects else {}
 
-    @pytest.mark.parametrize("num_envs", [1, 3])
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize(("num_envs", "dtype"), [(1, torch.float32), (3, torch.float64)])
     def test_specs(self, num_envs, dtype):
         env = self.make(num_envs, dtype=dtype)
         check_env_specs(env)
@@ -132,10 +131,10 @@ class EnvTestBase:
             with pytest.raises(ValueError, match="'action' must be finite.*environment 1"):
                 act(env, actions)
 
-    @pytest.mark.parametrize("bad", [{"num_envs": 0}, {"num_threads": 0}, {"max_steps": 2.5}, {"dtype": torch.int64}])
-    def test_bad_arguments_are_named(self, bad):
-        with pytest.raises(ValueError, match=next(iter(bad))):
-            self.ENV(**bad)
+    def test_bad_arguments_are_named(self):
+        for name, value in {"num_envs": 0, "num_threads": 0, "max_steps": 2.5, "dtype": torch.int64}.items():
+            with pytest.raises(ValueError, match=name):
+                self.ENV(**{name: value})
 
 
 class ContextTestBase(EnvTestBase):

@@ -207,19 +207,6 @@ def test_mode_index_numbers_all_24():
         mode_index(torch.zeros(3, 8))
 
 
-def test_full_state_round_trip_keeps_the_outcome():
-    env = AvoidingEnv(2, dtype=torch.float64)
-    env.reset()
-    while not env.obstacle_contacts()[0].any():
-        act(env, INTO_ROW_1, mask=[True, False])
-    env.set_state(1, env.get_state(0))
-    for _ in range(5):
-        out = act(env, INTO_ROW_1)
-        torch.testing.assert_close(out[1], out[0], rtol=0, atol=0)
-        np.testing.assert_array_equal(env.sims.data[0].qpos, env.sims.data[1].qpos)
-    assert out["collision"].all()
-
-
 def test_actions_beyond_the_human_range_are_executed_unclipped():
     env = AvoidingEnv(1, dtype=torch.float64)
     start = env.reset()["observation"][0, :2]
@@ -232,16 +219,6 @@ def test_obstacles_lie_where_the_task_says():
     for name, x, y, radius, half_height in OBSTACLES:
         np.testing.assert_allclose(model.body(name).pos, [x, y, 0])
         np.testing.assert_allclose(model.geom(name).size[:2], [radius, half_height])
-
-
-def test_rollout_with_one_episode_per_environment():
-    env = AvoidingEnv(3, max_steps=60, dtype=torch.float64)
-    actions = torch.stack([INTO_ROW_1, 1.2 * INTO_ROW_1, 0 * INTO_ROW_1])
-    data = env.rollout(100, lambda td: td.set("action", actions), break_when_any_done=False, break_when_all_done=True)
-    final = data[:, -1]["next"]
-    assert data.shape == (3, 60)
-    assert final["collision"][:, 0].tolist() == [True, True, False]
-    assert final["truncated"][2].item() and not final["success"].any()
 
 
 def test_collector_restarts_environments_that_end_at_different_times():

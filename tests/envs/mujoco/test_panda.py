@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -39,19 +40,6 @@ def test_joints_and_motors():
     assert not model.actuator_ctrllimited.any()
 
 
-def test_rod_ends_12_cm_below_the_tcp():
-    model = compiled(rod=True)
-    rod = model.geom("rod")
-    assert rod.pos[2] + rod.size[1] - model.body("tcp").pos[2] == pytest.approx(0.12)
-    assert model.geom("rod_tip").contype == 0
-
-
-def test_plain_variant_has_no_rod():
-    model = compiled(rod=False)
-    assert mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, "rod") == -1
-    assert model.nq == 9
-
-
 @pytest.mark.parametrize("link_collisions", [False, True])
 def test_what_collides(link_collisions):
     model = compiled(rod=True, link_collisions=link_collisions)
@@ -80,19 +68,20 @@ def test_scene_settings():
     assert table.pos[2] + table.size[2] == pytest.approx(TABLE_TOP)
 
 
-def test_missing_mesh_package_is_named(monkeypatch):
-    find_spec = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name: None if name == "gymnasium_robotics" else find_spec(name)
-    )
+def test_the_rod_ends_12_cm_below_the_tcp():
+    model = compiled(rod=True)
+    rod = model.geom("rod")
+    assert rod.pos[2] + rod.size[1] - model.body("tcp").pos[2] == pytest.approx(0.12)
+    assert model.geom("rod_tip").contype == 0
+    plain = compiled(rod=False)
+    assert mujoco.mj_name2id(plain, mujoco.mjtObj.mjOBJ_GEOM, "rod") == -1 and plain.nq == 9
+
+
+def test_a_missing_mesh_package_is_named(monkeypatch, tmp_path):
+    specs = {"gymnasium_robotics": None}
+    monkeypatch.setattr(importlib.util, "find_spec", specs.get)
     with pytest.raises(ImportError, match="gymnasium-robotics"):
         panda()
-
-
-def test_package_without_meshes_is_named(monkeypatch, tmp_path):
-    class Spec:
-        origin = str(tmp_path / "__init__.py")
-
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: Spec)
+    specs["gymnasium_robotics"] = SimpleNamespace(origin=str(tmp_path / "__init__.py"))
     with pytest.raises(FileNotFoundError, match="link0.stl"):
         panda()

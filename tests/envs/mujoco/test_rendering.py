@@ -48,19 +48,17 @@ def test_environments_look_different(env):
     assert np.abs(env.render(0, 64, 64).astype(int) - env.render(1, 64, 64)).max() > 50
 
 
-def test_unknown_camera_suggests_the_nearest(env):
-    with pytest.raises(ValueError, match="did you mean 'wrist'"):
-        env.render(camera="wist")
-
-
-def test_index_outside_the_batch(env):
-    with pytest.raises(ValueError, match="0 to 1, got 2"):
-        env.render(2)
-
-
-def test_bad_size(env):
-    with pytest.raises(ValueError, match="width must be a positive number of pixels, got 0"):
-        env.render(0, 0, 10)
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"camera": "wist"}, "did you mean 'wrist'"),
+        ({"index": 2}, "0 to 1, got 2"),
+        ({"width": 0}, "width must be a positive number of pixels, got 0"),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(env, asked, message):
+    with pytest.raises(ValueError, match=message):
+        env.render(**asked)
 
 
 def test_backends(monkeypatch):

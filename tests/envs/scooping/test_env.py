@@ -21,7 +21,7 @@ from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.envs.scooping.simulation import ScoopingSimulations, settled_layouts
 from torchrl_koap.files import DataError
 from torchrl_koap.tasks import get_task
-from torchrl_koap.tasks.scooping import BOWL, PIECE_RADIUS, RIM_RADIUS, START_HEIGHT, STARTS, start_of
+from torchrl_koap.tasks.scooping import BOWL, PIECE_RADIUS, RIM_RADIUS, START_HEIGHT, STARTS, scores, start_of
 
 NEAR = np.array([[*STARTS["near"], 0.4]])
 
@@ -90,17 +90,6 @@ def test_targets_that_are_far_away_are_approached_at_a_limited_speed():
         env.step(data.set("action", torch.full((1, 7), torch.nan)))
 
 
-def test_an_episode_goes_on_bit_for_bit():
-    env, other = ScoopingEnv(num_envs=1, embed=False), ScoopingEnv(num_envs=1, embed=False)
-    data = env.reset(contexts=NEAR[None])
-    action = torch.tensor(env.commands + 0.02, dtype=torch.float32)
-    env.step(data.set("action", action))
-    other.reset()
-    other.set_state(0, env.get_state(0))
-    ends = [each.step(data.clone().set("action", action))["next", "observation"] for each in (env, other)]
-    assert torch.equal(*ends)
-
-
 def test_inverse_kinematics_reaches_turned_poses():
     arm = SpoonKinematics()
     for x, y, z, yaw, pitch in ((0.5, 0.2, 0.2, 0.0, 0.0), (0.55, 0.0, 0.01, 0.8, 0.2), (0.5, 0.05, 0.14, -0.8, -0.5)):
@@ -111,8 +100,6 @@ def test_inverse_kinematics_reaches_turned_poses():
 def test_scores_tell_the_starts_apart():
     env = ScoopingEnv(num_envs=2, embed=False, contexts=np.array([[[0.5, 0.22, 0]], [[0.33, 0, 0]]]), max_steps=2)
     episodes = list(env.rollout(2))
-    from torchrl_koap.tasks.scooping import scores
-
     starts = {"success from left": [False], "success from near": [False]}
     assert scores({}, episodes, None) == {"rates": {"spoon over the bowl": [False, False], **starts}}
 
@@ -150,7 +137,7 @@ def test_no_graphics_is_one_clear_error(tmp_path, monkeypatch):
 
 
 def test_recordings_are_repeatable_and_an_unfinished_one_is_no_data_set(tmp_path):
-    record, seen = functools.partial(record_videos, embodiment="robot", episodes=2), []
+    record, seen = functools.partial(record_videos, embodiment="robot", episodes=1), []
 
     def interrupt(number, total):
         raise KeyboardInterrupt
@@ -159,7 +146,7 @@ def test_recordings_are_repeatable_and_an_unfinished_one_is_no_data_set(tmp_path
         report = record(tmp_path / "whole", progress=lambda number, total: seen.append(number))
     except RuntimeError as error:
         pytest.skip(f"no OpenGL library: {error}")
-    assert seen == [1, 2] and report.episodes == 2 and report.attempts >= 2
+    assert seen == [1] and report.episodes == 1 and report.attempts >= 1
     with pytest.raises(KeyboardInterrupt):
         record(tmp_path / "parts", progress=interrupt)
     with pytest.raises(DataError, match="no finished data set"):
