@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchrl_koap.tasks import TASKS, Action, Task, get_task, register_task
+from torchrl_koap.tasks import TASKS, Action, Modes, Task, get_task, register_task
 from torchrl_koap.tasks import registry as registry_module
 
 
@@ -44,6 +44,21 @@ def test_a_task_may_be_registered_again_but_no_other_of_its_name(tasks):
         register_task(Task(**TOY, max_steps=7))
     with pytest.raises(TypeError, match="wanted a Task, got dict"):
         register_task(TOY)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *((field, "my_package:code") for field in ("env", "expert", "goal", "score", "tool_kinematics")),
+        ("modes", Modes(index="my_package:code")),
+        ("modes", Modes(of_path="my_package:code")),
+        ("state", {"tool": "my_package:code"}),
+    ],
+)
+def test_a_task_that_somebody_sent_may_name_no_code(field, value):
+    entries = Task(**(TOY | {"name": "sent", field: value})).to_json()
+    with pytest.raises(ValueError, match=f"task 'sent' names code in {field}"):
+        registry_module.plain_task(entries)
 
 
 class Point:

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import torchrl_koap
+from torchrl_koap.envs import mode_index_of, sorting
 from torchrl_koap.tasks import TASKS, WINDOW, Action, Task, aligning, get_task
 
 TOY = {
@@ -23,17 +24,6 @@ TOY = {
     "position": "tool",
     "command": "command",
 }
-
-
-def test_facts_of_avoiding():
-    task = get_task("avoiding")
-    assert task.observation_dim == 4
-    assert task.action_dim == 2
-    assert task.observation[task.command] == slice(0, 2)
-    assert task.state_columns == (2, 3)
-    assert task.max_steps == 250
-    assert task.num_modes == 24
-    assert math.isclose(task.control_hz, 28.5714, rel_tol=1e-4)
 
 
 def test_tasks_cannot_be_changed():
@@ -124,40 +114,36 @@ def test_the_package_loads_no_task_and_a_task_no_simulator():
         torchrl_koap.register_tusk  # noqa: B018
 
 
-@pytest.mark.parametrize("mode", range(24))
-def test_mode_names_follow_the_flags(mode):
-    envs = pytest.importorskip("torchrl_koap.envs.avoiding")
-    row1, row2, row3 = TASKS["avoiding"].modes.name_of(mode).split(", ")
+def passed(mode):
+    """The flags of Avoiding's environment whose numbers are those of a mode."""
     flags = torch.zeros(9, dtype=torch.int64)
-    flags[("left", "right").index(row1)] = 1
-    flags[2 + ("left", "middle", "right").index(row2)] = 1
-    flags[5 + int(row3[-1]) - 1] = 1
-    assert envs.mode_index(flags) == mode
+    flags[[mode // 12, 2 + mode % 12 // 4, 5 + mode % 4]] = 1
+    return flags
 
 
-@pytest.mark.parametrize("task", [name for name, task in TASKS.items() if task.modes.choices])
-def test_every_task_has_as_many_names_as_modes(task):
-    modes, number = TASKS[task].modes, TASKS[task].num_modes
-    assert len({modes.name_of(mode) for mode in range(number)}) == number and modes.name_of(number) == "no mode"
+ORDERS = torch.tensor(list(itertools.permutations(range(3))))
+# leaves `mode` of the environments, and how their modes are called
+LEAVES = {
+    "avoiding": (
+        torch.stack([passed(mode) for mode in range(24)]),
+        itertools.product(("left", "right"), ("left", "middle", "right"), ("gap 1", "gap 2", "gap 3", "gap 4")),
+    ),
+    "aligning": (torch.tensor([[0], [1]]), [("inside",), ("outside",)]),
+    "stacking": (ORDERS, itertools.permutations(("red", "green", "blue"))),
+    "stacking_1": (ORDERS[::2], [("red",), ("green",), ("blue",)]),
+}
+for _name, _boxes in {"sorting": 4, "sorting_2": 2, "sorting_6": 6, "po_sorting": 4}.items():
+    _orders = [sorting.mode_colours(mode, _boxes) for mode in range(TASKS[_name].num_modes)]
+    LEAVES[_name] = torch.tensor(_orders), [[("red", "blue")[colour] for colour in order] for order in _orders]
 
 
-@pytest.mark.parametrize(("task", "boxes"), [("sorting", 4), ("sorting_2", 2), ("sorting_6", 6), ("po_sorting", 4)])
-def test_names_of_sorting(task, boxes):
-    sorting = pytest.importorskip("torchrl_koap.envs.sorting")
-    for mode in range(TASKS[task].num_modes):
-        colours = ("red, blue".split(", ")[colour] for colour in sorting.mode_colours(mode, boxes))
-        assert TASKS[task].modes.name_of(mode) == ", ".join(colours)
-
-
-def test_names_of_stacking_and_aligning():
-    registry = pytest.importorskip("torchrl_koap.envs.registry")
-    letters = ("red", "green", "blue")
-    for order in itertools.permutations(range(3)):
-        mode = int(registry.mode_index_of("stacking")(torch.tensor(order)))
-        assert TASKS["stacking"].modes.name_of(mode) == ", ".join(letters[letter] for letter in order)
-        first = int(registry.mode_index_of("stacking_1")(torch.tensor(order)))
-        assert TASKS["stacking_1"].modes.name_of(first) == letters[order[0]]
-    assert [TASKS["aligning"].modes.name_of(mode) for mode in (0, 1)] == ["inside", "outside"]
+@pytest.mark.parametrize("name", LEAVES)
+def test_modes_are_numbered_and_named_as_the_environment_tells_them(name):
+    leaves, words = LEAVES[name]
+    modes = TASKS[name].modes
+    assert mode_index_of(name)(leaves).tolist() == list(range(modes.number)) and TASKS[name].num_modes == modes.number
+    assert [modes.name_of(mode) for mode in range(modes.number)] == [", ".join(each) for each in words]
+    assert modes.name_of(modes.number) == modes.name_of(-1) == "no mode"
 
 
 def test_the_planar_tolerance_of_aligning_leaves_room_for_the_height():
