@@ -14,7 +14,6 @@ from tables import SOURCE, percent, share, table
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper import (
     DEFAULT,
-    PAPER_TASKS,
     Entry,
     above_the_paper,
     average_over_tasks,
@@ -24,6 +23,7 @@ from torchrl_koap.studies.paper import (
     paper_entries,
 )
 from torchrl_koap.studies.paper_results import paper_cell, paper_cells, paper_levels
+from torchrl_koap.studies.presets import PAPER_TASKS
 from torchrl_koap.studies.table import as_markdown, read_cells
 
 _PLURAL = {"window": "windows", "trajectory": "trajectories"}

@@ -24,7 +24,7 @@ from torchrl_koap.training import on_disk
 
 CELL = Cell("avoiding", "linear", 0.25, 1.0, 0)
 ROW = {"label_unit": "trajectory"}
-FEW = {"planner": PlannerConfig(steps=3), "controller": ControllerConfig(steps=3)}
+FEW = {"planner": PlannerConfig(steps=3, network="unet", width=8), "controller": ControllerConfig(steps=3)}
 
 
 def planner_config(out, demonstrations, share=1.0):

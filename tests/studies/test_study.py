@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,8 +13,8 @@ from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerC
 from torchrl_koap.runs.pretrained import pretrained_folders
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.studies import Study, run_study
-from torchrl_koap.studies.paper import PRESETS
-from torchrl_koap.studies.study import cells_of, check_study, complete, eval_config, planner_folder, train_config
+from torchrl_koap.studies.presets import PRESETS
+from torchrl_koap.studies.study import check_study, complete
 from torchrl_koap.tasks import TASKS, get_task
 from torchrl_koap.training import resolve
 from torchrl_koap.training.methods import METHODS
@@ -39,10 +39,10 @@ def test_cells_of_all_seeds_share_a_planner_that_knows_no_seed(asked):
         f"cells/avoiding/{method}-0.5-1-seed{seed}" for seed in (0, 1) for method in ("koap", "dp")
     ]
     shared = study.out / "planners/avoiding/1-seed0"
-    alone = train_config(study, cells[0], planner=True)
+    alone = study.planner_config(cells[0])
     assert (alone.out, alone.planner, alone.run.seed, alone.labels.fraction) == (shared, planner, 0, None)
     for cell in cells:
-        config = train_config(study, cell)
+        config = study.train_config(cell)
         assert (config.labels.fraction, config.run.seed, config.controller.steps) == (0.5, cell.seed, 7)
         expected = planner if cell.method == "dp" else PlannerConfig(source=shared)
         assert config.planner == expected and config.out == study.out / cell.folder
@@ -50,27 +50,27 @@ def test_cells_of_all_seeds_share_a_planner_that_knows_no_seed(asked):
 
 def test_a_planner_per_seed_and_share_of_the_demonstrations(asked):
     study, cells = asked(methods=("koap",), planner_seeds=2, demonstrations=(0.5, 1.0), seeds=3)
-    folders = {planner_folder(study, cell).name for cell in cells}
+    folders = {study.planner_folder(cell).name for cell in cells}
     assert folders == {f"{share}-seed{seed}" for share in ("0.5", "1") for seed in (0, 1)}
-    last = train_config(study, cells[-2], planner=True)  # seed 2, half of the demonstrations
+    last = study.planner_config(cells[-2])  # seed 2, half of the demonstrations
     assert (last.labels.trajectories, last.run.seed) == (0.5, 0)
 
 
 def test_every_training_seed_meets_noise_of_its_own(asked):
     study, cells = asked(methods=("koap", "dd"), seeds=3, evaluation=EvalConfig(episodes=2))
-    found = {(cell.method, cell.seed): eval_config(study, cell) for cell in cells}
+    found = {(cell.method, cell.seed): study.eval_config(cell) for cell in cells}
     assert [found["koap", seed].seed for seed in range(3)] == [EvalConfig.seed, 1100, 2100]
     assert found["koap", 2] == found["dd", 2] and found["dd", 0].episodes == 2
 
 
 def test_koap_paper_is_measured_as_published_unless_told_otherwise(asked):
     study, cells = asked(methods=("koap_paper", "koap"), seeds=1)
-    published, own = (train_config(replace(study, planners=()), cell) for cell in cells)
+    published, own = (study.train_config(cell) for cell in cells)
     published, own = (resolve(replace(c, planner=study.planner), get_task("avoiding")) for c in (published, own))
     assert (published.controller.columns, published.execution.strategy) == ("all", "open_loop")
     assert (own.controller.columns, own.execution.strategy) == ("robot", "feedback")
     study, (cell,) = asked(methods=("koap_paper",), seeds=1, execution=ExecutionConfig(strategy="feedback"))
-    config = replace(train_config(study, cell), planner=study.planner)
+    config = replace(study.train_config(cell), planner=study.planner)
     assert resolve(config, get_task("avoiding")).execution.strategy == "feedback"
 
 
@@ -78,7 +78,7 @@ def test_a_planner_of_another_run_is_taken_over_or_refused(asked, demonstrations
     run = tmp_path / "run"
     assert koap("train", "--out", run, "--dataset", demonstrations, "--method", "linear", *TINY) == 0
     study, cells = asked(methods=("koap",), planners=(str(run),))
-    assert {planner_folder(study, cell) for cell in cells} == {run}
+    assert {study.planner_folder(cell) for cell in cells} == {run}
     with pytest.raises(RunDirectoryError):
         asked(methods=("koap",), planners=(str(tmp_path / "none"),))
     assert not study.out.exists()
@@ -98,16 +98,25 @@ def test_data_are_needed_where_there_is_no_environment(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
-def test_presets_name_fields_methods_and_tasks_that_exist(preset):
-    assert set(preset) <= {field.name for field in fields(Study)}
-    assert set(preset["methods"]) <= set(METHODS) and set(preset["tasks"]) <= set(TASKS)
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_name_methods_tasks_and_levels_that_exist(name, tmp_path):
+    assert check_study(complete(Study(out=tmp_path / "study", preset=name)))
+    assert set(PRESETS[name].methods) <= set(METHODS) and set(PRESETS[name].tasks) <= set(TASKS)
+
+
+@pytest.mark.parametrize(("asked", "at_three"), [({}, [0]), ({"first_seed_only": ()}, [0, 1, 2])])
+def test_the_levels_in_the_middle_of_a_table_have_one_seed_unless_told_otherwise(asked, at_three, tmp_path):
+    study = complete(Study(out=tmp_path, preset="table1", tasks=("avoiding",), methods=("koap",), **asked))
+    seeds = {level: [] for level in get_task("avoiding").label_levels}
+    for cell in study.cells():
+        seeds[cell.labels].append(cell.seed)
+    assert list(seeds.values()) == [[0, 1, 2], [0, 1, 2], at_three, at_three, [0, 1, 2]]
 
 
 def test_a_table_is_the_papers_tasks_at_its_levels(tmp_path):
     study = complete(Study(out=tmp_path, preset="table1", tasks=("aligning", "sorting"), methods=("koap",), seeds=1))
     assert (study.label_unit, study.labels, study.planner.width, study.run.precision) == ("window", (), 512, "auto")
-    shares = {task: [cell.labels for cell in cells_of(study) if cell.task == task] for task in study.tasks}
+    shares = {task: [cell.labels for cell in study.cells() if cell.task == task] for task in study.tasks}
     assert shares == {"aligning": [0.02, 0.05, 0.1, 0.25, 0.5], "sorting": [0.01, 0.02, 0.05, 0.1, 0.25]}
     assert [config.split("=")[0] for config in study.datasets] == []
 

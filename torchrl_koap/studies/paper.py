@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The paper's comparisons: presets of studies, and measured cells in the layout of its tables, its own beside them."""
+"""Measured cells in the layout of the paper's tables, its own beside them."""
 
 from __future__ import annotations
 
@@ -16,46 +16,6 @@ from torchrl_koap.studies.summary import Summary, percent, summarise
 from torchrl_koap.studies.table import as_markdown
 from torchrl_koap.tasks import TASKS
 
-PAPER_TASKS = ("avoiding", "aligning", "sorting", "po_sorting", "stacking_unobserved_joints")
-WIDE = {"network": "mlp", "width": 512, "batch_size": 256, "learning_rate": 1e-3}
-_TABLE = {
-    "tasks": PAPER_TASKS,
-    "methods": ("koap", "koap_paper", "koap_untrained", "linear_steps", "pca", "dd", "vae", "lapo", "dp"),
-    "levels": (1, 2, 3, 4, 5),
-    "label_unit": "window",
-    "planner": WIDE,
-    "controller": {"steps": 1000},
-    "run": {"precision": "auto"},
-}
-# fields of a study, and options of its sections, that stand for what is not given
-PRESETS: dict[str, dict[str, Any]] = {
-    "table1": _TABLE,
-    "table2": _TABLE
-    | {
-        "tasks": ("avoiding", "stacking_unobserved_joints"),
-        "methods": (
-            *("koap", "koap_paper", "koap_sgd", "koap_labelled_only", "koap_untrained", "nonlinear", "pretrain"),
-            "relabel",
-        ),
-    },
-    "demonstrations": {
-        "tasks": ("avoiding",),
-        "methods": ("koap", "koap_paper", "koap_untrained", "pca", "linear_steps", "dd"),
-        "labels": (0.01,),
-        "demonstrations": (0.1, 0.25, 0.5, 1.0),
-        "controller": {"steps": 1000},
-    },
-    # a table that can be read, not one to be cited
-    "quick": _TABLE
-    | {
-        "levels": (1,),
-        "record": 48,
-        "seeds": 1,
-        "planner": WIDE | {"steps": 2000, "width": 256, "batch_size": 128},
-        "controller": {"steps": 200},
-        "evaluation": {"episodes": 10},
-    },
-}
 AVERAGE = "plots/average.png"
 DEFAULT = "task's default"  # what pictures call the method that a task is trained with unless told otherwise
 

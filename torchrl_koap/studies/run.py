@@ -14,29 +14,18 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import flatten_trajectories, save_ted, subsample_trajectories
+from torchrl_koap.evaluation import EvalConfig
+from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import to_json
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result, run_cell
+from torchrl_koap.studies.folder import FILE, check_folder, flat_options, read_study, together
 from torchrl_koap.studies.launchers import Job, Machines, launch
 from torchrl_koap.studies.paper import write_paper_layout
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_study_report
-from torchrl_koap.studies.study import (
-    FILE,
-    Study,
-    cells_of,
-    check_folder,
-    check_study,
-    complete,
-    dataset_of,
-    eval_config,
-    of_task,
-    planner_folder,
-    task_of,
-    together,
-    train_config,
-)
+from torchrl_koap.studies.study import Study, check_study, complete
 from torchrl_koap.studies.table import write_cells
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import label_budget, load_demonstrations
@@ -93,18 +82,20 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
     """
     machines = Machines() if machines is None else machines
     machines.check()
-    study = complete(study)
+    before = read_study(study.out)
+    study = complete(study, () if before is None else before.run.plugins)
     cells, root = check_study(study), RunDirectory(study.out)
-    for task in study.tasks:
-        check_labels(study, cells, task_of(study, task), _first_look(study, task_of(study, task)))
+    check_folder(study)
+    for name in study.tasks:
+        _check_labels(study, cells, name, _first_look(study, study.task(name)))
     with root.locked("koap curve", "lock"):
         check_folder(study)  # another one may have finished here in the meantime
-        for task in study.tasks:
-            recorded(study, cells, task_of(study, task))
+        for name in study.tasks:
+            _record(study, cells, name)
         whole = together(study)
         root.write_json(FILE, to_json(replace(whole, out=Path())))
         asked = set(cells)
-        earlier = [cell for cell in cells_of(whole) if cell not in asked and _began(study.out / cell.folder)]
+        earlier = [cell for cell in whole.cells() if cell not in asked and _began(study.out / cell.folder)]
         table = _Table(study, [*cells, *earlier])
         _work(study, cells, table, machines)
         table.write()
@@ -121,22 +112,15 @@ def _report(study: Study, table: _Table) -> Path:
         paper = [point for task in study.tasks for point in paper_points(task)]
         layout = write_paper_layout(study.out, rows) if study.levels else None
     named = study.tasks[0] if len(study.tasks) == 1 else f"{len(study.tasks)} tasks"
-    options = {name: value for name, value in _flat(to_json(study)) if value not in (None, [])}
+    options = {name: value for name, value in flat_options(study).items() if value not in (None, [])}
     title = f"Label efficiency on {named}"
     return write_study_report(study.out, rows, table.outcomes, title=title, options=options, paper=paper, layout=layout)
 
 
-def _flat(options: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
-    for name, value in options.items():
-        found += _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else [(prefix + name, value)]
-    return found
-
-
 def _first_look(study: Study, task: Task) -> TensorDictBase | None:
     """What can be known of the demonstrations without recording any: if nothing else, how many there will be."""
-    folder = dataset_of(study, task.name)
-    if of_task(study.datasets, task.name) is not None or (folder / "ted").exists():
+    folder = study.dataset_folder(task.name)
+    if study.given_dataset(task.name) is not None or (folder / "ted").exists():
         return load_demonstrations(str(folder), task)
     if task.env is None:
         raise ValueError(f"task {task.name!r} has no environment to record demonstrations in: name --datasets")
@@ -146,47 +130,28 @@ def _first_look(study: Study, task: Task) -> TensorDictBase | None:
     return flatten_trajectories([torch.zeros(2, 1)] * number, [torch.zeros(1, 1)] * number)
 
 
-def recorded(study: Study, cells: Sequence[Cell], task: Task) -> None:
-    """Records the demonstrations of a task, once for all cells, where none are given.
-
-    Args:
-        study (Study): the study.
-        cells (sequence of Cell): its cells.
-        task (Task): the task.
-
-    Raises:
-        ValueError: if a share of labels selects none of them.
-    """
-    folder = dataset_of(study, task.name)
-    if of_task(study.datasets, task.name) is not None or (folder / "ted").exists():
+def _record(study: Study, cells: Sequence[Cell], name: str) -> None:
+    """Records the demonstrations of a task, once for all cells, where none are given."""
+    folder, task = study.dataset_folder(name), study.task(name)
+    if study.given_dataset(name) is not None or (folder / "ted").exists():
         return
     from torchrl_koap.envs.experts.demonstrations import record_demonstrations  # needs a simulator
 
     episodes = study.record or task.defaults.demonstrations
     with progress_bar(episodes, "demonstrations", unit="episode") as bar:
-        data, _ = record_demonstrations(task.name, episodes, 0, progress=count_up_to(bar))
+        data, _ = record_demonstrations(name, episodes, 0, progress=count_up_to(bar))
     save_ted(data, folder / "ted", get_task(task.source))
-    check_labels(study, cells, task, load_demonstrations(str(folder), task))
+    _check_labels(study, cells, name, load_demonstrations(str(folder), task))
 
 
-def check_labels(study: Study, cells: Sequence[Cell], task: Task, data: TensorDictBase | None) -> None:
-    """Refuses before any work what would fail in a cell: labels that select nothing, shares below the labelled.
-
-    Args:
-        study (Study): the study.
-        cells (sequence of Cell): its cells.
-        task (Task): the task.
-        data (TensorDictBase, optional): its demonstrations; None where they are recorded later.
-
-    Raises:
-        ValueError: naming the share.
-    """
-    if data is None:
+def _check_labels(study: Study, cells: Sequence[Cell], task: str, data: TensorDictBase | None) -> None:
+    """Refuses before any work what would fail in a cell: labels that select nothing, shares below the labelled."""
+    if data is None:  # recorded later
         return
     # windows of another seed lie in another number of trajectories
-    wanted = {(cell.labels, cell.demonstrations, cell.seed): cell for cell in cells if cell.task == task.name}
+    wanted = {(cell.labels, cell.demonstrations, cell.seed): cell for cell in cells if cell.task == task}
     for cell in wanted.values():
-        labelled, _ = label_budget(train_config(study, cell)).apply(data)
+        labelled, _ = label_budget(study.train_config(cell)).apply(data)
         subsample_trajectories(labelled, cell.demonstrations)
 
 
@@ -228,15 +193,15 @@ def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines
     for cell in cells:
         if table.rows[cell]["status"] == "done":
             continue
-        planner, needs = planner_folder(study, cell), None
-        if planner is not None and of_task(study.planners, cell.task) is None and not _is_trained(planner):
+        planner, needs = study.planner_folder(cell), None
+        if planner is not None and study.given_planner(cell.task) is None and not _is_trained(planner):
             needs = planner
             if planner not in {job.folder for job in first}:
                 first.append(Job(planner))
-                _prepare(planner, train_config(study, cell, planner=True), None)
+                _prepare(planner, study.planner_config(cell), None)
         folder = study.out / cell.folder
         jobs[folder] = Job(folder, needs)
-        _prepare(folder, train_config(study, cell), eval_config(study, cell))
+        _prepare(folder, study.train_config(cell), study.eval_config(cell))
     places = {study.out / cell.folder: cell for cell in cells}
     alone = [job for job in jobs.values() if job.needs is None]  # they need not wait for a planner
     ordered = [*first, *alone, *(job for job in jobs.values() if job.needs is not None)]
@@ -249,7 +214,7 @@ def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines
                     table.ended(places[job.folder], reason)
 
 
-def _prepare(folder: Path, config: Any, evaluation: Any) -> None:
+def _prepare(folder: Path, config: TrainConfig, evaluation: EvalConfig | None) -> None:
     """Says what a cell is to do; where that cannot be written its own process will say why."""
     try:
         prepare_cell(folder, config, evaluation)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,34 +14,17 @@ from torchrl_koap.evaluation.config import check_options
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
 from torchrl_koap.runs.config import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig
-from torchrl_koap.runs.config_files import changed_options, from_json
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import find_run
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.cells import NOISE_STEP, Cell
-from torchrl_koap.studies.paper import PRESETS
+from torchrl_koap.studies.presets import PRESETS, Preset
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.defaults import resolve
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.trained import build_networks
 
-METHODS = (
-    *("koap", "koap_untrained", "koap_labelled_only", "linear", "dd", "vae", "lapo", "dp", "relabel", "nonlinear"),
-    "pretrain",
-)
-LABELS = (0.01, 0.02, 0.05, 0.1, 0.25)
 DEFAULT_TASK = "avoiding"
-FILE = "study.json"
-# options of sections that a study has axes for
-_OWN = {
-    "run.seed": "cells have the seeds 0, 1, ..., as many as --seeds says",
-    "run.resume": "it goes on by itself",
-    "planner.source": "name runs with --planners",
-    "evaluation.out": "a cell is evaluated in its own folder",
-}
-# what a later call in the folder may add to; all else must be as it was
-GROWS = ("tasks", "datasets", "planners", "methods", "labels", "levels", "demonstrations")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,9 +43,10 @@ class Study:
         methods: names in torchrl_koap.training.methods.METHODS.
         labels: shares of the units that keep their labels.
         levels: label levels of the paper for every task (1: fewest labels) instead of shares.
+        first_seed_only: levels that are measured with seed 0 alone (default: those of the preset).
         label_unit: "trajectory", "window" (the unit of the first public code) or "transition".
-        demonstrations: shares of the demonstrations that planner and controller know at all.
-        seeds: number of seeds of label choice and training.
+        demonstrations: shares of the demonstrations that planner and controller know at all (default: 1).
+        seeds: number of seeds of label choice and training (default: 3).
         planners: finished run, or pretrained:NAME, whose planner all cells of a task share, or TASK=RUN for each;
             where none is given one is trained. It must know the same data, which nothing here can check.
         planner_seeds: number of planners, trained with seeds 0, 1, ...; a cell of seed s has planner s modulo that.
@@ -86,8 +70,9 @@ class Study:
     methods: tuple[str, ...] = ()
     labels: tuple[float, ...] = ()
     levels: tuple[int, ...] = ()
+    first_seed_only: tuple[int, ...] | None = None
     label_unit: str | None = None
-    demonstrations: tuple[float, ...] = (1.0,)
+    demonstrations: tuple[float, ...] = ()
     seeds: int | None = None
     planners: tuple[str, ...] = ()
     planner_seeds: int = 1
@@ -100,208 +85,183 @@ class Study:
     def __post_init__(self):
         object.__setattr__(self, "out", Path(self.out))  # so that a string will do in Python
 
+    def given_dataset(self, task: str) -> str | None:
+        """The data set that was named for a task."""
+        return _of_task(self.datasets, task)
 
-def complete(study: Study) -> Study:
-    """Fills in what the preset, earlier calls in the folder and the library know; paths become absolute.
+    def given_planner(self, task: str) -> str | None:
+        """The run that was named for a task, whose planner is shared."""
+        return _of_task(self.planners, task)
 
-    Raises:
-        ValueError: for an unknown preset or task, or a data set that is no folder.
-        RunDirectoryError: if ``study.json`` is damaged.
-        PluginError: if a plugin cannot be imported.
-    """
-    earlier = read_study(study.out)
-    plugins = study.run.plugins if earlier is None else (*earlier.run.plugins, *study.run.plugins)
-    study = replace(study, run=replace(study.run, plugins=tuple(dict.fromkeys(plugins))))
-    load_plugins(study.run.plugins)
-    if study.preset is not None:
-        study = _filled(study, lookup(PRESETS, study.preset, "preset"))
-    study = _filled(study, {"methods": METHODS, "labels": LABELS, "label_unit": "trajectory", "seeds": 3})
-    if not study.tasks:
-        named = [text.partition("=")[0] for text in study.datasets if "=" in text]
-        alone = study.datasets[0] if study.datasets and not named else None
-        study = replace(study, tasks=tuple(named or [DEFAULT_TASK if alone is None else find_task_of(alone).name]))
-    for name in study.tasks:
-        task_of(study, name)
-    paths: dict[str, Any] = {
-        name: _absolute(name, getattr(study, name), study.tasks) for name in ("datasets", "planners")
-    }
-    return replace(study, out=study.out.absolute(), preset=None, **paths)
+    def task(self, name: str) -> Task:
+        """The task of a name: registered, or the one that its data set holds."""
+        dataset = self.given_dataset(name)
+        return get_task(name) if dataset is None else find_task_of(dataset, name)
 
+    def dataset_folder(self, task: str) -> Path:
+        """The folder of a task's demonstrations."""
+        return Path(self.given_dataset(task) or self.out / "demonstrations" / task)
 
-def _filled(study: Study, known: Mapping[str, Any]) -> Study:
-    """A study whose fields, and options of its sections, are those that are known where they were left open."""
-    empty, filled = Study(out=study.out), {}
-    asked_labels = study.labels or study.levels
-    for name, value in known.items():
-        own, usual = getattr(study, name), getattr(empty, name)
-        if isinstance(value, Mapping):
-            left = {key: entry for key, entry in value.items() if getattr(own, key) == getattr(usual, key)}
-            filled[name] = replace(own, **left)
-        elif own == usual and not (name in ("labels", "levels") and asked_labels):
-            filled[name] = value
-    return replace(study, **filled)
+    def planner_folder(self, cell: Cell) -> Path | None:
+        """The run whose planner a cell takes over, None for a method without one."""
+        if not get_method(cell.method).plans:
+            return None
+        name = f"{cell.demonstrations:.15g}-seed{cell.seed % self.planner_seeds}"
+        return Path(self.given_planner(cell.task) or self.out / "planners" / cell.task / name)
 
+    def cells(self) -> list[Cell]:
+        """Lists the cells of a complete study in the order asked for; repeated names count once.
 
-def _absolute(name: str, values: Sequence[str], tasks: Sequence[str]) -> tuple[str, ...]:
-    """``TASK=PATH`` of every value; a path alone is that of a single task."""
-    found = {}
-    for text in values:
-        task, equals, place = text.partition("=")
-        if not equals and len(tasks) == 1:
-            task, place = tasks[0], text
-        if not task or not place:
-            raise ValueError(f"{name} must be TASK=FOLDER where there are several tasks, got {text!r}")
-        lookup(tasks, task, f"task of {name}:")
-        found[task] = str(find_run(place).absolute()) if name == "planners" else os.path.abspath(place)
-    return tuple(f"{task}={place}" for task, place in found.items())
+        Raises:
+            ValueError: for unknown methods, or a share or level that there is not.
+        """
+        for name in self.methods:
+            get_method(name)
+        for name, shares in (("labels", self.labels), ("demonstrations", self.demonstrations)):
+            for value in shares:
+                if not 0 < value <= 1:
+                    raise ValueError(f"{name} must be in (0, 1], got {value:g}")
+        return [
+            Cell(task, method, labels, share, seed)
+            for task in dict.fromkeys(self.tasks)
+            for seed in range(self.seeds)
+            for share in dict.fromkeys(self.demonstrations)
+            for labels in self._labels_of(self.task(task), seed)
+            for method in dict.fromkeys(self.methods)
+        ]
 
+    def _labels_of(self, task: Task, seed: int) -> tuple[float, ...]:
+        """Shares of the labels that are measured with a seed: those asked for, and those of the levels."""
+        shares = task.label_levels
+        for level in self.levels:
+            if not 1 <= level <= len(shares):
+                has = f"its levels 1 to {len(shares)} are {', '.join(f'{100 * share:g}' for share in shares)} %"
+                raise ValueError(f"task {task.name!r} has no label level {level}: {has}")
+        levels = [level for level in self.levels if seed == 0 or level not in self.first_seed_only]
+        return union(self.labels, [shares[level - 1] for level in levels])
 
-def read_study(folder: Path) -> Study | None:
-    """Reads what an earlier call in a folder asked for, None if there was none.
+    def planner_config(self, cell: Cell) -> TrainConfig:
+        """How the planner that a cell shares is trained; it knows no label."""
+        return TrainConfig(
+            out=self.planner_folder(cell),
+            dataset=str(self.dataset_folder(cell.task)),
+            task=cell.task,
+            labels=LabelConfig(trajectories=cell.demonstrations),
+            planner=self.planner,
+            run=replace(self.run, seed=cell.seed % self.planner_seeds),
+        )
 
-    Raises:
-        RunDirectoryError: if ``study.json`` is damaged.
-    """
-    run = RunDirectory(folder)
-    if not (run.path / FILE).exists():
-        return None
-    return from_json(Study, run.read_json(FILE), run.path / FILE)
+    def train_config(self, cell: Cell) -> TrainConfig:
+        """How a cell is trained; the defaults of method and task are filled in by training."""
+        folder = self.planner_folder(cell)
+        return TrainConfig(
+            out=self.out / cell.folder,
+            dataset=str(self.dataset_folder(cell.task)),
+            task=cell.task,
+            method=cell.method,
+            labels=LabelConfig(fraction=cell.labels, unit=self.label_unit, trajectories=cell.demonstrations),
+            planner=self.planner if folder is None else PlannerConfig(source=folder),
+            controller=self.controller,
+            execution=self.execution,
+            run=replace(self.run, seed=cell.seed),
+        )
 
-
-def together(study: Study) -> Study:
-    """A complete study and what earlier calls in its folder asked for besides."""
-    earlier = read_study(study.out)
-    if earlier is None:
-        return study
-    grown: dict[str, Any] = {
-        name: tuple(dict.fromkeys([*getattr(earlier, name), *getattr(study, name)])) for name in GROWS
-    }
-    return replace(study, seeds=max(study.seeds, earlier.seeds), **grown)
-
-
-def cells_of(study: Study) -> list[Cell]:
-    """Lists the cells of a complete study in the order asked for; repeated names count once.
-
-    Raises:
-        ValueError: for unknown methods, or a share or level that there is not.
-    """
-    for name in study.methods:
-        get_method(name)
-    for name in ("labels", "demonstrations"):
-        for value in getattr(study, name):
-            if not 0 < value <= 1:
-                raise ValueError(f"{name} must be in (0, 1], got {value:g}")
-    return [
-        Cell(task, method, labels, share, seed)
-        for task in dict.fromkeys(study.tasks)
-        for seed in range(study.seeds)
-        for share in dict.fromkeys(study.demonstrations)
-        for labels in dict.fromkeys([*study.labels, *levels_of(task_of(study, task), study.levels)])
-        for method in dict.fromkeys(study.methods)
-    ]
+    def eval_config(self, cell: Cell) -> EvalConfig:
+        """How a cell is rolled out: cells with the next training seed meet other noise, in the same contexts."""
+        seed = self.evaluation.seed + NOISE_STEP * cell.seed
+        return replace(self.evaluation, seed=seed, threads=1, plugins=self.run.plugins)
 
 
-def levels_of(task: Task, levels: Sequence[int]) -> list[float]:
-    """The shares of labels at some label levels of a task.
-
-    Args:
-        task (Task): the task.
-        levels (sequence of int): from 1 on.
-
-    Raises:
-        ValueError: for a level that the task does not have.
-    """
-    for level in levels:
-        if not 1 <= level <= len(task.label_levels):
-            shares = ", ".join(f"{100 * share:g}" for share in task.label_levels)
-            has = f"its levels 1 to {len(task.label_levels)} are {shares} %"
-            raise ValueError(f"task {task.name!r} has no label level {level}: {has}")
-    return [task.label_levels[level - 1] for level in levels]
-
-
-def task_of(study: Study, name: str) -> Task:
-    """The task of a name: registered, or the one that its data set holds.
-
-    Args:
-        study (Study): the study.
-        name (str): of the task.
-    """
-    dataset = of_task(study.datasets, name)
-    return get_task(name) if dataset is None else find_task_of(dataset, name)
-
-
-def of_task(values: Sequence[str], task: str) -> str | None:
-    """What ``TASK=VALUE`` among some values says for a task.
-
-    Args:
-        values (sequence of str): ``TASK=VALUE`` each.
-        task (str): name of the task.
-    """
+def _of_task(values: Sequence[str], task: str) -> str | None:
+    """What ``TASK=VALUE`` among some values says for a task."""
     return next((text.partition("=")[2] for text in values if text.startswith(f"{task}=")), None)
 
 
-def planner_folder(study: Study, cell: Cell) -> Path | None:
-    """The run whose planner a cell takes over, None for a method without one.
+def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
+    """Fills in what the preset and the library know; paths become absolute.
 
     Args:
-        study (Study): the study.
-        cell (Cell): the cell.
+        study (Study): what was asked for.
+        plugins (sequence of str): those of earlier calls in the folder.
+
+    Raises:
+        ValueError: for an unknown preset or task, or a data set that is no folder.
+        RunDirectoryError: if a planner is no run.
+        PluginError: if a plugin cannot be imported.
     """
-    if not get_method(cell.method).plans:
-        return None
-    given = of_task(study.planners, cell.task)
-    name = f"{cell.demonstrations:.15g}-seed{cell.seed % study.planner_seeds}"
-    return study.out / "planners" / cell.task / name if given is None else Path(given)
-
-
-def dataset_of(study: Study, task: str) -> Path:
-    """The folder of a task's demonstrations.
-
-    Args:
-        study (Study): the study.
-        task (str): name of the task.
-    """
-    return Path(of_task(study.datasets, task) or study.out / "demonstrations" / task)
-
-
-def train_config(study: Study, cell: Cell, *, planner: bool = False) -> TrainConfig:
-    """How a cell is trained, or the planner that it shares: the defaults of method and task are filled in by training.
-
-    Args:
-        study (Study): a complete study.
-        cell (Cell): one of its cells.
-
-    Keyword Args:
-        planner (bool): the planner alone; it knows no label.
-    """
-    folder = planner_folder(study, cell)
-    common: dict[str, Any] = {"dataset": str(dataset_of(study, cell.task)), "task": cell.task}
-    if planner:
-        seed, labels = cell.seed % study.planner_seeds, LabelConfig(trajectories=cell.demonstrations)
-        run = replace(study.run, seed=seed)
-        return TrainConfig(out=folder, labels=labels, planner=study.planner, run=run, **common)
-    labels = LabelConfig(fraction=cell.labels, unit=study.label_unit, trajectories=cell.demonstrations)
-    return TrainConfig(
-        out=study.out / cell.folder,
-        method=cell.method,
+    plugins = union(plugins, study.run.plugins)
+    load_plugins(plugins)
+    usual = Preset() if study.preset is None else lookup(PRESETS, study.preset, "preset")
+    run, evaluation = study.run, study.evaluation
+    if run.precision == RunConfig.precision:
+        run = replace(run, precision=usual.precision)
+    if evaluation.episodes == EvalConfig.episodes:
+        evaluation = replace(evaluation, episodes=usual.episodes)
+    labels, levels = study.labels, study.levels
+    if not labels and not levels:
+        labels, levels = usual.labels, usual.levels
+    study = replace(
+        study,
+        out=study.out.absolute(),
+        preset=None,
+        tasks=study.tasks or usual.tasks or _tasks_of(study.datasets),
+        record=usual.record if study.record is None else study.record,
+        methods=study.methods or usual.methods,
         labels=labels,
-        planner=study.planner if folder is None else PlannerConfig(source=folder),
-        controller=study.controller,
-        execution=study.execution,
-        run=replace(study.run, seed=cell.seed),
-        **common,
+        levels=levels,
+        first_seed_only=usual.first_seed_only if study.first_seed_only is None else study.first_seed_only,
+        label_unit=study.label_unit or usual.label_unit,
+        demonstrations=study.demonstrations or usual.demonstrations,
+        seeds=usual.seeds if study.seeds is None else study.seeds,
+        planner=replace(usual.planner, **_asked(study.planner)),
+        controller=replace(usual.controller, **_asked(study.controller)),
+        evaluation=evaluation,
+        run=replace(run, plugins=plugins),
     )
+    for name in study.tasks:
+        study.task(name)
+    planners = [
+        (task, str(find_run(run).absolute())) for task, run in _by_task("planners", study.planners, study.tasks)
+    ]
+    datasets = [(task, os.path.abspath(path)) for task, path in _by_task("datasets", study.datasets, study.tasks)]
+    planners, datasets = (
+        tuple(f"{task}={path}" for task, path in dict(pairs).items()) for pairs in (planners, datasets)
+    )
+    return replace(study, planners=planners, datasets=datasets)
 
 
-def eval_config(study: Study, cell: Cell) -> EvalConfig:
-    """How a cell is rolled out: cells with the next training seed meet other noise, in the same contexts.
+def _asked(section: PlannerConfig | ControllerConfig) -> dict[str, Any]:
+    return {name: value for name, value in vars(section).items() if value is not None}
+
+
+def _tasks_of(datasets: Sequence[str]) -> tuple[str, ...]:
+    """The tasks that data sets name, else that of the only one."""
+    named = tuple(text.partition("=")[0] for text in datasets if "=" in text)
+    if named or not datasets:
+        return named or (DEFAULT_TASK,)
+    return (find_task_of(datasets[0]).name,)
+
+
+def _by_task(name: str, values: Sequence[str], tasks: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Task and path of every ``TASK=PATH``; a path alone is that of a single task."""
+    for text in values:
+        task, equals, path = text.partition("=")
+        if not equals and len(tasks) == 1:
+            task, path = tasks[0], text
+        if not task or not path:
+            raise ValueError(f"{name} must be TASK=FOLDER where there are several tasks, got {text!r}")
+        lookup(tasks, task, f"task of {name}:")
+        yield task, path
+
+
+def union(one: Sequence[Any], other: Sequence[Any]) -> tuple[Any, ...]:
+    """The entries of two sequences, each once.
 
     Args:
-        study (Study): the study.
-        cell (Cell): the cell.
+        one (sequence): these first.
+        other (sequence): these behind.
     """
-    seed = study.evaluation.seed + NOISE_STEP * cell.seed
-    return replace(study.evaluation, seed=seed, threads=1, plugins=study.run.plugins)
+    return tuple(dict.fromkeys([*one, *other]))
 
 
 def check_study(study: Study) -> list[Cell]:
@@ -312,27 +272,29 @@ def check_study(study: Study) -> list[Cell]:
 
     Raises:
         ValueError: for unknown names, shares and numbers out of range, and methods whose networks cannot be built.
-        RunDirectoryError: if the folder holds something else, or a study with other settings.
     """
-    for name in ("seeds", "record", "planner_seeds"):
-        value = getattr(study, name)
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be >= 1, got {value}")
-    for name, said in _OWN.items():
-        if _option(study, name) != _option(Study(out=study.out), name):
-            raise ValueError(f"{name} is not for a study: {said}")
+    for name, number in (("seeds", study.seeds), ("record", study.record), ("planner_seeds", study.planner_seeds)):
+        if number is not None and number < 1:
+            raise ValueError(f"{name} must be >= 1, got {number}")
+    for given, name, why in (
+        (study.run.seed != RunConfig.seed, "run.seed", "cells have the seeds 0, 1, ..., as many as --seeds says"),
+        (study.run.resume, "run.resume", "it goes on by itself"),
+        (study.planner.source is not None, "planner.source", "name runs with --planners"),
+        (study.evaluation.out is not None, "evaluation.out", "a cell is evaluated in its own folder"),
+    ):
+        if given:
+            raise ValueError(f"{name} is not for a study: {why}")
     check_options(study.evaluation)
     contexts = study.evaluation.contexts_file
     if contexts is not None and not Path(contexts).is_file():
         raise ValueError(f"contexts_file: there is no file {contexts}")
-    cells = cells_of(study)
+    cells = study.cells()
     sampling = [name for name in study.methods if not get_method(name).plans]
     if study.execution.strategy == "open_loop" and sampling:
         raise ValueError(
             f"strategy 'open_loop' was asked of {', '.join(sampling)}: a policy of its own executes chunks of actions"
             " and has no other strategy; leave it out of --methods"
         )
-    check_folder(study)
     for task in study.tasks:
         for method in study.methods:
             _check_networks(study, Cell(task, method, 1.0, 1.0, 0))
@@ -341,8 +303,8 @@ def check_study(study: Study) -> list[Cell]:
 
 def _check_networks(study: Study, cell: Cell) -> None:
     """Refuses a method whose networks cannot be built for a task, or for the planner that is to be shared."""
-    task, config = task_of(study, cell.task), train_config(study, cell)
-    if config.planner.source is not None and of_task(study.planners, cell.task) is None:  # not trained yet
+    task, config = study.task(cell.task), study.train_config(cell)
+    if config.planner.source is not None and study.given_planner(cell.task) is None:  # not trained yet
         config = replace(config, planner=study.planner)
     config = resolve(config, task)
     try:
@@ -350,44 +312,3 @@ def _check_networks(study: Study, cell: Cell) -> None:
     except ValueError as error:
         read = f"the columns {config.controller.columns!r} of " if get_method(cell.method).plans else ""
         raise ValueError(f"method {cell.method!r} cannot read {read}task {task.name!r}: {error}") from error
-
-
-def check_folder(study: Study) -> None:
-    """Refuses a folder that holds something else, or a study with other settings.
-
-    Raises:
-        RunDirectoryError: naming what differs.
-    """
-    path, earlier = study.out, read_study(study.out)
-    if earlier is not None:
-        fixed = {name: getattr(study, name) for name in (*GROWS, "out", "seeds")}
-        changed = changed_options(replace(earlier, **fixed, run=replace(earlier.run, plugins=study.run.plugins)), study)
-        for name in ("datasets", "planners"):
-            was, now = getattr(earlier, name), getattr(study, name)
-            both = {text.partition("=")[0] for text in was} | {text.partition("=")[0] for text in now}
-            changed += (
-                [name]
-                if any(
-                    of_task(was, task) != of_task(now, task)
-                    for task in both
-                    if {task} <= {*earlier.tasks} & {*study.tasks}
-                )
-                else []
-            )
-        if changed:
-            told = ", ".join(f"{name} ({_option(earlier, name)})" for name in changed)
-            raise RunDirectoryError(f"{path} holds a study with another {told}; choose another --out")
-        return
-    if path.exists() and not path.is_dir():
-        raise RunDirectoryError(f"{path} is a file; choose another --out")
-    # what a study leaves that was killed before it came to write its options
-    own = ("lock", "demonstrations", f".{FILE}.")
-    if path.exists() and not all(entry.name.startswith(own) for entry in path.iterdir()):
-        raise RunDirectoryError(f"{path} is not empty and no folder of `koap curve`; choose another --out")
-
-
-def _option(study: Study, name: str) -> Any:
-    value: Any = study
-    for part in name.split("."):
-        value = getattr(value, part)
-    return ", ".join(map(str, value)) if isinstance(value, tuple) else value
