@@ -94,11 +94,7 @@ def read_asked(folder: Path) -> tuple[TrainConfig, EvalConfig | None]:
 
 
 def run_cell(folder: str | Path) -> None:
-    """Trains and evaluates a cell, or trains a shared planner, from where it was left.
-
-    Args:
-        folder (str or Path): where :func:`prepare_cell` said what to do.
-    """
+    """Trains and evaluates a cell, or trains a shared planner, as :func:`prepare_cell` says, from where it was left."""
     folder = Path(folder)
     config, evaluation = read_asked(folder)
     config = replace(config, run=replace(config.run, resume=(folder / "config.json").exists()))
@@ -112,7 +108,7 @@ def run_cell(folder: str | Path) -> None:
     trained, summary = time.perf_counter(), run.read_json("summary.json")
     result = evaluate(folder, evaluation)
     seconds = {"train_seconds": trained - began, "eval_seconds": time.perf_counter() - trained}
-    run.write_json(FOUND, {"row": row_of(summary, result) | seconds, "outcomes": outcomes_of(result)})
+    run.write_json(FOUND, {"row": _found_in(summary, result) | seconds, "outcomes": _outcomes_of(result)})
 
 
 def _is_readable(run: RunDirectory, name: str) -> bool:
@@ -172,13 +168,8 @@ def cell_row(
     return row | {"status": "done"} | found[0], found[1]
 
 
-def row_of(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
-    """The columns of ``cells.csv`` that training and evaluation of a cell found.
-
-    Args:
-        summary (mapping): of its training.
-        result (mapping): of its evaluation.
-    """
+def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
+    """The columns of ``cells.csv`` that training and evaluation of a cell found."""
     labels = summary["labels"]
     errors: Mapping[str, Any] = next((value for name, value in summary.items() if name.startswith("action_error")), {})
     common = {
@@ -193,14 +184,9 @@ def row_of(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, A
         return common | {"kind": KIND, "action_error": _own_error(result)} | {name: result[name] for name in names}
     entropy = result["mode_entropy"]
     counts = ("episodes", "success_rate", "success_low", "success_high", "collisions", "mean_steps")
-    return (
-        common
-        | {name: result[name] for name in counts}
-        | {
-            "successes": round(result["success_rate"] * result["episodes"]),
-            "mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy,
-        }
-    )
+    common |= {name: result[name] for name in counts}
+    common["successes"] = round(result["success_rate"] * result["episodes"])
+    return common | {"mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy}
 
 
 def _own_error(result: Mapping[str, Any]) -> float | None:
@@ -212,7 +198,7 @@ def _own_error(result: Mapping[str, Any]) -> float | None:
     return row["controller"] * thousandths(row["unit"])[1]
 
 
-def outcomes_of(result: Mapping[str, Any]) -> list[list[float]]:
+def _outcomes_of(result: Mapping[str, Any]) -> list[list[float]]:
     """Success of every episode with its context and seed; without an environment the error of every trajectory.
 
     An episode without a context is one of its own.

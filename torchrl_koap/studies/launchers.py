@@ -46,10 +46,9 @@ if sys.argv[:1] == ["-c"] and "multiprocessing.forkserver" in sys.modules:  # ho
 
 @dataclass(frozen=True)
 class Job:
-    """A folder to work in.
+    """A folder that says what is to be done; what is printed is appended to its ``log.txt``.
 
     Args:
-        folder (Path): what is to be done is said there; what is printed is appended to its ``log.txt``.
         needs (Path, optional): folder of the job that must have succeeded before.
 
     Examples:
@@ -170,15 +169,12 @@ def _schedule(waiting: list[Job], pool: Any) -> Generator[tuple[Job, str | None]
 
 
 def run_logged(function: Callable[[str], None], folder: str, log: str) -> str | None:
-    """Calls a function with everything it prints going to a file.
+    """Calls a function of a folder with everything it prints going to a file; returns why it failed, if it did.
 
     Args:
         function (callable): what to call.
         folder (str): what with.
         log (str): file to append to.
-
-    Returns:
-        str or None: why it failed, None if it did not.
     """
     try:
         with open_log(log) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
@@ -219,10 +215,6 @@ def _without_ctrl_c() -> Iterator[None]:
 
 class LocalPool:
     """Processes that are copies of a server which has imported everything: a job starts in a fraction of a second.
-
-    Args:
-        function (callable): what jobs do.
-        workers (int): jobs at a time.
 
     Examples:
         >>> from torchrl_koap.studies.launchers import LocalPool

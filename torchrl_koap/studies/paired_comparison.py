@@ -22,20 +22,8 @@ Outcome = Mapping[tuple[int, int], float]
 """Successes of a cell by (context, evaluation seed); errors of one without an environment by (trajectory, 0)."""
 
 COMPARISON_COLUMNS = (
-    "task",
-    "label_unit",
-    "demonstrations",
-    "labels",
-    "reference",
-    "method",
-    "difference",
-    "low",
-    "high",
-    "p",
-    "p_holm",
-    "contexts",
-    "seeds",
-    "n",
+    *("task", "label_unit", "demonstrations", "labels", "reference", "method"),
+    *("difference", "low", "high", "p", "p_holm", "contexts", "seeds", "n"),
 )
 _FLIPS = 10_000
 _RESAMPLES = 4_000

@@ -22,15 +22,11 @@ DEFAULT = "task's default"  # what pictures call the method that a task is train
 
 @dataclass(frozen=True)
 class Entry:
-    """A measured cell and the paper's.
+    """A measured cell, pooled over seeds, and the paper's; either may be absent.
 
     Args:
-        task (str): name of the task.
-        method (str): name of the method.
         level (int): label level, 1 for the fewest labels.
         label_share (float): share of the labels.
-        measured (Summary, optional): what was measured, pooled over seeds.
-        paper (PaperCell, optional): the paper's cell.
 
     Examples:
         >>> from torchrl_koap.studies.paper import Entry
@@ -99,11 +95,7 @@ def _levels_of(task: str) -> tuple[float, ...]:
 
 
 def layout_rows(entries: Sequence[Entry]) -> list[dict[str, str]]:
-    """The table as text: a row per task and level, a column per method.
-
-    Args:
-        entries (sequence of Entry): of :func:`paper_entries`.
-    """
+    """The table as text: a row per task and level, a column per method."""
     lines: dict[tuple[str, int], dict[str, str]] = {}
     for entry in entries:
         line = lines.setdefault(
@@ -127,11 +119,7 @@ def above_the_paper(entries: Sequence[Entry], method: str = "koap") -> tuple[int
 def default_entries(entries: Sequence[Entry]) -> list[Entry]:
     """Cells of the method that a task is trained with unless told otherwise, under one name, beside the paper's KOAP.
 
-    Args:
-        entries (sequence of Entry): of :func:`paper_entries`.
-
-    Returns:
-        list of Entry: with the method :data:`DEFAULT`; tasks that nobody registered have none.
+    Their method is :data:`DEFAULT`; tasks that nobody registered have none.
 
     Examples:
         >>> from torchrl_koap.studies.paper import Entry, default_entries
@@ -148,9 +136,6 @@ def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, fl
 
     A method has a point where every task has a cell of it that is done, so that all points are of the same tasks. Its
     interval combines the Wilson intervals of the cells by the squares of their halves (Newcombe's method).
-
-    Args:
-        entries (sequence of Entry): of :func:`paper_entries`.
     """
     lines: dict[str, list[tuple[int, float, float, float]]] = {}
     number = len({entry.task for entry in entries})
@@ -206,7 +191,7 @@ def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) ->
     sentence = f"KOAP succeeds more often than the paper's KOAP in {above} of {both} cells." if both else ""
     with replacing_file(folder / "paper_table.md") as aside:
         aside.write_text(f"{as_markdown(table)}\n{sentence}\n", encoding="utf-8")
-    if average_over_tasks(entries):
-        draw_average(entries, folder / AVERAGE)
-        return {"rows": table, "sentence": sentence, "picture": AVERAGE}
-    return {"rows": table, "sentence": sentence, "picture": None}
+    picture = AVERAGE if average_over_tasks(entries) else None
+    if picture is not None:
+        draw_average(entries, folder / picture)
+    return {"rows": table, "sentence": sentence, "picture": picture}

@@ -23,8 +23,6 @@ class PaperCell:
 
     Args:
         table (int): 1 (methods) or 2 (variants of KOAP).
-        task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
-        method (str): name of the method.
         level (int): label level, 1 for the fewest labels.
         label_share (float): share of the labels at this level.
         success (float): mean success in 0..1.
@@ -58,9 +56,6 @@ def _content() -> dict[str, Any]:
 def paper_levels(task: str) -> tuple[float, ...]:
     """Shares of labels of the paper's levels, the fewest first; empty for a task that is not in the paper.
 
-    Args:
-        task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
-
     Examples:
         >>> from torchrl_koap.studies.paper_results import paper_levels
         >>> paper_levels("avoiding"), paper_levels("sorting_6")
@@ -72,9 +67,6 @@ def paper_levels(task: str) -> tuple[float, ...]:
 
 def paper_cells(table: int) -> list[PaperCell]:
     """All cells of a table; a task that stands for one of the paper's in several ways has them in each.
-
-    Args:
-        table (int): 1 or 2.
 
     Raises:
         ValueError: for another table.
@@ -119,19 +111,7 @@ def _by_place() -> dict[tuple[str, str, int], PaperCell]:
 
 
 def paper_points(task: str) -> list[dict[str, Any]]:
-    """The paper's figures of a task at its own shares of labels, for pictures and tables beside measured ones.
-
-    Args:
-        task (str): name of the task.
-
-    Returns:
-        list: ``task``, ``method``, ``labels``, ``success`` and ``spread`` in 0..1.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper_results import paper_points
-        >>> [row["success"] for row in paper_points("sorting") if (row["method"], row["labels"]) == ("koap", 0.25)]
-        [0.6583]
-    """
+    """The paper's figures of a task at its own shares of labels: task, method, labels, success, spread (in 0..1)."""
     return [
         {
             "task": task,

@@ -33,14 +33,14 @@ MEASURES = {  # label of the vertical axis, title, factor
     "relative_action_error": ("action error, share of the mean action's", _SEEDS, 1),
 }
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#3a3f47", "#e69f00", "#56b4e9", "#882255", "#7a8b00")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
-DASHES = ("solid", (0, (5, 1.6)), (0, (1.2, 1.2)))
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
+_DASHES = ("solid", (0, (5, 1.6)), (0, (1.2, 1.2)))
 _BANDS = 3  # more bands than these hide each other: whiskers instead
 
 
 @dataclass
 class Line:
-    """A named line: ``x``, values ``y`` with their intervals, the paper's values ``(x, y)``, and how it is drawn.
+    """A named line, the paper's points ``(x, y)`` beside it, and how it is drawn.
 
     Examples:
         >>> from torchrl_koap.studies.plots import Line
@@ -74,8 +74,8 @@ def method_styles(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
     return {
         method: {
             "color": _COLORS[index % len(_COLORS)],
-            "marker": MARKERS[index % len(MARKERS)],
-            "linestyle": DASHES[index // len(_COLORS) % len(DASHES)],
+            "marker": _MARKERS[index % len(_MARKERS)],
+            "linestyle": _DASHES[index // len(_COLORS) % len(_DASHES)],
         }
         for index, method in enumerate(methods)
     }
@@ -135,15 +135,20 @@ def plot_measure(
     for place, (axes, (name, lines)) in enumerate(
         zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True)
     ):
-        draw_lines(axes, lines)
+        _draw_lines(axes, lines)
         axes.set_xlabel(AXES[name] + (f" ({label_unit})" if label_unit and name == "labels" else ""))
         _log_x(axes, lines, ticks=name != "labelled_transitions")
         if place == 0:
             axes.set_ylabel(f"{head} ({unit})" if unit else head)
         set_title(axes, title if place == 0 else "")
-        (_scale_errors if error else _scale_shares)(axes, lines, measure)
+        if error:
+            _scale_errors(axes, lines)
+            if measure == "relative_action_error":  # of a controller that always gives the mean action
+                axes.axhline(1, color=INK, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)
+        else:
+            _scale_shares(axes, 100 if measure == "success" else 1)
         tidy(axes)
-    name_lines(figure, [line for lines in panels.values() for line in lines])
+    _name_lines(figure, [line for lines in panels.values() for line in lines])
     return save_figure(figure, path)
 
 
@@ -174,32 +179,23 @@ def plot_average(
         lines.append(line)
     figure = Figure(figsize=(7.4, 4.6), layout="constrained")
     axes = figure.add_subplot()
-    draw_lines(axes, lines, beside=lambda x, step: x + 0.028 * step)
+    _draw_lines(axes, lines, beside=lambda x, step: x + 0.028 * step)
     levels = sorted({level for line in lines for level in line.x})
     axes.set(xlim=(levels[0] - 0.25, levels[-1] + 0.25), xticks=levels)
     axes.set(xlabel="label level (1: fewest labels)", ylabel="success (%)")
-    _scale_shares(axes, lines, "success")
+    _scale_shares(axes, 100)
     title = f"success, 95 % interval: {tasks[0]}" if len(tasks) == 1 else f"mean over {len(tasks)} tasks, 95 % interval"
     hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
     set_title(axes, title + hollow)
     tidy(axes)
-    name_lines(figure, lines)
+    _name_lines(figure, lines)
     return save_figure(figure, path)
 
 
-def draw_lines(
+def _draw_lines(
     axes: Axes, lines: Sequence[Line], *, beside: Callable[[float, float], float] = lambda x, step: x * 1.014**step
 ) -> None:
-    """Draws lines with bands, or with whiskers where there are many or each has one point alone.
-
-    Args:
-        axes (Axes): where to.
-        lines (sequence of Line): what to draw; the first lies on top.
-
-    Keyword Args:
-        beside (callable): from a place and a number of steps to the place of a whisker that others would hide.
-            Defaults to a step on a logarithmic axis.
-    """
+    """Draws bands, or whiskers where there are many lines or each has one point; ``beside`` moves whiskers apart."""
     whiskers = len(lines) > _BANDS or all(len(line.x) == 1 for line in lines)
     for index, line in enumerate(lines):
         x, order = line.x, 3 + (len(lines) - index) / 100
@@ -217,13 +213,8 @@ def draw_lines(
             axes.plot(*zip(*sorted(line.paper), strict=True), **style, markersize=6.5, linewidth=1, zorder=order + 0.5)
 
 
-def name_lines(figure: Figure, lines: Sequence[Line]) -> None:
-    """Names every line once, to the right of all panels.
-
-    Args:
-        figure (Figure): the figure.
-        lines (sequence of Line): the lines.
-    """
+def _name_lines(figure: Figure, lines: Sequence[Line]) -> None:
+    """Names every line once, to the right of all panels."""
     named = {line.name: Line2D([], [], **line.style, markersize=5, markeredgewidth=0) for line in lines}
     figure.legend(named.values(), named.keys(), loc="outside right upper", frameon=False, fontsize=8.5)
 
@@ -238,7 +229,7 @@ def _lines(
     styles, lines = method_styles(methods), {}
     for method in methods:
         for n, labels in enumerate(shares if several else [None]):  # colour tells the method, marker and dash the share
-            own = {"marker": MARKERS[n % 13], "linestyle": DASHES[n % 3]} if several else {}
+            own = {"marker": _MARKERS[n % 13], "linestyle": _DASHES[n % 3]} if several else {}
             name = f"{method}, {percent(labels)}" if several else method
             lines[method, labels] = Line(name, styles[method] | own)
     for item in sorted(summaries, key=lambda item: item.mean(by) or 0):
@@ -253,16 +244,13 @@ def _lines(
     return drawn
 
 
-def _scale_shares(axes: Axes, lines: Sequence[Line], measure: str) -> None:
-    top = 100 if measure == "success" else 1
+def _scale_shares(axes: Axes, top: int) -> None:
     axes.set_ylim(-0.03 * top, 1.03 * top)
     axes.set_yticks([top * part / 5 for part in range(6)])
     axes.grid(axis="y", color=FAINT, linewidth=0.5)
 
 
-def _scale_errors(axes: Axes, lines: Sequence[Line], measure: str) -> None:
-    if measure == "relative_action_error":  # of a controller that always gives the mean action
-        axes.axhline(1, color=INK, linewidth=0.8, linestyle=(0, (2, 2)), zorder=1)
+def _scale_errors(axes: Axes, lines: Sequence[Line]) -> None:
     axes.set_yscale("log")
     low, high = min(min(line.low) for line in lines), max(max(line.high) for line in lines)
     wide = max(1.15, (2.2 * low / high) ** 0.5)  # at least a factor of two is shown, or chance looks like a trend

@@ -21,8 +21,8 @@ class RayPool:
 
     Args:
         function (callable): what jobs do.
-        workers (int): jobs at a time of a cluster on this machine.
-        address (str, optional): of a cluster that runs; it decides by itself how many, one CPU each.
+        workers (int): jobs at a time, on a cluster of its own.
+        address (str, optional): of a cluster that runs, which decides how many by itself.
 
     Examples:
         >>> from torchrl_koap.studies.ray_launcher import RayPool

@@ -20,7 +20,6 @@ from torchrl_koap.tasks.units import thousandths
 from torchrl_koap.training.methods import METHODS
 
 FOLDER = "plots"
-_CELL = ("method", "labels", "seed", "status", "success", "training", "evaluation", "run")
 _CAPTIONS = {
     "success": (
         "Success against the labels",
@@ -76,22 +75,13 @@ def write_study_report(
 
     Keyword Args:
         title (str): heading.
-        options (mapping, optional): of the study, for the page.
-        paper (sequence of mapping): the paper's figures, see :func:`~torchrl_koap.studies.paper_results.paper_points`.
-        reference (str): method that all others are compared with. Defaults to ``"koap"``.
-        layout (mapping, optional): of :func:`~torchrl_koap.studies.paper.write_paper_layout`, instead of the list of
-            the paper's figures.
+        options (mapping, optional): of the study.
+        paper (sequence of mapping): of :func:`~torchrl_koap.studies.paper_results.paper_points`.
+        reference (str): method that all others are compared with.
+        layout (mapping, optional): of :func:`~torchrl_koap.studies.paper.write_paper_layout`, in place of ``paper``.
 
     Raises:
         ValueError: if a cell occurs twice, or is done without its number of episodes and successes.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_koap.studies.report import write_study_report
-        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.02, "seed": 0, "status": "missing"}
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     "failed: 0, missing: 1" in write_study_report(folder, [cell], title="a study").read_text()
-        True
     """
     folder = Path(folder)
     summaries = summarise(rows)
@@ -122,7 +112,7 @@ def write_study_report(
         not_done=[f"{cell_name(row)}: {why_not_done(row)}" for row in rows if row["status"] != "done"],
         times=times,
         total_time=total,
-        cells=[dict(zip(_CELL, _cell(row), strict=True)) for row in rows],
+        cells=[_cell(row) for row in rows],
     )
 
 
@@ -207,38 +197,30 @@ def _paper_rows(summaries: Sequence[Summary], paper: Sequence[Mapping[str, Any]]
 
 
 def _comparison_rows(compared: Sequence[Mapping[str, Any]], reference: str, *, offline: bool) -> list[dict[str, str]]:
-    rows = []
-    for row in compared:
-        known = row["difference"] is not None
-        written, head, unit = _points, "difference (points)", "contexts"
-        if offline:
-            written, head, unit = _share, "difference of the relative action error", "trajectories"
-        names = {"task": row["task"]} if len({other["task"] for other in compared}) > 1 else {}
-        if len({other["demonstrations"] for other in compared}) > 1:
-            names["demonstrations used"] = percent(row["demonstrations"])
-        rows.append(
-            names
-            | {
-                "labels": percent(row["labels"]),
-                f"{reference} against": row["method"],
-                head: written(row["difference"]) if known else "nothing in common",
-                "95 % interval": "–" if row["low"] is None else f"{written(row['low'])} to {written(row['high'])}",
-                "p": p_text(row["p"]),
-                "p (Holm)": p_text(row["p_holm"]),
-                unit: str(row["contexts"] or 0),
-                "seeds": str(row["seeds"] or 0),
-                "n (pairs)": str(row["n"]),
-            }
-        )
-    return rows
+    factor, form, head, unit = 100, "+.1f", "difference (points)", "contexts"
+    if offline:
+        factor, form, head, unit = 1, "+.3f", "difference of the relative action error", "trajectories"
 
+    def text(difference: float) -> str:
+        return format(round(factor * difference, 1 if factor == 100 else 3) + 0.0, form)  # the sum turns -0.0 into 0.0
 
-def _points(difference: float) -> str:
-    return f"{round(100 * difference, 1) + 0.0:+.1f}"  # the sum turns -0.0 into 0.0
-
-
-def _share(difference: float) -> str:
-    return f"{round(difference, 3) + 0.0:+.3f}"
+    several = {name: len({row[name] for row in compared}) > 1 for name in ("task", "demonstrations")}
+    return [
+        ({"task": row["task"]} if several["task"] else {})
+        | ({"demonstrations used": percent(row["demonstrations"])} if several["demonstrations"] else {})
+        | {
+            "labels": percent(row["labels"]),
+            f"{reference} against": row["method"],
+            head: "nothing in common" if row["difference"] is None else text(row["difference"]),
+            "95 % interval": "–" if row["low"] is None else f"{text(row['low'])} to {text(row['high'])}",
+            "p": p_text(row["p"]),
+            "p (Holm)": p_text(row["p_holm"]),
+            unit: str(row["contexts"] or 0),
+            "seeds": str(row["seeds"] or 0),
+            "n (pairs)": str(row["n"]),
+        }
+        for row in compared
+    ]
 
 
 def _times(rows: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, str]], float]:
@@ -257,15 +239,15 @@ def _times(rows: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, str]], flo
     return spent_by, total
 
 
-def _cell(row: Mapping[str, Any]) -> list[str]:
-    good, episodes = row.get("successes"), row.get("episodes")
-    times = [row.get("train_seconds"), row.get("eval_seconds")]
-    return [
-        str(row["method"]),
-        percent(row["labels"]),
-        str(row["seed"]),
-        row["status"],
-        f"{good} of {episodes}" if episodes else "–",
-        *("–" if value is None else duration(value) for value in times),
-        row.get("run") or "–",
-    ]
+def _cell(row: Mapping[str, Any]) -> dict[str, str]:
+    episodes = row.get("episodes")
+    spent = {"training": row.get("train_seconds"), "evaluation": row.get("eval_seconds")}
+    return {
+        "method": row["method"],
+        "labels": percent(row["labels"]),
+        "seed": str(row["seed"]),
+        "status": row["status"],
+        "success": f"{row['successes']} of {episodes}" if episodes else "–",
+        **{name: "–" if seconds is None else duration(seconds) for name, seconds in spent.items()},
+        "run": row.get("run") or "–",
+    }

@@ -30,7 +30,7 @@ from torchrl_koap.studies.table import write_cells
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import label_budget, load_demonstrations
 
-_EVERY, _SHARE = 1.0, 0.05  # least time (s) between two writes of the table, share of the time that writes may take
+_EVERY = 1.0  # least time (s) between two writes of the table
 
 
 @dataclass(frozen=True)
@@ -180,10 +180,8 @@ class _Table:
 
     def write(self) -> None:
         """Writes the file."""
-        began = time.monotonic()
         write_cells(self.study.out / "cells.csv", list(self.rows.values()))
-        ended = time.monotonic()
-        self._next = ended + max(_EVERY, (ended - began) / _SHARE)
+        self._next = time.monotonic() + _EVERY
 
 
 def _work(study: Study, cells: Sequence[Cell], table: _Table, machines: Machines | None) -> None:

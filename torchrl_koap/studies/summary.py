@@ -30,14 +30,9 @@ MEASURES = (
 class Measure:
     """A mean with its ends: of ``"success"`` the Wilson 95 % interval, of all others the least and greatest seed.
 
-    Args:
-        mean (float): over the cells that are done; of ``"success"`` over their rollouts.
-        low (float): lower end.
-        high (float): upper end.
-
     Examples:
         >>> from torchrl_koap.studies.summary import Measure
-        >>> Measure(0.5, 0.2, 0.8).high
+        >>> Measure(0.5, low=0.2, high=0.8).high
         0.8
     """
 
@@ -51,18 +46,12 @@ class Summary:
     """All seeds of a method at one share of labels.
 
     Args:
-        task (str): the task.
-        method (str): the method.
         labels (float): share of the labels.
         demonstrations (float): share of the demonstrations that is known at all.
-        label_unit (str): what the labels are a share of.
-        done (tuple of int): seeds whose cell is done.
-        failed (tuple of int): seeds whose cell failed.
-        missing (tuple of int): seeds whose cell is not there.
-        successes (int): over all done cells.
-        episodes (int): over all done cells.
+        done, failed, missing (tuple of int): seeds whose cell is that.
+        successes, episodes (int): over all done cells.
         measures (mapping): :class:`Measure` by name: ``"success"``, ``"seed_success"`` (worst and best seed) and
-            :data:`MEASURES`, those that no cell has left out.
+            :data:`MEASURES`, those that some cell has.
 
     Examples:
         >>> from torchrl_koap.studies.summary import summarise
@@ -163,27 +152,12 @@ def _values(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[float]]]:
 
 
 def needed_when_done(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Columns that a cell which is done must have: those of its rollouts, none where it has no environment.
-
-    Args:
-        row (mapping): the cell; its ``kind`` is ``"offline"`` where there was no environment.
-
-    Examples:
-        >>> from torchrl_koap.studies.summary import needed_when_done
-        >>> needed_when_done({"kind": "offline"}), needed_when_done({})
-        ((), ('episodes', 'successes'))
-    """
+    """Columns that a cell which is done must have: those of its rollouts, none where it has no environment."""
     return () if row.get("kind") == KIND else ("episodes", "successes")
 
 
 def cell_name(row: Mapping[str, Any]) -> str:
-    """A cell in words.
-
-    Examples:
-        >>> from torchrl_koap.studies.summary import cell_name
-        >>> cell_name({"task": "avoiding", "method": "koap", "labels": 0.02, "seed": 1})
-        'avoiding, koap, 2 % labels, seed 1'
-    """
+    """A cell in words: ``avoiding, koap, 2 % labels, seed 1``."""
     demonstrations = row.get("demonstrations")
     used = "" if demonstrations in (None, 1.0) else f"{percent(demonstrations)} of the demonstrations, "
     return f"{row['task']}, {row['method']}, {percent(row['labels'])} labels, {used}seed {row['seed']}"
@@ -207,11 +181,5 @@ def percent(share: float | None, digits: int | None = None) -> str:
 
 
 def plural(unit: str) -> str:
-    """What the labels are counted in, in words.
-
-    Examples:
-        >>> from torchrl_koap.studies.summary import plural
-        >>> plural("trajectory"), plural("window"), plural("")
-        ('trajectories', 'windows', 'labels')
-    """
+    """What the labels are counted in, in words; "" is any unit."""
     return {"trajectory": "trajectories", "": "labels"}.get(unit, f"{unit}s")

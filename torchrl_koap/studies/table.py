@@ -56,15 +56,6 @@ def write_cells(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
 
     Raises:
         ValueError: for another column, or an unknown status.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_koap.studies.table import read_cells, write_cells
-        >>> row = {"task": "avoiding", "method": "koap", "labels": 0.02, "demonstrations": 1.0, "seed": 0}
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = write_cells(f"{folder}/cells.csv", [row | {"status": "failed", "reason": "no memory"}])
-        ...     read_cells(path)[0]["labels"], read_cells(path)[0]["episodes"]
-        (0.02, None)
     """
     path = Path(path)
     for row in rows:
@@ -138,11 +129,7 @@ def _read(text: str | None, name: str, where: str) -> Any:
 
 
 def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
-    """The table as text, from heading to cell per method and share of labels; columns without any value are left out.
-
-    Args:
-        summaries (sequence of Summary): of :func:`summarise`.
-    """
+    """The table as text, a row per method and share of labels; columns without any value are left out."""
     units = {item.label_unit for item in summaries}
     labels = f"labels ({plural(*units)})" if len(units) == 1 and "" not in units else "labels"
     offline = any(item.offline for item in summaries)
@@ -212,24 +199,7 @@ def as_markdown(table: Sequence[Mapping[str, str]]) -> str:
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The pooled table of all cells in markdown, and below it every cell that is not done with its reason.
-
-    Args:
-        rows (sequence of mapping): cells.
-
-    Examples:
-        >>> from torchrl_koap.studies.table import markdown_table
-        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.02, "seed": 0, "status": "missing"}
-        >>> print(markdown_table([cell]))
-        | labels | method | success (95 %) | n | seeds | not done |
-        |---|---|---|---|---|---|
-        | 2 % | koap | no cell done | 0 | 0 of 1 | missing: seed 0 |
-        <BLANKLINE>
-        1 of 1 cells is not done:
-        <BLANKLINE>
-        - avoiding, koap, 2 % labels, seed 0: missing
-        <BLANKLINE>
-    """
+    """The pooled table of all cells in markdown, and below it every cell that is not done with its reason."""
     text = as_markdown(table_rows(summarise(rows)))
     open_cells = [row for row in rows if row["status"] != "done"]
     if open_cells:
