@@ -21,6 +21,7 @@ from torchrl_koap.modules import (
     make_koopman_inverse_dynamics,
     make_policy,
 )
+from torchrl_koap.modules.execution.noise import NoiseStreams
 
 STEPS = 13
 
@@ -96,12 +97,14 @@ def test_numpy_or_torch_one_robot_or_several():
     assert not torch.allclose(several[0], several[1])  # a stream of noise per robot
 
 
-def test_reset_begins_anew():
-    agent, path = Agent(policy_of()), np.random.default_rng(0).normal(size=(6, 2))
-    runs = []
-    for _ in range(2):
-        agent.reset()
-        runs.append([agent.act(row) for row in path])
+def test_reset_forgets_the_episode_before():
+    path, runs = np.random.default_rng(0).normal(size=(6, 2)), []
+    for before in (path, -path):  # as much noise is drawn
+        agent = Agent(policy_of())
+        for episode in (before, path):
+            agent.reset()
+            actions = [agent.act(row) for row in episode]
+        runs.append(actions)
     np.testing.assert_array_equal(*runs)
     assert agent.latency()["steps"] == 12 and agent.latency()["p50"] <= agent.latency()["p99"] <= agent.latency()["max"]
 
@@ -159,3 +162,26 @@ def test_latencies_do_not_grow_for_ever(monkeypatch):
     for _ in range(5):
         agent.act(np.zeros(2))
     assert agent.latency()["steps"] == 3
+
+
+def test_episodes_of_an_agent_differ_and_are_drawn_again_by_its_seed():
+    def episodes(seed):
+        agent, found = Agent(policy_of(), seed=seed), []
+        for _ in range(2):
+            agent.reset()
+            found.append(np.stack([agent.act(np.zeros(2)) for _ in range(6)]))
+        return found
+
+    first, second = episodes(3)
+    assert not np.array_equal(first, second)
+    np.testing.assert_array_equal(episodes(3), [first, second])
+
+
+def test_a_default_of_float64_draws_the_same_noise():
+    usual = NoiseStreams([7], (3, 2), block=2).draw()
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(NoiseStreams([7], (3, 2), block=2).draw(), usual)
+    finally:
+        torch.set_default_dtype(before)

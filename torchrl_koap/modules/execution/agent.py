@@ -23,7 +23,8 @@ class Agent:
     """Acts with a policy, one robot or several at a time, without gradients.
 
     Frames observed so far, the current plans and start noise live inside. With the same seed the actions are bit for
-    bit those of a :class:`~torchrl_koap.modules.PolicyEnv`, and of the episode of that seed in ``koap eval``.
+    bit those of a :class:`~torchrl_koap.modules.PolicyEnv`. Its first episode is that of this seed in ``koap eval``;
+    the next ones go on in the same stream.
 
     Args:
         policy (PlanningPolicy): of :func:`~torchrl_koap.modules.make_policy` or :func:`~torchrl_koap.load_policy`.
@@ -54,11 +55,12 @@ class Agent:
         example = next(policy.parameters(), torch.empty(0))
         self.device, self.dtype = example.device, example.dtype
         self.latencies: deque[float] = deque(maxlen=KEPT)
+        self._streams: NoiseStreams | None = None
         self._ready = False
         self._forget()
 
     def reset(self) -> None:
-        """Forgets everything: the next observation begins an episode."""
+        """Begins an episode with the next observation; the start noise goes on in its stream."""
         self._forget()
         self._ready = True
 
@@ -100,7 +102,6 @@ class Agent:
     def _forget(self) -> None:
         self._carried: TensorDict | None = None  # what the policy wrote in the last step
         self._frames = None
-        self._streams: NoiseStreams | None = None
         self._shape: tuple[int, ...] | None = None  # of the observations
 
     def _decide(self) -> Tensor:
@@ -117,7 +118,7 @@ class Agent:
 
     def _noise(self, robots: int) -> Tensor:
         """Start noise of a plan ``[n, *noise_shape]``, from a stream per robot."""
-        if self._streams is None:
+        if self._streams is None or len(self._streams) != robots:
             seeds = range(self.seed, self.seed + robots)
             self._streams = NoiseStreams(seeds, self.policy.noise_shape, block=self.policy.max_steps)
         return self._streams.draw().to(self.device, self.dtype)

@@ -48,7 +48,7 @@ class NoiseStreams:
         """The noise of the next step ``[E, *shape]``."""
         if not self._left:
             size = (self.block, *self.shape)
-            self._draws = torch.stack([torch.randn(size, generator=generator) for generator in self._generators])
+            self._draws = torch.stack([torch.randn(size, generator=g, dtype=torch.float32) for g in self._generators])
             self._left = self.block
         self._left -= 1
         return self._draws[:, self.block - 1 - self._left]
