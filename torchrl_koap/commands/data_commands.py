@@ -29,7 +29,7 @@ from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import find_task_of
 
-_READING = ("control_hz", "observations", "action_columns", "action_dim")
+_READING = ("control_hz", "observations", "action_columns", "action_dim", "state_columns", "drop_columns")
 _DESCRIBING = ("name", "robot", "command", "action_kind", "targets", "action_units", "state_units", "max_steps")
 
 
@@ -121,6 +121,9 @@ class Convert(Command):
             that are no images).
         action_columns: columns of CSV or parquet tables that are actions, if they are not named action...
         action_dim: number of action columns, where nothing has actions.
+        state_columns: columns that make up the state, in that order (default: all that are no clock, counter, reward
+            or flag of an episode).
+        drop_columns: state and action columns that are left out.
         robot: state columns of the robot itself, which the controller reads (default: all that are no command).
         command: neighbouring columns that repeat the last command; nothing that learns sees them.
         action_kind: "delta" (velocities, efforts, changes) or "absolute" (targets of state columns) (default: delta).
@@ -138,6 +141,8 @@ class Convert(Command):
     observations: tuple[str, ...] = ()
     action_columns: tuple[str, ...] = ()
     action_dim: int | None = None
+    state_columns: tuple[str, ...] = ()
+    drop_columns: tuple[str, ...] = ()
     robot: tuple[str, ...] = ()
     command: tuple[str, ...] = ()
     action_kind: str | None = None

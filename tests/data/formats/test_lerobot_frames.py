@@ -35,7 +35,7 @@ def test_what_is_read_is_what_was_written(tmp_path, embodiment):
 def test_the_reader_of_any_robot_takes_the_numbers_and_skips_the_camera(tmp_path):
     recordings = read_recordings(write_camera_set(tmp_path / "set", "robot"))
     assert recordings.state_names == ("x", "y", "z") and recordings.control_hz == 10
-    assert list(recordings.skipped) == ["observation.images.third_person"]
+    assert list(recordings.skipped) == ["observation.images.third_person", "timestamp"]
 
 
 def test_bad_data_sets_are_refused(tmp_path):

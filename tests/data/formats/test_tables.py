@@ -81,7 +81,7 @@ def test_columns_of_text_are_named(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     parquet.write_table(pyarrow.table(columns_of(action=[0.1] * 6, phase=["reach"] * 6)), tmp_path / "run.parquet")
     recordings = read_tables(tmp_path)
-    assert recordings.skipped == ("phase",) and recordings.state_names == ("x", "y")
+    assert recordings.skipped == ("phase", "timestamp") and recordings.state_names == ("x", "y")
 
 
 def test_faults_of_all_files_are_named(tmp_path):
@@ -102,7 +102,10 @@ def test_faults_of_all_files_are_named(tmp_path):
     ("columns", "message"),
     [
         ({"x": [0.0, 1.0]}, "no file has time stamps"),
-        ({"x": [0.0, 1.0, 2.0], "time": [0.0, 0.1, 0.5]}, "0.1 to 0.4 s apart; resample"),
+        (
+            {"x": [0.0, 1.0, 2.0], "time": [0.0, 0.1, 0.5]},
+            r"run.csv: frames are 0.1 to 0.4 s apart \(frame \d\).*resample",
+        ),
         ({"x": [0.0, 1.0], "time": [0.1, 0.0]}, "time stamps do not increase"),
         ({"action": [0.0, 1.0], "time": [0.0, 0.1]}, "has no state columns, only action, time"),
     ],
@@ -123,7 +126,7 @@ def test_a_rate_that_is_given_needs_no_time_stamps(tmp_path):
 def test_other_columns_in_another_file(tmp_path):
     write_csv(tmp_path / "a.csv", columns_of())
     write_csv(tmp_path / "b.csv", {"timestamp": [0.0, 0.02], "y": [0.0, 1.0], "x": [0.0, 1.0]})
-    with pytest.raises(DataError, match="b.csv: state columns are y, x; those of a.csv are x, y"):
+    with pytest.raises(DataError, match="b.csv: state columns are timestamp, y, x; those of a.csv are timestamp, x, y"):
         read_tables(tmp_path)
 
 
@@ -141,7 +144,7 @@ def test_damaged_archives_are_named(content, tmp_path):
 
 @pytest.mark.parametrize(
     ("header", "message"),
-    [("time,x,y,x", "columns 2 and 4 are both named 'x'"), (",time,x,y", "column 1 has no name; is it the index")],
+    [("time,x,y,x", "columns 2 and 4 are both named 'x'"), ("time,,x,y", "column 2 has no name")],
 )
 def test_columns_that_would_be_lost_are_refused(header, message, tmp_path):
     (tmp_path / "a.csv").write_text(header + "\n0,0.1,1,2\n1,0.2,1,2\n")

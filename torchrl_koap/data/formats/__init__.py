@@ -44,28 +44,30 @@ class Format:
     write: Callable[[Recordings, Path], None] | None = None
 
 
+COMMON = ("control_hz", "action_dim", "state_columns", "drop_columns")  # options of all but this library's own
+
 FORMATS = {
     "minari": Format(
         f"{PREFIX}NAME, a Minari data set on this machine",
         lambda source: source.startswith(PREFIX),
         read_minari,
-        ("control_hz",),
+        COMMON,
     ),
     "ted": Format("a data set of this library", stored.is_stored, stored.read_stored),
     "robomimic": Format(
         "an HDF5 file in robomimic's layout (*.hdf5)",
         is_hdf5,
         read_robomimic,
-        ("control_hz", "observations", "action_dim"),
+        ("observations", *COMMON),
     ),
     "lerobot": Format(
-        "a LeRobot data set (meta/info.json)", is_lerobot, read_lerobot, ("control_hz", "observations"), write_lerobot
+        "a LeRobot data set (meta/info.json)", is_lerobot, read_lerobot, ("observations", *COMMON), write_lerobot
     ),
     "npz": Format(
         "a folder of *.npz, *.csv or *.parquet files, a trajectory each",
         is_table_folder,
         read_tables,
-        ("control_hz", "action_columns", "action_dim"),
+        ("action_columns", *COMMON),
         write_npz,
     ),
 }
@@ -78,6 +80,8 @@ def read_recordings(
     observations: Sequence[str] = (),
     action_columns: Sequence[str] = (),
     action_dim: int | None = None,
+    state_columns: Sequence[str] = (),
+    drop_columns: Sequence[str] = (),
 ) -> Recordings:
     """Reads recordings of any robot; where they lie decides which of the :data:`FORMATS` they are in.
 
@@ -92,6 +96,9 @@ def read_recordings(
         action_columns (sequence of str): columns of CSV and parquet tables that are actions, if they are not named
             ``action...``.
         action_dim (int, optional): number of action columns where nothing has actions.
+        state_columns (sequence of str): columns that make up the state, in that order. Default: all that are no clock,
+            counter, reward or flag of an episode; those are in ``skipped``.
+        drop_columns (sequence of str): state and action columns that are left out.
 
     Returns:
         Recordings: trajectories with the names of their columns.
@@ -107,6 +114,7 @@ def read_recordings(
     """
     asked: dict[str, Any] = {"control_hz": control_hz, "observations": list(observations)}
     asked |= {"action_columns": list(action_columns), "action_dim": action_dim}
+    asked |= {"state_columns": list(state_columns), "drop_columns": list(drop_columns)}
     given = {name: value for name, value in asked.items() if value not in (None, [])}
     for form in FORMATS.values():
         if form.matches(str(source)):

@@ -36,7 +36,7 @@ def number_type(kind: Any) -> Any:
     types = pyarrow.types
     nested = types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
     inner = kind.value_type if nested else kind
-    if not (types.is_floating(inner) or types.is_integer(inner)):
+    if not (types.is_floating(inner) or types.is_integer(inner) or types.is_boolean(inner)):
         return None
     return pyarrow.list_(pyarrow.float64()) if nested else pyarrow.float64()
 

@@ -23,11 +23,12 @@ from typing import Any
 import numpy as np
 
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError, check_file, read_bytes
 
 PREFIX, STATE, ACTION = "observation.", "observation.state", "action"
-EPISODE, FRAME = "episode_index", "frame_index"
+EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
 IMAGES = ("image", "video")
 _INFO = "meta/info.json"
 _LARGEST = 1 << 40  # bytes of a file of rows
@@ -61,9 +62,7 @@ def is_lerobot(folder: str | Path) -> bool:
     return (Path(folder) / _INFO).is_file()
 
 
-def read_lerobot(
-    root: str | Path, *, observations: Sequence[str] | None = None, control_hz: float | None = None
-) -> Recordings:
+def read_lerobot(root: str | Path, *, observations: Sequence[str] | None = None, **options: Any) -> Recordings:
     """Reads states and actions of all episodes; rows without actions have no label.
 
     Args:
@@ -72,7 +71,7 @@ def read_lerobot(
     Keyword Args:
         observations (sequence of str, optional): features that make up the state, in that order. Default: every feature
             named ``observation...`` that holds numbers; images are skipped and listed.
-        control_hz (float, optional): frames per second. Default: ``fps`` of the data set.
+        options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the data set declares its rate by ``fps``.
 
     Raises:
         DataError: with all problems: features that do not exist, or an image is asked for; files that are unreadable,
@@ -105,20 +104,36 @@ def read_lerobot(
         raise DataError(root, problems)
     rows = read_rows(root, chosen)
     names = [label for name in chosen for label in _names(known[name], name, rows.columns[name].shape[1])]
-    states = np.concatenate([rows.columns[name] for name in chosen], 1)
+    if len(set(names)) < len(names):  # two features with the same names of columns
+        names = [label for name in chosen for label in _names({}, name, rows.columns[name].shape[1])]
+    columns = dict(zip(names, np.concatenate([rows.columns[name] for name in chosen], 1).T, strict=True))
+    if TIME in rows.columns and np.isfinite(rows.columns[TIME]).all():
+        columns[TIME] = rows.columns[TIME][:, 0]
     actions, width = rows.columns.get(ACTION), _announced(info)
     if actions is None and not width:
         raise DataError(root, "no file has actions, and info.json does not say how many columns an action has")
-    return make_recordings(
-        [states[span] for span in rows.spans],
-        None if actions is None else [actions[span] for span in rows.spans],
-        action_dim=width if actions is None else None,
-        state_names=names if len(set(names)) == len(names) else None,
-        action_names=_names(known.get(ACTION) or {}, ACTION, width if actions is None else actions.shape[1]),
-        sources=[f"episode {number}" for number in rows.numbers],
-        control_hz=_rate(info) if control_hz is None else control_hz,
-        skipped=images,
-        source=str(root),
+    acting = _names(known.get(ACTION) or {}, ACTION, width if actions is None else actions.shape[1])
+    pieces = [
+        Piece(
+            f"episode {number}",
+            {name: values[span] for name, values in columns.items()},
+            None if actions is None else dict(zip(acting, actions[span].T, strict=True)),
+        )
+        for number, span in zip(rows.numbers, rows.spans, strict=True)
+    ]
+    if actions is None:
+        options = {"action_dim": width} | options
+    unread = [
+        name for name in known if name not in (*chosen, *images, ACTION, TIME, EPISODE, FRAME, "index", "task_index")
+    ]
+    return assemble(
+        pieces,
+        str(root),
+        declared_hz=_rate(info),
+        action_names=acting,
+        skipped=[*images, *unread],
+        no_rate="info.json holds no fps: pass control_hz",
+        **options,
     )
 
 
@@ -205,7 +220,7 @@ def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):
             continue
         missing = [name for name in (*needed, *pictures) if name not in schema.names]
         problems += [f"{file}: missing column {name!r}; the file has {', '.join(schema.names)}" for name in missing]
-        for name in {*needed, *pictures, ACTION}.intersection(schema.names):
+        for name in {*needed, *pictures, ACTION, TIME}.intersection(schema.names):
             got = schema.field(name).type
             kind = _picture(pyarrow, got) if name in pictures else number_type(got)
             kinds.setdefault(name, kind)

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.columns import Piece, assemble, spread
+from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError
 
 PREFIX = "minari:"
 
 
-def read_minari(source: str, *, control_hz: float | None = None) -> Recordings:
+def read_minari(source: str, **options: Any) -> Recordings:
     """Reads a Minari data set that was downloaded or created before; nothing is fetched.
 
     Args:
@@ -23,7 +24,8 @@ def read_minari(source: str, *, control_hz: float | None = None) -> Recordings:
             observations are laid side by side in the order of their names; images are skipped.
 
     Keyword Args:
-        control_hz (float, optional): control steps per second. Default: ``render_fps`` of the data set's environment.
+        options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the rate is declared by ``render_fps`` of the
+            data set's environment.
 
     Raises:
         DataError: if the data set holds no usable observations, actions are no vectors of numbers, or no rate is
@@ -46,24 +48,33 @@ def read_minari(source: str, *, control_hz: float | None = None) -> Recordings:
             f"Minari data set {name!r} is not on this machine (here: {known}); `minari download` it"
         )
     dataset = minari.load_dataset(name, download=False)
-    states, actions, names, skipped, problems = [], [], None, [], []
+    pieces, skipped, problems = [], [], []
     for episode in dataset.iterate_episodes():
         tables, images = _tables(episode.observations)
         skipped += images
         if not tables:
             problems.append(f"episode {episode.id}: observations hold no numbers but images")
+        if isinstance(episode.actions, (Mapping, tuple)):
+            kind = "Dict" if isinstance(episode.actions, Mapping) else "Tuple"
+            problems.append(f"episode {episode.id}: its actions are a {kind}, wanted one vector [T, a] of numbers")
             continue
-        names = _labels(tables)
-        states.append(np.concatenate([table.astype(np.float64) for table in tables.values()], 1))
         steps = np.asarray(episode.actions)
-        actions.append(steps[:, None] if steps.ndim == 1 and steps.dtype.kind == "f" else steps)
-    if control_hz is None:
-        control_hz = _rate(dataset)
-        if control_hz is None:
-            problems.append("its environment says nothing of render_fps: pass control_hz")
+        if steps.ndim > 2 or steps.dtype.kind != "f" and (steps.ndim < 2 or steps.dtype.kind not in "iub"):
+            problems.append(f"episode {episode.id}: actions must be [T, a], got {steps.dtype} {list(steps.shape)}")
+            continue
+        states = {column: values for name, table in tables.items() for column, values in spread(name, table).items()}
+        acting = {f"action_{index}": values for index, values in enumerate(steps.reshape(len(steps), -1).T)}
+        pieces.append(Piece(str(episode.id), states, acting))
     if problems:
         raise DataError(source, problems)
-    return make_recordings(states, actions, state_names=names, control_hz=control_hz, skipped=skipped, source=source)
+    return assemble(
+        pieces,
+        source,
+        declared_hz=_rate(dataset),
+        skipped=skipped,
+        no_rate="its environment says nothing of render_fps: pass control_hz",
+        **options,
+    )
 
 
 def _tables(observations: Any, name: str = "") -> tuple[dict[str, np.ndarray], list[str]]:
@@ -77,17 +88,9 @@ def _tables(observations: Any, name: str = "") -> tuple[dict[str, np.ndarray], l
             images += left
         return tables, images
     array = np.asarray(observations)
-    if array.ndim > 2 or array.dtype.kind not in "fiu":
+    if array.ndim > 2 or array.dtype.kind not in "fiub":
         return {}, [name or "observation"]
     return {name or "state": array.reshape(len(array), -1)}, []
-
-
-def _labels(tables: Mapping[str, np.ndarray]) -> list[str]:
-    return [
-        key if table.shape[1] == 1 else f"{key}_{index}"
-        for key, table in tables.items()
-        for index in range(table.shape[1])
-    ]
 
 
 def _rate(dataset: Any) -> float | None:

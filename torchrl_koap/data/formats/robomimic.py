@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.columns import Piece, assemble, spread
+from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError
 
 
@@ -34,8 +35,7 @@ def read_robomimic(
     file: str | Path,
     *,
     observations: Sequence[str] | None = None,
-    control_hz: float | None = None,
-    action_dim: int | None = None,
+    **options: Any,
 ) -> Recordings:
     """Reads trajectories from an HDF5 file in robomimic's layout.
 
@@ -45,8 +45,8 @@ def read_robomimic(
     Keyword Args:
         observations (sequence of str, optional): entries of ``obs`` that make up the state, in that order. Default: all
             that are no images, by name.
-        control_hz (float, optional): frames per second. Default: ``control_freq`` of the file's ``env_args``.
-        action_dim (int, optional): number of action columns, where no trajectory has actions.
+        options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the file declares its rate by ``control_freq``
+            of ``env_args``.
 
     Raises:
         DataError: with all faults: a trajectory without ``obs``, entries that are missing or of other widths, no
@@ -89,30 +89,47 @@ def read_robomimic(
             elif not _is_table(group[entry]):
                 shape = list(group[entry].shape)
                 problems.append(f"data/{name}/obs/{entry} is {shape}: an image cannot be part of the state")
-        if control_hz is None:
-            control_hz = _control_frequency(stream["data"].attrs.get("env_args"))
-        if control_hz is None:
-            problems.append("env_args holds no control_freq: pass control_hz")
+        declared = _control_frequency(stream["data"].attrs.get("env_args"))
         if problems:
             raise DataError(file, problems)
-        states, actions = [], []
-        for group in (stream[f"data/{name}"] for name in demos):
-            frames = _frames(group["obs"], chosen)
-            if "next_obs" in group and all(entry in group["next_obs"] for entry in chosen):
-                frames = np.concatenate([frames, _frames(group["next_obs"], chosen)[-1:]])
-            states.append(frames)
-            actions.append(np.asarray(group["actions"]) if "actions" in group else None)
-        names = [label for entry in chosen for label in _labels(entry, first[entry].shape)]
-    return make_recordings(
-        states,
-        actions,
-        action_dim=action_dim,
-        state_names=names,
-        sources=demos,
-        control_hz=control_hz,
+        pieces = [_piece(name, stream[f"data/{name}"], chosen, problems) for name in demos]
+    if problems:
+        raise DataError(file, problems)
+    return assemble(
+        pieces,
+        str(file),
+        declared_hz=declared,
         skipped=[name for name in skipped if name not in chosen],
-        source=str(file),
+        no_rate="env_args holds no control_freq: pass control_hz",
+        **options,
     )
+
+
+def _piece(name: str, group: Any, chosen: Sequence[str], problems: list[str]) -> Piece:
+    """One demonstration; entries must have a row per frame."""
+    parts = {entry: np.asarray(group["obs"][entry]) for entry in chosen}
+    if "next_obs" in group and all(entry in group["next_obs"] for entry in chosen):
+        for entry, part in parts.items():
+            behind = np.asarray(group["next_obs"][entry])
+            if behind.shape[1:] != part.shape[1:] or not len(behind):
+                problems.append(
+                    f"data/{name}/next_obs/{entry} is {list(behind.shape)}, obs/{entry} is {list(part.shape)}"
+                )
+                continue
+            parts[entry] = np.concatenate([part, behind[-1:]])
+    longest = {len(part) for part in parts.values()}
+    if len(longest) > 1:
+        shapes = ", ".join(f"{entry} {list(part.shape)}" for entry, part in parts.items())
+        problems.append(f"data/{name}/obs: entries have different numbers of frames: {shapes}")
+    states = {column: values for entry, part in parts.items() for column, values in spread(entry, part).items()}
+    if "actions" not in group:
+        return Piece(name, states)
+    actions = np.asarray(group["actions"])
+    if actions.ndim not in (1, 2) or actions.dtype.kind not in "fiub":
+        problems.append(f"data/{name}/actions must be numbers [T, a], got {actions.dtype} {list(actions.shape)}")
+        return Piece(name, states)
+    columns = actions.reshape(len(actions), -1).T
+    return Piece(name, states, {f"action_{index}": values for index, values in enumerate(columns)})
 
 
 def _number(name: str) -> tuple[int, str]:
@@ -123,16 +140,7 @@ def _number(name: str) -> tuple[int, str]:
 def _is_table(entry: Any) -> bool:
     import h5py
 
-    return isinstance(entry, h5py.Dataset) and entry.ndim in (1, 2) and entry.dtype.kind in "fiu"
-
-
-def _labels(name: str, shape: Sequence[int]) -> list[str]:
-    return [name] if len(shape) == 1 or shape[1] == 1 else [f"{name}_{index}" for index in range(shape[1])]
-
-
-def _frames(group: Any, names: Sequence[str]) -> np.ndarray:
-    parts = [np.asarray(group[name], dtype=np.float64) for name in names]
-    return np.concatenate([part.reshape(len(part), -1) for part in parts], 1)
+    return isinstance(entry, h5py.Dataset) and entry.ndim in (1, 2) and entry.dtype.kind in "fiub"
 
 
 def _control_frequency(text: Any) -> float | None:

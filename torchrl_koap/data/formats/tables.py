@@ -19,13 +19,14 @@ import csv
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
-from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.formats.columns import UNEVEN, Piece, assemble, kind_of
+from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.files import DataError
 from torchrl_koap.lookup import lookup
 
@@ -33,21 +34,8 @@ from torchrl_koap.lookup import lookup
 _UNREADABLE = (ValueError, OSError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, csv.Error)
 STATES = ("states", "state", "observations", "observation", "obs")
 ACTIONS = ("actions", "action")
-TIMES = ("timestamp", "timestamps", "time", "t")
-EPISODES = ("episode_index", "episode", "trajectory")
-_COUNTERS = ("frame_index", "index", "task_index", "step")
-_UNEVEN = 0.2  # share of the median step by which steps in time may differ before a rate cannot be read off
-
-
-@dataclass(frozen=True)
-class _Table:
-    """What a file holds: trajectories, names of their columns where it has any, rate, and what is not read."""
-
-    trajectories: list[tuple[np.ndarray, np.ndarray | None]]
-    state_names: list[str] | None
-    action_names: list[str] | None
-    rate: float | None
-    unread: list[str]
+_TRUTH = {"true": 1.0, "false": 0.0}
+_Table = tuple[Piece, "float | None", list[str]]  # columns, declared rate, and what is not read
 
 
 def is_table_folder(folder: str | Path) -> bool:
@@ -58,9 +46,8 @@ def is_table_folder(folder: str | Path) -> bool:
 def read_tables(
     folder: str | Path,
     *,
-    control_hz: float | None = None,
     action_columns: Sequence[str] | None = None,
-    action_dim: int | None = None,
+    **options: Any,
 ) -> Recordings:
     """Reads a folder of ``*.npz``, ``*.csv`` or ``*.parquet`` files.
 
@@ -68,10 +55,9 @@ def read_tables(
         folder (str or Path): the folder; files are taken in the order of their names.
 
     Keyword Args:
-        control_hz (float, optional): frames per second. Default: from the files' time stamps or ``control_hz`` entry.
         action_columns (sequence of str, optional): columns of CSV and parquet files that are actions, if they are not
             named ``action...``. In NumPy archives actions are an entry of their own.
-        action_dim (int, optional): number of action columns, where no file has actions.
+        options: of :func:`~torchrl_koap.data.formats.columns.assemble`.
 
     Raises:
         ValueError: for ``action_columns`` where a file is a NumPy archive.
@@ -100,33 +86,25 @@ def read_tables(
             f" {' or '.join(map(repr, ACTIONS))}"
         )
     problems: list[str] = []
-    tables: dict[Path, _Table] = {}
+    tables: list[_Table] = []
     for file in files:
         try:
-            tables[file] = _READERS[file.suffix](file, action_columns)
+            tables.append(_READERS[file.suffix](file, action_columns))
         except _UNREADABLE as error:
             problems.append(f"{file}: {error or type(error).__name__}")
-    names = [_common_names(tables, kind, problems) for kind in ("state", "action")]
-    if control_hz is None and not problems:
-        control_hz = _common_rate([table.rate for table in tables.values() if table.rate], problems)
     if problems:
         raise DataError(folder, problems)
-    found = [
-        (frames, steps, file.name if len(table.trajectories) == 1 else f"{file.name}[{index}]")
-        for file, table in tables.items()
-        for index, (frames, steps) in enumerate(table.trajectories)
-    ]
-    states, actions, sources = zip(*found, strict=True)
-    return make_recordings(
-        states,
-        actions,
-        action_dim=action_dim,
-        state_names=names[0],
-        action_names=names[1],
-        sources=sources,
-        control_hz=control_hz,
-        source=str(folder),
-        skipped=[name for table in tables.values() for name in table.unread],
+    rates = [rate for _, rate, _ in tables if rate]
+    if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
+        raise DataError(folder, f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second: resample them")
+    pieces = _named_alike([piece for piece, _, _ in tables])
+    unread = [f"{path.name} (no table)" for path in sorted(folder.iterdir()) if path not in files]
+    return assemble(
+        pieces,
+        str(folder),
+        declared_hz=float(np.median(rates)) if rates else None,
+        skipped=[*(name for _, _, names in tables for name in names), *unread],
+        **options,
     )
 
 
@@ -143,25 +121,85 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
             f"has no states: wanted one of {', '.join(STATES)}, it holds {', '.join(entries) or 'nothing'}"
         )
     acting = next((name for name in ACTIONS if name in entries), None)
-    names = [
-        [str(name) for name in entries[entry]] if entry in entries else None
-        for entry in ("state_names", "action_names")
-    ]
+    frames, read = entries[key], {key, acting, "state_names", "action_names", "control_hz"}
+    if frames.ndim != 2 or frames.dtype.kind != "f":
+        raise ValueError(f"{key} must be floating-point numbers [T, d], got {frames.dtype} {list(frames.shape)}")
+    states = _named(frames, entries.get("state_names"), "state")
+    for name, values in entries.items():
+        if name not in read and kind_of(name)[0] not in (None, "other"):
+            states[name] = _frame_entry(name, values, len(frames))
+            read.add(name)
+        elif (
+            name not in read
+            and kind_of(name)[0] is None
+            and values.shape == frames.shape[:1]
+            and values.dtype.kind in "iub"
+        ):
+            raise ValueError(
+                f"entry {name!r} has one whole number a frame: does it say which episode a frame is of"
+                " ('episode_index'), or where episodes end ('timeouts')? name it so, or leave it out"
+            )
+    steps = None
+    if acting is not None:
+        if entries[acting].ndim != 2 or entries[acting].dtype.kind not in "fiub":
+            raise ValueError(f"{acting} must be numbers [T, a] or [T - 1, a], got {list(entries[acting].shape)}")
+        steps = _named(entries[acting], entries.get("action_names"), "action")
     rate = float(entries["control_hz"]) if "control_hz" in entries else None
-    read = {key, acting, "state_names", "action_names", "control_hz"}
-    steps = None if acting is None else entries[acting]
-    return _Table([(entries[key], steps)], names[0], names[1], rate, [name for name in entries if name not in read])
+    return Piece(file.name, states, steps), rate, [name for name in entries if name not in read]
+
+
+def _named_alike(pieces: list[Piece]) -> list[Piece]:
+    """Archives without names take those of the first archive of their width that has some."""
+
+    def alike(piece: Piece) -> Piece:
+        found = [piece.states, piece.actions]
+        for number, kind in enumerate(("state", "action")):
+            for other in (piece.states if number == 0 else piece.actions for piece in pieces):
+                mine = found[number]
+                if mine and other and len(mine) == len(other) and f"{kind}_0" in mine and f"{kind}_0" not in other:
+                    found[number] = dict(zip(other, mine.values(), strict=True))
+        return Piece(piece.name, found[0] or {}, found[1])
+
+    return [alike(piece) for piece in pieces]
+
+
+def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, np.ndarray]:
+    """Columns of a table by name."""
+    width = table.shape[1]
+    names = [f"{kind}_{index}" for index in range(width)] if given is None else [str(name) for name in given]
+    if len(names) != width or len(set(names)) != width:
+        raise ValueError(f"{kind}_names must be {width} different names, got {', '.join(names)}")
+    return {name: table[:, index] for index, name in enumerate(names)}
+
+
+def _frame_entry(name: str, values: np.ndarray, length: int) -> np.ndarray:
+    """An entry about frames, one number each; of ends that are counted a flag at the last frame of every episode."""
+    if values.shape == (length, 1):
+        values = values[:, 0]
+    counted = values.ndim == 1 and values.dtype.kind in "iu" and len(values) and len(values) != length
+    if kind_of(name)[0] == "end" and counted and values[-1] == length and (np.diff(values) > 0).all():
+        flags = np.zeros(length)
+        flags[values - 1] = 1
+        return flags
+    if values.shape != (length,) or values.dtype.kind not in "fiub":
+        raise ValueError(f"entry {name!r} must have one number for each of {length} frames, got {list(values.shape)}")
+    return values.astype(np.float64)
 
 
 def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
     with file.open(newline="", encoding="utf-8-sig") as stream:
-        rows = list(csv.reader(stream))
+        text = stream.read()
+    first = text.partition("\n")[0]
+    separator = max(",;\t", key=first.count)
+    rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(field.strip() for field in row)]
     if len(rows) < 2:
         raise ValueError("wanted a header and a row per frame")
     header = [name.strip() for name in rows[0]]
+    if not header[0]:
+        header[0] = "unnamed: 0"  # the index of the rows, as pandas writes and reads it
     for number, name in enumerate(header):
         if not name:
-            raise ValueError(f"column {number + 1} has no name; is it the index of the rows? leave it out")
+            raise ValueError(f"column {number + 1} has no name")
         if header.index(name) != number:
             raise ValueError(f"columns {header.index(name) + 1} and {number + 1} are both named {name!r}")
     values = np.empty((len(rows) - 1, len(header)))
@@ -170,10 +208,12 @@ def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
             raise ValueError(f"row {number + 2} has {len(row)} fields, the header has {len(header)}")
         for column, text in enumerate(row):
             try:
-                values[number, column] = float(text) if text.strip() else np.nan
+                values[number, column] = (
+                    _TRUTH[text.strip().lower()] if text.strip().lower() in _TRUTH else float(text.strip() or "nan")
+                )
             except ValueError:
                 raise ValueError(f"row {number + 2}, column {header[column]!r}: {text!r} is no number") from None
-    return _split({name: values[:, index] for index, name in enumerate(header)}, action_columns, [])
+    return _split(file, {name: values[:, index] for index, name in enumerate(header)}, action_columns, [])
 
 
 def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
@@ -195,67 +235,16 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
         block = numbers(values.cast(kind), name)
         alone = not pyarrow.types.is_list(kind)
         columns |= {name if alone else f"{name}_{index}": block[:, index] for index in range(block.shape[1])}
-    return _split(columns, action_columns, unread)
+    return _split(file, columns, action_columns, unread)
 
 
 _READERS = {".npz": _read_npz, ".csv": _read_csv, ".parquet": _read_parquet}
 
 
-def _split(columns: Mapping[str, np.ndarray], action_columns: Sequence[str] | None, unread: list[str]) -> _Table:
-    """Trajectories of a table with named columns."""
+def _split(file: Path, columns: Mapping[str, np.ndarray], action_columns: Sequence[str] | None, unread: list[str]):
+    """States and actions of a table with named columns."""
     acting = [name for name in columns if name == "action" or name.startswith(("action_", "action."))]
     if action_columns is not None:
         acting = [name for name in action_columns if lookup(columns, name, "action column") is not None]
-    time = next((name for name in TIMES if name in columns), None)
-    episode = next((name for name in EPISODES if name in columns), None)
-    apart = {time, episode, *_COUNTERS, *acting}
-    observed = [name for name in columns if name not in apart]
-    if not observed:
-        raise ValueError(f"has no state columns, only {', '.join(columns)}")
-    frames = np.stack([columns[name] for name in observed], 1)
-    steps = np.stack([columns[name] for name in acting], 1) if acting else None
-    number = columns[episode] if episode else np.zeros(len(frames))
-    starts = np.flatnonzero(np.r_[True, np.diff(number) != 0])
-    pieces = [slice(start, end) for start, end in zip(starts, [*starts[1:], len(frames)], strict=True)]
-    found = [(frames[piece], None if steps is None else steps[piece]) for piece in pieces]
-    rate = _rate([columns[time][piece] for piece in pieces]) if time else None
-    return _Table(found, observed, acting or None, rate, unread)
-
-
-def _rate(times: Sequence[np.ndarray]) -> float:
-    steps = np.concatenate([np.diff(stamps) for stamps in times])
-    if not len(steps) or not (steps > 0).all():
-        raise ValueError("time stamps do not increase")
-    middle = np.median(steps)
-    if np.abs(steps - middle).max() > _UNEVEN * middle:
-        raise ValueError(
-            f"frames are {steps.min():.4g} to {steps.max():.4g} s apart; resample them to a fixed rate first, or pass"
-            " control_hz"
-        )
-    return float(1 / middle)
-
-
-def _common_rate(rates: Sequence[float], problems: list[str]) -> float | None:
-    if not rates:
-        problems.append("no file has time stamps (a column 'timestamp' in seconds): pass control_hz")
-        return None
-    if max(rates) > (1 + _UNEVEN) * min(rates):
-        problems.append(
-            f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second: resample them, or pass control_hz"
-        )
-    return float(np.median(rates))
-
-
-def _common_names(tables: Mapping[Path, _Table], kind: str, problems: list[str]) -> list[str] | None:
-    """Names of the state or action columns that all files with any have."""
-    every = {file: table.state_names if kind == "state" else table.action_names for file, table in tables.items()}
-    named = {file: names for file, names in every.items() if names is not None}
-    if not named:
-        return None
-    first, wanted = next(iter(named.items()))
-    problems += [
-        f"{file}: {kind} columns are {', '.join(names)}; those of {first.name} are {', '.join(wanted)}"
-        for file, names in named.items()
-        if names != wanted
-    ]
-    return wanted
+    states = {name: values for name, values in columns.items() if name not in acting}
+    return Piece(file.name, states, {name: columns[name] for name in acting} or None), None, unread

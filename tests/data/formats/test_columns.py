@@ -1,0 +1,97 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Named columns as recordings: what is no state, where episodes end, and the rate by the time stamps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from torchrl_koap.data import read_recordings
+from torchrl_koap.data.formats.columns import Piece, assemble
+from torchrl_koap.files import DataError
+
+X = np.random.default_rng(0).normal(size=6).cumsum()
+ENDS = np.array([0, 0, 1, 0, 0, 1])
+
+
+def read(actions=None, control_hz=20.0, **columns):
+    states = {"x": X[: len(next(iter(columns.values()), X))]} | {name: np.asarray(v) for name, v in columns.items()}
+    return assemble([Piece("run", states, {"v": np.ones(len(states["x"]))})], "data", control_hz=control_hz)
+
+
+@pytest.mark.parametrize("name", ["timeouts", "terminals", "done", "episode_ends"])
+@pytest.mark.parametrize("kind", [int, float, bool])
+def test_a_flag_ends_an_episode(name, kind):
+    found = read(**{name: ENDS.astype(kind)})
+    np.testing.assert_array_equal(np.stack(found.states)[..., 0], X.reshape(2, 3))
+    assert found.skipped == (name,) and found.sources == ("run[0]", "run[1]")
+
+
+@pytest.mark.parametrize("ends", [ENDS, np.array([3, 6])])
+def test_archives_say_where_episodes_end(ends, tmp_path):
+    np.savez(tmp_path / "all.npz", observations=X[:, None], actions=X[:, None], episode_ends=ends, control_hz=20.0)
+    assert [len(frames) for frames in read_recordings(tmp_path).states] == [3, 3]
+    np.savez(tmp_path / "all.npz", observations=X[:, None], actions=X[:, None], which=[0, 0, 0, 1, 1, 1])
+    with pytest.raises(DataError, match="entry 'which' has one whole number a frame"):
+        read_recordings(tmp_path, control_hz=20)
+
+
+def test_a_counter_splits_and_sorts():
+    assert [len(frames) for frames in read(frame_index=[0, 1, 2, 0, 1, 2]).states] == [3, 3]
+    np.testing.assert_array_equal(read(frame_index=[2, 0, 1, 3, 5, 4]).states[0][:, 0], X[[1, 2, 0, 3, 5, 4]])
+    mixed = read(traj_id=[0, 1, 0, 1, 0, 1], frame_index=[0, 0, 1, 1, 2, 2])
+    np.testing.assert_array_equal(np.stack(mixed.states)[..., 0], [X[::2], X[1::2]])
+    with pytest.raises(DataError, match="episode_id 0 comes back"):
+        read(episode_id=[0, 0, 1, 1, 0, 0])
+    with pytest.raises(DataError, match="neither counts on nor starts again"):
+        read(frame_index=[0, 1, 1, 2, 3, 4])
+
+
+@pytest.mark.parametrize(
+    "name", ["Timestamp", "time_s", "stamp", "Time [ms]", "__index_level_0__", "Unnamed: 0", "reward"]
+)
+def test_what_is_no_state_is_left_out_and_listed(name):
+    found = read(**{name: X})
+    assert found.state_names == ("x",) and found.skipped == (name,)
+
+
+def test_a_column_that_rises_evenly_is_a_clock():
+    found = read(x=np.random.default_rng(0).normal(size=30), ticks=np.arange(30) * 7.0)
+    assert found.state_names == ("x",) and found.skipped == ("ticks (it rises evenly: a clock)",)
+
+
+def test_columns_are_chosen_by_name():
+    states = {"x": X, "time": X, "y": X}
+    pieces = [Piece("run", states, {"v": X, "w": X})]
+    found = assemble(pieces, "data", control_hz=5, state_columns=["time", "x"], drop_columns=["w"])
+    assert (found.state_names, found.action_names, found.skipped) == (("time", "x"), ("v",), ("y", "w"))
+    with pytest.raises(DataError, match="unknown column 'yy'; did you mean 'y'"):
+        assemble(pieces, "data", control_hz=5, drop_columns=["yy"])
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"time": np.arange(6) * 33.0}, "0.0303 frames per second if it is in seconds: name it time_ms"),
+        ({"time": np.zeros(6)}, "time stamps do not increase"),
+        ({"time": [0, 0.1, 0.2, 3.2, 3.3, 3.4]}, r"run: frames are 0.1 to 3 s apart \(frame 2\)"),
+    ],
+)
+def test_time_stamps_that_cannot_be(columns, message):
+    with pytest.raises(DataError, match=message):
+        read(control_hz=None, **columns)
+    assert read(**columns).control_hz == 20  # what is asked for counts
+
+
+def test_the_rate_is_read_in_its_unit_and_compared():
+    assert read(control_hz=None, time_ms=np.arange(6) * 20.0).control_hz == pytest.approx(50)
+    with pytest.raises(DataError, match="says 50 frames per second, the source declares 20"):
+        assemble([Piece("run", {"x": X, "timestamp": np.arange(6) / 50}, {"v": X})], "data", declared_hz=20)
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_separators_blank_lines_and_truth_values(separator, tmp_path):
+    rows = [["time", "x", "touch", "action"], ["0", "0.5", "True", "1"], ["0.1", "0.7", "False", "2"]]
+    (tmp_path / "a.csv").write_text("\n".join(separator.join(row) for row in rows) + "\n\n")
+    found = read_recordings(tmp_path)
+    assert found.control_hz == pytest.approx(10) and found.states[0].tolist() == [[0.5, 1], [0.7, 0]]
