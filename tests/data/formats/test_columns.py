@@ -65,7 +65,7 @@ def test_columns_are_chosen_by_name():
     pieces = [Piece("run", states, {"v": X, "w": X})]
     found = assemble(pieces, "data", control_hz=5, state_columns=["time", "x"], drop_columns=["w"])
     assert (found.state_names, found.action_names, found.skipped) == (("time", "x"), ("v",), ("y", "w"))
-    with pytest.raises(DataError, match="unknown column 'yy'; did you mean 'y'"):
+    with pytest.raises(DataError, match="unknown column in drop_columns: 'yy'; did you mean 'y'"):
         assemble(pieces, "data", control_hz=5, drop_columns=["yy"])
 
 

@@ -75,7 +75,7 @@ def assemble(
     *,
     declared_hz: float | None = None,
     control_hz: float | None = None,
-    state_columns: Sequence[str] | None = None,
+    state_columns: Sequence[str] = (),
     drop_columns: Sequence[str] = (),
     action_dim: int | None = None,
     action_names: Sequence[str] | None = None,
@@ -91,8 +91,8 @@ def assemble(
     Keyword Args:
         declared_hz (float, optional): frames per second that the source declares; time stamps must agree.
         control_hz (float, optional): frames per second, whatever source and time stamps say.
-        state_columns (sequence of str, optional): columns that make up the state, in that order. Default: all that are
-            no clock, counter, reward or flag of an episode.
+        state_columns (sequence of str): columns that make up the state, in that order. Default: all that are no clock,
+            counter, reward or flag of an episode.
         drop_columns (sequence of str): state and action columns that are left out.
         action_dim (int, optional): number of action columns, where nothing has actions.
         action_names (sequence of str, optional): their names, where nothing has actions.
@@ -111,23 +111,20 @@ def assemble(
     pieces = [part for piece in pieces for part in _episodes(piece, problems)]
     names = list(pieces[0].states)
     acting = next((list(piece.actions) for piece in pieces if piece.actions is not None), None)
-    known = [*names, *(acting or [])]
-    for column in [*(state_columns or ()), *drop_columns]:
-        try:
-            lookup(known, column, "column")
-        except ValueError as error:
-            problems.append(str(error))
-    left_out = list(skipped)
-    if state_columns:
-        observed = list(state_columns)
-    else:
-        even = _even(pieces)
-        observed = [name for name in names if kind_of(name)[0] is None and name not in even]
-        left_out += [f"{name} (it rises evenly: a clock)" for name in names if name in even]
-        observed = [name for name in observed if name not in drop_columns]
-    left_out += [
-        name for name in names if name not in observed and f"{name} (it rises evenly: a clock)" not in left_out
-    ]
+    for option, asked, known in (
+        ("state_columns", state_columns, names),
+        ("drop_columns", drop_columns, [*names, *(acting or [])]),
+    ):
+        for column in asked:
+            try:
+                lookup(known, column, f"column in {option}:")
+            except ValueError as error:
+                problems.append(str(error))
+    even = set() if state_columns else _even(pieces)
+    usable = [name for name in names if kind_of(name)[0] is None and name not in even]
+    observed = [name for name in state_columns or usable if name not in drop_columns]
+    unused = [name for name in names if name not in observed]
+    left_out = [*skipped, *(f"{name} (it rises evenly: a clock)" if name in even else name for name in unused)]
     if not observed:
         problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*(acting or []), *names])}")
     if acting is not None:
