@@ -22,7 +22,7 @@ import torch
 import tyro
 from resumable_table import open_table
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 from tiny_runs import TINY, koap, write_demonstrations  # noqa: E402
 
 from torchrl_koap import load_policy

@@ -6,5 +6,5 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-SHARED = Path(os.environ.get("KOAP_SHARED", Path(__file__).parents[2] / "shared"))
+SHARED = Path(os.environ.get("KOAP_SHARED", Path(__file__).parents[3] / "shared"))
 HUMAN = SHARED / "d3il_avoiding_human"
