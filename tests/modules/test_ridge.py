@@ -72,8 +72,6 @@ def test_input_noise_leaves_out_smaller_penalties_alone():
     free, floored = (fit(latent, action, input_noise=noise) for noise in (0.0, 1e-6))
     assert min(free.errors) == pytest.approx(1e-6) and min(floored.errors) == pytest.approx(200e-6)
     assert all(floored.errors[penalty] == free.errors[penalty] for penalty in free.errors if penalty > 200e-6)
-    with pytest.raises(ValueError, match="input_noise must be finite and not negative, got -1"):
-        fit(latent, action, input_noise=-1.0)
 
 
 def brute_force(latent, action, groups, penalty, bias):
@@ -163,8 +161,6 @@ def test_a_ridge_around_a_prior_is_a_ridge_around_zero_on_the_rest():
     assert around.penalty == rest.penalty
     around = ridge(latent, action, prior=prior, bias=False, penalties=(1e9,))
     torch.testing.assert_close(around.weight.float(), prior, rtol=1e-4, atol=1e-4)
-    with pytest.raises(ValueError, match="prior"):
-        ridge(latent, action, prior=prior.T)
 
 
 @pytest.mark.parametrize(
@@ -201,11 +197,6 @@ def test_the_filter_solves_the_ridge_equations():
     np.testing.assert_allclose(shared_filter(steps, action, penalty=0.3).numpy(), expected, rtol=1e-9)
 
 
-def test_axes_that_differ_are_refused():
-    with pytest.raises(ValueError, match=r"\[N, S, act\]"):
-        shared_filter(torch.zeros(5, 3, 2), torch.zeros(5, 3))
-
-
 # held-out errors by themselves
 
 SIZES = (1, 3, 30, 9)  # single rows, fewer and more rows than directions
@@ -237,7 +228,7 @@ def test_groups_of_any_size_in_any_order_against_refits(directions, centred):
     target = torch.randn(len(groups), 2, dtype=torch.float64)
     mean = matrix.mean(0) if centred else torch.zeros(directions).double()
     shift = target.mean(0) if centred else torch.zeros(2).double()
-    left, singular, _ = thin_svd(matrix - mean, wide=2048)
+    left, singular, _ = thin_svd(matrix - mean)
     penalties = (0.3, 5.0)
     shrinks = torch.stack([singular.square() / (singular.square() + penalty) for penalty in penalties])
     found = held_out_errors(left, shrinks, target - shift, groups, centred=centred)
@@ -265,18 +256,18 @@ def test_systems_that_rounding_makes_indefinite_are_solved_all_the_same():
 @pytest.mark.parametrize("size", [1, 5])
 def test_features_that_never_move_leave_the_mean(size, centred):
     groups, target = torch.arange(20) // size, torch.randn(20, 3, dtype=torch.float64)
-    left, singular, _ = thin_svd(torch.zeros(20, 2).double(), wide=2048)
+    left, singular, _ = thin_svd(torch.zeros(20, 2).double())
     target = target - target.mean(0) if centred else target
     found = held_out_errors(left, singular.expand(2, -1), target, groups, centred=centred)
     factor = torch.stack([target[groups != group].mean(0) for group in groups]) if centred else 0.0
     torch.testing.assert_close(found, (target - factor).square().mean(0).expand(2, -1))
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(90, 4), (9, 4), (4, 9), (3, 50)])
+@pytest.mark.parametrize(("rows", "columns"), [(90, 4), (9, 4), (4, 9), (3, 2100)])
 def test_decomposition_is_one(rows, columns):
     torch.manual_seed(0)
     matrix = torch.randn(rows, columns, dtype=torch.float64)
-    left, singular, right = thin_svd(matrix, wide=20)
+    left, singular, right = thin_svd(matrix)
     torch.testing.assert_close((left * singular) @ right, matrix)
     torch.testing.assert_close(left.mT @ left, torch.eye(len(singular)).double())
     torch.testing.assert_close(singular, torch.linalg.svdvals(matrix)[: len(singular)])
@@ -285,7 +276,7 @@ def test_decomposition_is_one(rows, columns):
 def test_directions_that_are_lost_in_rounding_are_left_out():
     matrix = torch.randn(60, 3, dtype=torch.float64)
     matrix = torch.cat([matrix, torch.zeros(60, 2).double(), matrix[:, :1]], -1)  # nothing, and one column twice
-    left, singular, right = thin_svd(matrix, wide=2048)
+    left, singular, right = thin_svd(matrix)
     assert len(singular) == 3
     torch.testing.assert_close((left * singular) @ right, matrix)
-    assert thin_svd(torch.zeros(60, 2).double(), wide=2048)[1].numel() == 0
+    assert thin_svd(torch.zeros(60, 2).double())[1].numel() == 0

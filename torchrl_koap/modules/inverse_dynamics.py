@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from torchrl_koap.keys import ACTION, LATENT_ACTION, STATE
 from torchrl_koap.modules.windows import WindowReader
 
+BATCH = 4096  # windows that are read at once
+
 
 class InverseDynamics(TensorDictModuleBase):
     """Maps windows of raw states to the raw action of every frame; all that losses, training and policies ask of it.
@@ -81,12 +83,7 @@ class InverseDynamics(TensorDictModuleBase):
         return self.out_keys[-1]
 
     def set_keys(self, *, state: NestedKey | None = None, action: NestedKey | None = None) -> None:
-        """Renames the entries read and written.
-
-        Keyword Args:
-            state (NestedKey, optional): new :attr:`in_key`.
-            action (NestedKey, optional): new :attr:`out_key`.
-        """
+        """Renames :attr:`in_key` and :attr:`out_key`, those that are given."""
         if state is not None:
             self.in_keys = [state]
         if action is not None:
@@ -99,15 +96,11 @@ class InverseDynamics(TensorDictModuleBase):
 
     @property
     def num_window_frames(self) -> int:
-        """Frames of the shortest window in which a frame (number ``num_past``) has all it reads and its successor."""
+        """Frames of the shortest window in which a frame has all it reads, and its successor."""
         return self.reader.num_window_frames
 
     def valid_frames(self, num_frames: int) -> range:
-        """Returns the frames of a window of ``num_frames`` that count in the losses.
-
-        Raises:
-            ValueError: if the window is too short to hold one.
-        """
+        """Returns the frames of a window of ``num_frames`` that count in the losses (:class:`WindowReader`)."""
         return self.reader.valid_frames(num_frames)
 
     def normalize_state(self, state: Tensor) -> Tensor:
@@ -133,7 +126,7 @@ class InverseDynamics(TensorDictModuleBase):
 
         Keyword Args:
             updates (int): updates that a network may be trained for before its losses; here none is.
-            progress (callable, optional): called with the number of these updates that are done, and of all.
+            progress (callable, optional): called with the number of updates done, and of all.
         """
         if self.reader is not None:
             self.reader.fit(self.normalize_state(windows))
@@ -175,7 +168,7 @@ class InverseDynamics(TensorDictModuleBase):
             guessed (bool): the axes are only likely.
 
         Returns:
-            dict: numbers for the summary, mostly :meth:`~torchrl_koap.modules.ridge.RidgeFit.summary`.
+            dict: numbers for the summary (:meth:`~torchrl_koap.modules.ridge.RidgeFit.summary`).
 
         Raises:
             ValueError: if no labelled frame counts, or shapes disagree.
@@ -188,26 +181,15 @@ class InverseDynamics(TensorDictModuleBase):
         windows: TensorDictBase,
         mask: Tensor,
         groups: Tensor | None = None,
-        *,
-        batch_size: int = 4096,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Selects what :meth:`fit_labels` fits a decoder to.
+        """Selects what :meth:`fit_labels`, whose other arguments these are, fits a decoder to.
 
         Args:
             read (callable): maps raw states ``[N, T, d]`` and a range of frames to what the decoder reads of them,
                 ``[N, frames, m]``.
-            windows (TensorDictBase): as for :meth:`fit_labels`, as the following two.
-            mask (Tensor): labelled frames.
-            groups (Tensor, optional): trajectory of every window.
-
-        Keyword Args:
-            batch_size (int): windows that are read at once.
 
         Returns:
             tuple of Tensor: inputs ``[n, m]``, normalised actions ``[n, act]``, and groups ``[n]`` if they were given.
-
-        Raises:
-            ValueError: if no labelled frame counts, or shapes disagree.
         """
         shape = windows.get(self.in_key).shape[:-1]
         if mask.shape != shape or mask.dtype != torch.bool:
@@ -221,7 +203,7 @@ class InverseDynamics(TensorDictModuleBase):
         if not rows.any():
             raise ValueError(f"no labelled frame lies in frames {frames.start}..{frames.stop - 1} of any window")
         states, action, mask = windows.get(self.in_key)[rows], windows.get(self.out_key)[rows], mask[rows]
-        inputs = torch.cat([read(some, frames) for some in states.split(batch_size)])[mask]
+        inputs = torch.cat([read(some, frames) for some in states.split(BATCH)])[mask]
         action = self.normalize_action(action[:, part][mask], states[:, part][mask])
         return inputs, action, None if groups is None else groups[rows].unsqueeze(-1).expand_as(mask)[mask]
 
@@ -261,19 +243,11 @@ class LatentInverseDynamics(InverseDynamics):
         self.action_decoder = action_decoder
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Infers the latents of a window of raw states; a subclass says how.
-
-        Args:
-            state (Tensor): window of raw states ``[*B, T, d]``.
-            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
-
-        Returns:
-            Tensor: ``[*B, len(frames), m]``.
-        """
+        """Infers the latents ``[*B, len(frames), m]`` of raw states ``[*B, T, d]``; a subclass says how."""
         raise NotImplementedError
 
     def sample(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Samples latents, where there is a distribution of them; otherwise :meth:`infer`."""
+        """Samples latents where they have a distribution; otherwise it is :meth:`infer`."""
         return self.infer(state, frames)
 
     def decode(self, latent: Tensor) -> Tensor:

@@ -79,13 +79,9 @@ def ridge(
     r"""Fits ``targets ~ D inputs + b``, in float64.
 
     The penalty is chosen by leaving out one row at a time, :math:`e_i = (a_i - \hat a_i) / (1 - h_i)` with the leverage
-    ``h_i``, which is exact for least squares. With ``groups`` all rows of a group are left out together (exact as
-    well): steps of one trajectory resemble each other so much that leaving out one says little.
-
-    Rows that are left out are recorded ones too. Inputs from *plans* have errors besides, which many labels do not
-    show: the more there are, the smaller the penalty that is chosen, and the more a direction counts in which recorded
-    steps hardly differ. Noise of variance :math:`s^2` on every entry acts as a penalty of :math:`n s^2` (Bishop 1995,
-    "Training with noise is equivalent to Tikhonov regularization"), so no smaller one is chosen.
+    ``h_i``; with ``groups`` all rows of a group at once, since steps of one trajectory resemble each other. Both are
+    exact. Noise of variance :math:`s^2` on every entry of inputs to come acts as a penalty of :math:`n s^2` (Bishop
+    1995, "Training with noise is equivalent to Tikhonov regularization"), so no smaller one is chosen.
 
     Args:
         inputs (Tensor): ``[n, m]``.
@@ -93,11 +89,9 @@ def ridge(
 
     Keyword Args:
         groups (Tensor, optional): group of every row, int64 ``[n]``.
-        penalties (sequence of float): candidates, in units of the mean square norm of the inputs: the ratio of noise to
-            signal variance that the fit assumes.
+        penalties (sequence of float): candidates, in units of the mean square norm of the inputs.
         default_penalty (float, optional): used instead of the choice where there are fewer than three groups.
-        input_noise (float): variance :math:`s^2` of the errors of every entry of inputs to come, in units of their mean
-            square norm. Defaults to 0.
+        input_noise (float): :math:`s^2`, in units of the mean square norm of the inputs. Defaults to 0.
         bias (bool): fit ``b``; otherwise it is 0. Defaults to ``True``.
         prior (Tensor, optional): ``[act, m]``, what ``D`` is shrunk towards. Defaults to 0.
 
@@ -122,18 +116,13 @@ def ridge(
     candidates = tuple(penalties) if default_penalty is None else (*penalties, default_penalty)
     if not candidates or not all(0 < penalty < float("inf") for penalty in candidates):
         raise ValueError(f"penalties must be positive and finite, got {candidates}")
-    if not 0 <= input_noise < float("inf"):
-        raise ValueError(f"input_noise must be finite and not negative, got {input_noise}")
     if not len(inputs):
         raise ValueError("a ridge regression needs at least one labelled step, there is none")
     x, y = inputs.double(), targets.double()
     for name, value in (("action", y), ("input", x)):
         if not value.isfinite().all():
             raise ValueError(f"a labelled {name} is not finite")
-    prior = torch.zeros(y.shape[-1], x.shape[-1]) if prior is None else prior
-    if prior.shape != (y.shape[-1], x.shape[-1]):
-        raise ValueError(f"prior must be {[y.shape[-1], x.shape[-1]]}, got {list(prior.shape)}")
-    prior = prior.to(x)
+    prior = x.new_zeros(y.shape[-1], x.shape[-1]) if prior is None else prior.to(x)
     y = y - x @ prior.mT  # a ridge around the prior is a ridge around 0 on what the prior leaves over
     rows = torch.arange(len(x), device=x.device)
     groups = rows if groups is None else groups.unique(return_inverse=True)[1]
@@ -145,7 +134,7 @@ def ridge(
 
     mean_x, mean_y = (x.mean(0), y.mean(0)) if bias else (torch.zeros_like(x[0]), torch.zeros_like(y[0]))
     centred, target = (x - mean_x, y - mean_y) if bias else (x, y)  # a copy may take gigabytes
-    left, singular, right = thin_svd(centred, wide=WIDE)
+    left, singular, right = thin_svd(centred)
     unit = centred.square().sum(-1).mean()
     unit = torch.where(unit > 0, unit, torch.ones_like(unit))  # constant inputs: any scale will do
     projected = left.mT @ target
@@ -166,9 +155,8 @@ def shared_filter(steps: Tensor, action: Tensor, *, penalty: float = 0.02) -> Te
     .. math::
         a_{t,i} \approx \sum_s w_s v_{t,s,i} \qquad \text{for every axis } i
 
-    with a ridge penalty relative to the mean square of the steps. A trajectory that hardly moves along one axis says
-    little about that axis; together they determine the few numbers ``w`` well. A full decoder is then fitted around
-    this one (``prior`` of :func:`ridge`).
+    A trajectory that hardly moves along one axis says little about that axis; together they determine the few numbers
+    ``w`` well.
 
     Args:
         steps (Tensor): steps ``v`` of each axis' own coordinate, ``[N, S, act]``, raw units.
@@ -179,52 +167,22 @@ def shared_filter(steps: Tensor, action: Tensor, *, penalty: float = 0.02) -> Te
 
     Returns:
         Tensor: the filter ``w`` ``[S]``.
-
-    Raises:
-        ValueError: if the axes of steps and actions differ.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.ridge import shared_filter
-        >>> steps, true = torch.randn(500, 3, 2), torch.tensor([0.5, -1.0, 2.0])
-        >>> found = shared_filter(steps, torch.einsum("nsa,s->na", steps, true))
-        >>> bool((found - true).abs().max() < 0.01)
-        True
     """
-    if steps.ndim != 3 or action.shape != (steps.shape[0], steps.shape[2]):
-        raise ValueError(
-            f"steps must be [N, S, act] and action [N, act], got {list(steps.shape)} and {list(action.shape)}"
-        )
     rows, target = steps.mT.flatten(0, 1), action.flatten()  # [N * act, S]
     unit = rows.square().sum(-1).mean()
     gram = rows.mT @ rows + penalty * unit * torch.eye(rows.shape[-1], dtype=rows.dtype, device=rows.device)
     return torch.linalg.solve(gram, rows.mT @ target)
 
 
-def thin_svd(matrix: Tensor, *, wide: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Thin singular value decomposition, by whichever product is small where one side is much longer than the other.
+def thin_svd(matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Decomposes ``[N, m]`` into left vectors ``[N, r]``, singular values ``[r]``, descending, and right ``[r, m]``.
 
-    Args:
-        matrix (Tensor): ``[N, m]``.
-
-    Keyword Args:
-        wide (int): columns above which the products of the rows are decomposed, if there are few enough of these.
-
-    Returns:
-        tuple: left vectors ``[N, r]``, singular values ``[r]`` in descending order and right vectors ``[r, m]``.
-            Directions that are lost in rounding are left out: below a millionth of the largest singular value by
-            products of rows, below a billionth of it where there are many rows.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.ridge import thin_svd
-        >>> matrix = torch.randn(50, 3, dtype=torch.float64)
-        >>> left, singular, right = thin_svd(matrix, wide=2048)
-        >>> bool(((left * singular) @ right - matrix).abs().max() < 1e-12)
-        True
+    Where one side is much longer than the other, the small product is decomposed. Directions that are lost in rounding
+    are left out: below a millionth of the largest singular value by products of rows, below a billionth where there are
+    many rows.
     """
     rows, columns = matrix.shape
-    if columns > max(wide, 2 * rows):
+    if columns > max(WIDE, 2 * rows):
         values, left = torch.linalg.eigh(matrix @ matrix.mT)
         kept = values > 1e-12 * values[-1].clamp_min(1e-300)
         singular, left = values[kept].flip(0).sqrt(), left[:, kept].flip(-1)
@@ -239,7 +197,7 @@ def thin_svd(matrix: Tensor, *, wide: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def held_out_errors(left: Tensor, shrinks: Tensor, target: Tensor, groups: Tensor, *, centred: bool) -> Tensor:
-    r"""Mean squared errors of ridge regressions on every group of rows, predicted without it.
+    r"""Computes mean squared errors of ridge regressions on every group of rows, predicted without it.
 
     With the left singular vectors ``U`` and the shrinkages ``s`` of the directions a ridge predicts
     :math:`\hat Y = H Y`, :math:`H = U \mathrm{diag}(s) U^T`. Rows ``G`` left out have the errors
@@ -260,16 +218,6 @@ def held_out_errors(left: Tensor, shrinks: Tensor, target: Tensor, groups: Tenso
 
     Returns:
         Tensor: ``[P, act]``; infinite where nothing is left to take a mean of.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.ridge import held_out_errors
-        >>> left = torch.linalg.qr(torch.randn(30, 2, dtype=torch.float64)).Q
-        >>> target, groups = left @ torch.ones(2, 1, dtype=torch.float64), torch.arange(30) // 10
-        >>> shrinks = torch.tensor([[1.0, 1.0], [0.5, 0.5]], dtype=torch.float64)
-        >>> errors = held_out_errors(left, shrinks, target, groups, centred=False)
-        >>> bool(errors[0] < 1e-20), bool(errors[1] > 1e-4)  # the first fits exactly, the second is shrunk
-        (True, True)
     """
     coefficients = shrinks.unsqueeze(-1) * (left.mT @ target)  # [P, r, act]
     if centred and len(left) == 1:

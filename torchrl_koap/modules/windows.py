@@ -30,9 +30,8 @@ class WindowReader(nn.Module):
                                   x_2    x_3           x_5                  x_8
         relative          (x_3 - x_2) / s_0, x_3, (x_5 - x_3) / s_2, (x_8 - x_5) / s_3
 
-    Each step is divided by its own spread ``s`` (:meth:`fit`): steps of a few millimetres then reach a network at unit
-    scale, not as differences of numbers of order one, and a decoder that weighs them all alike is a local mean
-    velocity. The present frame stays in the normaliser's units.
+    Each step is divided by its own spread ``s`` (:meth:`fit`), so that steps of a few millimetres reach a network at
+    unit scale. The present frame stays in the normaliser's units.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -91,14 +90,11 @@ class WindowReader(nn.Module):
 
     @property
     def num_window_frames(self) -> int:
-        """Frames of the shortest window in which a frame (number ``num_past``) has all it reads and its successor."""
+        """Frames of the shortest window in which a frame has all it reads, and its successor."""
         return self.num_past + 1 + self.look_ahead[-1]
 
     def valid_frames(self, num_frames: int) -> range:
         """Returns the frames that count in the losses: past, successor and look-ahead lie in the window.
-
-        Args:
-            num_frames (int): frames ``T`` of the window.
 
         Raises:
             ValueError: if no frame of so short a window counts.
@@ -113,29 +109,16 @@ class WindowReader(nn.Module):
         return frames
 
     def index(self, num_frames: int, frames: range | None = None, device: torch.device | None = None) -> Tensor:
-        """Returns which frames are read for each of ``frames``, clamped to the window.
-
-        Args:
-            num_frames (int): frames ``T`` of the window.
-            frames (range, optional): frames to read for. Default: all.
-            device (torch.device, optional): of the index.
-
-        Returns:
-            Tensor: int64 ``[len(frames), F]`` with ``F = num_past + 1 + len(look_ahead)``.
-        """
+        """Returns which frames are read for each, clamped to the window: int64 ``[len(frames), F]``."""
         frames = range(num_frames) if frames is None else frames
         offsets = torch.tensor([*range(-self.num_past, 1), *self.look_ahead], device=device)
         return (torch.arange(frames.start, frames.stop, device=device)[:, None] + offsets).clamp(0, num_frames - 1)
 
     def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Reads a window for all or some of its frames.
-
-        Args:
-            state (Tensor): states ``[*B, T, d]`` in the networks' units.
-            frames (range, optional): frames to read for. Default: all; offsets beyond the window are clamped to it.
+        """Reads a window of states ``[*B, T, d]`` for all or some of its frames.
 
         Returns:
-            Tensor: ``[*B, len(frames), F, d]``.
+            Tensor: ``[*B, len(frames), F, d]``; offsets beyond the window are clamped to it.
 
         Raises:
             ValueError: if the states have another number of columns.

@@ -105,7 +105,8 @@ def test_each_stage_trains_what_it_should():
 
 def test_an_action_is_a_function_of_the_code_alone():
     """Two frames with one code have one action, whatever their states; few levels make such pairs."""
-    network = make_network(levels=(3,), num_codebooks=2)
+    network = make_network()
+    network.quantizer = FiniteScalarQuantizer(6, levels=(3,))
     state = 5 * torch.randn(30, T, 3, generator=torch.Generator().manual_seed(2))
     written = network(TensorDict({"state": state}, [30]))
     action, latent = written["action"].flatten(0, 1), written["latent_action"].flatten(0, 1)

@@ -11,7 +11,6 @@ from torchrl_koap.modules import (
     PRESETS,
     LatentActionFourier,
     LatentActionLSTM,
-    LatentActionMLP,
     Normalizer,
     make_koopman_inverse_dynamics,
 )
@@ -69,9 +68,7 @@ def test_every_preset_trains(preset):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize(
-    ("network", "kind"), [("fourier", LatentActionFourier), ("lstm", LatentActionLSTM), ("mlp", LatentActionMLP)]
-)
+@pytest.mark.parametrize(("network", "kind"), [("fourier", LatentActionFourier), ("lstm", LatentActionLSTM)])
 def test_every_network_fits_every_preset(preset, network, kind):
     model = make_koopman_inverse_dynamics(4, 3, preset=preset, network=network, latent_dim=8, hidden_dim=16)
     assert isinstance(model.latent_action, kind)
@@ -85,7 +82,6 @@ def test_options_override_the_preset_and_reach_the_parts():
         2,
         2,
         preset="paper",
-        network="mlp",
         relative=True,
         look_ahead=(2, 5),
         num_past=3,
@@ -109,12 +105,10 @@ def test_options_override_the_preset_and_reach_the_parts():
         ({"preset": "paperr"}, "unknown preset 'paperr'; did you mean 'paper'"),
         ({"preset": "xyz"}, "unknown preset 'xyz'; known: default, absolute, semi_supervised, paper"),
         ({"preset": None}, "unknown preset None"),
-        ({"network": "tcn"}, "unknown network 'tcn'; known: fourier, smoothed, lstm, mlp"),
+        ({"network": "tcn"}, "unknown network 'tcn'; known: fourier, smoothed, lstm"),
         ({"network": "lstmm"}, "unknown network 'lstmm'; did you mean 'lstm'"),
         ({"latentdim": 3}, "option .* 'latentdim'; did you mean 'latent_dim'"),
         ({"preset": "paper", "curvature": 0.1}, "option .* network 'lstm': 'curvature'"),
-        ({"network": "mlp", "num_features": 8}, "option .* network 'mlp': 'num_features'"),
-        ({"network": "smoothed", "lifting": "double"}, "unknown lifting 'double'"),
     ],
 )
 def test_unknown_names_are_refused(options, message):

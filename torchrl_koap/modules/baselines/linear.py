@@ -58,21 +58,7 @@ class LinearInverseDynamics(InverseDynamics):
     def fit_labels(
         self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None, **_: Any
     ) -> dict[str, Any]:
-        """Fits the regression on the labelled frames that see their whole look-ahead.
-
-        Args:
-            windows (TensorDictBase): see :meth:`InverseDynamics.fit_labels`, as the following ones.
-            mask (Tensor): labelled frames.
-
-        Keyword Args:
-            groups (Tensor, optional): trajectory of every window.
-
-        Returns:
-            dict: penalty, number of labels and held-out error.
-
-        Raises:
-            ValueError: if no labelled frame counts, or shapes disagree.
-        """
+        """Fits the regression on the labelled frames; see :meth:`InverseDynamics.fit_labels`."""
 
         def read(state: Tensor, frames: range) -> Tensor:
             return self.reader(self.normalize_state(state), frames)

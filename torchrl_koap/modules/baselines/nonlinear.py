@@ -38,9 +38,6 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         look_ahead (int or sequence of int): offsets ``k >= 2``. Defaults to ``(2, 3, 4, 5)``.
         **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
-    Raises:
-        ValueError: for a negative ``num_past`` or an offset below 2; at the call for states of another size.
-
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -81,15 +78,7 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         return self.lifting.encode(self.normalize_state(state))
 
     def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """Predicts ``z_{t+1}``.
-
-        Args:
-            lifted (Tensor): lifted states ``z_t``, ``[*B, T, m]``.
-            latent_action (Tensor): latent actions ``u_t``, ``[*B, T, m]``.
-
-        Returns:
-            Tensor: ``[*B, T, m]``.
-        """
+        """Predicts ``z_{t+1}`` of lifted states and latent actions, all ``[*B, T, m]``."""
         return self.dynamics(torch.cat([lifted, latent_action], -1))
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:

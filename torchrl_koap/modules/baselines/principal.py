@@ -16,6 +16,7 @@ from torchrl_koap.modules.ridge import DEFAULT_PENALTY, INPUT_NOISE, ridge
 from torchrl_koap.modules.windows import WindowReader
 
 COUNTS = (2, 4, 8, 16, 32, 64)
+MOST_WINDOWS = 4096  # of which components are computed, evenly spaced among all
 
 
 class PrincipalInverseDynamics(LatentInverseDynamics):
@@ -79,16 +80,9 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
         return self.action_decoder.linear(latent)
 
     @torch.no_grad()
-    def finish(self, windows: Tensor, *, most: int = 4096) -> None:
-        """Sets the components to those of windows of raw states ``[N, T, d]``; no label is read.
-
-        Args:
-            windows (Tensor): all windows.
-
-        Keyword Args:
-            most (int): windows used, evenly spaced among all.
-        """
-        windows = windows[:: max(1, len(windows) // most)]
+    def finish(self, windows: Tensor) -> None:
+        """Sets the components to those of windows of raw states ``[N, T, d]``; no label is read."""
+        windows = windows[:: max(1, len(windows) // MOST_WINDOWS)]
         now = self.reader.num_past
         rows = self.reader(self.normalize_state(windows), range(now, now + 1)).flatten(0, -2).double()
         if rows.shape[0] < rows.shape[1]:
@@ -105,18 +99,7 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
     ) -> dict[str, Any]:
         """Fits the ridge for every number of components and keeps the one with the smallest held-out error.
 
-        Args:
-            windows (TensorDictBase): see :meth:`InverseDynamics.fit_labels`, as the following ones.
-            mask (Tensor): labelled frames.
-
-        Keyword Args:
-            groups (Tensor, optional): trajectory of every window.
-
-        Returns:
-            dict: penalty, number of labels and held-out error of the number chosen.
-
-        Raises:
-            ValueError: if no labelled frame counts, or shapes disagree.
+        Args and result as of :meth:`InverseDynamics.fit_labels`.
         """
         self.gate.fill_(1.0)
         latent, action, groups = self.labelled_frames(self.infer, windows, mask, groups)

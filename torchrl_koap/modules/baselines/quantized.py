@@ -96,8 +96,6 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
 
     Keyword Args:
         latent_dim (int): size ``m`` of a latent, before the quantisation and after it. Defaults to ``16``.
-        levels (sequence of int): levels of every entry of a code. Defaults to ``(8, 5, 5, 5)``.
-        num_codebooks (int): codes side by side. Defaults to ``2``.
         hidden_dims (sequence of int): widths of the three networks. Defaults to ``(128, 128)``.
         num_past (int): number ``n`` of frames before the present one. Defaults to ``4``.
         look_ahead (int or sequence of int): offsets ``k``; 1 must be one of them, the transition that is encoded.
@@ -105,8 +103,7 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
-        ValueError: for a negative ``num_past``, a look-ahead without 1, or fewer than 3 levels; at the call for states
-            of another size.
+        ValueError: for a look-ahead without 1.
 
     Examples:
         >>> import torch
@@ -124,8 +121,6 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         action_dim: int,
         *,
         latent_dim: int = 16,
-        levels: Sequence[int] = (8, 5, 5, 5),
-        num_codebooks: int = 2,
         hidden_dims: Sequence[int] = (128, 128),
         num_past: int = 4,
         look_ahead: int | Sequence[int] = (1, 2, 3, 4, 5),
@@ -138,7 +133,7 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         super().__init__(reader, MLP(latent_dim, action_dim, **layers), **kwargs)
         self.latent_dim = latent_dim
         self.encoder = MLP(reader.num_features, latent_dim, **layers)
-        self.quantizer = FiniteScalarQuantizer(latent_dim, levels=levels, num_codebooks=num_codebooks)
+        self.quantizer = FiniteScalarQuantizer(latent_dim)
         self.dynamics = MLP((num_past + 1) * state_dim + latent_dim, state_dim, **layers)
 
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
@@ -146,11 +141,7 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
         return self.quantizer(self.encoder(self.reader(self.normalize_state(state), frames)))
 
     def predict_step(self, state: Tensor, frames: range | None = None) -> tuple[Tensor, Tensor]:
-        """Predicts the next step from the past and the code of the transition.
-
-        Args:
-            state (Tensor): window of raw states ``[*B, T, d]``.
-            frames (range, optional): frames to predict for. Default: all ``T`` of the window.
+        """Predicts the next step of raw states ``[*B, T, d]`` from the past and the code of the transition.
 
         Returns:
             tuple of Tensor: the prediction and the step ``x_{t+1} - x_t`` itself, both ``[*B, len(frames), d]`` and

@@ -31,9 +31,6 @@ class SupervisedInverseDynamics(InverseDynamics):
         look_ahead (int or sequence of int): offsets ``k >= 1``. Defaults to ``1``.
         **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
-    Raises:
-        ValueError: for a negative ``num_past`` or an offset below 1.
-
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

@@ -21,8 +21,7 @@ class VariationalInverseDynamics(LatentInverseDynamics):
     with ``s_t`` the present state and the steps to and from it (:class:`~torchrl_koap.modules.WindowReader`), and an
     LSTM that runs over the window in both directions. Trained in two stages, as the paper says:
     :class:`~torchrl_koap.objectives.VariationalLoss` on all windows, then :class:`~torchrl_koap.objectives.ActionLoss`
-    with ``freeze_latents`` and ``sample`` on the labelled frames. Where it acts it reads the mean, so that a state
-    always has the same action; noise could only make that worse.
+    with ``freeze_latents`` and ``sample`` on the labelled frames. Where it acts it reads the mean.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -33,9 +32,6 @@ class VariationalInverseDynamics(LatentInverseDynamics):
         latent_dim (int): size ``m`` of a latent. Defaults to ``16``.
         hidden_dim (int): size of the LSTM's state in either direction, and width of the decoders. Defaults to ``128``.
         **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
-
-    Raises:
-        ValueError: at the call for states of another size.
 
     Examples:
         >>> import torch
@@ -75,11 +71,7 @@ class VariationalInverseDynamics(LatentInverseDynamics):
         return self.window
 
     def posterior(self, state: Tensor, frames: range | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        """Reads a window and infers the distribution of its latents.
-
-        Args:
-            state (Tensor): window of raw states ``[*B, T, d]``.
-            frames (range, optional): frames to infer for. Default: all ``T`` of the window.
+        """Infers the distribution of the latents of a window of raw states ``[*B, T, d]``.
 
         Returns:
             tuple of Tensor: what every frame read ``[*B, len(frames), 3 d]``, at unit scale; mean and log-variance of

@@ -6,10 +6,10 @@ from __future__ import annotations
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 
 from torchrl_koap.keys import ACTION, LATENT_ACTION
-from torchrl_koap.modules.ridge import RidgeFit, ridge
+from torchrl_koap.modules.ridge import RidgeFit
 
 
 class LinearActionDecoder(TensorDictModuleBase):
@@ -27,8 +27,9 @@ class LinearActionDecoder(TensorDictModuleBase):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import LinearActionDecoder
+        >>> from torchrl_koap.modules.ridge import ridge
         >>> decoder, latent = LinearActionDecoder(4, 2), torch.randn(50, 4)
-        >>> fit = decoder.fit(latent, latent[:, :2], torch.ones(50, dtype=torch.bool))
+        >>> decoder.assign(ridge(latent, latent[:, :2]))
         >>> td = decoder(TensorDict({"latent_action": latent}, [50]))
         >>> bool((td["action"] - latent[:, :2]).abs().max() < 1e-3)
         True
@@ -44,37 +45,6 @@ class LinearActionDecoder(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the decoded actions."""
         return tensordict.set(self.out_keys[0], self.linear(tensordict.get(self.in_keys[0])))
-
-    def fit(self, latent: Tensor, action: Tensor, mask: Tensor, *, groups: Tensor | None = None, **options) -> RidgeFit:
-        """Sets ``D`` and ``b`` by ridge regression (:func:`~torchrl_koap.modules.ridge.ridge`) on latent actions.
-
-        Args:
-            latent (Tensor): latent actions ``[*B, m]``.
-            action (Tensor): actions ``[*B, act]``; anything, NaN included, where ``mask`` is False.
-            mask (Tensor): labelled steps, bool ``[*B]``.
-
-        Keyword Args:
-            groups (Tensor, optional): group of every step, int64 ``[*B]``, left out together.
-            **options: of :func:`~torchrl_koap.modules.ridge.ridge`.
-
-        Returns:
-            RidgeFit: the penalty chosen and its held-out errors.
-
-        Raises:
-            ValueError: if nothing is labelled, a labelled value is not finite, or shapes disagree.
-        """
-        if mask.dtype != torch.bool:
-            raise ValueError(f"mask must be bool, got {mask.dtype}")
-        if latent.shape[:-1] != action.shape[:-1] or mask.shape != latent.shape[:-1]:
-            raise ValueError(
-                f"latent {list(latent.shape)}, action {list(action.shape)} and mask {list(mask.shape)} must share"
-                " their leading shape"
-            )
-        if groups is not None and groups.shape != mask.shape:
-            raise ValueError(f"groups must have the shape of mask {list(mask.shape)}, got {list(groups.shape)}")
-        found = ridge(latent[mask], action[mask], groups=None if groups is None else groups[mask], **options)
-        self.assign(found)
-        return found
 
     @torch.no_grad()
     def assign(self, fit: RidgeFit) -> None:

@@ -106,27 +106,11 @@ class KoopmanInverseDynamics(LatentInverseDynamics):
         return self.action_decoder.linear(latent)
 
     def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """Predicts ``z_{t+1} = K z_t + u_t``.
-
-        Args:
-            lifted (Tensor): lifted states ``z_t``, ``[*B, T, m]``.
-            latent_action (Tensor): latent actions ``u_t``, ``[*B, T, input_dim]`` of the operator.
-
-        Returns:
-            Tensor: ``[*B, T, m]``.
-        """
+        """Predicts ``z_{t+1} = K z_t + u_t`` of lifted states ``[*B, T, m]`` and latent actions ``[*B, T, p]``."""
         return self.operator.step(lifted, latent_action)
 
     def rollout_latent(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """Rolls the linear dynamics out from one lifted state.
-
-        Args:
-            lifted (Tensor): first lifted state ``[*B, m]``.
-            latent_action (Tensor): latent actions ``[*B, T, input_dim]`` of the following steps.
-
-        Returns:
-            Tensor: lifted states ``[*B, T, m]`` after each of the steps.
-        """
+        """Rolls out from a lifted state ``[*B, m]``: those ``[*B, T, m]`` after each latent action ``[*B, T, p]``."""
         states = []
         for step in latent_action.unbind(-2):
             lifted = self.predict_next(lifted, step)
@@ -136,12 +120,7 @@ class KoopmanInverseDynamics(LatentInverseDynamics):
     def prepare(self, windows: Tensor, *, updates: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
         """Sets what is known of the inputs before training, and trains a lifting that starts from Isomap coordinates.
 
-        Args:
-            windows (Tensor): raw states ``[*B, T, d]``; no label is read.
-
-        Keyword Args:
-            updates (int): updates that such a lifting may have. Defaults to 0: it starts at linear components.
-            progress (callable, optional): called with the number of these updates that are done, and of all.
+        Args and keywords as of :meth:`InverseDynamics.prepare`. Without updates a lifting starts at linear components.
         """
         windows = self.normalize_state(windows)
         with torch.no_grad():
@@ -152,7 +131,7 @@ class KoopmanInverseDynamics(LatentInverseDynamics):
 
     @torch.no_grad()
     def finish(self, windows: Tensor) -> None:
-        """Fits what is fitted in closed form to raw states ``[*B, T, d]`` after training, where a part has any."""
+        """Fits the parts that are fitted to raw states ``[*B, T, d]`` after training."""
         windows = self.normalize_state(windows)
         self.lifting.finish(windows)
         self.latent_action.finish(windows)
@@ -166,70 +145,55 @@ class KoopmanInverseDynamics(LatentInverseDynamics):
         groups: Tensor | None = None,
         axes: Sequence[int] = (),
         guessed: bool = False,
-        **options: Any,
     ) -> dict[str, Any]:
         """Fits the decoder in closed form, and chooses the block that a latent action with several reads.
 
         With ``axes``, where a latent action holds the steps along them, the decoder is shrunk towards one filter of the
         steps that all axes share, instead of towards 0. Guessed axes are used only if labels left out are then
-        predicted better: on a robot of seven joints with five labelled trajectories that is a fifth of the error.
-
-        Args:
-            windows (TensorDictBase): see :meth:`InverseDynamics.fit_labels`, as the following ones.
-            mask (Tensor): labelled frames.
-
-        Keyword Args:
-            groups (Tensor, optional): trajectory of every window.
-            axes (sequence of int): state column that each action moves.
-            guessed (bool): the axes are only likely.
-            **options: of :func:`~torchrl_koap.modules.ridge.ridge`.
+        predicted better. Args and keywords as of :meth:`InverseDynamics.fit_labels`.
 
         Returns:
             dict: penalty, number of labels, held-out error in normalised units, and ``block`` if there were several.
-
-        Raises:
-            ValueError: if no labelled frame counts, shapes disagree, or the axes are not one per action.
         """
         normalizer = self.action_normalizer
         options = {
             "default_penalty": self.penalty,
             "input_noise": INPUT_NOISE,
             "bias": normalizer is not None and bool(normalizer.offset.any()),
-        } | options
+        }
         was_training, fits = self.training, {}
         self.eval()
         try:
-            for block in self.latent_action.blocks or ("",):
-                if block:
-                    self.latent_action.choose(block)
+            for block in self.latent_action.blocks:
+                self.latent_action.choose(block)
                 inputs, action, rows = self.labelled_frames(self.infer, windows, mask, groups)
                 fits[block] = self._fit_decoder(inputs, action, axes, guessed, groups=rows, **options)
         finally:
             self.train(was_training)
         best = min(fits, key=lambda block: fits[block].error / (RAW_SHARE if block == RAW else 1.0))
         self.action_decoder.assign(fits[best])
-        if not best:
-            return fits[best].summary()
         self.latent_action.choose(best)
-        return fits[best].summary() | {"block": best}
+        return fits[best].summary() | ({"block": best} if best else {})
 
     def _fit_decoder(
         self, latent: Tensor, action: Tensor, axes: Sequence[int], guessed: bool, **options: Any
     ) -> RidgeFit:
         """Fits around the shared filter of known axes; around that of guessed ones, or around 0, by held-out error."""
-        if not axes or not self.latent_action.holds_steps:
+        features = self.latent_action.axis_features(axes) if axes else None
+        if features is None:
             return ridge(latent, action, **options)
-        fit = ridge(latent, action, prior=self._shared_filter_prior(latent, action, axes), **options)
+        if len(axes) != action.shape[-1]:
+            raise ValueError(f"axes must be one state column per action entry ({action.shape[-1]}), got {list(axes)}")
+        fit = ridge(latent, action, prior=self._shared_filter_prior(latent, action, axes, *features), **options)
         if not guessed:
             return fit
         plain = ridge(latent, action, **options)
         return plain if plain.error <= fit.error else fit
 
-    def _shared_filter_prior(self, latent: Tensor, action: Tensor, axes: Sequence[int]) -> Tensor:
-        """The decoder ``[act, m]`` that applies one and the same filter to the steps of every axis."""
-        if len(axes) != action.shape[-1]:
-            raise ValueError(f"axes must be one state column per action entry ({action.shape[-1]}), got {list(axes)}")
-        entries, factors = self.latent_action.axis_features(axes)  # [S, act]
+    def _shared_filter_prior(
+        self, latent: Tensor, action: Tensor, axes: Sequence[int], entries: Tensor, factors: Tensor
+    ) -> Tensor:
+        """The decoder ``[act, m]`` that applies one and the same filter to the steps ``[S, act]`` of every axis."""
         size = _unit(self.state_normalizer, self.latent_action.state_dim, factors)[list(axes)]
         action_size = _unit(self.action_normalizer, action.shape[-1], factors)
         per_unit = (factors * size).double()

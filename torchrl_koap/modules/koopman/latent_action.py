@@ -22,7 +22,7 @@ class LatentActionModule(TensorDictModuleBase):
     .. math::
         u_t = f_\theta(x_{t-n}, \dots, x_t, x_{t+k}), \qquad x_{t+1} \text{ is never an input}
 
-    A subclass writes :meth:`infer`. What it is given is drawn in :class:`~torchrl_koap.modules.WindowReader`.
+    A subclass writes :meth:`infer`; :class:`~torchrl_koap.modules.WindowReader` draws what it is given.
 
     Args:
         state_dim (int): size ``d`` of a state.
@@ -32,7 +32,7 @@ class LatentActionModule(TensorDictModuleBase):
         num_past (int): number ``n`` of frames before the present one. Defaults to ``1``.
         look_ahead (int or sequence of int): offset ``k >= 2``, or several. Defaults to ``8``.
         relative (bool): read steps at unit scale beside the present frame, instead of frames. Defaults to ``False``.
-        clamped (bool): let frames whose look-ahead is cut at the window's end count in the losses.
+        clamped (bool): let frames whose look-ahead is cut at the window's end count. Defaults to ``False``.
         in_key (NestedKey): window of states ``[*B, T, d]`` in the network's units. Defaults to ``"state"``.
         out_key (NestedKey): latent actions ``[*B, T, m]``. Defaults to ``"latent_action"``.
 
@@ -48,7 +48,7 @@ class LatentActionModule(TensorDictModuleBase):
         [2.0, 2.0, 1.0, 0.0]
     """
 
-    blocks: tuple[str, ...] = ()  # parts of a latent action of which labels choose one; most have no such parts
+    blocks: tuple[str, ...] = ("",)  # parts of a latent action of which labels choose one; most have no such parts
 
     def __init__(
         self,
@@ -77,33 +77,21 @@ class LatentActionModule(TensorDictModuleBase):
         """Reads a window of states ``[*B, T, d]`` (:meth:`WindowReader.gather`): ``[*B, len(frames), F, d]``."""
         return self.reader.gather(state, frames)
 
-    @property
-    def holds_steps(self) -> bool:
-        """Whether :meth:`axis_features` can say where the steps along state columns are."""
-        return False
-
-    def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
+    def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor] | None:
         """Says where a latent action holds the steps along some state columns, and their size per unit of it.
 
         Args:
             axes (sequence of int): state columns.
 
         Returns:
-            tuple of Tensor: entries of the latent action, int64 ``[S, len(axes)]``, and factors ``[S, len(axes)]`` that
-            turn them into steps in the networks' units; ``S = num_past + len(look_ahead)``.
-
-        Raises:
-            ValueError: if it does not hold them.
+            tuple of Tensor or None: entries of the latent action, int64 ``[S, len(axes)]``, and factors of that shape
+                that turn them into steps in the networks' units; ``S = num_past + len(look_ahead)``. None if it does
+                not hold them.
         """
-        raise ValueError(f"{type(self).__name__} does not hold the steps along state columns")
+        return None
 
     def choose(self, block: str) -> None:
-        """Reads one of :attr:`blocks`; the entries of the others are 0.
-
-        Raises:
-            ValueError: if there is no such block.
-        """
-        raise ValueError(f"unknown block {block!r} of the latent action; there are {list(self.blocks)}")
+        """Reads one of :attr:`blocks`; the entries of the others are 0."""
 
     def prepare(self, windows: Tensor) -> None:
         """Sets the spread of the steps from windows ``[*B, T, d]`` without labels, before training."""
@@ -181,8 +169,8 @@ class LatentActionFourier(LatentActionModule):
 
     with ``v_t`` the ``D`` entries of the steps between neighbouring frames. A linear decoder under a ridge penalty is
     then Gaussian process regression with a linear plus ``c`` times a squared-exponential kernel (random Fourier
-    features): linear where labels are few, curved where they are many. The frequencies and phases are trained by the
-    Koopman loss, so the operator needs an input matrix (``KoopmanOperator(input_dim=...)``).
+    features). The Koopman loss trains frequencies and phases, so the operator needs an input matrix
+    (``KoopmanOperator(input_dim=...)``).
 
     Args and keys as in :class:`LatentActionModule`, with ``relative`` always on.
 
@@ -196,8 +184,7 @@ class LatentActionFourier(LatentActionModule):
         motion_scale (float): length ``l_v``, in spreads of the steps. Defaults to ``1``.
         position_scale (float): length ``l_x``, in units of the normalised state. Defaults to ``4``.
         position_weight (float): prior standard deviation, against the linear part's, of a further linear part in
-            ``x_t`` itself, for actions that say where the robot is to be instead of how it moves; ``latent_dim`` grows
-            by ``d``. Defaults to ``0``: none.
+            ``x_t`` itself, for absolute actions; ``latent_dim`` grows by ``d``. Defaults to ``0``: none.
         trainable (bool): train frequencies and phases; otherwise they stay as drawn. Defaults to ``True``.
 
     Examples:
@@ -252,13 +239,8 @@ class LatentActionFourier(LatentActionModule):
         curved = self.amplitude * torch.cos(where @ self.frequency + self.phase)
         return torch.cat([motion, curved, *((self.position_weight * present,) if self.position_weight else ())], -1)
 
-    @property
-    def holds_steps(self) -> bool:
-        """Whether :meth:`axis_features` has an answer: the first entries are the steps."""
-        return True
-
     def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Says where a latent action holds the steps along state columns (:meth:`LatentActionModule.axis_features`)."""
+        """Says where a latent action holds the steps along state columns: in its first entries."""
         n, axes = self.reader.num_past, list(axes)
         scales = torch.cat([self.reader.scales[:n], self.reader.scales[n + 1 :]])[:, axes]
         first = torch.arange(len(scales), device=scales.device)[:, None] * self.state_dim

@@ -11,7 +11,7 @@ from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.koopman.action_decoder import LinearActionDecoder
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
-from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionLSTM, LatentActionMLP
+from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionLSTM
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
 from torchrl_koap.modules.koopman.operator import KoopmanOperator
 from torchrl_koap.modules.koopman.smoothed_action import LatentActionSmoothed
@@ -51,7 +51,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     | {
         "latent_dim": None,
         "include_state": False,
-        "lifting": "compact",
         "network": "smoothed",
         "num_past": 8,
         "look_ahead": (2, 3, 4, 5, 6, 7, 8),
@@ -71,8 +70,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
-LIFTINGS = ("single", "compact")
-
 # a smoothed lifting keeps states of at most so many columns as they are
 NARROW = 8
 
@@ -80,9 +77,8 @@ _KERNEL: dict[str, Any] = {"num_features": 256, "curvature": 0.1, "motion_scale"
 # what only one kind of latent-action network takes, and its value where a preset does not name it
 NETWORK_OPTIONS: dict[str, dict[str, Any]] = {
     "fourier": _KERNEL | {"position_weight": 0.0},
-    "smoothed": _KERNEL | {"lifting": "single"},  # or "compact": CompactLifting, where the lifting is learned
+    "smoothed": _KERNEL,
     "lstm": {"relative": False},
-    "mlp": {"relative": False},
 }
 
 
@@ -139,23 +135,19 @@ def make_koopman_inverse_dynamics(
         latent_dim = state_dim if include_state else action_dim
     if "latent_dim" not in overrides and "include_state" not in overrides and latent_dim < state_dim:
         include_state = False  # a preset's size is too small for a wide state to be part of the lifting
-    settings = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *options) if key != "lifting"}
+    settings = {key: choice[key] for key in ("num_past", "look_ahead", "clamped", *options)}
     # networks are built in this order: their first weights are drawn one after the other
     latent_action = None
     if network == "fourier":
         latent_action = LatentActionFourier(state_dim, **settings)
     elif network == "lstm":
         latent_action = LatentActionLSTM(state_dim, latent_dim, hidden_dim=hidden[0], **settings)
-    elif network == "mlp":
-        latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=hidden, **settings)
-    if lookup(LIFTINGS, choice.get("lifting", "single"), "lifting") == "compact" and not include_state:
+    lifting: KoopmanLifting | CompactLifting
+    if network == "smoothed" and not include_state:
         widths: dict[str, Any] = {"hidden_dims": hidden} if "hidden_dim" in overrides else {}
         lifting = CompactLifting(state_dim, latent_dim, **widths)
     else:
-        linear_skip = network == "smoothed" and not include_state
-        lifting = KoopmanLifting(
-            state_dim, latent_dim, hidden_dims=hidden, include_state=include_state, linear_skip=linear_skip
-        )
+        lifting = KoopmanLifting(state_dim, latent_dim, hidden_dims=hidden, include_state=include_state)
     latent_action = LatentActionSmoothed(lifting, **settings) if latent_action is None else latent_action
     has_input = network in ("fourier", "smoothed")
     operator = KoopmanOperator(lifting.latent_dim, input_dim=latent_action.latent_dim if has_input else None)

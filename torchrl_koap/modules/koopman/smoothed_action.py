@@ -16,6 +16,7 @@ from torchrl_koap.modules.koopman.smoothing import WienerSmoother
 from torchrl_koap.modules.windows import WindowReader
 
 LIFTED, RAW = "lifted", "raw"
+RAW_PAST, RAW_LOOK_AHEAD = 4, (2, 3, 4, 5)  # frames that the raw block reads
 
 
 class LatentActionSmoothed(LatentActionModule):
@@ -37,14 +38,12 @@ class LatentActionSmoothed(LatentActionModule):
         num_features (int): Fourier features of each block.
 
     Keyword Args:
-        raw_past (int): frames before the present one that the raw block reads. Defaults to ``4``.
-        raw_look_ahead (sequence of int): its look-ahead. Defaults to ``(2, 3, 4, 5)``.
         curvature, motion_scale, position_scale (float): as for :class:`LatentActionFourier`, for both blocks.
         **kwargs: ``num_past``, ``look_ahead`` (of the lifted block; no shorter than the raw one's) and keys, see
             :class:`LatentActionModule`.
 
     Raises:
-        ValueError: if the raw block would read frames that the lifted one does not, or for an unknown block.
+        ValueError: if the raw block would read frames that the lifted one does not.
 
     Examples:
         >>> import torch
@@ -66,8 +65,6 @@ class LatentActionSmoothed(LatentActionModule):
         lifting: KoopmanLifting | CompactLifting,
         num_features: int,
         *,
-        raw_past: int = 4,
-        raw_look_ahead: Sequence[int] = (2, 3, 4, 5),
         curvature: float = 0.1,
         motion_scale: float = 1.0,
         position_scale: float = 4.0,
@@ -75,10 +72,10 @@ class LatentActionSmoothed(LatentActionModule):
         look_ahead: Sequence[int] = (2, 3, 4, 5, 6, 7, 8),
         **kwargs,
     ):
-        if raw_past > num_past or max(raw_look_ahead) > max(look_ahead):
+        if RAW_PAST > num_past or max(RAW_LOOK_AHEAD) > max(look_ahead):
             raise ValueError(
-                f"the raw block reads {raw_past} frames back and {max(raw_look_ahead)} ahead: no further than the"
-                f" lifted one, {num_past} and {max(look_ahead)}"
+                f"the raw block reads {RAW_PAST} frames back and {max(RAW_LOOK_AHEAD)} ahead: the lifted one must read"
+                f" as many, got {num_past} and {max(look_ahead)}"
             )
         dim = lifting.latent_dim
         # random features as they are: training them was measured to change nothing
@@ -87,7 +84,7 @@ class LatentActionSmoothed(LatentActionModule):
         frames: dict[str, Any] = {"num_past": num_past, "look_ahead": look_ahead}
         lifted = LatentActionFourier(dim, num_features, **frames, **kernel)
         raw = LatentActionFourier(
-            lifting.state_dim, num_features, num_past=raw_past, look_ahead=raw_look_ahead, **kernel
+            lifting.state_dim, num_features, num_past=RAW_PAST, look_ahead=RAW_LOOK_AHEAD, **kernel
         )
         super().__init__(lifting.state_dim, lifted.latent_dim + raw.latent_dim, **frames, **kwargs)
         self.reader = WindowReader(dim, relative=False, **frames)  # of lifted frames, which are smoothed together
@@ -99,20 +96,9 @@ class LatentActionSmoothed(LatentActionModule):
         self.register_buffer("gates", torch.tensor([1.0, 0.0]))
         self.chosen = LIFTED
 
-    @property
-    def holds_steps(self) -> bool:
-        """Whether :meth:`axis_features` has an answer: the raw block does, the lifted one if it keeps the state."""
-        return self.keeps_state or self.chosen == RAW
-
     @torch.no_grad()
     def choose(self, block: str) -> None:
-        """Reads one block; the other is 0.
-
-        Raises:
-            ValueError: if there is no such block.
-        """
-        if block not in self.blocks:
-            super().choose(block)
+        """Reads one block; the other is 0."""
         self.gates.copy_(torch.tensor([float(name == block) for name in self.blocks]))
         self.chosen = block
 
@@ -124,15 +110,7 @@ class LatentActionSmoothed(LatentActionModule):
         return self._lifting[0].encode(state) / self.spread
 
     def gather(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Reads for the chosen block.
-
-        Args:
-            state (Tensor): states ``[*B, T, d]`` in the networks' units.
-            frames (range, optional): frames to read for. Default: all.
-
-        Returns:
-            Tensor: ``[*B, len(frames), F, m]``, smoothed steps and the present frame, or raw ones ``[..., 9, d]``.
-        """
+        """Reads for the chosen block: smoothed steps and present frame ``[*B, T, F, m]``, or raw ``[*B, T, 9, d]``."""
         if self.chosen == RAW:
             return self.raw.gather(state, frames)
         smoothed = self.smoother(self.reader.gather(self._lift(state), frames))
@@ -150,14 +128,7 @@ class LatentActionSmoothed(LatentActionModule):
 
     @torch.no_grad()
     def finish(self, windows: Tensor, *, batch_size: int = 2048) -> None:
-        """Fits what depends on the lifting: spread of its coordinates, smoother, spread of the steps.
-
-        Args:
-            windows (Tensor): ``[N, T, d]`` in the networks' units; no label is read.
-
-        Keyword Args:
-            batch_size (int): windows lifted at once.
-        """
+        """Fits to windows ``[*B, T, d]`` what depends on the lifting: spread, smoother, spread of the steps."""
         windows = windows.flatten(0, -3)
         now = self.reader.valid_frames(windows.shape[-2])[:1]
         self.spread.fill_(1.0)
@@ -175,16 +146,12 @@ class LatentActionSmoothed(LatentActionModule):
         self.lifted.reader.scales.copy_(torch.where(steps > 1e-9, steps, torch.ones_like(steps)))
         self.raw.reader.fit(windows)
 
-    def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Says where the chosen block holds the steps along state columns (:meth:`LatentActionModule.axis_features`).
-
-        Raises:
-            ValueError: if the chosen block does not hold the state's own columns.
-        """
+    def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor] | None:
+        """Says where the chosen block holds the steps along state columns; the lifted one if it keeps the state."""
         if self.chosen == RAW:
             entries, factors = self.raw.axis_features(axes)
             return entries + self.lifted.latent_dim, factors
         if not self.keeps_state:
-            raise ValueError("the lifted block has no columns of the state: the lifting is learned")
+            return None
         entries, factors = self.lifted.axis_features(axes)
         return entries, factors * self.spread[list(axes)]
