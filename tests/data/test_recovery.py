@@ -23,16 +23,18 @@ def moving_windows():
     return TensorDict({"state": state, "action": action}, [6])
 
 
-@pytest.mark.parametrize(("history", "decay"), [(2, 0.7), (1, 0.5), (4, 0.0)])
-def test_shift_is_constant_in_the_history_and_decays_geometrically(history, decay):
+@pytest.mark.parametrize(
+    ("history", "decay", "under_way"), [(2, 0.7, False), (1, 0.5, True), (4, 0, False), (3, 0.6, 1)]
+)
+def test_shift_decays_geometrically_after_the_history_or_from_its_start(history, decay, under_way):
     torch.manual_seed(0)
     state = torch.randn(5, 3, 10, 2, dtype=torch.float64)
-    augment = RecoveryAugmentation(0.01, history=history, decay=decay)
+    augment = RecoveryAugmentation(0.01, history=history, decay=decay, under_way=bool(under_way))
     shift = augment(TensorDict({"state": state.clone()}, [5, 3]))["state"] - state
-    delta = shift[..., 0, :]
+    delta = shift[..., history - 1, :]
     assert (delta.abs() > 0).all() and delta.flatten(0, 1).unique(dim=0).shape[0] == 15  # one draw per window
     for frame in range(10):
-        remaining = decay ** max(0, frame - history + 1)
+        remaining = decay ** (frame - history + 1 if under_way else max(0, frame - history + 1))
         torch.testing.assert_close(shift[..., frame, :], delta * remaining, atol=1e-14, rtol=0)
 
 
@@ -49,7 +51,7 @@ def test_no_sigma_changes_nothing_and_options_are_checked():
     assert torch.equal(RecoveryAugmentation(0.0)(TensorDict({"state": state.clone()}, [4]))["state"], state)
     renamed = RecoveryAugmentation(0.1, key=("a", "b"))(TensorDict({"a": {"b": state.clone()}}, [4]))
     assert not torch.equal(renamed["a", "b"], state)
-    for options in ({"sigma": -1.0}, {"sigma": 1.0, "decay": 1.0}):
+    for options in ({"sigma": -1.0}, {"sigma": 1.0, "decay": 1.0}, {"sigma": 1.0, "decay": 0.0, "under_way": True}):
         with pytest.raises(ValueError, match="sigma must be >= 0 and decay"):
             RecoveryAugmentation(**options)
 
@@ -79,10 +81,11 @@ def test_joints_follow_the_tool_aside_and_come_back_with_it():
         RecoveryAugmentation(0.02, columns=(0, 1), tool=(2, 3, 4))
 
 
-def test_actions_follow_the_way_back():
+@pytest.mark.parametrize("under_way", [False, True])
+def test_actions_follow_the_way_back(under_way):
     """Actions that move the state stay its differences; labels that are hidden stay hidden."""
     windows = moving_windows()
-    moved = RecoveryAugmentation(0.1, columns=[0, 1], moved_by=[0, 1])(windows.clone())
+    moved = RecoveryAugmentation(0.1, under_way=under_way, columns=[0, 1], moved_by=[0, 1])(windows.clone())
     torch.testing.assert_close(moved["action"][:, :-1], moved["state"][..., :2].diff(dim=1))
     assert moved["action"][:, -1].isnan().all() and not torch.equal(moved["action"][:, :-1], windows["action"][:, :-1])
     torch.manual_seed(3)

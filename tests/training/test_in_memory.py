@@ -196,3 +196,24 @@ def test_data_in_double_precision_are_fitted_like_others(method):
     fitted = [fit_controller(each, task, method=method, steps=2) for each in (data, wide)]
     assert same_weights(*(each.controller for each in fitted))
     assert wide["observation"].dtype == torch.float64
+
+
+def drawn_to_a_goal():
+    """Three joints that go 0.4 % of the way to one goal in every frame, and the changes that do it."""
+    random = np.random.default_rng(0)
+    goal, starts = random.uniform(-1, 1, 3), random.uniform(-1, 1, (12, 3))
+    states = [goal + 0.996 ** np.arange(300)[:, None] * (start - goal) for start in starts]
+    return states, [np.diff(rows, axis=0) for rows in states]
+
+
+def test_plans_of_smooth_motions_at_a_high_rate_do_not_grow_in_a_loop():
+    """Where velocity follows from position, their difference must not tell how far a window was displaced."""
+    states, actions = drawn_to_a_goal()
+    data, task = make_demonstrations(states, actions[:4] + [None] * 8, control_hz=500)
+    options = {"planner": {"network": "mlp", "steps": 2, **SMALL}, "controller": {"steps": 0}}
+    planner = fit(data, task, **options, progress=False).planner
+    frames = torch.tensor(np.stack([rows[[0, 0]] for rows in states]), dtype=torch.float32)
+    for _ in range(60):
+        following = planner.sample(frames, torch.zeros(len(frames), *planner.noise_shape))[:, :1]
+        frames = torch.cat([frames[:, 1:], following], 1)
+        assert frames.diff(dim=1).abs().max() < 2 * max(np.abs(rows).max() for rows in actions)

@@ -18,10 +18,10 @@ _DAMPING = 1e-4  # m2 / rad2, added to the squared reach of the joints: bounds t
 EMPTY = 0.05  # m; fingers nearer to each other than that hold nothing: the boxes of Stacking are 0.06 m wide
 
 
-def _remaining(state: Tensor, history: int, decay: float, ahead: int = 0) -> Tensor:
+def _remaining(state: Tensor, history: int, decay: float, ahead: int = 0, under_way: bool = False) -> Tensor:
     """Share of a shift that is left in every frame of windows ``[*B, T, d]``, so many frames later, ``[T, 1]``."""
     frames = torch.arange(state.shape[-2], device=state.device) - (history - 1) + ahead
-    return (decay ** frames.clamp_min(0).to(state.dtype))[:, None]
+    return (decay ** (frames if under_way else frames.clamp_min(0)).to(state.dtype))[:, None]
 
 
 class RecoveryAugmentation(TensorDictModuleBase):
@@ -34,6 +34,11 @@ class RecoveryAugmentation(TensorDictModuleBase):
     A planner trained on demonstrations alone has never seen a state beside them; executed in closed loop it drifts
     there. The augmentation shows it such states together with the way back.
 
+    Frames that all move alike show the moment of a push, and the velocity of before. Where motions are so smooth that
+    velocity follows from position, the difference of the two betrays the shift, and a planner learns to answer small
+    errors of velocity with large ones. With ``under_way`` the robot is on its way back already, as in the next steps of
+    the loop: :math:`x'_{t-j} = x_{t-j} + \rho^{-j} \delta`.
+
     An arm with more joints than its tool needs is moved aside at the tool: the tool is displaced, and the joints follow
     by the least motion that does it, :math:`\delta = J(x_t)^+ \delta_{tool}`. Joints shifted one by one would mostly
     turn the elbow about, and a planner that has seen that learns to wander.
@@ -44,6 +49,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
     Keyword Args:
         history (int): observed frames of the window. Defaults to ``2``.
         decay (float): ``rho``, how slowly it comes back. Defaults to ``0.7``.
+        under_way (bool): observed frames come back too. Defaults to ``False``.
         columns (sequence of int, optional): state columns to shift, those of the robot. Default: all.
         tool (sequence of int, optional): state columns of the tool's position; the shift is drawn there, and the
             arm's joints, which are then ``columns``, follow.
@@ -56,7 +62,8 @@ class RecoveryAugmentation(TensorDictModuleBase):
             ``"action"``.
 
     Raises:
-        ValueError: for a negative ``sigma``, a ``decay`` outside [0, 1), a ``tool`` without joints or kinematics.
+        ValueError: for a negative ``sigma``, a ``decay`` outside [0, 1) (0 excluded with ``under_way``), a ``tool``
+            without joints or kinematics.
 
     Examples:
         >>> import torch
@@ -73,6 +80,7 @@ class RecoveryAugmentation(TensorDictModuleBase):
         *,
         history: int = 2,
         decay: float = 0.7,
+        under_way: bool = False,
         columns: Sequence[int] | None = None,
         tool: Sequence[int] | None = None,
         kinematics: Callable[[Tensor], Tensor] | None = None,
@@ -83,11 +91,11 @@ class RecoveryAugmentation(TensorDictModuleBase):
         super().__init__()
         if tool is not None and (columns is None or kinematics is None):
             raise ValueError(f"a tool follows joints: wanted columns and kinematics, got {columns} and {kinematics}")
-        if sigma < 0 or not 0 <= decay < 1:
-            raise ValueError(f"sigma must be >= 0 and decay in [0, 1), got {sigma} and {decay}")
+        if sigma < 0 or not 0 <= decay < 1 or (under_way and not decay):
+            raise ValueError(f"sigma must be >= 0 and decay in [0, 1), 0 without under_way, got {sigma} and {decay}")
         self.in_keys = self.out_keys = [key] if moved_by is None else [key, action_key]
         self.moved_by = None if moved_by is None else list(moved_by)
-        self.sigma, self.history, self.decay = sigma, history, decay
+        self.sigma, self.history, self.decay, self.under_way = sigma, history, decay, under_way
         self.columns = None if columns is None else list(columns)
         self.tool = None if tool is None else list(tool)
         self.kinematics = kinematics
@@ -102,10 +110,10 @@ class RecoveryAugmentation(TensorDictModuleBase):
             keep = torch.zeros_like(shift)
             keep[..., self.columns] = 1
             shift = shift * keep
-        remaining = _remaining(state, self.history, self.decay)
+        remaining = _remaining(state, self.history, self.decay, under_way=self.under_way)
         shifted = state + shift * remaining
         if self.moved_by is not None:
-            following = _remaining(state, self.history, self.decay, ahead=1)
+            following = _remaining(state, self.history, self.decay, ahead=1, under_way=self.under_way)
             back = shift[..., self.moved_by] * (following - remaining)
             tensordict.set(self.in_keys[1], tensordict.get(self.in_keys[1]) + back)
         if self.tool is not None and self.sigma:

@@ -145,7 +145,14 @@ def augmentation(task: Task, *, actions: bool = False) -> TensorDictSequential:
         arm = [column for column in task.robot if task.gripper is None or column != task.gripper[1]]
         tool: dict[str, Any] = {"tool": task.tool_columns, "kinematics": task.tool_position}
         steps.append(
-            RecoveryAugmentation(task.defaults.recovery, history=HISTORY, columns=arm, moved_by=moved_by, **tool)
+            RecoveryAugmentation(
+                task.defaults.recovery,
+                history=HISTORY,
+                under_way=task.env is None,
+                columns=arm,
+                moved_by=moved_by,
+                **tool,
+            )
         )
     if task.gripper is not None and not actions:
         steps.append(GripperRecovery(task.gripper[1], history=HISTORY))
