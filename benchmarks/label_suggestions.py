@@ -30,7 +30,6 @@ from torchrl_koap.objectives import KOAPLoss
 from torchrl_koap.runs.config import ControllerConfig
 from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.tasks import WINDOW, Task, get_task
-from torchrl_koap.training.action_errors import rmse_mm
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.datasets import load_demonstrations
 from torchrl_koap.training.loop import train_phase
@@ -71,7 +70,7 @@ def error_of(
     fit_closed_form(controller, labelled, **axes_of(task, task.controller_columns("robot")))
     with torch.no_grad():
         decoded = controller.raw_action(controller.decode(test["latent_action"]), test["state"])
-        return rmse_mm(decoded, test["action"])
+        return 1e3 * (decoded - test["action"]).square().mean().sqrt().item()
 
 
 def uncertainty(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:

@@ -26,7 +26,6 @@ from torchrl_koap.envs.scooping.recording import record_videos
 from torchrl_koap.evaluation import EvalConfig, evaluate
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import ExecutionConfig
-from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.tasks.scooping import EMBEDDING_DIM, EMBODIMENTS
 from torchrl_koap.training.methods import METHODS as KNOWN
 from torchrl_koap.training.methods import get_method
@@ -100,8 +99,8 @@ def run_cell(
     rates = result["rates"]
     counts = (round(result["success_rate"] * n), round(rates["spoon over the bowl"]["rate"] * n))
     starts = (f"{rates[f'success from {start}']['rate']:.3f}" for start in ("left", "near", "right"))
-    errors = RunDirectory(out).read_json("summary.json").get("action_error_mrad") or {}
-    error = f"{errors['controller']:.1f}" if "controller" in errors else ""
+    split = result["action_errors_on"]
+    error = f"{1e3 * result['action_errors'][split]['unit'][0]['controller']:.1f}" if split else ""
     return (labels, unlabelled, method, seed, n, *counts, *starts, error)
 
 

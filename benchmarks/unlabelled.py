@@ -34,11 +34,12 @@ from torchrl.envs.utils import step_mdp
 from torchrl_koap import fit
 from torchrl_koap.data import controller_view, make_demonstrations, select_state
 from torchrl_koap.envs.registry import make_env
+from torchrl_koap.evaluation.action_errors import first_actions
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules import Execution, InverseDynamics, Normalizer, blend_plan
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.tasks import Task
-from torchrl_koap.training.action_errors import first_actions, rmse
+from torchrl_koap.tasks.units import thousandths
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 from torchrl_koap.training.datasets import find_task_of, load_demonstrations
 
@@ -141,7 +142,8 @@ def shuffled_trajectories(data: TensorDictBase, seed: int) -> torch.Tensor:
 def error_row(controller: InverseDynamics, full: TensorDictBase, numbers: torch.Tensor, unit: str) -> tuple[str, str]:
     """Error of one decoded action, and its unit."""
     predicted, true, _ = first_actions(controller, full, numbers[-JUDGED:])
-    return f"{rmse(predicted, true, unit):.4f}", {"m": "mm", "rad": "mrad"}[unit]
+    shown, factor = thousandths(unit)
+    return f"{factor * (predicted - true).square().mean().sqrt().item():.4f}", shown
 
 
 def padded(paths: list[torch.Tensor], length: int) -> torch.Tensor:

@@ -36,7 +36,6 @@ COVERED_BY = {
     "envs/scooping/recording.py": "envs/scooping/test_env.py",
     "envs/scooping/scene.py": "envs/scooping/test_env.py",
     "envs/scooping/simulation.py": "envs/scooping/test_env.py",
-    "evaluation/action_errors.py": "evaluation/test_offline.py",
     "evaluation/closed_loop.py": "commands/test_eval.py",
     "evaluation/config.py": "commands/test_eval.py",
     "evaluation/environments.py": "evaluation/test_gymnasium.py",

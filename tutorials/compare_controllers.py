@@ -28,7 +28,7 @@ from torch import nn
 from torchrl_koap import fit, get_task
 from torchrl_koap.data import LabelBudget, cut_windows, select_state
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
-from torchrl_koap.training.action_errors import hidden_action_errors, rmse_mm
+from torchrl_koap.evaluation.action_errors import episodes_outside, first_actions
 
 task = get_task("avoiding")
 demonstrations, _ = record_demonstrations("avoiding", episodes=48)
@@ -38,6 +38,10 @@ counts, seeds = (1, 2, 5), (0, 1, 2)
 
 def budget(count, seed):
     return LabelBudget(count=count, seed=seed).apply(demonstrations, command=task.command_columns)[0]
+
+
+def rmse_mm(predicted, true):
+    return 1e3 * (predicted - true).square().mean().sqrt().item()
 
 
 # %%
@@ -99,7 +103,7 @@ for name in titles:
             else:
                 options = {"planner": False, "controller": {"steps": 150}}  # controllers alone are compared here
                 controller = fit(data, task, method=name, seed=seed, progress=False, **options).controller
-            predicted, true = hidden_action_errors(controller, demonstrations, data)
+            predicted, true, _ = first_actions(controller, demonstrations, episodes_outside(demonstrations, data))
             values.append(rmse_mm(predicted, true))
             if (count, seed) == (1, 0):
                 fast = true.norm(dim=-1) > true.norm(dim=-1).median()

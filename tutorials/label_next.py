@@ -24,9 +24,9 @@ import torchrl_koap
 from torchrl_koap import get_task
 from torchrl_koap.data import LabelBudget, select_state
 from torchrl_koap.envs.experts.demonstrations import record_demonstrations
+from torchrl_koap.evaluation.action_errors import first_actions
 from torchrl_koap.evaluation.active_labelling import rank_trajectories
 from torchrl_koap.evaluation.latent_space import infer_steps
-from torchrl_koap.training.action_errors import hidden_action_errors, rmse_mm
 
 task = get_task("avoiding")
 demonstrations, _ = record_demonstrations("avoiding", episodes=48)
@@ -84,8 +84,8 @@ for first in firsts:
     for name, episodes in order.items():
         for count in counts:
             controller = fit(episodes[:count])[0].controller
-            nothing_seen = held_out.clone().set("has_action", torch.zeros_like(held_out["has_action"]))
-            errors[name][count].append(rmse_mm(*hidden_action_errors(controller, held_out, nothing_seen)))
+            predicted, true, _ = first_actions(controller, held_out, judged)
+            errors[name][count].append(1e3 * (predicted - true).square().mean().sqrt().item())
 print("the first", firsts[0], "was followed by", {name: chosen[1:] for name, chosen in order.items()})
 
 print(f"\naction error in mm on {len(judged)} other demonstrations, median over {len(firsts)} first labels")

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 
 import pytest
@@ -35,12 +34,14 @@ def study(benchmark_script, monkeypatch, tmp_path):
         if planner_only:
             (config.out / "planner.safetensors").touch()
         else:
-            (config.out / "summary.json").write_text(json.dumps({"action_error_mrad": {"controller": 12.34}}))
+            (config.out / "summary.json").touch()
 
     def evaluate(run, config):
         asked.append((run, config))
         starts = {f"success from {start}": {"rate": rate} for start, rate in (("left", 1), ("near", 0.5), ("right", 0))}
-        return {"success_rate": 6 / 15, "rates": {"spoon over the bowl": {"rate": 9 / 15}} | starts}
+        errors = {"outside_budget": {"unit": [{"controller": 0.01234}]}}
+        found = {"action_errors_on": "outside_budget", "action_errors": errors}
+        return found | {"success_rate": 6 / 15, "rates": {"spoon over the bowl": {"rate": 9 / 15}} | starts}
 
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "evaluate", evaluate)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from tiny_runs import koap
 
+from torchrl_koap.evaluation.action_errors import AFTER
 from torchrl_koap.runs.weights import load_tensors
 
 
@@ -30,7 +31,29 @@ def test_what_an_evaluation_writes(copied_run, capsys):
     tensors, about = load_tensors(copied_run / "rollouts.safetensors")
     assert tensors["length"].tolist() == [row["steps"] for row in rows] and about["task"] == "avoiding"
     assert (copied_run / "index.html").stat().st_size > 1000
-    assert "success_rate" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "success_rate" in out and "labels_read_outside_budget" in out and "mean_action" not in out
+
+
+def test_labels_outside_the_budget_are_read_here_alone(copied_run, demonstrations, no_report, tmp_path):
+    """Counted, decoded by controller and ridge; none where the data are not there."""
+    assert not (copied_run / "actions.safetensors").exists()
+    call = ("eval", copied_run, "--episodes", 1, "--threads", 1)
+    assert koap(*call) == 0
+    result = json.loads((copied_run / "eval.json").read_text())
+    outside = result["action_errors"]["outside_budget"]
+    labels = json.loads((copied_run / "summary.json").read_text())["labels"]
+    hidden = labels["total_transitions"] - labels["labelled_transitions"]
+    assert result["labels_read_outside_budget"] == outside["labels"] == hidden - 6 * AFTER
+    assert outside["trajectories"] == 6 and min(outside["unit"][0][name] for name in ("controller", "ridge")) > 0
+    assert len(load_tensors(copied_run / "actions.safetensors")[0]["true"]) == outside["labels"]
+    assert koap(*call, "--dataset", tmp_path / "gone") == 1
+    config = json.loads((copied_run / "config.json").read_text()) | {"dataset": str(tmp_path / "gone")}
+    (copied_run / "config.json").write_text(json.dumps(config))
+    assert koap(*call) == 0
+    result = json.loads((copied_run / "eval.json").read_text())
+    assert result["labels_read_outside_budget"] == 0 and result["relative_action_error"] is None
+    assert "is not there" in result["action_errors"]["outside_budget"]["note"]
 
 
 def test_an_evaluation_does_not_depend_on_the_batch_size(copied_run, no_report):

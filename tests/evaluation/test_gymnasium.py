@@ -23,6 +23,7 @@ from torchrl_koap import (
     train,
 )
 from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
 
 
@@ -89,6 +90,6 @@ def test_refusals(arm_run, capsys):
     )
     with pytest.raises(ValueError, match="rollouts_per_context was given, but an env.* has no contexts"):
         evaluate(arm_run, EvalConfig(env="toy_gym:ToyReach-v0", rollouts_per_context=2))
-    with pytest.raises(ValueError, match="dataset is for judging without an environment"):
+    with pytest.raises(RunDirectoryError, match="the data set 'anywhere' of .* is not there"):
         evaluate(arm_run, EvalConfig(env="toy_gym:ToyReach-v0", dataset="anywhere"))
     assert (arm_run / "config.json").read_bytes() == before

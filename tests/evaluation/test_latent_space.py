@@ -216,7 +216,7 @@ def test_findings_without_experiments_says_whose_labels_were_read():
     latent = analyse_latent(controller, data, data["episode"] == 0, {"measured_xy": [0, 1]})
     text = describe_inspection({"latent": latent}, get_task("avoiding"))
     assert text.startswith("10 steps ahead the latent dynamics miss the measured xy by")
-    assert "Outside the budget, for analysis only" in text and "100.0%" in text
+    assert "Outside the budget, for evaluation only" in text and "100.0%" in text
     assert "have labels in the budget" not in text
     latent = analyse_latent(controller, data, data["episode"] >= 1, {"measured_xy": [0, 1]})
     assert describe_inspection({"latent": latent}, get_task("avoiding")).endswith(
@@ -241,7 +241,7 @@ def test_inspect_the_latent_space_alone(run, capsys):
     assert list(latent["multi_step"]["koopman"]) == ["measured_xy"] and latent["multi_step"]["steps"] == 3
     assert len(latent[OUTSIDE_THE_BUDGET]["probe_r2"]) == 2
     assert latent[OUTSIDE_THE_BUDGET]["held_out_in_budget"] == 0  # 2 of 8 are labelled
-    assert "for analysis only" in written["findings"] and (run / "plots" / "latent.png").exists()
+    assert "for evaluation only" in written["findings"] and (run / "plots" / "latent.png").exists()
     assert not (run / "plots" / "inspect.png").exists()
     assert koap("inspect", run, "--latent-only", "--latent-steps", "0") == 1
     assert "latent_steps must be >= 1, got 0" in capsys.readouterr().err

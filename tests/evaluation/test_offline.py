@@ -18,6 +18,7 @@ from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.runs.config import LabelConfig
 from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import Action, Task
 from torchrl_koap.training import Trained
 
@@ -97,7 +98,11 @@ def test_a_single_column_with_labels_outside_the_budget(tmp_path):
     assert result["action_errors_on"] == "outside_budget" and outside["trajectories"] == 8
     # the method is that ridge itself
     assert outside["column"][0]["controller"] == pytest.approx(outside["column"][0]["ridge"], rel=1e-4)
-    assert "action_error" in json.loads((run / "summary.json").read_text())
+    assert (
+        result["labels_read_outside_budget"]
+        == outside["labels"]
+        == len(load_tensors(run / "actions.safetensors")[0]["true"])
+    )
     page = write_report(run).read_text()
     assert "action_errors.png" in page and "None" not in page
 

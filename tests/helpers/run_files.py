@@ -23,6 +23,13 @@ LABELS = {
     "total_trajectories": 2,
     "seed": 7,
 }
+_MODELS = {"controller": 0.00091, "ridge": 0.00104, "mean_action": 0.003}
+ERRORS = {
+    "labels": 20,
+    "trajectories": 1,
+    "unit": [{"unit": "m", "columns": ["x", "y"], **_MODELS}],
+    "column": [{"name": name, "unit": "m", **_MODELS} for name in "xy"],
+}
 EVALUATION = {
     "rates": {"success": {"rate": 0.5, "low": 0.15, "high": 0.85}},
     "success_rate": 0.5,
@@ -36,6 +43,9 @@ EVALUATION = {
     "plan_ms": 8.5,
     "control_ms": 0.5,
     "control_hz": 400.0,
+    "action_errors_on": "outside_budget",
+    "labels_read_outside_budget": 20,
+    "action_errors": {"outside_budget": ERRORS},
     "execution": {"strategy": "feedback", "replan_interval": 4},
     "episode": [{"seed": 100 + e, "outcome": "success", "mode": e, "steps": 20} for e in range(4)],
 }
@@ -93,7 +103,6 @@ def write_run(folder: Path) -> Path:
     config = {"task": "avoiding", "method": "koap", "preset": "default", "seed": 0, "sizes": {"planner": [32, 64]}}
     config |= {"command": ["koap", "train", "--out", "a folder"], "versions": {"torch": "2.13.0"}}
     summary = {"labels": LABELS, "planner_parameters": 812345, "train_seconds": {"planner": 65.0, "controller": 20.0}}
-    summary["action_error_mm"] = {"koap": 0.91, "ridge": 1.04, "analysis_labels_read": 20}
     for name, content in (("config", config), ("summary", summary), ("eval", EVALUATION)):
         (folder / f"{name}.json").write_text(json.dumps(content))
     head = "phase,step,loss_planner,loss_reconstruction,loss_koopman,loss_action,learning_rate,iterations_per_second\n"

@@ -24,6 +24,11 @@ def found(**numbers):
     return advice(RunFacts(Path("run"), **numbers))
 
 
+def actions(own, ridge):
+    errors = {"left_out": {"relative": own, "relative_of_ridge": ridge}}
+    return {"action_errors_on": "left_out", "action_errors": errors}
+
+
 def commands(**numbers):
     return [item.command for item in found(**numbers)]
 
@@ -34,7 +39,8 @@ def test_nothing_is_known_and_nothing_is_said():
 
 def test_a_run_that_succeeds_in_many_ways_needs_nothing():
     evaluation = {"success_rate": 0.95, "success_low": 0.86, "success_high": 0.98, "episodes": 60, "mode_entropy": 0.9}
-    summary = {"labels": {"labelled_transitions": 80}, "action_error_mm": {"controller": 1.0, "ridge": 3.0}}
+    summary = {"labels": {"labelled_transitions": 80}}
+    evaluation |= actions(0.1, 0.3)
     run = {"task": get_task("avoiding"), "config": {"method": "koap"}}
     assert commands(summary=summary, evaluation=evaluation, **run) == []
 
@@ -81,9 +87,9 @@ def test_low_entropy(candidates, command):
 
 
 def test_a_ridge_that_errs_less_is_pointed_out():
-    (item,) = found(config={"method": "koap"}, summary={"action_error_mm": {"controller": 3.2, "ridge": 3.1}})
-    assert item.finding == "the action error of koap is 3.2 mm, that of a plain ridge 3.1 mm"
-    assert not found(config={"method": "linear"}, summary={"action_error_mm": {"controller": 3, "ridge": 3}})
+    (item,) = found(config={"method": "koap"}, evaluation=actions(0.32, 0.31))
+    assert item.finding == "actions of koap err 0.32 times as much as their mean would, a plain ridge's 0.31 times"
+    assert not found(config={"method": "linear"}, evaluation=actions(0.3, 0.3))
 
 
 def test_recorded_data():

@@ -60,11 +60,11 @@ def test_headline_has_intervals_and_n(run):
     for wanted in (
         "50.0 % interval 95 % interval 15.0 to 85.0 %, 2 of 4 rollouts",
         f"0.22 2 of 24 modes; a uniform choice averages {expected_entropy(2, 24):.2f}, n = 2",
-        "action error, koap 0.91 mm ridge 1.04 mm, n = 20 unlabelled steps",
+        "action error, 2 columns 0.91 mm ridge 1.04, mean action 3, n = 20 labels, outside budget",
         "action labels 20 50.00 % of 40 transitions, in 1 of 2 demonstrations",
         "400 Hz 8.5 ms per plan, 0.5 ms per control step",
         "1 min 25 s planner 1 min 5 s, controller 20.0 s",
-        "Outside the budget, for analysis only: 20 labels",
+        "Outside the budget, for evaluation only: 20 labels",
     ):
         assert wanted in text
 
@@ -81,7 +81,7 @@ def test_order_headline_labels_pictures_commands(run):
 def test_pictures_are_there_with_captions_and_no_outside_resource(run):
     page = Page(run / "index.html")
     # this run has kept no actions, was not inspected, and has an environment
-    left_out = ("film.gif", "latent.png", "inspect.png", "plan_errors.png", "action_errors.png")
+    left_out = ("film.gif", "latent.png", "inspect.png", "plan_errors.png")
     expected = [picture for picture in PICTURES if picture.name not in left_out]
     assert {f"plots/{picture.name}" for picture in expected} <= set(page.links)
     for link in page.links:
@@ -111,10 +111,11 @@ def test_everything_from_files_is_escaped(tmp_path):
     content = {evil: evil, "command": evil, "task": evil, "method": evil, "seed": evil, "versions": {evil: evil}}
     (tmp_path / "config.json").write_text(json.dumps(content))
     labels = {evil: evil, "labelled_transitions": 1, "total_transitions": 2}
-    summary = {"labels": labels, "action_error_mm": {evil: 1.0, "ridge": 2.0}, "train_seconds": {evil: 1.0}}
+    summary = {"labels": labels, "train_seconds": {evil: 1.0}}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     evaluation = {"success_rate": 0.5, "execution": evil, "distinct_modes": evil, "mode_entropy": 0.1}
     evaluation["episode"] = [{"seed": evil, evil: evil}]
+    evaluation["action_errors"] = {"outside_budget": {"note": evil}}
     (tmp_path / "eval.json").write_text(json.dumps(evaluation))
     page = Page(write_report(tmp_path))
     assert page.tags.count("script") == 1 and page.source.count("<script") == 1
@@ -131,11 +132,12 @@ def test_empty_run_says_which_commands_make_the_sections(tmp_path):
     assert "img" not in page.tags and not (folder / "plots").exists()
 
 
-def test_a_picture_that_no_training_could_leave_says_why(tmp_path):
-    (tmp_path / "summary.json").write_text(json.dumps({"action_error": {"note": "no labels outside the budget"}}))
+def test_a_picture_that_no_evaluation_could_leave_says_why(tmp_path):
+    errors = {"outside_budget": {"note": "no labels outside the budget"}}
+    (tmp_path / "eval.json").write_text(json.dumps({"action_errors": errors}))
     page = write_report(tmp_path).read_text()
     assert "Predicted against recorded actions: not drawn, no labels outside the budget." in page
-    (tmp_path / "summary.json").write_text(json.dumps({"action_error": {"overall": 0.1}}))
+    (tmp_path / "eval.json").write_text(json.dumps({"action_errors": {"outside_budget": {"relative": 0.1}}}))
     assert "Predicted against recorded actions: not drawn" not in write_report(tmp_path).read_text()
 
 
@@ -167,7 +169,7 @@ def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path):
 def test_odd_values_do_not_stop_the_report(tmp_path):
     odd = {"success_rate": None, "episodes": "many", "mode_entropy": float("nan"), "control_hz": [], "episode": "none"}
     (tmp_path / "eval.json").write_text(json.dumps(odd | {"plan_ms": "x"}))
-    (tmp_path / "summary.json").write_text(json.dumps({"labels": 3, "action_error_mm": 1.0, "train_seconds": 12.0}))
+    (tmp_path / "summary.json").write_text(json.dumps({"labels": 3, "train_seconds": 12.0}))
     page = Page(write_report(tmp_path))
     assert "not a number" in page.text and "training time 12.0 s" in page.text
 
@@ -201,9 +203,6 @@ def test_tiles_of_a_task_with_contexts(tmp_path):
     rates = {"one box stacked": {"rate": 0.75, "low": 0.3, "high": 0.954}, "three boxes stacked": {"rate": 0.5}}
     pooled = {"mode_entropy": None, "pooled_mode_entropy": 0.387, "pooled_mode_entropy_low": 0.0}
     write_object_run(tmp_path, rates=rates, **pooled, pooled_mode_entropy_high=0.5)
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    summary["action_error_mrad"] = summary.pop("action_error_mm")
-    (tmp_path / "summary.json").write_text(json.dumps(summary))
     text = Page(write_report(tmp_path, draw=False)).text
     even = f"a uniform choice averages {expected_entropy(2, 6):.2f}, n = 2"
     for wanted in (
@@ -211,8 +210,7 @@ def test_tiles_of_a_task_with_contexts(tmp_path):
         "one box stacked 75.0 % interval 95 % interval 30.0 to 95.4 %, 3 of 4 rollouts",
         "three boxes stacked 50.0 % 2 of 4 rollouts",
         f"mode entropy, all contexts together, base 6 0.39 95 % interval 0.00 to 0.50; 2 of 6 modes; {even}",
-        "action error, koap 0.91 mrad ridge 1.04 mrad, n = 20 unlabelled steps",
-        "Outside the budget, for analysis only: 20 labels",
+        "Outside the budget, for evaluation only: 20 labels",
     ):
         assert wanted in text
     assert "two boxes" not in text
@@ -234,7 +232,7 @@ def test_report_of_a_task_with_objects(task, tmp_path, monkeypatch):
     plans = get_task(task).plans_position
     expected = (
         {picture.name for picture in PICTURES}
-        - {"film.gif", "latent.png", "inspect.png", "plan_errors.png", "action_errors.png"}
+        - {"film.gif", "latent.png", "inspect.png", "plan_errors.png"}
         - (set() if plans else {"plans.png"})
     )
     assert {link.removeprefix("plots/") for link in page.links} == expected

@@ -56,15 +56,13 @@ def test_bad_metrics(rows, message):
         draw_losses(rows, NOTHING)
 
 
-def test_actions_tell_the_error_and_the_broken_budget():
+def test_actions_tell_the_error_and_what_they_are_read_for():
     true = np.zeros((50, 2))
     predicted = np.tile([0.003, 0.004], (50, 1))
     predicted[0] = np.nan  # left out
     figure = draw_actions({"predicted": predicted, "true": true}, RunFacts(Path("run"), get_task("avoiding")))
     assert titles(figure) == ["x: RMSE 3 mm", "y: RMSE 4 mm", "all: RMSE 3.54 mm, median 3.5"]
-    assert figure.get_suptitle() == (
-        "49 steps of unlabelled demonstrations - for analysis only: reads labels outside the budget"
-    )
+    assert figure.get_suptitle() == "49 steps of demonstrations outside the label budget, for evaluation only"
 
 
 def test_actions_in_two_units():

@@ -53,7 +53,6 @@ def test_a_run_of_a_plugin_s_method(run):
     assert config["run"]["plugins"] == ["nearest_neighbour"] and config["method"] == "nearest_neighbour"
     remembered = load_tensors(run / "controller.safetensors")[0]["actions"]
     assert len(remembered) == summary["decoder_fit"]["labels_used"] > 20
-    assert summary["action_error_mm"]["controller"] > 0
 
 
 def test_log_columns_follow_from_what_is_logged(run):

@@ -110,7 +110,9 @@ def test_a_row_says_what_a_cell_found(finished):
     assert row["mean_steps"] == result["episode"][0]["steps"]
     assert row["labelled_units"] == row["trajectories_touched"] == 2
     assert row["labelled_transitions"] == summary["labels"]["labelled_transitions"] > 0
-    assert row["action_error"] == summary["action_error_mm"]["controller"] and math.isfinite(row["action_error"])
+    assert row["action_error"] == 1e3 * result["action_errors"]["outside_budget"]["unit"][0][
+        "controller"
+    ] and math.isfinite(row["action_error"])
 
 
 def test_a_cell_that_is_not_done_is_missing_or_failed(tmp_path):

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+_LONG = ("episode", "action_errors")
 HINT = "KOAP_TRACEBACK=1 shows where"
 
 
@@ -29,11 +30,11 @@ def complain(message: str) -> None:
 
 
 def show(result: Any) -> None:
-    """Prints a result: a table of names and values, without the rows of single episodes."""
+    """Prints a result: a table of names and values, without the rows of single episodes or action columns."""
     if not isinstance(result, Mapping):
         print(result)
         return
-    lines = [line for key, value in result.items() if key != "episode" for line in _lines(key, value)]
+    lines = [line for key, value in result.items() if key not in _LONG for line in _lines(key, value)]
     width = min(max((len(name) for name, _ in lines), default=0), 45)
     for name, text in lines:
         print(f"{name:<{width}}  {text}")

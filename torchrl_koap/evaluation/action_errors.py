@@ -1,5 +1,8 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How far actions, decoded or sampled, lie from recorded ones, beside always giving the mean action."""
+"""How far actions, decoded or sampled, lie from recorded ones, beside always giving the mean action.
+
+Labels outside the budget are read here, for evaluation only, after the training; how many is in the result.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
@@ -19,16 +22,60 @@ from torchrl_koap.modules.planning.energy_score import sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.units import unit_groups
-from torchrl_koap.training.action_errors import episodes_outside, first_actions
 from torchrl_koap.training.closed_form import axes_of, fit_closed_form
 
+# frames around a decoded action: enough history and look-ahead for every controller compared
+BEFORE, AFTER = 8, 11
 _MOST_FOLDS = 20  # labelled trajectories that are left out in turn, at most
+
+
+def episodes_outside(data: TensorDictBase, labelled: TensorDictBase) -> Tensor:
+    """Numbers of the trajectories of which no label was in the budget.
+
+    Args:
+        data (TensorDictBase): flat, with all labels that there are.
+        labelled (TensorDictBase): the same, or a part, after the budget was applied.
+    """
+    touched = labelled["episode"][labelled["has_action"].squeeze(-1)].unique()
+    every = data["episode"].unique()
+    return every[~torch.isin(every, touched.to(every.device))]
+
+
+@torch.no_grad()
+def first_actions(
+    controller: nn.Module, data: TensorDictBase, episodes: Tensor | Sequence[int]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Predicted and true actions on the labelled steps of some trajectories: the same steps for every controller.
+
+    The first action decoded from a window of recorded states, ``BEFORE`` frames of history (the first frame of a
+    trajectory repeated where there is none) and ``AFTER`` frames of future.
+
+    Args:
+        controller (nn.Module): writes actions ``[*B, T, act]`` for windows of states ``[*B, T, d]``.
+        data (TensorDictBase): flat, as the controller sees it.
+        episodes (Tensor or sequence of int): the trajectories; those that are too short are left out.
+
+    Returns:
+        tuple of Tensor: both ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
+    """
+    wanted = torch.isin(data["episode"], torch.as_tensor(episodes, device=data["episode"].device))
+    numbers, lengths = data["episode"][wanted].unique(return_counts=True)
+    part = data[torch.isin(data["episode"], numbers[lengths > AFTER])]
+    if not len(part):
+        return data["action"][:0].cpu(), data["action"][:0].cpu(), data["episode"][:0].cpu()
+    windows = cut_windows(part, BEFORE + 1 + AFTER, select=["state", "action", "episode"], pad_before=BEFORE)
+    windows = windows[windows["action"][:, BEFORE].isfinite().all(-1)]  # the data may lack labels themselves
+    device = next(iter(controller.state_dict().values())).device
+    past = min(controller.num_past, BEFORE)
+    states = windows["state"][:, BEFORE - past :].to(device)
+    predicted = controller(TensorDict({"state": states}, batch_size=[len(states)]))["action"]
+    return predicted[:, past].cpu(), windows["action"][:, BEFORE], windows["episode"][:, -1]
 
 
 def errors_outside_budget(
     controller: nn.Module, data: TensorDictBase, labelled: TensorDictBase, task: Task
-) -> dict[str, Any]:
-    """Errors on the trajectories that have labels of which none was in the budget; an analysis, nothing selects by it.
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Errors on the trajectories that have labels of which none was in the budget.
 
     Args:
         controller (nn.Module): the trained controller.
@@ -37,20 +84,22 @@ def errors_outside_budget(
         task (Task): names and units of the actions.
 
     Returns:
-        dict: of :func:`summarise_errors`, or a ``note`` why there is none.
+        tuple: of :func:`summarise_errors`, or a ``note`` why there is none; ``predicted`` and ``true`` ``[N, act]``,
+        raw units, or nothing.
     """
-    predicted, true, episode = first_actions(controller, data, episodes_outside(data, labelled))
+    outside = episodes_outside(data, labelled)
+    predicted, true, episode = first_actions(controller, data, outside)
     if not len(true):
-        return {"note": "no trajectory outside the budget has labels"}
+        return {"note": "no trajectory outside the budget has labels"}, {}
     known = labelled["action"][labelled["has_action"].squeeze(-1)]
     ridge = LinearInverseDynamics(data["state"].shape[-1], task.action_dim).to(data["state"].dtype)
     fit_closed_form(ridge, labelled)
     models = {
         "controller": predicted,
-        "ridge": first_actions(ridge, data, episodes_outside(data, labelled))[0],
+        "ridge": first_actions(ridge, data, outside)[0],
         "mean_action": known.mean(0).expand_as(true),
     }
-    return summarise_errors(models, true, episode, task)
+    return summarise_errors(models, true, episode, task), {"predicted": predicted, "true": true}
 
 
 def errors_left_out(
@@ -121,7 +170,7 @@ def errors_of_chunks(
     chunks: int = 500,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Errors on the trajectories that have labels of which none was in the budget; an analysis, nothing selects by it.
+    """Errors of sampled actions on the trajectories that have labels of which none was in the budget.
 
     Args:
         policy (DiffusionPolicy): the trained policy.

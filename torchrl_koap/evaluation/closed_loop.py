@@ -12,7 +12,7 @@ import torch
 from torchrl_koap.evaluation.config import EvalConfig, check_options
 from torchrl_koap.evaluation.environments import choose_contexts, environment_of
 from torchrl_koap.evaluation.latency import measure_latency
-from torchrl_koap.evaluation.offline import evaluate_offline
+from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
 from torchrl_koap.evaluation.scores import score, task_scores
@@ -71,8 +71,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         return _judge_offline(trained, config)
     if config.execution.strategy == "oracle" and config.env is not None:
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
-    if config.dataset is not None:
-        raise ValueError(f"dataset is for judging without an environment; task {task.name!r} is rolled out in one")
+    actions = evaluate_actions(trained, config.dataset)
     policy = trained_policy(trained, config.execution).to(config.device)
     seeds = list(range(config.seed, config.seed + config.episodes))
     where = environment_of(task, config)
@@ -101,10 +100,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     learned = config.execution if policy.execution.strategy != "oracle" else ExecutionConfig()
     timed = policy if learned is config.execution else trained_policy(trained, learned).to(config.device)
     result |= measure_latency(timed, task.observation_dim)
-    result |= {
-        "execution": asdict(policy.execution),
-        "episode": rows,
-    }
+    result |= actions | {"execution": asdict(policy.execution), "episode": rows}
     if config.env is not None:
         result |= {"env": config.env, "success_key": config.success_key}
     rollouts = rollouts_to_tensors(

@@ -190,7 +190,7 @@ def _describe_probe(outside: Mapping[str, Any]) -> str:
         return outside["note"].capitalize()
     shared, held_out = (outside.get(name, 0) for name in ("held_out_in_budget", "held_out_trajectories"))
     probe, own = (min(outside[name]) for name in ("probe_r2", "decoder_r2"))
-    head, reservation = "Outside the budget, for analysis only", ""
+    head, reservation = "Outside the budget, for evaluation only", ""
     if shared and shared == held_out:
         head = "On labels of the budget, which the run's decoder was fitted on"
     elif shared:

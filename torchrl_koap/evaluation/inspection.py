@@ -103,7 +103,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
     ``planner_alone`` lets its plans come true, which needs a goal in the states of the task; ``controller_alone``
     follows recorded states (blind to where objects went), ``both`` is the closed loop. Plans are followed as
     ``koap eval`` follows them. ``latent`` (:func:`~torchrl_koap.evaluation.latent_space.analyse_latent`) reads labels
-    outside the budget, for analysis only.
+    outside the budget, for evaluation only.
 
     Args:
         run (str or Path): a run directory, or ``"pretrained:NAME"``.

@@ -12,6 +12,8 @@ from torchrl_koap.data import controller_view, select_trajectories
 from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chunks, errors_outside_budget
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.plan_errors import plan_errors
+from torchrl_koap.runs.run_directory import RunDirectoryError
+from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks.units import thousandths
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 KIND = "offline"
 SPLITS = ("outside_budget", "left_out")
 _CHUNKS = ("policy", "mean_action")
+_COMMANDS = "the controller decodes no recorded states: it follows plans by the command that it gave"
 
 
 def evaluate_offline(
@@ -52,17 +55,53 @@ def evaluate_offline(
     data = trained.data(dataset)
     labelled, _ = trained.hide_labels(data)
     plan = _plans(trained, data, samples=samples, plans=plans, seed=seed)
-    action = _actions(trained, data, labelled, samples=samples, chunks=plans, seed=seed)
-    split = next((name for name in SPLITS if "relative" in action[name]), None)
+    if trained.planner is None:
+        outside = errors_of_chunks(
+            trained.controller, data, labelled, trained.task, samples=samples, chunks=plans, seed=seed
+        )
+    else:
+        outside = _outside_budget(trained, data, labelled)
+    action = {"outside_budget": outside, "left_out": _left_out(trained, labelled, outside)}
     return {
         "kind": KIND,
         "relative_plan_error": plan.get("relative"),
-        "relative_action_error": None if split is None else action[split]["relative"],
-        "action_errors_on": split,
         "faults": offline_faults(plan, action),
         "plan_errors": plan,
-        "action_errors": action,
+        **_summary_of(action),
         "trajectory": _per_trajectory(plan, action),
+    }
+
+
+def evaluate_actions(trained: Trained, dataset: str | None = None) -> dict[str, Any]:
+    """Compares decoded actions with labels outside the budget, for evaluation only, beside rollouts in an environment.
+
+    Args:
+        trained (Trained): the run.
+        dataset (str, optional): where its data set is now. Default: where it was; if it is not there, nothing is read.
+
+    Returns:
+        dict: ``action_errors`` and what they come to, as of :func:`evaluate_offline`.
+
+    Raises:
+        RunDirectoryError: if the data set that was named is not that of the training.
+    """
+    try:
+        data = trained.data(dataset)
+        outside = _outside_budget(trained, data, trained.hide_labels(data)[0])
+    except RunDirectoryError as error:
+        if dataset is not None:
+            raise
+        outside = {"note": str(error)}
+    return _summary_of({"outside_budget": outside})
+
+
+def _summary_of(action: Mapping[str, Any]) -> dict[str, Any]:
+    split = next((name for name in SPLITS if "relative" in action.get(name, {})), None)
+    return {
+        "relative_action_error": None if split is None else action[split]["relative"],
+        "action_errors_on": split,
+        "labels_read_outside_budget": action["outside_budget"].get("labels", 0),
+        "action_errors": dict(action),
     }
 
 
@@ -75,28 +114,29 @@ def _plans(trained: Trained, data: TensorDictBase, **options: Any) -> dict[str, 
     return {"trajectories": len(trained.held_out)} | plan_errors(trained.planner, unseen, trained.task, **options)
 
 
-def _actions(trained: Trained, data: TensorDictBase, labelled: TensorDictBase, **options: Any) -> dict[str, Any]:
-    task = trained.task
+def _outside_budget(trained: Trained, data: TensorDictBase, labelled: TensorDictBase) -> dict[str, Any]:
+    """Errors of decoded actions; writes ``actions.safetensors``."""
     if trained.planner is None:
-        outside = errors_of_chunks(trained.controller, data, labelled, task, **options)
+        return {"note": f"method {trained.config.method!r} samples actions: it decodes no recorded states"}
+    if trained.method.fit is not None:
+        return {"note": _COMMANDS}
+    view, seen = (controller_view(part, trained.columns, targets=trained.task.targets) for part in (data, labelled))
+    errors, tensors = errors_outside_budget(trained.controller.cpu(), view, seen, trained.task)
+    if tensors:
+        save_tensors(trained.folder / "actions.safetensors", tensors)
+    return errors
+
+
+def _left_out(trained: Trained, labelled: TensorDictBase, outside: Mapping[str, Any]) -> dict[str, Any]:
+    if trained.planner is None:
         note = f"method {trained.config.method!r} would have to be trained again without each trajectory"
         hint = "; train it on fewer labels than there are (--labels): the others tell how good it is"
-        return {"outside_budget": outside, "left_out": {"note": note + (hint if "note" in outside else "")}}
+        return {"note": note + (hint if "note" in outside else "")}
     if trained.method.fit is not None:
-        note = "the controller decodes no recorded states: it follows plans by the command that it gave"
-        return {"outside_budget": {"note": note}, "left_out": {"note": note}}
-    view, seen = (controller_view(part, trained.columns, targets=task.targets) for part in (data, labelled))
-    controller = trained.controller.cpu()
-    return {
-        "outside_budget": errors_outside_budget(controller, view, seen, task),
-        "left_out": errors_left_out(
-            controller,
-            seen,
-            task,
-            closed_form=trained.method.closed_form,
-            columns=trained.columns,
-        ),
-    }
+        return {"note": _COMMANDS}
+    seen = controller_view(labelled, trained.columns, targets=trained.task.targets)
+    fitted = trained.method.closed_form
+    return errors_left_out(trained.controller.cpu(), seen, trained.task, closed_form=fitted, columns=trained.columns)
 
 
 def _per_trajectory(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[dict[str, Any]]:

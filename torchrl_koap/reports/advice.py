@@ -123,12 +123,13 @@ def one_way_only(run: RunFacts) -> Advice | None:
 
 def control_is_as_good(run: RunFacts) -> Advice | None:
     """A plain ridge errs no more than the method."""
-    method, (errors, unit) = run.config.get("method"), run.action_errors
-    own, ridge = number(errors.get("controller")), number(errors.get("ridge"))
+    method, split = run.config.get("method"), run.evaluation.get("action_errors_on")
+    errors = run.action_errors.get(split) if split else None
+    own, ridge = (number((errors or {}).get(name)) for name in ("relative", "relative_of_ridge"))
     if own is None or ridge is None or own < ridge or method in CONTROLS:
         return None
     return Advice(
-        f"the action error of {method} is {own:.3g} {unit}, that of a plain ridge {ridge:.3g} {unit}".strip(),
+        f"actions of {method} err {own:.3g} times as much as their mean would, a plain ridge's {ridge:.3g} times",
         "the ridge is simpler; compare both in closed loop before keeping either",
         "koap curve --methods koap,koap_untrained,linear_steps,linear --out curves/compare",
     )

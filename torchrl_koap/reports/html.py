@@ -22,7 +22,7 @@ _PLAIN = ("seed", "mode")
 _WORDS = {
     "success_low": "success, 95 % from",
     "success_high": "success, 95 % to",
-    "analysis_labels_read": "labels read for analysis only",
+    "labels_read_outside_budget": "labels read outside the budget, for evaluation only",
     "held_out_error_mm": "error on held-out labelled steps (mm)",
 }
 

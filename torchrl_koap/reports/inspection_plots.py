@@ -88,7 +88,7 @@ def draw_eigenvalues(data: Mapping[str, Any], run: RunFacts) -> Figure:
     source="inspect.json",
     title="What the latent space holds",
     caption="Left: eigenvalues of the operator. Middle: errors of predicted states, latent actions given; a test of the"
-    " models, not a forecast. Right, for analysis only: how much of the true actions a linear probe on labels"
+    " models, not a forecast. Right, for evaluation only: how much of the true actions a linear probe on labels"
     " outside the budget, and the run's own decoder, explain on held-out demonstrations.",
     order=60,
 )
@@ -119,7 +119,7 @@ def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
         shared = outside.get("held_out_in_budget")
         inside = bool(shared) and shared == outside.get("held_out_trajectories")
         which = "of the budget, which the decoder has seen" if inside else "outside the budget"
-        head = f"probe and decoder: for analysis only, reads {outside['labels_read']:,} labels, {which}"
+        head = f"probe and decoder: for evaluation only, reads {outside['labels_read']:,} labels, {which}"
         figure.suptitle(head, fontsize=10, color=WARNING, x=0.99, ha="right")
     return figure
 

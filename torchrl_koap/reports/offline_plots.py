@@ -39,7 +39,7 @@ _ACTIONS = {
     "mean_action": ("always the mean action", MUTED),
 }
 _SPLITS = {
-    "outside_budget": "labels outside the budget, for analysis only",
+    "outside_budget": "labels outside the budget, for evaluation only",
     "left_out": "labels inside the budget, a trajectory left out at a time",
 }
 _MANY = 6  # from here on names of columns are turned

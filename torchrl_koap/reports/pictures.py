@@ -45,6 +45,7 @@ _MOVING = (".gif", ".mp4")
 _COMMANDS = {
     "rollouts.safetensors": "koap eval {run} --episodes 60 --seed 100",
     "eval.json": "koap eval {run}",
+    "actions.safetensors": "koap eval {run}",
     "inspect.json": "koap inspect {run}",
 }
 Draw = Callable[[Any, RunFacts], "Figure | Film"]

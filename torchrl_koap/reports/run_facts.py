@@ -123,12 +123,10 @@ class RunFacts:
         return number(account.get("labelled_transitions")) if isinstance(account, Mapping) else None
 
     @property
-    def action_errors(self) -> tuple[Mapping[str, Any], str]:
-        """Errors of the predicted actions, empty if there are none, and their unit."""
-        for name, errors in self.summary.items():
-            if name.startswith("action_error") and isinstance(errors, Mapping):
-                return errors, name.removeprefix("action_error").removeprefix("_")
-        return {}, ""
+    def action_errors(self) -> Mapping[str, Any]:
+        """Errors of decoded actions by the labels that they were measured on; each may be a note why there is none."""
+        found = self.evaluation.get("action_errors")
+        return found if isinstance(found, Mapping) else {}
 
     def evaluated(self, name: str) -> float | None:
         """Returns a number of the evaluation, None if it is not there."""

@@ -11,7 +11,7 @@ from typing import Any
 from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.html import write_page
 from torchrl_koap.reports.pictures import FOLDER, all_pictures, draw_pictures
-from torchrl_koap.reports.run_facts import RunFacts, number
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.tiles import tiles
 
 _SIMULATED = ("rollouts.safetensors", "inspect.json")
@@ -19,7 +19,7 @@ _BESIDE_LABELS = "demonstrations.png"
 _COMMANDS = {"train": "koap train --out {run}", "eval": "koap eval {run} --episodes 60 --seed 100"}
 _OFFLINE_COMMANDS = _COMMANDS | {"eval": "koap eval {run}"}
 _SUMMARY_ELSEWHERE = ("labels",)
-_EVAL_ELSEWHERE = ("episode", "command", "trajectory", "faults", "rates")
+_EVAL_ELSEWHERE = ("episode", "command", "trajectory", "faults", "rates", "action_errors")
 _CONFIG_ELSEWHERE = ("versions", "command")
 
 
@@ -59,8 +59,7 @@ def write_report(
     run = RunFacts.read(folder)
     problems = draw_pictures(run.folder, animation=animation, progress=progress) if draw else {}
     config, summary, evaluation = run.config, run.summary, run.evaluation
-    errors, _ = run.action_errors
-    figures, missing = _figures(run, problems, errors.get("note"))
+    figures, missing = _figures(run, problems)
     commands = _OFFLINE_COMMANDS if run.offline else _COMMANDS
     return write_page(
         "run.html",
@@ -76,7 +75,7 @@ def write_report(
             for item in advice(run)
         ],
         labels=summary.get("labels"),
-        labels_read=number(errors.get("analysis_labels_read")),
+        labels_read=run.evaluated("labels_read_outside_budget"),
         label_figure=next((item for item in figures if item["name"] == _BESIDE_LABELS), None),
         figures=[item for item in figures if item["name"] != _BESIDE_LABELS],
         missing=missing,
@@ -107,13 +106,10 @@ def _subtitle(run: RunFacts) -> str:
     return " · ".join([str(run.folder), *shown])
 
 
-def _figures(
-    run: RunFacts, problems: Mapping[str, str], no_actions: Any
-) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
-    """What is to be shown, and for each command the titles of the pictures whose source it would leave.
-
-    ``no_actions`` says why the training left no actions to draw, if it is a string.
-    """
+def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str, Any]], dict[str, list[str]]]:
+    """What is to be shown, and for each command the titles of the pictures whose source it would leave."""
+    outside = run.action_errors.get("outside_budget")
+    no_actions = outside.get("note") if isinstance(outside, Mapping) else None
     figures: list[dict[str, Any]] = []
     missing: dict[str, list[str]] = {}
     for name, item in all_pictures().items():

@@ -27,7 +27,7 @@ def tiles(run: RunFacts) -> list[dict[str, Any]]:
         >>> tiles(RunFacts(Path("runs/koap"), evaluation={"success_rate": 0.5, "episodes": 8}))
         [{'name': 'success', 'value': '50.0 %', 'note': '4 of 8 rollouts', 'bar': None}]
     """
-    found = [*_offline_errors(run), *_rates(run), _entropy(run), _action_error(run), _labels(run), _speed(run)]
+    found = [*_offline_errors(run), *_rates(run), _entropy(run), _labels(run), _speed(run)]
     return [item for item in (*found, _time(run)) if item is not None]
 
 
@@ -45,7 +45,7 @@ def _offline_errors(run: RunFacts) -> list[dict[str, Any]]:
         head = f"plan error, energy score, {len(row['columns'])} columns"
         found.append(_tile(head, f"{values['planner']:.3g} {shown}".rstrip(), note))
     split = evaluation.get("action_errors_on")
-    errors = evaluation["action_errors"][split] if split else {}
+    errors = run.action_errors[split] if split else {}
     for row in errors.get("unit", ()):
         shown, factor = thousandths(row["unit"])
         others = [f"{name.replace('_', ' ')} {factor * row[name]:.3g}" for name in ("ridge", "mean_action")]
@@ -93,19 +93,6 @@ def _entropy(run: RunFacts) -> dict[str, Any] | None:
     elif run.successes:
         notes.append(f"a uniform choice averages {run.expected_entropy:.2f}, n = {run.successes}")
     return _tile(f"{_ENTROPIES[name]}, base {modes}", f"{value:.2f}", "; ".join(notes))
-
-
-def _action_error(run: RunFacts) -> dict[str, Any] | None:
-    errors, unit = run.action_errors
-    values = {key: value for key in errors if (value := number(errors[key])) is not None}
-    read = values.pop("analysis_labels_read", None)
-    method = run.config.get("method")
-    own = method if method in values else next(iter(values), None)
-    if own is None:
-        return None
-    notes = [f"{key} {value:.2f} {unit}" for key, value in values.items() if key != own]
-    notes += [f"n = {read:,.0f} unlabelled steps"] if read else []
-    return _tile(f"action error, {own}", f"{values[own]:.2f} {unit}", ", ".join(notes))
 
 
 def _labels(run: RunFacts) -> dict[str, Any] | None:

@@ -132,16 +132,16 @@ def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
     "actions.png",
     source="actions.safetensors",
     title="Predicted against recorded actions",
-    caption="For analysis only: the recorded actions of unlabelled demonstrations lie outside the label budget and were"
-    " not used for training or selection. Points on the diagonal are exact; a slope below 1 means timid actions, an"
-    " offset in the error histogram means drift.",
+    caption="Uses all actions, for evaluation only: those of demonstrations outside the label budget, which trained and"
+    " selected nothing. Points on the diagonal are exact; a slope below 1 means timid actions, an offset in the error"
+    " histogram means drift.",
     order=90,
 )
 def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws predicted against recorded actions, a panel per dimension, and the distribution of the errors.
 
-    The recorded actions are those of unlabelled demonstrations: reading them spends labels outside the budget, which
-    only an analysis may do. The title says so. Metres, radians, seconds and newtons are shown in thousandths.
+    The recorded actions are those of demonstrations outside the budget, read for evaluation only; the title says so.
+    Metres, radians, seconds and newtons are shown in thousandths.
 
     Args:
         data (mapping): ``predicted`` and ``true`` actions ``[N, d]``.
@@ -178,7 +178,7 @@ def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
     left_out = [names[index] for index in range(width) if index not in same]
     axes = figure.add_subplot(down, across, width + 1)
     _histogram(axes, error[:, same], [names[index] for index in same], shown[same[0]], left_out)
-    title = f"{len(true):,} steps of unlabelled demonstrations - for analysis only: reads labels outside the budget"
+    title = f"{len(true):,} steps of demonstrations outside the label budget, for evaluation only"
     figure.suptitle(title, fontsize=10, color=WARNING, x=0.01, ha="left")
     return figure
 

@@ -171,17 +171,16 @@ def cell_row(
 def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str, Any]:
     """The columns of ``cells.csv`` that training and evaluation of a cell found."""
     labels = summary["labels"]
-    errors: Mapping[str, Any] = next((value for name, value in summary.items() if name.startswith("action_error")), {})
     common = {
         "labelled_units": labels["selected_units"],
         "labelled_transitions": labels["labelled_transitions"],
         "trajectories_touched": labels["trajectories_touched"],
-        "action_error": errors.get("controller"),
+        "action_error": _own_error(result),
         "controller_updates": summary["controller_updates"],
     }
     if result.get("kind") == KIND:
         names = ("relative_plan_error", "relative_action_error")
-        return common | {"kind": KIND, "action_error": _own_error(result)} | {name: result[name] for name in names}
+        return common | {"kind": KIND} | {name: result[name] for name in names}
     entropy = result["mode_entropy"]
     counts = ("episodes", "success_rate", "success_low", "success_high", "collisions", "mean_steps")
     common |= {name: result[name] for name in counts}

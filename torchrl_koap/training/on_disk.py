@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_koap.data import LabelReport, WindowTable, select_trajectories, subsample_trajectories
 from torchrl_koap.modules import StatePlanner
@@ -19,9 +20,8 @@ from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.progress import check_logger, count_up_to, open_logger, progress_bar
 from torchrl_koap.runs.resume import begun_with, check_data, check_resume
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.runs.weights import load_weights, save_weights
+from torchrl_koap.runs.weights import load_weights, save_tensors, save_weights
 from torchrl_koap.tasks import WINDOW, Task
-from torchrl_koap.training.action_errors import AFTER, BEFORE, error_entry, write_analysis
 from torchrl_koap.training.command_model import with_label_commands
 from torchrl_koap.training.controller import learn_controller
 from torchrl_koap.training.datasets import (
@@ -88,22 +88,20 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
         set_up_torch(config.run.threads, config.run.device)
         check_resume(run, config)
         frames = _frames(task, config)
-        data, every, held_out, report = _read_data(task, config, planner_only)
-        content = to_json(config) | {"data": fingerprint(data), "versions": versions()}
+        used, held_out, report = _read_data(task, config, planner_only)
+        content = to_json(config) | {"data": fingerprint(used), "versions": versions()}
         check_data(run, content)
         if not task.import_strings():
             content["task_definition"] = task.to_json()  # plain facts, such as those that come with data
         if held_out:
             content["held_out_episodes"] = held_out
         if not planner_only:  # trajectories that are too short are found now rather than after the planner was trained
-            WindowTable.build(data, frames[0], pad_before=frames[1])
-            if get_method(config.method).plans:
-                WindowTable.build(data, BEFORE + 1 + AFTER, pad_before=BEFORE)
+            WindowTable.build(used, frames[0], pad_before=frames[1])
         for_planner, unseen = (
-            without_held_out(data, held_out),
-            select_trajectories(data, held_out) if held_out else None,
+            without_held_out(used, held_out),
+            select_trajectories(used, held_out) if held_out else None,
         )
-        data = data if planner_only else without_held_out(data, held_out, keep_labelled=True)
+        data = used if planner_only else without_held_out(used, held_out, keep_labelled=True)
         if not mine:
             held.enter_context(run.locked("koap train"))
             check_resume(run, config)  # another one may have begun here in the meantime
@@ -134,10 +132,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             "planner": losses,
             **results,
         }
-        if get_method(config.method).plans:  # afterwards: it reads labels that the training was not given
-            columns = task.controller_columns(config.controller.columns)
-            analysis = write_analysis(run, task, every, data, controller, columns)
-            summary[error_entry(task.action_unit)] = analysis
+        save_tensors(run.path / "demonstrations.safetensors", _drawn(task, used.cpu()))
         run.write_json("summary.json", summary)
     return Trained(task, config, planner, controller, summary, tuple(held_out), run.path)
 
@@ -161,8 +156,8 @@ def _frames(task: Task, config: TrainConfig) -> tuple[int, int]:
 
 def _read_data(
     task: Task, config: TrainConfig, planner_only: bool
-) -> tuple[TensorDictBase, TensorDictBase, list[int], LabelReport | None]:
-    """The trajectories that are used, all data, those that the planner does not see, a report of the labels seen."""
+) -> tuple[TensorDictBase, list[int], LabelReport | None]:
+    """The trajectories that are used, those that the planner does not see, a report of the labels seen."""
     with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:  # read in a moment, but for thousands
         data = load_demonstrations(config.dataset, task, progress=count_up_to(bar))
     planner, share, seed = config.planner, config.labels.trajectories, config.run.seed
@@ -171,15 +166,25 @@ def _read_data(
         held_out = choose_held_out(data, planner.held_out, seed=seed)
         data["action"] = torch.full_like(data["action"], torch.nan)
         data["has_action"] = torch.zeros_like(data["has_action"])
-        return subsample_trajectories(data, share).to(config.run.device), data, held_out, None
+        return subsample_trajectories(data, share).to(config.run.device), held_out, None
     labelled, report = label_budget(config).apply(data, command=task.command_columns)
     if get_method(config.method).knows_commands:
         labelled = with_label_commands(labelled, data, task.command_columns)
     # not drawn by the seed: all runs know the same unlabelled trajectories, but for as many as have labels
     labelled = subsample_trajectories(labelled, share).to(config.run.device)
     if planner.source is not None:
-        return labelled, data, held_out_by(planner.source, config.dataset), report
-    return labelled, data, choose_held_out(labelled, planner.held_out, seed=seed), report
+        return labelled, held_out_by(planner.source, config.dataset), report
+    return labelled, choose_held_out(labelled, planner.held_out, seed=seed), report
+
+
+def _drawn(task: Task, data: TensorDictBase) -> dict[str, Tensor]:
+    """What pictures show of the demonstrations: states, which steps had a label, where tool and objects were."""
+    shown = {"state": data["state"], "episode": data["episode"], "labelled": data["has_action"].squeeze(-1)}
+    if task.env is None:  # nobody knows what lies in a plane
+        return shown
+    starts = [task.observation[part].start for part in (task.position, *(body.position for body in task.bodies))]
+    tool, *objects = (data["observation"][:, start : start + 2].contiguous() for start in starts)
+    return shown | {"position": tool} | ({"objects": torch.stack(objects, 1)} if objects else {})
 
 
 def _planner(
