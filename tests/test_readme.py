@@ -14,8 +14,8 @@ import tyro
 
 import torchrl_koap
 from torchrl_koap import LabelConfig, PlannerConfig
+from torchrl_koap.commands.options import SHORT, expand
 from torchrl_koap.commands.subcommands import Subcommand
-from torchrl_koap.commands.train import SHORT, expand
 from torchrl_koap.reports import pictures
 
 ROOT = Path(__file__).parents[1]

@@ -85,7 +85,7 @@ def _run(arguments: Sequence[str]) -> int:
 def _parsed(tyro: Any, kind: Any, arguments: Sequence[str]) -> Any:
     """The command; what one of our own checks refuses is raised as it is, what tyro refuses leaves with 2."""
     if arguments[:1] == ["train"]:
-        from torchrl_koap.commands.train import expand, show_help
+        from torchrl_koap.commands.options import expand, show_help
 
         if {"-h", "--help"} & set(arguments):
             show_help()
@@ -131,7 +131,7 @@ def _commands() -> tuple[Any, ...]:
         try:
             import tyro
 
-            from torchrl_koap.commands.command import check_options
+            from torchrl_koap.commands.options import check_options
             from torchrl_koap.commands.subcommands import Subcommand
             from torchrl_koap.runs.progress import without_progress_bars
         except (ImportError, AttributeError) as error:

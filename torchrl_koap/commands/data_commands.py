@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from torchrl_koap.commands.command import Command
+from torchrl_koap.commands.options import Command
 from torchrl_koap.data import open_dataset, read_about, read_recordings, save_demonstrations, write_recordings
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings

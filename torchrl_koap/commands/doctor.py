@@ -16,7 +16,7 @@ from typing import Any
 import torch
 import tyro
 
-from torchrl_koap.commands.command import Command
+from torchrl_koap.commands.options import Command
 from torchrl_koap.runs.device import has_bfloat16_units
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors

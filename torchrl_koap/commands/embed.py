@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from torchrl_koap.commands.command import Command
+from torchrl_koap.commands.options import Command
 from torchrl_koap.data import read_about
 from torchrl_koap.files import check_file
 from torchrl_koap.tasks import get_task

@@ -1,15 +1,16 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The commands that evaluate runs or compare them: eval, inspect, suggest, latency, curve, bench."""
+"""The commands that train, evaluate, export or compare runs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import tyro
 
-from torchrl_koap.commands.command import Command, Options
+from torchrl_koap.commands.options import Command, Options, as_typed
 from torchrl_koap.evaluation import (
     EvalConfig,
     InspectConfig,
@@ -17,15 +18,37 @@ from torchrl_koap.evaluation import (
     SuggestedLabels,
     evaluate,
     inspect,
+    load_policy,
     suggest,
 )
-from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop
+from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop, time_calls
 from torchrl_koap.evaluation.offline import KIND, describe_offline
+from torchrl_koap.lookup import lookup
+from torchrl_koap.modules import InverseDynamicsFollower
+from torchrl_koap.modules.execution.export import PARTS, SUFFIXES, export_part, exportable
 from torchrl_koap.reports.pictures import draw_pictures
 from torchrl_koap.reports.run_report import write_report
-from torchrl_koap.runs.progress import check_logger, log_scores, open_logger
+from torchrl_koap.runs.device import set_up_torch
+from torchrl_koap.runs.pretrained import writable_folder
+from torchrl_koap.runs.progress import check_logger, log_scores, open_logger, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.studies import Machines, Study, run_study
+from torchrl_koap.training import TrainConfig, Trained, train
+
+
+@dataclass(kw_only=True)
+class Train(Command):
+    """Train planner and controller on demonstrations of which few have action labels.
+
+    Attributes:
+        config: all options.
+    """
+
+    config: Options[TrainConfig]
+
+    def __call__(self) -> Mapping[str, Any]:
+        """Trains."""
+        return train(self.config, command=as_typed()).results
 
 
 @dataclass(kw_only=True)
@@ -116,6 +139,48 @@ class Latency(Command):
     def __call__(self) -> dict[str, Any]:
         """Measures."""
         return measure_control_loop(self.run, self.config)
+
+
+@dataclass(kw_only=True)
+class Export(Command):
+    """Write the whole policy, its controller and its denoiser, and compare each with the original (1e-5).
+
+    Attributes:
+        run: run directory of `koap train`, or pretrained:NAME.
+        out: folder to write (default: RUN/exported).
+        format: "torch" (torch.export), "onnx" (ONNX Runtime) or "aoti" (AOTInductor, needs a C++ compiler).
+        threads: torch threads.
+        latency: time the exported parts against eager ones.
+    """
+
+    run: tyro.conf.Positional[str]
+    out: Path | None = None
+    format: str = "torch"
+    threads: int = 1
+    latency: bool = True
+
+    def __call__(self) -> dict[str, Any]:
+        """Exports, compares, times."""
+        suffix = lookup(SUFFIXES, self.format, "export format")
+        set_up_torch(self.threads, "cpu")
+        trained = Trained.load(self.run)
+        policy = load_policy(trained)
+        out = writable_folder(self.run) / "exported" if self.out is None else self.out
+        out.mkdir(parents=True, exist_ok=True)
+        parts = [part for part in PARTS if part != "controller" or isinstance(policy.follower, InverseDynamicsFollower)]
+        result: dict[str, Any] = {}
+        with progress_bar(len(parts), "export", unit="part") as bar:
+            for part in parts:
+                what = exportable(policy, part, observation_dim=trained.task.observation_dim)
+                file = out / f"{part}{suffix}"
+                loaded = export_part(what, file, kind=self.format)
+                result[part] = {"file": str(file), "kilobytes": round(file.stat().st_size / 1e3)}
+                result[part] |= {f"{name} in": list(value.shape) for name, value in what.inputs.items()}
+                if self.latency:
+                    times = time_calls({"eager": what.module, self.format: loaded}, tuple(what.inputs.values()))
+                    result[f"{part} ms"] = times
+                bar.update()
+        return result
 
 
 @dataclass(kw_only=True)

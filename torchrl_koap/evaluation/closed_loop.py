@@ -21,7 +21,7 @@ from torchrl_koap.runs.device import set_up_torch
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import count_up_to, progress_bar
-from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
+from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.training.trained import Trained
 
@@ -64,8 +64,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     check_options(config)
     set_up_torch(config.threads, config.device)
     load_plugins(config.plugins)
-    trained = Trained.load(_folder(run, config))
-    _check_task(trained.folder, trained.task.name, config)
+    trained = Trained.load(writable_folder(run, config.out))
     directory, task = RunDirectory(trained.folder), trained.task
     if task.env is None and config.env is None:
         return _judge_offline(trained, config)
@@ -116,18 +115,6 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     save_tensors(directory.path / "rollouts.safetensors", rollouts, {"task": task.name})
     directory.write_json("eval.json", result)
     return result
-
-
-def _folder(run: str | Path, config: EvalConfig) -> Path:
-    """The folder to evaluate in: the run's own, or a copy of what it is made of."""
-    if config.out is not None and config.task is not None:  # before anything is copied
-        _check_task(run, Trained.load(run).task.name, config)
-    return writable_folder(run, config.out)
-
-
-def _check_task(run: str | Path, name: str, config: EvalConfig) -> None:
-    if config.task not in (None, name):
-        raise RunDirectoryError(f"{run} was trained on task {name!r}, not on {config.task!r}")
 
 
 def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:

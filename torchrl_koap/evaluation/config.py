@@ -30,7 +30,6 @@ class EvalConfig:
         env: id of a Gymnasium environment to roll out in instead of the task's own, such as "my_package:Reach-v0".
         success_key: entry of its info that says whether the task is done (default: "is_success" or "success" where it
             has one of them, else an episode that terminates with a positive reward).
-        task: refuse a run of another task than this.
         dataset: for a task without an environment: where the data set of the training is now (default: where it was).
         samples: for a task without an environment: plans that are sampled in each recorded situation.
         threads: torch and simulator threads (default: as many as torch has).
@@ -51,7 +50,6 @@ class EvalConfig:
     contexts_file: Path | None = None
     env: str | None = None
     success_key: str | None = None
-    task: str | None = None
     dataset: str | None = None
     samples: int = 16
     threads: int | None = None

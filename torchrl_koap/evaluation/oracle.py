@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
+from torchrl_koap.envs.episode_state import EpisodeState
 from torchrl_koap.modules import Follower, blend_plan
 from torchrl_koap.modules.execution.followers import command_rest
 from torchrl_koap.tasks import Task
@@ -86,7 +87,7 @@ class OracleFollower(Follower):
             ValueError: if it cannot be looked ahead in.
         """
         base = env.base_env if isinstance(env, TransformedEnv) else env
-        if not hasattr(base, "simulate_actions"):
+        if not isinstance(base, EpisodeState):
             raise ValueError(
                 f"the oracle controller needs an environment that simulates actions, {type(base).__name__} does not"
             )

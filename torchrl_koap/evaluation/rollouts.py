@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict
@@ -99,14 +99,21 @@ def device_of(policy: PlanningPolicy) -> torch.device:
     return next(itertools.chain(policy.parameters(), policy.buffers()), torch.empty(0)).device
 
 
+@runtime_checkable
+class _SeedsEpisodes(Protocol):
+    """An environment or transform in which what is random has a generator per episode."""
+
+    def seed_episodes(self, seeds: Sequence[int]) -> None: ...
+
+
 def _seed_episodes(env: EnvBase, seeds: Sequence[int]) -> None:
     """What is random in an episode depends on its own seed alone, where the environment can see to that."""
     base = env.base_env if isinstance(env, TransformedEnv) else env
-    if hasattr(base, "seed_episodes"):
+    if isinstance(base, _SeedsEpisodes):
         base.seed_episodes(seeds)
     transforms = env.transform if isinstance(env, TransformedEnv) else ()
     for transform in transforms if isinstance(transforms, Iterable) else (transforms,):
-        if hasattr(transform, "seed_episodes"):
+        if isinstance(transform, _SeedsEpisodes):
             transform.seed_episodes(seeds)
 
 

@@ -1,22 +1,28 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""``koap train``: demonstrations and a label budget in, a run directory out."""
+"""What all commands have in common: their base class, what no option can mean, and short names of `koap train`'s."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
-from torchrl_koap.commands.command import Command, Options, as_typed
+import tyro
+
 from torchrl_koap.files import read_bytes
+from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import FACTS, from_json
 from torchrl_koap.runs.run_directory import RunDirectoryError
-from torchrl_koap.training import TrainConfig, train
 
+LARGEST = 2**53  # beyond it a number is not even counted exactly
+Config = TypeVar("Config")
+# the fields of a configuration are options of the command itself: `--steps`, not `--config.steps`
+Options = Annotated[Config, tyro.conf.arg(name="")]
 # short names of the options that most calls need: option, what follows, help
 SHORT: dict[str, tuple[str, str, str]] = {
     "--dataset": ("--dataset", "DIR", "folder with demonstrations, such as `koap demos --out DIR` records"),
@@ -38,18 +44,60 @@ SHORT: dict[str, tuple[str, str, str]] = {
 
 
 @dataclass(kw_only=True)
-class Train(Command):
-    """Train planner and controller on demonstrations of which few have action labels.
+class Command:
+    """A command of ``koap``: its fields are options, calling it does the work and returns what is printed.
 
     Attributes:
-        config: all options.
+        quiet: no progress bars, and no table at the end.
     """
 
-    config: Options[TrainConfig]
+    quiet: bool = False
 
-    def __call__(self) -> Mapping[str, Any]:
-        """Trains."""
-        return train(self.config, command=as_typed()).results
+
+def as_typed() -> str:
+    """The command line of this process, for ``config.json``."""
+    return "koap " + " ".join(sys.argv[1:])
+
+
+def check_options(options: Any) -> None:
+    """Checks the options of a command, those of its configurations included.
+
+    Args:
+        options (dataclass): the command.
+
+    Raises:
+        ValueError: for numbers that are NaN, infinite or beyond 2^53, and an ``out`` that lies below a file.
+
+    Examples:
+        >>> from dataclasses import dataclass
+        >>> from torchrl_koap.commands.options import check_options
+        >>> @dataclass
+        ... class Options:
+        ...     label_fraction: float
+        >>> check_options(Options(0.5))
+        >>> try:
+        ...     check_options(Options(float("nan")))
+        ... except ValueError as error:
+        ...     print(error)
+        --label-fraction must be a finite number, got nan
+    """
+    for field in fields(options):
+        value, option = getattr(options, field.name), f"--{field.name.replace('_', '-')}"
+        if is_dataclass(value):
+            check_options(value)
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and not math.isfinite(number):
+                raise ValueError(f"{option} must be a finite number, got {number}")
+            if isinstance(number, (int, float)) and abs(number) > LARGEST:
+                raise ValueError(f"{option} must be at most {LARGEST:,}, got {number:,}")
+        if field.name == "out" and value is not None:
+            _check_folder(Path(value), option)
+
+
+def _check_folder(path: Path, option: str) -> None:
+    there = next((above for above in (path, *path.parents) if above.exists()), None)
+    if there is not None and not there.is_dir():
+        raise ValueError(f"{option} {path} cannot be made: {there} is no folder")
 
 
 def expand(words: Sequence[str]) -> list[str]:
@@ -63,7 +111,7 @@ def expand(words: Sequence[str]) -> list[str]:
         ValueError: if ``--labels`` is no number.
 
     Examples:
-        >>> from torchrl_koap.commands.train import expand
+        >>> from torchrl_koap.commands.options import expand
         >>> expand(["--steps", "20", "--labels", "0.02", "--seed=3"])
         ['--planner.steps', '20', '--labels.fraction', '0.02', '--run.seed=3']
     """
