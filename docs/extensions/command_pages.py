@@ -23,10 +23,7 @@ def setup(app: Any) -> dict[str, Any]:
 
 def write_command_pages() -> None:
     """Writes ``generated/commands``: an index and a page per command."""
-    commands = {}
-    for member in get_args(Subcommand):
-        kind, *about = get_args(member)
-        commands[next(entry.name for entry in about if getattr(entry, "name", None))] = kind
+    commands = {kind.__name__.lower(): kind for kind in get_args(Subcommand)}
     for name, kind in commands.items():
         write_page(
             f"commands/{name}",

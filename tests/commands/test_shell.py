@@ -13,7 +13,7 @@ import pytest
 from tiny_runs import TINY, write_demonstrations
 
 from torchrl_koap.commands import cli
-from torchrl_koap.commands.command import check_options
+from torchrl_koap.commands.options import check_options
 from torchrl_koap.commands.shell import Interrupted, describe_interrupt, ending_like_ctrl_c
 
 COMMAND = (sys.executable, "-m", "torchrl_koap.commands.cli")

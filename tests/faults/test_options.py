@@ -93,9 +93,8 @@ def options(command: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def faults() -> Iterator[Fault]:
-    for part in get_args(Subcommand):
-        command, configuration = get_args(part)[:2]
-        name = configuration.name
+    for command in get_args(Subcommand):
+        name = command.__name__.lower()
         for option, kind in options(command):
             kind, _ = plain(kind)
             for value in WRONG[kind]:
