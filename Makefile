@@ -30,15 +30,15 @@ demo: setup
 	@echo "report: $(OUT)/index.html"
 
 test: setup
-	$(BIN)/python -m pytest -n 2 -q
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q
 
 slow: setup
 	$(BIN)/python -m pytest -q -m slow
 
 # every fault of the ledger, and the state machines at length
 faults: setup
-	$(BIN)/python -m pytest -n 2 -q -m "faults or not faults" tests/faults
-	$(BIN)/python -m pytest -n 2 -q -m faults tests/commands tests/studies
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m "faults or not faults" tests/faults
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m faults tests/commands tests/studies
 
 # lowest and newest dependencies on every Python that is here (needs uv); TORCH is the version of the CPU wheels
 test-matrix:

@@ -96,8 +96,7 @@ def rows_without_speed(folder):
     return [{key: value for key, value in row.items() if key != "iterations_per_second"} for row in rows]
 
 
-@pytest.mark.parametrize("phase", ["planner", "controller"])
-@pytest.mark.parametrize("checkpoint_every", [20, 1000])
+@pytest.mark.parametrize(("phase", "checkpoint_every"), [("planner", 20), ("controller", 1000)])
 def test_a_run_killed_in_the_middle_ends_bit_for_bit_like_one_that_was_not(
     phase, checkpoint_every, long_run, demonstrations, tmp_path, monkeypatch, capsys
 ):
@@ -165,11 +164,8 @@ def hidden_commands_changed(folder, source, budget, *, inside=False):
 @pytest.mark.parametrize(
     ("amount", "unit", "options"),
     [
-        (2, "trajectory", ()),
-        (2, "window", ("--method", "koap_sgd")),
         (30, "transition", ("--method", "dd", "--controller.steps", "5")),
-        (2, "trajectory", ("--preset", "paper")),
-        (3, "window", ("--method", "linear")),
+        (2, "trajectory", ("--preset", "paper", "--controller.steps", "5")),
     ],
 )
 def test_nothing_outside_the_label_budget_reaches_planner_or_controller(

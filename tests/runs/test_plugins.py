@@ -1,19 +1,16 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Methods from outside the package, by name: in this process, in others, after a kill, and what is said when not."""
+"""Methods from outside the package, by name: in a run, in what reads it, in cells, and what is said when not."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-from tiny_runs import TINY
+from command_calls import fails
+from tiny_runs import TINY, koap
 
 from torchrl_koap.runs.plugins import PluginError, load_plugins
 from torchrl_koap.runs.run_directory import RunDirectory
@@ -22,35 +19,39 @@ from torchrl_koap.studies.table import read_cells
 from torchrl_koap.training.method import Method, Phase
 from torchrl_koap.training.methods import METHODS, register_method
 
+NAME = "nearest_neighbour"
 PLUGINS = Path(__file__).parents[1] / "plugins"
-PLUGIN = ("--plugin", "nearest_neighbour")
-ROOT = Path(__file__).parents[2]
 
 
-def program(*arguments, folder=None, **options):
-    """`koap` in a process of its own, which finds plugins in a folder."""
-    path = os.pathsep.join(map(str, [ROOT, *([] if folder is None else [folder])]))
-    command = [sys.executable, "-m", "torchrl_koap.commands.cli", *map(str, arguments)]
-    return subprocess.run(
-        command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, timeout=300, **options
-    )
+def forget():
+    """Afterwards this process is like one that never heard of the plugin."""
+    sys.modules.pop(NAME, None)
+    METHODS.pop(NAME, None)
+
+
+@pytest.fixture(autouse=True)
+def search_path(monkeypatch):
+    """Search path without the plugin, put back afterwards."""
+    forget()
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    yield sys.path
+    forget()
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, demonstrations):
     """A run of the plugin's method; not to be written to."""
     out = tmp_path_factory.mktemp("plugin") / "run"
-    made = program(
-        "train", *PLUGIN, "--method", "nearest_neighbour", "--out", out, "--dataset", demonstrations, *TINY,
-        folder=PLUGINS,
-    )  # fmt: skip
-    assert made.returncode == 0, made.stderr
+    words = ("--plugin", NAME, "--method", NAME, "--out", out, "--dataset", demonstrations, *TINY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "path", [*sys.path, str(PLUGINS)])
+        assert koap("train", *words) == 0
     return out
 
 
 def test_a_run_of_a_plugin_s_method(run):
     config, summary = (json.loads((run / f"{name}.json").read_text()) for name in ("config", "summary"))
-    assert config["run"]["plugins"] == ["nearest_neighbour"] and config["method"] == "nearest_neighbour"
+    assert config["run"]["plugins"] == [NAME] and config["method"] == NAME
     remembered = load_tensors(run / "controller.safetensors")[0]["actions"]
     assert len(remembered) == summary["decoder_fit"]["labels_used"] > 20
 
@@ -62,56 +63,42 @@ def test_log_columns_follow_from_what_is_logged(run):
     assert RunDirectory(run).last_metrics("controller")["loss_neighbours"] == float(rows[1]["loss_neighbours"])
 
 
-def test_what_reads_the_run_imports_the_plugin_by_itself(run, tmp_path):
+def test_what_reads_the_run_imports_the_plugin_by_itself(run, tmp_path, monkeypatch, search_path, capsys):
     out = tmp_path / "run"
     shutil.copytree(run, out)
-    done = program("eval", out, "--episodes", 1, "--threads", 1, "--no-report", folder=PLUGINS)
-    assert done.returncode == 0 and "success_rate" in done.stdout, done.stderr
+    search_path.append(str(PLUGINS))
+    assert koap("eval", out, "--episodes", 1, "--threads", 1, "--no-report") == 0 and NAME in METHODS
+    assert "success_rate" in capsys.readouterr().out
     weights = (out / "controller.safetensors").read_bytes()
     (out / "controller.safetensors").unlink()
     # found in the current directory as well, as by `python -m`
-    again = program("train", "--out", out, "--resume", cwd=PLUGINS)
-    assert again.returncode == 0 and (out / "controller.safetensors").read_bytes() == weights, again.stderr
+    forget()
+    search_path.remove(str(PLUGINS))
+    monkeypatch.chdir(PLUGINS)
+    assert koap("train", "--out", out, "--resume") == 0 and NAME in METHODS
+    assert (out / "controller.safetensors").read_bytes() == weights
 
 
-def test_a_plugin_that_is_nowhere_is_named_with_where_it_was_looked_for(run, tmp_path):
-    said = program("eval", run, "--episodes", 1, cwd=tmp_path)
-    (line,) = said.stderr.splitlines()
-    assert said.returncode == 1 and line.startswith("koap: there is no plugin 'nearest_neighbour'; looked for it in ")
+def test_a_plugin_that_is_nowhere_is_named_with_where_it_was_looked_for(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    line = fails(capsys, "eval", run, "--episodes", 1)
+    assert line.startswith(f"koap: there is no plugin {NAME!r}; looked for it in ")
     assert str(tmp_path) in line and "KOAP_TRACEBACK=1" in line
 
 
-def test_a_curve_killed_goes_on_with_the_plugin_in_every_cell(tmp_path, demonstrations):
-    """Killed when the first cell is done; the second call does not name the plugin, its folder does."""
-    out, env = tmp_path / "curve", {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(PLUGINS)])}
-    arguments = (
-        *("curve", "--out", out, "--datasets", demonstrations, "--methods", "nearest_neighbour", "linear"),
-        *("--labels", 0.25, "--seeds", 1, "--planner.steps", 3, "--controller.steps", 3),
-        *("--evaluation.episodes", 1, "--workers", 1),
-    )
-    command = [sys.executable, "-m", "torchrl_koap.commands.cli", *map(str, arguments)]
-    first = subprocess.Popen(
-        [*command, "--run.plugin", "nearest_neighbour"], env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    mark = out / "cells/avoiding/nearest_neighbour-0.25-1-seed0/result.json"
-    try:
-        for _ in range(1200):
-            if mark.exists() or first.poll() is not None:
-                break
-            time.sleep(0.1)
-        assert mark.exists()
-    finally:
-        first.send_signal(signal.SIGKILL)
-        first.wait()
-    made = mark.stat().st_mtime_ns
-    assert json.loads((out / "study.json").read_text())["run"]["plugins"] == ["nearest_neighbour"]
-    second = subprocess.run(command, env=env, capture_output=True, text=True, timeout=300)
-    assert second.returncode == 0, second.stderr
-    assert {row["method"]: row["status"] for row in read_cells(out / "cells.csv")} == {
-        "nearest_neighbour": "done",
-        "linear": "done",
-    }
-    assert mark.stat().st_mtime_ns == made
+def test_a_study_goes_on_with_the_plugin_in_every_cell(tmp_path, demonstrations, search_path):
+    """Cells are processes of their own; the second call does not name the plugin, its folder does."""
+    search_path.append(str(PLUGINS))
+    out = tmp_path / "curve"
+    words = ("--datasets", demonstrations, "--labels", 0.25, "--seeds", 1, "--planner.steps", 3)
+    words += ("--controller.steps", 3, "--evaluation.episodes", 1, "--workers", 1, "--methods", NAME)
+    assert koap("curve", "--out", out, *words, "--run.plugin", NAME) == 0
+    assert json.loads((out / "study.json").read_text())["run"]["plugins"] == [NAME]
+    made = (out / f"cells/avoiding/{NAME}-0.25-1-seed0/result.json").stat().st_mtime_ns
+    forget()
+    assert koap("curve", "--out", out, *words, "linear") == 0
+    assert {row["method"]: row["status"] for row in read_cells(out / "cells.csv")} == {NAME: "done", "linear": "done"}
+    assert (out / f"cells/avoiding/{NAME}-0.25-1-seed0/result.json").stat().st_mtime_ns == made
     assert "nearest labelled steps" in (out / "index.html").read_text()
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import importlib.metadata
 import platform
 import types
@@ -122,7 +123,10 @@ def _unknown(name: str, known: tuple[str, ...]) -> str:
 
 def versions() -> dict[str, str]:
     """Returns the versions of Python and of the packages that results depend on."""
-    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
+
+
+_version = functools.cache(importlib.metadata.version)
 
 
 def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
