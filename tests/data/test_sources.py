@@ -15,6 +15,7 @@ from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import get_task
+from torchrl_koap.training.datasets import find_task_of
 
 
 def write_sorting(folder, episodes=3):
@@ -97,10 +98,13 @@ def test_what_cannot_be_opened(tmp_path):
     write_demonstrations(tmp_path / "raw", episodes=1)
     with pytest.raises(DataError, match="task 'arm' is none of D3IL's: `koap convert` it"):
         open_dataset(tmp_path / "raw", task=arm)
-    (tmp_path / "lerobot" / "meta").mkdir(parents=True)
-    (tmp_path / "lerobot" / "meta" / "info.json").write_text("{}")
-    with pytest.raises(DataError, match="does not say what its columns mean: `koap convert` it first"):
-        open_dataset(tmp_path / "lerobot", task=get_task("avoiding"))
+    for name in ("lerobot/meta/info.json", "tables/run.csv", "arm.hdf5"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("{}")
+        source = tmp_path / name.partition("/")[0]
+        for find in (open_dataset, find_task_of):
+            with pytest.raises(DataError, match=f"`koap convert .*{source.name} --out {source.stem}_data`, then"):
+                find(str(source))
     save_ted(flatten_trajectories([torch.zeros(5, 3)], [torch.zeros(4, 2)]), tmp_path / "narrow", arm)
     about = (tmp_path / "narrow" / "about.json").read_text().replace('"task": "arm"', '"task": "avoiding"')
     (tmp_path / "narrow" / "about.json").write_text(about)

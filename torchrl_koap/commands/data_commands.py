@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from tensordict import TensorDictBase
 
 from torchrl_koap.commands.options import Command
-from torchrl_koap.data import open_dataset, read_about, read_recordings, save_demonstrations, write_recordings
+from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations, write_recordings
+from torchrl_koap.data.cleaning import drop_short, trim_still
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings
 from torchrl_koap.data.quality import find_warnings
@@ -124,6 +126,8 @@ class Convert(Command):
         state_columns: columns that make up the state, in that order (default: all that are no clock, counter, reward
             or flag of an episode).
         drop_columns: state and action columns that are left out.
+        trim_still: cut the frames at both ends of trajectories in which nothing moves.
+        drop_short: leave out trajectories that are shorter than a window.
         robot: state columns of the robot itself, which the controller reads (default: all that are no command).
         command: neighbouring columns that repeat the last command; nothing that learns sees them.
         action_kind: "delta" (velocities, efforts, changes) or "absolute" (targets of state columns) (default: delta).
@@ -143,6 +147,8 @@ class Convert(Command):
     action_dim: int | None = None
     state_columns: tuple[str, ...] = ()
     drop_columns: tuple[str, ...] = ()
+    trim_still: bool = False
+    drop_short: bool = False
     robot: tuple[str, ...] = ()
     command: tuple[str, ...] = ()
     action_kind: str | None = None
@@ -163,19 +169,20 @@ class Convert(Command):
             raise ValueError(f"{self.source} is a data set of this library already: name another format with --to")
         if (self.out / "ted").exists():
             raise FileExistsError(f"{self.out / 'ted'} exists already; choose another --out")
-        recordings, described = read_recordings(self.source, **self._given(_READING)), self._given(_DESCRIBING)
+        recordings, described = self._read(), self._given(_DESCRIBING)
         for name in ("action_units", "state_units"):
             if len(described.get(name, ())) == 1:  # one for all
                 described[name] = described[name][0]
         folder = save_demonstrations(self.out, recordings, **described)
-        about = read_about(folder / "ted")
+        data, task = open_dataset(folder)
         return {
             "data set": str(folder),
-            "task": about["task"],
-            "steps": about["steps"],
+            "task": task.name,
+            "steps": len(data),
             **_contents(recordings),
             "skipped": ", ".join(recordings.skipped) or "nothing",
-            "next": f"koap train --dataset {shlex.quote(str(folder))} --out runs/{about['task']}",
+            **_warnings(data, task, recordings.sources),
+            "next": f"koap train --dataset {shlex.quote(str(folder))} --out runs/{task.name}",
         }
 
     def _take_out(self, kind: str) -> dict[str, Any]:
@@ -183,8 +190,14 @@ class Convert(Command):
         lookup([name for name, form in FORMATS.items() if form.write is not None], kind, "format")
         for name in self._given(_DESCRIBING):
             raise ValueError(f"--{name.replace('_', '-')} was given, but format {kind!r} does not hold it")
-        recordings = read_recordings(self.source, **self._given(_READING))
+        recordings = self._read()
         return {"written": str(write_recordings(recordings, self.out, kind)), "format": kind, **_contents(recordings)}
+
+    def _read(self) -> Recordings:
+        recordings = read_recordings(self.source, **self._given(_READING))
+        for asked, change in ((self.trim_still, trim_still), (self.drop_short, drop_short)):
+            recordings = change(recordings) if asked else recordings
+        return recordings
 
     def _given(self, options: Sequence[str]) -> dict[str, Any]:
         """Those of the options that were given."""
@@ -216,10 +229,7 @@ class Validate(Command):
         with progress_bar(None, "demonstrations", unit="episode", delay=3) as bar:
             data = validate(open_dataset(self.dataset, task=task, progress=count_up_to(bar))[0])
         files = [] if stored_folder(self.dataset) else find_raw_files(CONVERTERS[task.source], self.dataset)
-        units, seen = task.observation_units or _metres(task), task.state_names
-        warnings = find_warnings(
-            data, names=list(map(str, files)), units=units, columns=task.observation_names, seen=seen
-        )
+        warnings = _warnings(data, task, list(map(str, files)))
         lengths = data["episode"].unique(return_counts=True)[1]
         labels = int(data["has_action"].sum())
         return {
@@ -228,7 +238,7 @@ class Validate(Command):
             "labelled steps": str(labels) if labels else "none: `koap train` needs a few",
             "shortest, longest": f"{int(lengths.min())}, {int(lengths.max())}",
             "observation, action columns": f"{data['observation'].shape[-1]}, {data['action'].shape[-1]}",
-            **{f"warning {number}": warning for number, warning in enumerate(warnings, 1)},
+            **warnings,
             "result": f"no problem found, {len(warnings)} warning(s)" if warnings else "no problem found",
         }
 
@@ -241,6 +251,13 @@ def _contents(recordings: Recordings) -> dict[str, Any]:
         "actions": ", ".join(recordings.action_names),
         "frames per second": recordings.control_hz,
     }
+
+
+def _warnings(data: TensorDictBase, task: Task, names: Sequence[str]) -> dict[str, str]:
+    """What is unlikely in data, numbered."""
+    units, columns, actions = task.observation_units or _metres(task), task.observation_names, task.action_names
+    found = find_warnings(data, names=names, units=units, columns=columns, seen=task.state_names, actions=actions)
+    return {f"warning {number}": warning for number, warning in enumerate(found, 1)}
 
 
 def _metres(task: Task) -> list[str]:

@@ -14,8 +14,8 @@ import torch
 from numpy.typing import ArrayLike
 from tensordict import TensorDict
 
+from torchrl_koap.data.formats.columns import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
-from torchrl_koap.data.quality import constant_actions
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories
 from torchrl_koap.files import DataError
@@ -24,6 +24,7 @@ from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.action_rules import ActionKind
 
 ACTION_KINDS: tuple[ActionKind, ...] = ("delta", "absolute")
+_COARSE = 1e-3  # share of a column's range to which float32 must hold it
 _SLACK = 1.5  # episodes may be that much longer than the longest demonstration
 
 
@@ -116,7 +117,8 @@ def make_demonstrations(
 
     Raises:
         DataError: with all faults: those of :func:`~torchrl_koap.data.make_recordings`, columns that
-            do not exist or overlap, targets that do not fit, units of another number, an action that never changes.
+            do not exist or overlap, targets that do not fit, units of another number, a robot that never moves, a
+            column whose movement float32 cannot hold.
         ValueError: for an unknown kind of action.
 
     Examples:
@@ -141,7 +143,11 @@ def make_demonstrations(
             action_names=action_names,
             control_hz=control_hz,
         )
-    problems: list[str] = []
+    problems = [
+        f"state column {column!r} is a clock, a counter or a flag by its name: leave it out, or name it otherwise"
+        for column in recordings.state_names
+        if recordings is not states and kind_of(column)[0]
+    ]
     names, acting = recordings.state_names, recordings.action_names
     rate = control_hz or recordings.control_hz
     if rate is None:
@@ -159,7 +165,10 @@ def make_demonstrations(
     reached = _targets(kinds, targets, own, names, problems)
     units = _each(action_units, len(acting), "action_units", problems)
     own_units = _each(state_units, len(names), "state_units", problems)
-    problems += constant_actions(np.concatenate(recordings.actions), acting)
+    problems += _coarse(np.concatenate(recordings.states), names)
+    if recordings.num_labels and not any(np.ptp(frames[:, own], axis=0).any() for frames in recordings.states):
+        which = ", ".join(names[column] for column in own)
+        problems.append(f"robot: {which} never move, so nothing tells what an action does: name others in robot")
     if problems:
         raise DataError(f"task {name!r}", problems)
     data = flatten_trajectories(
@@ -240,6 +249,17 @@ def _targets(
             " action is the target of"
         )
     return columns
+
+
+def _coarse(frames: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Columns of all frames ``[N, d]`` of which float32 keeps too few digits."""
+    spans, farthest = np.ptp(frames, axis=0), np.abs(frames).max(0)
+    kept = np.spacing(farthest.astype(np.float32))
+    return [
+        f"column {names[column]!r} moves by {spans[column]:.3g} at up to {farthest[column]:.3g}, and float32 holds it to"
+        f" {kept[column]:.2g}: subtract an offset from it, here and on the robot"
+        for column in np.flatnonzero((kept > _COARSE * spans) & (spans > 0))
+    ]
 
 
 def _each(given: Any, wide: int, what: str, problems: list[str]) -> tuple[Any, ...]:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,8 +13,12 @@ from torch import Tensor
 
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.tasks import WINDOW
 
 FARTHEST = 100.0  # m, or rad: no robot on a table gets there
+LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and so many times the usual one
+STILL, MUCH = 2e-3, 0.2  # share of the range within which a robot stands still; share of still frames to be told
+_LISTED = 5  # trajectories that are named, of how many there may be
 
 
 def find_warnings(
@@ -25,6 +28,7 @@ def find_warnings(
     units: Sequence[str] = (),
     columns: Sequence[str] = (),
     seen: Sequence[str] = (),
+    actions: Sequence[str] = (),
 ) -> list[str]:
     """Finds trajectories and columns that say nothing or say it twice, and trajectories that cannot have happened.
 
@@ -37,35 +41,38 @@ def find_warnings(
             Default: no column is.
         columns (sequence of str): what to call the observation columns. Default: their numbers.
         seen (sequence of str): what to call the columns of ``state``, those that are seen. Default: none is looked at.
+        actions (sequence of str): what to call the action columns. Default: none is looked at.
 
     Returns:
         list of str: a sentence each: a trajectory that repeats another one, one without any movement, one whose labels
-        are all zero, one that reaches a place beyond 100 m or rad; a seen column that never changes, or that is the
-        same as another one in every step.
+        are all zero, one that reaches a place beyond 100 m or rad, those that are shorter than a window; a seen column
+        that never changes, that is the same as another one in every step, or that leaps; frames at both ends in which
+        nothing moves; an action that is the same in all labels.
 
     Examples:
         >>> import torch
         >>> from torchrl_koap.data import flatten_trajectories
         >>> from torchrl_koap.data.quality import find_warnings
-        >>> path, still = torch.arange(6.0).reshape(3, 2), torch.zeros(2, 1)
+        >>> path, still = torch.arange(40.0).reshape(20, 2), torch.zeros(19, 2)
         >>> find_warnings(flatten_trajectories([path, path], [still + 1, still + 1]), names=["a.pkl", "b.pkl"])
         ['b.pkl repeats a.pkl: every step is the same']
         >>> find_warnings(flatten_trajectories([1e6 * path, path], [still + 1, still]), units=["m", "m"])
-        ['trajectory 0: column 0 reaches 2e+06 m', 'trajectory 1: all 2 labelled actions are zero']
+        ['trajectory 0: column 0 reaches 3.6e+07 m', 'trajectory 1: all 19 labelled actions are zero']
     """
     warnings: list[str] = []
     first: dict[bytes, str] = {}
     lengths = trajectory_lengths(data).tolist()
+    called = [*names, *(f"trajectory {index}" for index in range(len(names), len(lengths)))]
     looked_at = [column for column, unit in enumerate(units) if unit in ("m", "rad")]
     entries = [data.get(key) for key in (keys.OBSERVATION, keys.ACTION, keys.HAS_ACTION, keys.NEXT_OBSERVATION)]
-    for index, end in enumerate(itertools.accumulate(lengths)):
-        name = names[index] if index < len(names) else f"trajectory {index}"
-        observed, actions, has_action, last = (entry[end - lengths[index] : end] for entry in entries)
-        same = first.setdefault(_digest(observed, actions, last[-1:]), name)
+    for name, observed, steps, has_action, last in zip(
+        called, *(entry.split(lengths) for entry in entries), strict=True
+    ):
+        same = first.setdefault(_digest(observed, steps, last[-1:]), name)
         if same is not name:
             warnings.append(f"{name} repeats {same}: every step is the same")
             continue
-        labelled = actions[has_action.squeeze(-1)]
+        labelled = steps[has_action.squeeze(-1)]
         if len(labelled) and not labelled.any():
             warnings.append(f"{name}: all {len(labelled)} labelled actions are zero")
         if bool((observed == observed[:1]).all()) and bool((last == observed[:1]).all()):
@@ -73,10 +80,20 @@ def find_warnings(
         for column in looked_at:
             farthest = observed[:, column].abs().max()
             if farthest > FARTHEST:
-                called = columns[column] if column < len(columns) else f"column {column}"
-                warnings.append(f"{name}: {called} reaches {farthest:.3g} {units[column]}")
+                what = columns[column] if column < len(columns) else f"column {column}"
+                warnings.append(f"{name}: {what} reaches {farthest:.3g} {units[column]}")
                 break
-    return warnings + _column_warnings(data.get(keys.STATE), seen) if seen else warnings
+    short = [f"{name} ({length})" for name, length in zip(called, lengths, strict=True) if length < WINDOW]
+    if short:
+        warnings.append(
+            f"{len(short)} of {len(lengths)} trajectories have fewer steps than a window of {WINDOW}, so training may"
+            f" refuse them: {_some(short)}; `koap convert --drop-short` leaves them out"
+        )
+    if seen:
+        frames = [part.double().numpy() for part in data.get(keys.STATE).cpu().split(lengths)]
+        warnings += _column_warnings(data.get(keys.STATE), seen) + _leaps(frames, called, seen)
+        warnings += _stillness(frames, called)
+    return warnings + constant_actions(entries[1].cpu().numpy(), actions) if actions else warnings
 
 
 def _column_warnings(state: Tensor, names: Sequence[str]) -> list[str]:
@@ -92,8 +109,91 @@ def _column_warnings(state: Tensor, names: Sequence[str]) -> list[str]:
     return found
 
 
+def _leaps(trajectories: Sequence[np.ndarray], called: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Columns whose largest step is above a third of their range and twenty times the usual one, and why."""
+    steps = np.concatenate([np.diff(frames, axis=0) for frames in trajectories])
+    if not len(steps):
+        return []
+    spans = np.ptp(np.concatenate(trajectories), axis=0)
+    usual = np.array([np.median(moved) if len(moved := step[step > 0]) else np.inf for step in np.abs(steps).T])
+    bound = np.maximum(LEAP * spans, UNUSUAL * usual)
+    found: dict[str, list[str]] = {}
+    for column, name in enumerate(names):
+        where = [np.flatnonzero(np.abs(np.diff(frames[:, column])) > bound[column]) for frames in trajectories]
+        number = sum(map(len, where))
+        if not number:
+            continue
+        trajectory = next(index for index, at in enumerate(where) if len(at))
+        at = int(where[trajectory][0])
+        frames = trajectories[trajectory]
+        before, after = frames[at : at + 2]
+        leaping = (np.abs(after - before) > bound).mean()
+        flipped = (np.abs(after + before) < UNUSUAL * usual) & (np.abs(after - before) > UNUSUAL * usual)
+        why = _cause(frames[at : at + 3, column], UNUSUAL * usual[column], flipped.sum() > 1, leaping > 0.5)
+        more = f" and {number - 1} times more" if number > 1 else ""
+        found.setdefault(why, []).append(
+            f"{name!r} from {frames[at, column]:.3g} to {frames[at + 1, column]:.3g} (frame {at + 1} of"
+            f" {called[trajectory]}{more})"
+        )
+    return [f"columns leap: {', '.join(which)}: {why}" for why, which in found.items()]
+
+
+def _cause(values: np.ndarray, near: float, flipped: bool, most: bool) -> str:
+    """Why a column leaps between the first two of three values, and what to do."""
+    leap = abs(values[1] - values[0])
+    turn = next((turn for turn in (2 * np.pi, 360.0) if abs(leap - turn) < max(near, 0.1 * turn)), None)
+    if turn is not None:
+        bound = "pi" if turn < 10 else "180 degrees"
+        return f"angles that were wrapped at {bound}? np.unwrap them, or give their sine and cosine"
+    if flipped and leap <= 2 + near:
+        return "a quaternion that changes its sign? flip it where its product with the frame before is negative"
+    if len(values) > 2 and abs(values[2] - values[0]) < near:
+        return "a measurement that failed for a frame? fill it from its neighbours"
+    if most:
+        return "two episodes in one trajectory? say where they end (a column 'episode_index' or 'timeouts')"
+    return "a switch, or a measurement that failed? leave it out (--drop-columns), or fill it from its neighbours"
+
+
+def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
+    """Frames at the start and at the end of every trajectory, int ``[n, 2]``, in which no column moves.
+
+    The last still frame before the movement and the first one behind it are not counted. A trajectory in which nothing
+    ever moves has none.
+
+    Args:
+        trajectories (sequence of np.ndarray): frames ``[T_i, d]`` of each.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data.quality import still_ends
+        >>> still_ends([np.array([[0.0], [0.0], [0.0], [1.0], [2.0], [2.0]])])
+        array([[2, 1]])
+    """
+    room = STILL * np.ptp(np.concatenate(trajectories), axis=0)
+    found = np.zeros((len(trajectories), 2), dtype=int)
+    for number, frames in enumerate(trajectories):
+        for end, ordered in enumerate((frames, frames[::-1])):
+            moves = (np.abs(ordered - ordered[0]) > room).any(-1)
+            found[number, end] = max(int(moves.argmax()) - 1, 0)
+    return found
+
+
+def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> list[str]:
+    ends = still_ends(trajectories)
+    shares = ends.sum(0) / sum(map(len, trajectories))
+    if shares.max() <= MUCH:
+        return []
+    lengths = np.array([len(frames) for frames in trajectories])
+    longest = int((ends.sum(1) / lengths).argmax())
+    return [
+        f"nothing moves in {shares[0]:.0%} of all frames at the start and {shares[1]:.0%} at the end of trajectories"
+        f" (most in {called[longest]}: {ends[longest, 0]} and {ends[longest, 1]} of {lengths[longest]}), so a policy"
+        " may learn to stand still; `koap convert --trim-still` cuts them"
+    ]
+
+
 def constant_actions(actions: np.ndarray, names: Sequence[str]) -> list[str]:
-    """Names actions that are the same in all labels, of which nothing can be learnt.
+    """Names actions that are the same in all labels.
 
     Args:
         actions (np.ndarray): actions ``[N, act]``, NaN where there is no label.
@@ -106,10 +206,13 @@ def constant_actions(actions: np.ndarray, names: Sequence[str]) -> list[str]:
     if len(steps) < 2:
         return []
     return [
-        f"action {names[column]!r} is {steps[0, column]:g} in all {len(steps)} labels: nothing can be learnt of it;"
-        " leave it out"
+        f"action {names[column]!r} is {steps[0, column]:g} in all {len(steps)} labels: it is always commanded so"
         for column in np.flatnonzero(np.ptp(steps, axis=0) == 0)
     ]
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
 
 
 def _digest(*values: Tensor) -> bytes:

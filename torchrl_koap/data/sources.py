@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data.d3il.conversion import CONVERTERS, read_raw
+from torchrl_koap.data.formats import FORMATS, find_format
 from torchrl_koap.data.ted import read_about, read_steps, stored_folder, stored_task
 from torchrl_koap.data.trajectories import flatten_trajectories, select_state
 from torchrl_koap.files import DataError
@@ -52,14 +54,10 @@ def open_dataset(
         (torch.Size([8, 3]), 'arm')
     """
     folder = Path(folder).expanduser()
-    stored = stored_folder(folder)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"dataset {str(folder)!r} is no folder of {Path.cwd()}")
+    stored = find_stored(folder)
     if stored is not None:
         task = _fitting(stored, task)
         data = read_steps(stored)
-    elif (folder / "meta" / "info.json").is_file():
-        raise DataError(folder, "a LeRobot data set does not say what its columns mean: `koap convert` it first")
     else:
         task = get_task(_OF_D3IL) if task is None else task
         if task.source not in CONVERTERS:
@@ -76,6 +74,33 @@ def open_dataset(
     if task.noise:
         data = with_noise(data, task.observation[task.position], task.noise)
     return select_state(data, task.state_of), task
+
+
+def find_stored(source: str | Path) -> Path | None:
+    """Where a folder holds a data set of this library; None if it may hold D3IL's raw pickles.
+
+    Args:
+        source (str or Path): the folder.
+
+    Raises:
+        FileNotFoundError: if there is no such folder.
+        DataError: if it holds recordings that are to be converted first.
+    """
+    form = find_format(source)
+    if form == "ted":
+        return stored_folder(source)
+    if form is not None:
+        out = shlex.quote(f"{Path(source).stem}_data")
+        raise DataError(
+            source,
+            f"it is {FORMATS[form].what}, and does not say what its columns are for:"
+            f" `koap convert {shlex.quote(str(source))} --out {out}`, then `--dataset {out}`",
+        )
+    if not Path(source).is_dir():
+        raise FileNotFoundError(
+            f"dataset {str(source)!r} is no folder of {Path.cwd()}; `koap demos --out DIR` records one"
+        )
+    return None
 
 
 def _fitting(stored: Path, task: Task | None) -> Task:

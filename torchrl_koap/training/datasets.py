@@ -14,7 +14,8 @@ import torch
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import LabelBudget, open_dataset, read_about, trajectory_lengths
-from torchrl_koap.data.ted import stored_folder, stored_task
+from torchrl_koap.data.sources import find_stored
+from torchrl_koap.data.ted import stored_task
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import read_config
 from torchrl_koap.runs.run_directory import RunDirectory
@@ -36,7 +37,7 @@ def find_task_of(dataset: str | None, name: str | None = None) -> Task:
     Raises:
         FileNotFoundError: if there is no such folder.
         ValueError: if none is named, the name is unknown, or the data set holds the definition of another task.
-        DataError: if the data set's task is damaged or names code.
+        DataError: if the data set's task is damaged or names code, or the data are to be converted first.
     """
     if dataset is None:
         what = name or DEFAULT_TASK
@@ -44,9 +45,7 @@ def find_task_of(dataset: str | None, name: str | None = None) -> Task:
             f"no demonstrations to learn from: record some with `koap demos --task {what} --out DEMOS`, then"
             f" `koap train --task {what} --dataset DEMOS --out RUN`"
         )
-    if not Path(dataset).is_dir():
-        raise FileNotFoundError(f"dataset {dataset!r} is no folder of {Path.cwd()}; `koap demos --out DIR` records one")
-    folder = stored_folder(dataset)
+    folder = find_stored(dataset)
     if folder is None:
         return get_task(DEFAULT_TASK if name is None else name)
     about = read_about(folder)

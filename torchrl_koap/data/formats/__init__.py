@@ -116,16 +116,22 @@ def read_recordings(
     asked |= {"action_columns": list(action_columns), "action_dim": action_dim}
     asked |= {"state_columns": list(state_columns), "drop_columns": list(drop_columns)}
     given = {name: value for name, value in asked.items() if value not in (None, [])}
-    for form in FORMATS.values():
-        if form.matches(str(source)):
-            unfit = [name for name in given if name not in form.options]
-            if unfit:
-                raise ValueError(f"{', '.join(unfit)}: not an option for {form.what}")
-            return form.read(str(source), **given)
-    if not Path(source).exists():
+    name = find_format(source)
+    if name is None and not Path(source).exists():
         raise FileNotFoundError(f"{source} does not exist")
-    known = "; ".join(form.what for form in FORMATS.values())
-    raise ValueError(f"{source} holds no recordings that can be read; there are readers for {known}")
+    if name is None:
+        known = "; ".join(form.what for form in FORMATS.values())
+        raise ValueError(f"{source} holds no recordings that can be read; there are readers for {known}")
+    form = FORMATS[name]
+    unfit = [name for name in given if name not in form.options]
+    if unfit:
+        raise ValueError(f"{', '.join(unfit)}: not an option for {form.what}")
+    return form.read(str(source), **given)
+
+
+def find_format(source: str | Path) -> str | None:
+    """Which of the :data:`FORMATS` recordings are in; None if in none of them."""
+    return next((name for name, form in FORMATS.items() if form.matches(str(source))), None)
 
 
 def write_recordings(recordings: Recordings, out: str | Path, name: str) -> Path:

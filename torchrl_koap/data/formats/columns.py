@@ -40,11 +40,13 @@ class Piece:
         name (str): what messages call it.
         states (dict): columns ``[T]`` of everything that is no action, by name.
         actions (dict, optional): columns ``[T]`` or ``[T - 1]`` of actions, by name; None where there are none.
+        unclear (tuple of str): columns among the states of which the user has to say what they are.
     """
 
     name: str
     states: dict[str, np.ndarray]
     actions: dict[str, np.ndarray] | None = None
+    unclear: tuple[str, ...] = ()
 
 
 def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -120,6 +122,12 @@ def assemble(
                 lookup(known, column, f"column in {option}:")
             except ValueError as error:
                 problems.append(str(error))
+    problems += [
+        f"{name!r} has a number for every frame: does it say which episode a frame is of, or where episodes end? call"
+        " it episode_index or timeouts then; else name the state's columns in state_columns, or drop it in drop_columns"
+        for name in dict.fromkeys(name for piece in pieces for name in piece.unclear)
+        if name not in drop_columns and not state_columns
+    ]
     even = set() if state_columns else _even(pieces)
     usable = [name for name in names if kind_of(name)[0] is None and name not in even]
     observed = [name for name in state_columns or usable if name not in drop_columns]
@@ -235,7 +243,7 @@ def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
     spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
     names = [piece.name] if len(spans) == 1 else [f"{piece.name}[{index}]" for index in range(len(spans))]
     return [
-        Piece(name, _rows(piece.states, span), None if piece.actions is None else _rows(piece.actions, span))
+        Piece(name, _rows(piece.states, span), piece.actions and _rows(piece.actions, span), piece.unclear)
         for name, span in zip(names, spans, strict=True)
     ]
 

@@ -87,7 +87,7 @@ def make_recordings(
     Raises:
         DataError: with all faults: no trajectories, other widths than in the first, fewer than two frames,
             integers where floating-point numbers are wanted, states that are not finite, infinite actions, a number of
-            actions that is neither ``T`` nor ``T - 1``, names that do not fit.
+            actions that is neither ``T`` nor ``T - 1``, an action column with few numbers, names that do not fit.
 
     Examples:
         >>> import numpy as np
@@ -108,6 +108,7 @@ def make_recordings(
     frames = [_frames(value, name, problems) for value, name in zip(states, what, strict=True)]
     width = next((array.shape[1] for array in frames if array is not None), 0)
     steps = [_steps(value, name, problems) for value, name in zip(actions, what, strict=True)]
+    whole = list(steps)
     wide = next((array.shape[1] for array in steps if array is not None), action_dim)
     if wide is None:
         wide = len(action_names) if action_names is not None else None
@@ -135,6 +136,7 @@ def make_recordings(
             steps[index] = _without_rest(steps[index][: length - 1])
     given_states = _names(state_names, width, "state", problems)
     given_actions = _names(action_names, wide, "action", problems)
+    problems += _sparse([array for array in whole if array is not None and array.shape[1] == wide], given_actions)
     if control_hz is not None and not (np.isfinite(control_hz) and control_hz > 0):
         problems.append(f"control_hz must be a positive number of frames per second, got {control_hz!r}")
     if problems:
@@ -184,6 +186,20 @@ def _steps(value: ArrayLike | None, name: str, problems: list[str]) -> np.ndarra
 
 def _array(value: ArrayLike) -> np.ndarray:
     return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+
+
+def _sparse(actions: Sequence[np.ndarray], names: Sequence[str]) -> list[str]:
+    """Names action columns that are known in less than half of the steps in which another one is."""
+    known = np.isfinite(np.concatenate(actions)).sum(0) if actions else np.zeros(0, dtype=int)
+    sparse = [
+        f"{name!r} (known in {count})" for name, count in zip(names, known, strict=False) if 2 * count < known.max()
+    ]
+    if not sparse:
+        return []
+    return [
+        f"{known.max()} steps have actions, but action column {', '.join(sparse)} is mostly empty, and only steps in"
+        " which all columns are known are labels: repeat its last value where it holds on, or drop it (drop_columns)"
+    ]
 
 
 def _without_rest(steps: np.ndarray) -> np.ndarray:

@@ -124,28 +124,21 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
     frames, read = entries[key], {key, acting, "state_names", "action_names", "control_hz"}
     if frames.ndim != 2 or frames.dtype.kind != "f":
         raise ValueError(f"{key} must be floating-point numbers [T, d], got {frames.dtype} {list(frames.shape)}")
-    states = _named(frames, entries.get("state_names"), "state")
-    for name, values in entries.items():
-        if name not in read and kind_of(name)[0] not in (None, "other"):
+    states, unclear = _named(frames, entries.get("state_names"), "state"), []
+    for name in [name for name in entries if name not in read]:
+        values, kind = entries[name], kind_of(name)[0]
+        single = values.shape in ((len(frames),), (len(frames), 1)) and values.dtype.kind in "fiub"
+        if kind not in (None, "other") or single and kind is None:
             states[name] = _frame_entry(name, values, len(frames))
             read.add(name)
-        elif (
-            name not in read
-            and kind_of(name)[0] is None
-            and values.shape == frames.shape[:1]
-            and values.dtype.kind in "iub"
-        ):
-            raise ValueError(
-                f"entry {name!r} has one whole number a frame: does it say which episode a frame is of"
-                " ('episode_index'), or where episodes end ('timeouts')? name it so, or leave it out"
-            )
+            unclear += [name] if kind is None else []
     steps = None
     if acting is not None:
         if entries[acting].ndim != 2 or entries[acting].dtype.kind not in "fiub":
             raise ValueError(f"{acting} must be numbers [T, a] or [T - 1, a], got {list(entries[acting].shape)}")
         steps = _named(entries[acting], entries.get("action_names"), "action")
     rate = float(entries["control_hz"]) if "control_hz" in entries else None
-    return Piece(file.name, states, steps), rate, [name for name in entries if name not in read]
+    return Piece(file.name, states, steps, tuple(unclear)), rate, [name for name in entries if name not in read]
 
 
 def _named_alike(pieces: list[Piece]) -> list[Piece]:
@@ -158,7 +151,7 @@ def _named_alike(pieces: list[Piece]) -> list[Piece]:
                 mine = found[number]
                 if mine and other and len(mine) == len(other) and f"{kind}_0" in mine and f"{kind}_0" not in other:
                     found[number] = dict(zip(other, mine.values(), strict=True))
-        return Piece(piece.name, found[0] or {}, found[1])
+        return Piece(piece.name, found[0] or {}, found[1], piece.unclear)
 
     return [alike(piece) for piece in pieces]
 
