@@ -17,7 +17,7 @@ from torchrl_koap.data import (
     save_demonstrations,
 )
 from torchrl_koap.keys import validate
-from torchrl_koap.tasks import Action
+from torchrl_koap.tasks import Action, Task
 
 RANDOM = np.random.default_rng(0)
 STATES = [RANDOM.normal(size=(30, 4)).cumsum(0) for _ in range(3)]
@@ -115,10 +115,42 @@ def test_faults_of_the_description(options, message):
         make_demonstrations(STATES, ACTIONS, **{"control_hz": 20, "state_names": NAMES} | options)
 
 
-def test_an_action_that_never_changes():
+def test_an_action_that_never_changes_is_commanded_as_it_is():
     still = [np.column_stack([ACTIONS[0], np.full(29, 0.5)]), None, None]
-    with pytest.raises(DataError, match="action 'action_2' is 0.5 in all 29 labels: nothing can be learnt"):
-        make_demonstrations(STATES, still, control_hz=20)
+    _, task = make_demonstrations(STATES, still, control_hz=20)
+    assert task.actions["action_2"] == Action(constant=0.5)
+    decoded = torch.ones(1, 3, 3)
+    assert task.action_rule(torch.zeros(1, 3, 4), decoded)[0].tolist() == [[1, 1, 0.5]] * 3 and decoded.min() == 1
+    assert Task.from_json(task.to_json()) == task
+    absolute = make_demonstrations(STATES, still, control_hz=20, action_kind="absolute", targets=[0, 1, 2])[1]
+    assert absolute.action_rule(torch.full((1, 3, 4), 2.0), decoded)[0].tolist() == [[3, 3, 0.5]] * 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda frames: np.column_stack([0 * frames[:, :2], frames[:, 2:]]), "robot: q1, q2 never move"),
+        (lambda frames: frames + 4e6, "'q1' moves by .* at up to 4e.06, and float32 holds it to .*subtract an offset"),
+    ],
+)
+def test_states_of_which_nothing_can_be_learnt(change, message):
+    with pytest.raises(DataError, match=message):
+        states = [change(frames) for frames in STATES]
+        make_demonstrations(states, ACTIONS, control_hz=20, state_names=NAMES, robot=["q1", "q2"])
+
+
+def test_names_of_clocks_and_flags_are_no_states():
+    with pytest.raises(DataError, match="state column 'time' is a clock, a counter or a flag by its name"):
+        make_demonstrations(STATES, ACTIONS, control_hz=20, state_names=["time", *NAMES[1:]])
+
+
+def test_an_action_column_that_is_mostly_empty_is_named():
+    sparse = ACTIONS[0].copy()
+    sparse[np.arange(29) % 9 != 0, 1] = np.nan
+    with pytest.raises(
+        DataError, match=r"29 steps have actions, but action column 'action_1' \(known in 4\) is mostly"
+    ):
+        make_demonstrations(STATES, [sparse, None, None], control_hz=20)
 
 
 def test_an_unknown_kind_of_action():

@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+import re
+
+import numpy as np
+import pytest
 import torch
 
 from torchrl_koap.data import flatten_trajectories
-from torchrl_koap.data.quality import find_warnings
+from torchrl_koap.data.quality import constant_columns, find_warnings, still_ends
 
-PATH = torch.arange(12.0).reshape(6, 2)
-ACTIONS = torch.ones(5, 1)
+PATH = torch.arange(40.0).reshape(20, 2)
+ACTIONS = torch.ones(19, 1)
 
 
 def warnings(observations, actions, **options):
@@ -22,13 +26,13 @@ def test_sound_demonstrations_raise_none():
 
 def test_each_warning_is_said_once_and_names_its_trajectory():
     names = [f"{letter}.pkl" for letter in "abcdef"]
-    paths = [PATH, PATH, PATH * 0, PATH * 1e37, PATH + 1, PATH + 2]
+    paths = [PATH, PATH, PATH * 0, PATH * 1e36, PATH + 1, PATH + 2]
     actions = [ACTIONS, ACTIONS, ACTIONS, ACTIONS, 0 * ACTIONS, None]
     assert warnings(paths, actions, names=names, columns=["x", "y"]) == [
         "b.pkl repeats a.pkl: every step is the same",
-        "c.pkl: nothing moves in its 5 steps",
-        "d.pkl: x reaches 8e+37 m",
-        "e.pkl: all 5 labelled actions are zero",
+        "c.pkl: nothing moves in its 19 steps",
+        "d.pkl: x reaches 3.6e+37 m",
+        "e.pkl: all 19 labelled actions are zero",
     ]
 
 
@@ -38,11 +42,76 @@ def test_columns_without_a_unit_are_not_looked_at():
 
 
 def test_columns_that_say_nothing_are_named():
-    states = [torch.cat([path, path[:, :1], torch.full((6, 1), 3.0)], -1) for path in (PATH, PATH + 1)]
+    states = [torch.cat([path, path[:, :1], torch.full((20, 1), 3.0)], -1) for path in (PATH, PATH + 1)]
     data = flatten_trajectories(states, [ACTIONS, ACTIONS])
     data["state"] = data["observation"]
     assert find_warnings(data) == []
     assert find_warnings(data, seen=["x", "y", "again", "shelf"]) == [
         "columns 'x' and 'again' are the same in every step",
-        "column 'shelf' is 3 in all 10 steps: it says nothing",
+        "column 'shelf' is 3 in all 38 steps: it says nothing",
     ]
+
+
+def test_short_trajectories_are_named():
+    (warning,) = warnings([PATH, PATH[:6], PATH[:9]], [ACTIONS, ACTIONS[:5], ACTIONS[:8]])
+    assert "2 of 3 trajectories have fewer steps than a window of 16" in warning
+    assert "trajectory 1 (5), trajectory 2 (8); `koap convert --drop-short`" in warning
+
+
+def test_actions_that_never_change_are_named():
+    data = flatten_trajectories([PATH], [torch.cat([PATH[1:, :1], ACTIONS], 1)])
+    assert find_warnings(data, actions=["v", "grip"]) == [
+        "action 'grip' is 1 in all labels: a policy always commands that"
+    ]
+    assert constant_columns(np.array([[1.0, np.nan], [2.0, 5.0], [2.0, 5.0]])) == [2.0, 5.0]
+
+
+TIME = np.linspace(0, 2, 60)[:, None]
+
+
+def seen(*trajectories):
+    """Warnings about smooth states, by name."""
+    frames = [
+        torch.from_numpy(np.hstack([np.sin(TIME + index), columns])) for index, columns in enumerate(trajectories)
+    ]
+    data = flatten_trajectories(frames, None, action_dim=1, dtype=torch.float64)
+    data["state"] = data["observation"]
+    return find_warnings(data, seen=["sine", *(f"q{index}" for index in range(trajectories[0].shape[1]))])
+
+
+def leaping(frames, at, change):
+    frames = frames.copy()
+    frames[at] = change(frames[at])
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ((3 * TIME + 1 + np.pi) % (2 * np.pi) - np.pi, r"'q0' from 3.14 to -3.05 \(frame 22 of trajectory 0\): angles"),
+        ((170 * TIME + 180) % 360 - 180, "angles that were wrapped at 180 degrees"),
+        (np.hstack([np.cos(TIME), np.sin(TIME)]) * np.where(TIME < 1, 1, -1), "'q0' .*, 'q1' .*: a quaternion"),
+        (
+            leaping(TIME + 3, 17, lambda value: 0 * value),
+            "from 3.54 to 0 .*and 1 times more.*: a measurement that failed",
+        ),
+        (leaping(TIME, slice(40, None), lambda value: value + 9), "'q0' .*: a switch, or a measurement that failed"),
+        (leaping(np.hstack([TIME, TIME**2]), slice(40, None), lambda value: value + 9), "two episodes in one"),
+    ],
+)
+def test_leaps_are_named_with_their_cause(columns, message):
+    (warning,) = seen(columns)
+    assert re.search(message, warning)
+
+
+def test_switches_and_smooth_columns_do_not_leap():
+    assert seen(np.hstack([TIME > 1, np.exp(-3 * TIME), np.repeat([[0.0], [0.04], [0.08]], 20, 0)])) == []
+
+
+def test_stillness_is_told():
+    frames = [np.concatenate([np.zeros((40, 1)), TIME[:20]]) + index for index in range(2)]
+    assert still_ends(frames).tolist() == [[40, 0], [40, 0]]
+    data = flatten_trajectories([torch.from_numpy(part) for part in frames], None, action_dim=1, dtype=torch.float64)
+    data["state"] = data["observation"]
+    (warning,) = find_warnings(data, seen=["q"])
+    assert warning.startswith("nothing moves in 68% of all frames at the start and 0% at the end")

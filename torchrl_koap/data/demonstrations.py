@@ -16,6 +16,7 @@ from tensordict import TensorDict
 
 from torchrl_koap.data.formats.columns import kind_of
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
+from torchrl_koap.data.quality import constant_columns
 from torchrl_koap.data.ted import save_ted
 from torchrl_koap.data.trajectories import flatten_trajectories
 from torchrl_koap.files import DataError
@@ -171,6 +172,7 @@ def make_demonstrations(
         problems.append(f"robot: {which} never move, so nothing tells what an action does: name others in robot")
     if problems:
         raise DataError(f"task {name!r}", problems)
+    constants = constant_columns(np.concatenate(recordings.actions))
     data = flatten_trajectories(
         [torch.from_numpy(frames) for frames in recordings.states],
         [torch.from_numpy(steps) for steps in recordings.actions],
@@ -183,8 +185,8 @@ def make_demonstrations(
         observation_parts=parts,
         observation_units=own_units,
         actions={
-            name: Action(unit, kind, column)
-            for name, unit, kind, column in zip(acting, units, kinds, moved or (None,) * len(acting), strict=True)
+            name: Action(*facts)
+            for name, *facts in zip(acting, units, kinds, moved or (None,) * len(acting), constants, strict=True)
         },
         position=next(part for part in parts if part != _COMMAND),
         max_steps=max_steps or round(_SLACK * max(len(frames) for frames in recordings.states)),
@@ -256,8 +258,8 @@ def _coarse(frames: np.ndarray, names: Sequence[str]) -> list[str]:
     spans, farthest = np.ptp(frames, axis=0), np.abs(frames).max(0)
     kept = np.spacing(farthest.astype(np.float32))
     return [
-        f"column {names[column]!r} moves by {spans[column]:.3g} at up to {farthest[column]:.3g}, and float32 holds it to"
-        f" {kept[column]:.2g}: subtract an offset from it, here and on the robot"
+        f"column {names[column]!r} moves by {spans[column]:.3g} at up to {farthest[column]:.3g}, and float32 holds it"
+        f" to {kept[column]:.2g}: subtract an offset from it, here and on the robot"
         for column in np.flatnonzero((kept > _COARSE * spans) & (spans > 0))
     ]
 

@@ -93,7 +93,12 @@ def find_warnings(
         frames = [part.double().numpy() for part in data.get(keys.STATE).cpu().split(lengths)]
         warnings += _column_warnings(data.get(keys.STATE), seen) + _leaps(frames, called, seen)
         warnings += _stillness(frames, called)
-    return warnings + constant_actions(entries[1].cpu().numpy(), actions) if actions else warnings
+    constants = zip(actions, constant_columns(entries[1].cpu().numpy()), strict=False)
+    return warnings + [
+        f"action {name!r} is {value:g} in all labels: a policy always commands that"
+        for name, value in constants
+        if value is not None
+    ]
 
 
 def _column_warnings(state: Tensor, names: Sequence[str]) -> list[str]:
@@ -192,23 +197,14 @@ def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> lis
     ]
 
 
-def constant_actions(actions: np.ndarray, names: Sequence[str]) -> list[str]:
-    """Names actions that are the same in all labels.
+def constant_columns(actions: np.ndarray) -> list[float | None]:
+    """Of every action column what it is in all labels; None where it differs, or is known once at most.
 
     Args:
         actions (np.ndarray): actions ``[N, act]``, NaN where there is no label.
-        names (sequence of str): names of the columns.
-
-    Returns:
-        list of str: a sentence for each.
     """
     steps = actions[np.isfinite(actions).all(-1)]
-    if len(steps) < 2:
-        return []
-    return [
-        f"action {names[column]!r} is {steps[0, column]:g} in all {len(steps)} labels: it is always commanded so"
-        for column in np.flatnonzero(np.ptp(steps, axis=0) == 0)
-    ]
+    return [float(column[0]) if len(column) > 1 and np.ptp(column) == 0 else None for column in steps.T]
 
 
 def _some(names: Sequence[str]) -> str:

@@ -9,8 +9,8 @@ otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -34,6 +34,7 @@ class Action:
             ``"absolute"``: a command itself; ``"gripper"``: an absolute one that is read off planned widths.
         column (int, optional): state column that a ``"delta"`` moves, that an ``"absolute"`` action is the target of
             (controllers then decode the distance to it), or in which a ``"gripper"`` tells its width.
+        constant (float, optional): what it always is, whatever is decoded. Default: it differs.
 
     Examples:
         >>> from torchrl_koap.tasks import Action
@@ -44,6 +45,7 @@ class Action:
     unit: str = ""
     kind: ActionKind = "delta"
     column: int | None = None
+    constant: float | None = None
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,7 @@ class ActionRule:
             widths (:func:`gripper_command`).
         targets (sequence of int): for absolute actions the state column that each is the target of: the controller has
             decoded the distance to it.
+        constants (mapping): what action columns always are, by number.
 
     Examples:
         >>> import torch
@@ -66,14 +69,18 @@ class ActionRule:
 
     gripper: tuple[int, int] | None = None
     targets: Sequence[int] = ()
+    constants: Mapping[int, float] = field(default_factory=dict)
 
     def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
         """Returns the actions ``[*B, T, act]`` in states ``[*B, T, d]``."""
         if self.targets:
             actions = actions + states[..., list(self.targets)]
-        if self.gripper is not None:
+        if self.gripper is not None or self.constants:
+            actions = actions.clone()
+        for entry, value in self.constants.items():
+            actions[..., entry] = value
+        if self.gripper is not None:  # the last frame, which nothing follows, stays as it is
             entry, column = self.gripper
-            actions = actions.clone()  # the last frame, which nothing follows, stays as it is
             actions[..., :-1, entry] = gripper_command(states[..., column], open_above=PLANNED_OPEN_ABOVE)
         return actions
 

@@ -200,7 +200,9 @@ class Task(Columns):
     @property
     def action_rule(self) -> ActionRule | None:
         """What has the last word on decoded actions, None if nothing has."""
-        return ActionRule(self.gripper, self.targets) if self.gripper or self.targets else None
+        actions = enumerate(self.actions.values())
+        constants = {index: action.constant for index, action in actions if action.constant is not None}
+        return ActionRule(self.gripper, self.targets, constants) if self.gripper or self.targets or constants else None
 
     @property
     def num_modes(self) -> int:

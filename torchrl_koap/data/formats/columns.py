@@ -41,6 +41,14 @@ class Piece:
         states (dict): columns ``[T]`` of everything that is no action, by name.
         actions (dict, optional): columns ``[T]`` or ``[T - 1]`` of actions, by name; None where there are none.
         unclear (tuple of str): columns among the states of which the user has to say what they are.
+
+    Examples:
+        >>> import numpy as np
+        >>> from torchrl_koap.data.formats.columns import Piece, assemble
+        >>> columns = {"t_ms": 50 * np.arange(4), "done": np.array([0, 1, 0, 1]), "x": np.arange(4.0)}
+        >>> found = assemble([Piece("run.csv", columns, {"v": np.ones(4)})], "recordings")
+        >>> found.sources, found.control_hz, found.state_names, found.skipped
+        (('run.csv[0]', 'run.csv[1]'), 20.0, ('x',), ('t_ms', 'done'))
     """
 
     name: str
@@ -50,7 +58,12 @@ class Piece:
 
 
 def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of a table ``[T]`` or ``[T, d]``, numbered if there are several."""
+    """Spreads a table into columns, numbered if there are several.
+
+    Args:
+        name (str): of the table.
+        values (np.ndarray): ``[T]`` or ``[T, d]``.
+    """
     table = np.asarray(values).reshape(len(values), -1)
     alone = table.shape[1] == 1
     return {name if alone else f"{name}_{index}": table[:, index] for index in range(table.shape[1])}
