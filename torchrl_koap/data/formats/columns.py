@@ -151,7 +151,7 @@ def assemble(
     if acting is not None:
         left_out += [name for name in acting if name in drop_columns]
         acting = [name for name in acting if name not in drop_columns]
-    rate = control_hz if control_hz is not None else find_rate(pieces, declared_hz, no_rate, problems)
+    rate = control_hz if control_hz is not None else _find_rate(pieces, declared_hz, no_rate, problems)
     if problems:
         raise DataError(source, problems)
     return make_recordings(
@@ -167,7 +167,7 @@ def assemble(
     )
 
 
-def find_rate(pieces: Sequence[Piece], declared: float | None, otherwise: str, problems: list[str]) -> float | None:
+def _find_rate(pieces: Sequence[Piece], declared: float | None, otherwise: str, problems: list[str]) -> float | None:
     """Frames per second by the time stamps of all pieces; what is declared where there are none."""
     clock = next((name for name in pieces[0].states if kind_of(name)[0] == "clock"), None)
     if clock is None:
