@@ -62,13 +62,13 @@ def test_objects_get_a_panel(task):
 
 def test_plans_of_a_task_with_objects():
     rollouts = make_object_rollouts("aligning")
-    lines = drawn_lines(draw_plans(rollouts, run_of("aligning"), episodes=[1, 3]).axes[0])
+    lines = drawn_lines(draw_plans(rollouts, run_of("aligning")).axes[3])  # the two failures come first
     outline = scenes.outlines(rollouts["context"][1, 0], (0.05, 0.05))
     assert any(line.shape == (5, 2) and np.allclose(line, outline) for line in lines)
 
 
 def test_plans_lie_over_their_path():
-    axes = draw_plans(ROLLOUTS, run_of("avoiding"), episodes=[1]).axes[0]
+    axes = draw_plans(ROLLOUTS, run_of("avoiding")).axes[3]
     assert axes.get_title(loc="left") == "episode 1: left, left, gap 2\noff the path: median 0.0, 95 % within 0.0 mm"
     lines = drawn_lines(axes)
     assert len(lines) == 4 and all(len(line) == 4 for line in lines)
@@ -97,7 +97,7 @@ def test_plan_deviation_is_the_distance_to_the_polyline():
     ],
 )
 def test_episodes_are_chosen_for_variety(mode, outcome, count, wanted):
-    assert choose_episodes(list(mode), outcome, count) == wanted
+    assert choose_episodes(np.array(mode), np.array(outcome), count) == wanted
 
 
 @pytest.mark.parametrize(
@@ -113,5 +113,3 @@ def test_bad_rollouts(change, message):
     rollouts = {key: value for key, value in (ROLLOUTS | change).items() if value is not None}
     with pytest.raises(ValueError, match=message):
         draw_plans(rollouts, run_of("avoiding"))
-    with pytest.raises(ValueError, match="must be 0 to 3, got 4"):
-        draw_plans(ROLLOUTS, run_of("avoiding"), episodes=[4])

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +14,10 @@ from run_files import make_demonstrations, make_object_rollouts, write_run
 from safetensors.numpy import save_file
 
 from torchrl_koap.evaluation.statistics import expected_entropy
+from torchrl_koap.reports import pictures
 from torchrl_koap.reports.html import templates
 from torchrl_koap.reports.pictures import all_pictures, draw_pictures
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.tasks import get_task
 
@@ -152,7 +155,9 @@ def test_damaged_json_is_named_and_the_rest_is_shown(name, content, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["rollouts.safetensors", "actions.safetensors", "metrics.csv"])
-def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path):
+def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path, monkeypatch):
+    few = {p.name: p for p in PICTURES if p.source == name or p.name == "eigenvalues.png"}
+    monkeypatch.setattr(pictures, "_PICTURES", few)
     write_run(tmp_path)
     draw_pictures(tmp_path, animation=False)
     data = tmp_path / name
@@ -172,13 +177,6 @@ def test_odd_values_do_not_stop_the_report(tmp_path):
     (tmp_path / "summary.json").write_text(json.dumps({"labels": 3, "train_seconds": 12.0}))
     page = Page(write_report(tmp_path))
     assert "not a number" in page.text and "training time 12.0 s" in page.text
-
-
-def test_camera_film_is_shown_if_there(tmp_path):
-    (tmp_path / "plots").mkdir()
-    (tmp_path / "plots" / "film.mp4").write_bytes(b"")
-    page = Page(write_report(tmp_path))
-    assert "video" in page.tags and "plots/film.mp4" in page.links
 
 
 def write_object_run(folder, task="stacking", **evaluation):
@@ -222,7 +220,7 @@ def test_entropy_within_contexts(tmp_path):
     assert "mode entropy, base 2 0.50 2 of 2 modes; mean over contexts, 2 rollouts each" in text
 
 
-@pytest.mark.parametrize("task", ["aligning", "sorting", "stacking"])
+@pytest.mark.parametrize("task", ["aligning", "stacking"])
 def test_report_of_a_task_with_objects(task, tmp_path, monkeypatch):
     """Every picture that the task has, no word of Avoiding, and one line where no film can be made."""
     monkeypatch.setenv("MUJOCO_GL", "off")
@@ -241,8 +239,13 @@ def test_report_of_a_task_with_objects(task, tmp_path, monkeypatch):
     assert page.source.count('class="warning"') == 1
     assert "film.gif was not made: rendering is switched off by the environment variable MUJOCO_GL=off" in page.text
     assert "cylinder" not in page.text and "gap taken" not in page.text
-    word = {"aligning": "thick far side", "sorting": "frames are the bins", "stacking": "still in the gripper"}[task]
-    assert word in page.text and "Squares are the objects" in page.text
+    assert "Squares are the objects" in page.text
+
+
+def test_the_picture_of_rollouts_says_what_stands_in_the_scene():
+    words = {"aligning": "thick far side", "sorting": "frames are the bins", "stacking": "still in the gripper"}
+    for task, word in words.items():
+        assert word in all_pictures()["rollouts.png"].caption_for(RunFacts(Path("run"), get_task(task)))
 
 
 def test_no_such_directory(tmp_path):

@@ -148,6 +148,8 @@ def test_bad_contexts():
 
 def test_executed_paths_end_where_the_episode_does():
     data = {"position": np.zeros((2, 9, 2)), "length": np.array([4, 9]), "object_position": np.zeros((2, 9, 1, 2))}
-    assert [len(path) for path in scenes.executed_paths(data)] == [4, 9]
+    paths, mode, outcome = scenes.read_episodes(data | {"mode": [3.0, -1.0], "outcome": [1, 0]})
+    assert [len(path) for path in paths] == [4, 9]
+    assert mode.tolist() == [3, -1] and outcome.tolist() == [1, 0]
     assert [len(path) for path in scenes.body_paths(data)] == [5, 9]  # with the state after the last step
     assert scenes.body_paths({"position": data["position"]}) == []

@@ -41,18 +41,7 @@ class Advice:
 
 
 def advice(run: RunFacts) -> list[Advice]:
-    """Returns everything that the rules have to say about a run, most telling first.
-
-    Args:
-        run (RunFacts): what is known of the run.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from torchrl_koap.reports.advice import RunFacts, advice
-        >>> evaluation = {"success_rate": 0.5, "success_low": 0.2, "success_high": 0.8, "episodes": 8}
-        >>> [item.command for item in advice(RunFacts(Path("runs/koap"), evaluation=evaluation))][-1]
-        'koap eval {run} --episodes 60 --seed 100'
-    """
+    """Returns everything that the rules have to say about a run, most telling first."""
     return [item for rule in RULES for item in [rule(run)] if item is not None]
 
 

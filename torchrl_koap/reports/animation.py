@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from torchrl_koap.reports.mode_plots import color_of_mode, mode_colors
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.scenes import bodies_of, body_paths, draw_scene, executed_paths, keep_inside
+from torchrl_koap.reports.scenes import bodies_of, body_paths, draw_scene, keep_inside, read_episodes
 from torchrl_koap.reports.style import FAILURE_MARKS, INK, SUCCESS, entry, set_title
 from torchrl_koap.reports.writing import Film
 from torchrl_koap.tasks import CONTROL_HZ
@@ -38,7 +38,7 @@ def _caption(run: RunFacts) -> str:
     caption=_caption,
     order=20,
 )
-def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts, *, stride: int | None = None) -> Film:
+def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     """Shows all rollouts from above in real time; plans are thin lines ahead of the dots.
 
     The bodies of tasks that have them are squares in their colours with a thin path; tools then leave no path.
@@ -47,40 +47,29 @@ def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts, *, stride: int 
         rollouts (mapping): the entries of :func:`~torchrl_koap.reports.rollout_plots.draw_rollouts`, ``plan`` and
             ``plan_step`` if there are any.
         run (RunFacts): the run.
-
-    Keyword Args:
-        stride (int, optional): control steps per frame. Default: 2, more where that makes more than 170 frames.
-
-    Raises:
-        NothingToDraw: if there is no rollout.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> import numpy as np
-        >>> from torchrl_koap.reports.animation import animate_rollouts
-        >>> from torchrl_koap.reports.run_facts import RunFacts
-        >>> one = {"position": np.random.rand(1, 4, 2), "length": [4], "mode": [3], "outcome": [1]}
-        >>> len(list(animate_rollouts(one, RunFacts(Path("runs/koap"))).frames))
-        3
     """
-    paths = executed_paths(rollouts)
+    paths, mode, outcome = read_episodes(rollouts)
     longest = max(map(len, paths), default=0)
     if not longest:
         raise NothingToDraw("there are no rollouts")
-    stride = stride or max(2, -(-longest // MOST_FRAMES))
+    stride = max(2, -(-longest // MOST_FRAMES))
     steps = list(range(0, longest, stride))
     steps += [longest - 1] * (steps[-1] != longest - 1)
-    return Film(_frames(rollouts, paths, steps, run), stride / (run.control_hz or CONTROL_HZ))
+    return Film(_frames(rollouts, paths, mode, outcome, steps, run), stride / (run.control_hz or CONTROL_HZ))
 
 
 def _frames(
-    rollouts: Mapping[str, Any], paths: list[np.ndarray], steps: list[int], run: RunFacts
+    rollouts: Mapping[str, Any],
+    paths: list[np.ndarray],
+    mode: np.ndarray,
+    outcome: np.ndarray,
+    steps: list[int],
+    run: RunFacts,
 ) -> Iterator[np.ndarray]:
     """Draws the scene once, adds each new piece of path to it, and lays dots and plans over it for one frame."""
     moving = body_paths(rollouts)
     bodies = bodies_of(run.task, moving[0].shape[1]) if moving else ()
     pales = [tuple(0.45 * np.array(to_rgb(body.color)) + 0.55) for body in bodies]
-    mode, outcome = (entry(rollouts, key, [len(paths)]).astype(int) for key in ("mode", "outcome"))
     plan, plan_step = np.zeros((len(paths), 0, 0, 2)), np.zeros((len(paths), 0))
     if "plan" in rollouts and "plan_step" in rollouts:
         plan = entry(rollouts, "plan", [len(paths), None, None, 2])

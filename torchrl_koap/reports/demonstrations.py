@@ -45,9 +45,6 @@ def draw_demonstrations(demonstrations: Mapping[str, Any], run: RunFacts) -> Fig
             environment, which are drawn over time, ``position`` ``[N, 2]`` (m) for others; optionally ``objects``
             ``[N, bodies, 2]`` (m), which get a panel of their own.
         run (RunFacts): the run.
-
-    Raises:
-        ValueError: if an entry is missing or has a wrong shape.
     """
     episode = entry(demonstrations, "episode", [None])
     labelled = entry(demonstrations, "labelled", [len(episode)]).astype(bool)

@@ -42,7 +42,7 @@ def duration(seconds: float) -> str:
 
 
 def show(value: Any, key: str = "") -> str:
-    """Returns a single value as text, not escaped: the template does that.
+    """Returns a single value as text; the template escapes it.
 
     Args:
         value: a value of a JSON file that is no container.
@@ -102,17 +102,6 @@ def templates() -> Environment:
     filters = {"show": show, "label": label, "columns": columns, "duration": duration}
     environment.filters.update(filters | {"all_mappings": lambda items: all(isinstance(i, Mapping) for i in items)})
     return environment
-
-
-def bar(value: float, low: float, high: float) -> tuple[float, ...]:
-    """Returns a share and the ends of its interval in percent, cut to 0..100.
-
-    Args:
-        value (float): share, 0 to 1.
-        low (float): lower end of its interval.
-        high (float): upper end.
-    """
-    return tuple(100 * min(max(part, 0.0), 1.0) for part in (value, low, high))
 
 
 def write_page(template: str, path: str | Path, **content: Any) -> Path:

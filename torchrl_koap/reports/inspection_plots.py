@@ -71,9 +71,6 @@ def draw_eigenvalues(data: Mapping[str, Any], run: RunFacts) -> Figure:
     Args:
         data (mapping): ``real`` and ``imag`` parts ``[m]``.
         run (RunFacts): the run; its control rate gives the time in which a part of the state fades.
-
-    Raises:
-        ValueError: if there is none, or one is not finite.
     """
     values = _spectrum(data)
     figure = Figure(figsize=(9.4, 4.2), layout="constrained")
@@ -99,9 +96,6 @@ def draw_latent(result: Mapping[str, Any], run: RunFacts) -> Figure:
         result (mapping): ``inspect.json``, whose entry ``latent`` is of
             :func:`~torchrl_koap.evaluation.latent_space.analyse_latent`.
         run (RunFacts): the run; the first panel is left out where its eigenvalues are absent.
-
-    Raises:
-        NothingToDraw: if no latent space was looked into.
     """
     latent, eigenvalues = result.get("latent", {}), run.folder / _EIGENVALUES
     if "multi_step" not in latent or run.task is None:
@@ -138,9 +132,6 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     Args:
         result (mapping): ``inspect.json``.
         run (RunFacts): the run.
-
-    Raises:
-        NothingToDraw: if the experiments were not made.
     """
     if "both" not in result:
         raise NothingToDraw("the experiments in the simulator were left out")

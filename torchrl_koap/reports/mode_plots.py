@@ -41,9 +41,6 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     Args:
         rollouts (mapping): ``mode`` ``[E]`` (-1: no mode, counted in the title) and ``outcome`` ``[E]``.
         run (RunFacts): the run; the modes of its demonstrations are drawn as ticks, scaled to the number of rollouts.
-
-    Raises:
-        NothingToDraw: if the task can be done in one way only.
     """
     modes, number = run.modes, run.modes.number
     if number < 2:
@@ -108,20 +105,7 @@ def recorded_modes(demonstrations: Path, modes: Modes) -> np.ndarray:
 
 
 def mode_colors(modes: Modes) -> np.ndarray:
-    """Returns a colour for each mode: hue tells the last choice apart, lightness all choices before it.
-
-    Args:
-        modes (Modes): those of a task.
-
-    Returns:
-        np.ndarray: sRGB colours in 0..1 ``[num_modes, 3]``.
-
-    Examples:
-        >>> from torchrl_koap.reports.mode_plots import mode_colors
-        >>> from torchrl_koap.tasks import get_task
-        >>> mode_colors(get_task("avoiding").modes).shape
-        (24, 3)
-    """
+    """Returns an sRGB colour in 0..1 for each mode: hue tells the last choice apart, lightness all before it."""
     if modes.number < 2:
         return np.array([to_rgb(BLUE)])
     hues = len(modes.choices[-1][1])

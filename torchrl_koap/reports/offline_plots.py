@@ -63,9 +63,6 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
         result (mapping): ``eval.json`` with ``plan_errors``, as of
             :func:`~torchrl_koap.evaluation.plan_errors.plan_errors`.
         run (RunFacts): the run.
-
-    Raises:
-        NothingToDraw: if no plan was evaluated on recorded data.
     """
     plan = _part(result, "plan_errors")
     if "unit" not in plan:
@@ -110,9 +107,6 @@ def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     Args:
         result (mapping): ``eval.json`` with ``action_errors`` by split; notes are skipped.
         run (RunFacts): the run.
-
-    Raises:
-        NothingToDraw: if no action was evaluated on recorded data.
     """
     parts = [(name, part) for name, part in _part(result, "action_errors").items() if "column" in part]
     if not parts:

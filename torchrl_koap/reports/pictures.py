@@ -41,9 +41,10 @@ _BUILT_IN = (
     "training_plots",
     "inspection_plots",
 )
-_MOVING = (".gif", ".mp4")
+EVAL = "koap eval {run} --episodes 60 --seed 100"
+TRAIN = "koap train --out {run}"
 _COMMANDS = {
-    "rollouts.safetensors": "koap eval {run} --episodes 60 --seed 100",
+    "rollouts.safetensors": EVAL,
     "eval.json": "koap eval {run}",
     "actions.safetensors": "koap eval {run}",
     "inspect.json": "koap inspect {run}",
@@ -124,16 +125,6 @@ def picture(
 
     Raises:
         ValueError: if there is a picture of that name already.
-
-    Examples:
-        >>> from matplotlib.figure import Figure
-        >>> from torchrl_koap.reports.pictures import all_pictures, picture
-        >>> @picture("speed.png", source="rollouts.safetensors", title="Speed", caption="Of the tool.")
-        ... def draw_speed(rollouts, run):
-        ...     return Figure()
-        >>> all_pictures()["speed.png"].command
-        'koap eval {run} --episodes 60 --seed 100'
-        >>> del _PICTURES["speed.png"]
     """
 
     def register(draw: Draw) -> Draw:
@@ -141,7 +132,7 @@ def picture(
         if known is not None:
             first, second = (f"{item.__module__}.{item.__qualname__}" for item in (known.draw, draw))
             raise ValueError(f"a picture {name!r} is registered already, by {first}; {second} needs another name")
-        usual = command or _COMMANDS.get(source, "koap train --out {run}")
+        usual = command or _COMMANDS.get(source, TRAIN)
         _PICTURES[name] = Picture(name, source, title, caption, draw, usual, order, empty, offline)
         return draw
 
@@ -149,13 +140,7 @@ def picture(
 
 
 def all_pictures() -> dict[str, Picture]:
-    """Returns every registered picture by name, in the order of the report.
-
-    Examples:
-        >>> from torchrl_koap.reports.pictures import all_pictures
-        >>> list(all_pictures())[0]
-        'rollouts.png'
-    """
+    """Returns every registered picture by name, in the order of the report."""
     for module in _BUILT_IN:
         import_module(f"torchrl_koap.reports.{module}")
     return dict(sorted(_PICTURES.items(), key=lambda item: item[1].order))
@@ -168,7 +153,7 @@ def draw_pictures(
     animation: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, str]:
-    r"""Draws every picture whose source is there into ``plots/``; one that fails does not stop the others.
+    """Draws every picture whose source is there into ``plots/``; one that fails does not stop the others.
 
     Args:
         folder (str or Path): the run directory.
@@ -184,22 +169,13 @@ def draw_pictures(
 
     Raises:
         FileNotFoundError: if there is no such directory.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from torchrl_koap.reports.pictures import draw_pictures
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = Path(folder, "metrics.csv").write_text("phase,step,loss_planner\nplanner,1,0.5\nplanner,2,0.4\n")
-        ...     draw_pictures(folder), sorted(path.name for path in Path(folder, "plots").iterdir())
-        ({}, ['losses.png'])
     """
     run = RunFacts.read(folder)
     wanted = [item for name, item in all_pictures().items() if names is None or name in names]
     problems = {}
     for done, item in enumerate(wanted, 1):
         source, path = run.folder / item.source, run.folder / FOLDER / item.name
-        if source.exists() and (animation or not item.name.endswith(_MOVING)):
+        if source.exists() and (animation or not item.name.endswith(".gif")):
             try:
                 item.write(run)
             except NothingToDraw:

@@ -22,10 +22,10 @@ from torchrl_koap.reports.scenes import (
     draw_bodies,
     draw_failure_end,
     draw_scene,
-    executed_paths,
     keep_inside,
+    read_episodes,
 )
-from torchrl_koap.reports.style import FAILURE_MARKS, INK, OUTCOMES, SUCCESS, as_array, entry, set_title
+from torchrl_koap.reports.style import FAILURE_MARKS, INK, OUTCOMES, SUCCESS, entry, set_title
 from torchrl_koap.tasks.units import thousandths
 
 
@@ -55,18 +55,8 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
             none), ``outcome`` ``[E]`` (0 out of time, 1 success, 2 collision); optionally ``object_position``
             ``[E, T, bodies, 2]`` (m) and ``context`` ``[E, bodies, 3]`` (x, y in m, yaw in rad).
         run (RunFacts): the run.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> import numpy as np
-        >>> from torchrl_koap.reports.rollout_plots import draw_rollouts
-        >>> from torchrl_koap.reports.run_facts import RunFacts
-        >>> from torchrl_koap.tasks import get_task
-        >>> one = {"position": np.random.rand(1, 9, 2), "length": [9], "mode": [3], "outcome": [1]}
-        >>> len(draw_rollouts(one, RunFacts(Path("runs/koap"), get_task("avoiding"))).axes)
-        2
     """
-    paths, mode, outcome = _read(rollouts)
+    paths, mode, outcome = read_episodes(rollouts)
     bodies, colors = body_paths(rollouts), mode_colors(run.modes)
     good, crowded = outcome == SUCCESS, sum(map(len, paths)) > 8000
     figure = Figure(figsize=(8.4, 5.9), layout="constrained")
@@ -132,32 +122,23 @@ def _plans_caption(run: RunFacts) -> str:
     order=50,
     empty="the rollouts hold no plans of positions",
 )
-def draw_plans(rollouts: Mapping[str, Any], run: RunFacts, *, episodes: Sequence[int] | None = None) -> Figure:
+def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     """Draws every plan of a few episodes over the path that was executed.
+
+    Shown are up to two failures, then successes of as many different modes as possible, six in all.
 
     Args:
         rollouts (mapping): the entries of :func:`draw_rollouts`, ``plan`` ``[E, P, H, 2]`` (m, NaN padded) and
             ``plan_step`` ``[E, P]``, the control step at which each plan was made (-1 padding).
         run (RunFacts): the run.
-
-    Keyword Args:
-        episodes (sequence of int, optional): episodes to draw. Default: up to two failures, then successes of as many
-            different modes as possible, six in all.
-
-    Raises:
-        ValueError: if an entry is missing or has a wrong shape, or an episode does not exist.
-        NothingToDraw: if no plan was kept.
     """
-    paths, mode, outcome = _read(rollouts)
+    paths, mode, outcome = read_episodes(rollouts)
     plan = entry(rollouts, "plan", [len(paths), None, None, 2])
     if not plan.shape[1]:
         raise NothingToDraw("the rollouts hold no plans of positions")
     plan_step = entry(rollouts, "plan_step", plan.shape[:2])
     colors, bodies = mode_colors(run.modes), body_paths(rollouts)
-    episodes = choose_episodes(mode, outcome, 6) if episodes is None else episodes
-    wrong = [index for index in episodes if not 0 <= index < len(paths)]
-    if wrong:
-        raise ValueError(f"episodes must be 0 to {len(paths) - 1}, got {wrong[0]}")
+    episodes = choose_episodes(mode, outcome, 6)
     across = min(len(episodes), 3)
     down = math.ceil(len(episodes) / max(across, 1))
     figure = Figure(figsize=(3.8 * across + 0.3, 4.25 * down + 0.3), layout="constrained")
@@ -191,7 +172,7 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts, *, episodes: Sequence
     return figure
 
 
-def choose_episodes(mode: Any, outcome: Any, count: int) -> list[int]:
+def choose_episodes(mode: np.ndarray, outcome: np.ndarray, count: int) -> list[int]:
     """Chooses the episodes worth showing: two failures, then a success of a new mode each, then what is left.
 
     Args:
@@ -201,13 +182,7 @@ def choose_episodes(mode: Any, outcome: Any, count: int) -> list[int]:
 
     Returns:
         list of int: rows of the arrays.
-
-    Examples:
-        >>> from torchrl_koap.reports.rollout_plots import choose_episodes
-        >>> choose_episodes([0, 0, 5, 9, -1], [1, 1, 1, 1, 2], 4)
-        [4, 0, 2, 3]
     """
-    mode, outcome = as_array("mode", mode, [None]), as_array("outcome", outcome, [None])
     bad = np.flatnonzero(outcome != SUCCESS).tolist()
     chosen, spare = bad[: min(2, count)], bad[2:]
     good = np.flatnonzero(outcome == SUCCESS)
@@ -230,13 +205,6 @@ def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:
 
     Returns:
         np.ndarray: distances, one per planned point that was reached.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.reports.rollout_plots import plan_deviation
-        >>> path = np.stack([np.arange(5.0), np.zeros(5)], axis=1)
-        >>> plan_deviation(path, [np.array([[1.5, 0.25], [6.0, 0.0]])]).tolist()
-        [0.25]
     """
     points = np.concatenate([np.zeros((0, 2)), *plans])
     if len(path) < 2 or not len(points):
@@ -249,10 +217,3 @@ def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:
     nearest = distance.argmin(1)
     beyond = (nearest == len(along) - 1) & (share[:, -1] > 1)
     return distance.min(1)[~beyond]
-
-
-def _read(rollouts: Mapping[str, Any]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Paths of all episodes, their modes and outcomes."""
-    paths = executed_paths(rollouts)
-    mode, outcome = (entry(rollouts, key, [len(paths)]).astype(int) for key in ("mode", "outcome"))
-    return paths, mode, outcome

@@ -62,9 +62,6 @@ class RunFacts:
     def read(cls, folder: str | Path) -> RunFacts:
         """Reads the JSON files of a run directory, those that are there.
 
-        Args:
-            folder (str or Path): the run directory.
-
         Raises:
             FileNotFoundError: if there is no such directory.
         """

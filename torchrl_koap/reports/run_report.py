@@ -10,15 +10,12 @@ from typing import Any
 
 from torchrl_koap.reports.advice import advice
 from torchrl_koap.reports.html import write_page
-from torchrl_koap.reports.pictures import FOLDER, all_pictures, draw_pictures
+from torchrl_koap.reports.pictures import EVAL, FOLDER, TRAIN, all_pictures, draw_pictures
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.tiles import tiles
 
 _SIMULATED = ("rollouts.safetensors", "inspect.json")
 _BESIDE_LABELS = "demonstrations.png"
-_COMMANDS = {"train": "koap train --out {run}", "eval": "koap eval {run} --episodes 60 --seed 100"}
-_OFFLINE_COMMANDS = _COMMANDS | {"eval": "koap eval {run}"}
-_SUMMARY_ELSEWHERE = ("labels",)
 _EVAL_ELSEWHERE = ("episode", "command", "trajectory", "faults", "rates", "action_errors")
 _CONFIG_ELSEWHERE = ("versions", "command")
 
@@ -46,21 +43,12 @@ def write_report(
 
     Raises:
         FileNotFoundError: if there is no such directory.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> from torchrl_koap.reports.run_report import write_report
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = Path(folder, "eval.json").write_text('{"success_rate": 0.5, "episodes": 2}')
-        ...     "50.0 %" in write_report(folder).read_text()
-        True
     """
     run = RunFacts.read(folder)
     problems = draw_pictures(run.folder, animation=animation, progress=progress) if draw else {}
     config, summary, evaluation = run.config, run.summary, run.evaluation
     figures, missing = _figures(run, problems)
-    commands = _OFFLINE_COMMANDS if run.offline else _COMMANDS
+    commands = {"train": TRAIN, "eval": "koap eval {run}" if run.offline else EVAL}
     return write_page(
         "run.html",
         run.folder / "index.html",
@@ -83,7 +71,7 @@ def write_report(
             (head, shown)
             for head, source, elsewhere in (
                 ("Evaluation", evaluation, _EVAL_ELSEWHERE),
-                ("Training", summary, _SUMMARY_ELSEWHERE),
+                ("Training", summary, ("labels",)),
             )
             if (shown := {key: value for key, value in source.items() if key not in elsewhere})
         ],
@@ -113,14 +101,12 @@ def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str,
     figures: list[dict[str, Any]] = []
     missing: dict[str, list[str]] = {}
     for name, item in all_pictures().items():
-        names = (name, Path(name).stem + ".mp4")
-        file = next((own for own in names if (run.folder / FOLDER / own).exists()), None)
         source = (run.folder / item.source).exists()
         figure: dict[str, Any] = {"name": name, "title": item.title, "caption": item.caption_for(run), "empty": ""}
         if name in problems:
             continue
-        if file is not None:
-            figures.append(figure | {"source": f"{FOLDER}/{file}", "beside": file.endswith((".gif", ".mp4"))})
+        if (run.folder / FOLDER / name).exists():
+            figures.append(figure | {"source": f"{FOLDER}/{name}", "beside": name.endswith(".gif")})
         elif (item.source in _SIMULATED) if run.offline else item.offline:
             continue  # no command makes it for this task
         elif item.source == "actions.safetensors" and not source and isinstance(no_actions, str):

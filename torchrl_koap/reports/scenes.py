@@ -52,22 +52,11 @@ def color_of(name: str) -> str:
 
 
 def draw_scene(axes: Axes, task: Task | None) -> Axes:
-    """Draws the still shapes of a task to scale, with axes in metres.
+    """Draws the still shapes of a task to scale, with axes in metres, and returns the axes.
 
     Args:
         axes (Axes): where to draw.
         task (Task, optional): the task. None draws the axes only.
-
-    Returns:
-        Axes: the same axes.
-
-    Examples:
-        >>> from matplotlib.figure import Figure
-        >>> from torchrl_koap.reports.scenes import draw_scene
-        >>> from torchrl_koap.tasks import get_task
-        >>> axes = draw_scene(Figure().add_subplot(), get_task("avoiding"))
-        >>> len(axes.patches)  # six cylinders, each with a ring where the rod touches it
-        12
     """
     if task is not None:
         for shape in task.scene.shapes:
@@ -127,45 +116,32 @@ def keep_inside(axes: Axes, paths: Sequence[np.ndarray]) -> None:
             change(max(min(now[0], start), now[0] - room), min(max(now[1], end), now[1] + room), auto=False)
 
 
-def executed_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
-    """Returns the positions of each episode without the padding, ``[length, 2]`` each.
+def read_episodes(rollouts: Mapping[str, Any]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Returns the positions ``[length, 2]`` (m) of each episode without the padding, and modes and outcomes ``[E]``.
 
     Args:
-        rollouts (mapping): ``position`` ``[E, T, 2]`` (m) and ``length`` ``[E]``.
+        rollouts (mapping): ``position`` ``[E, T, 2]`` (m), ``length``, ``mode`` and ``outcome`` ``[E]``.
 
     Raises:
         ValueError: if an entry is missing or has a wrong shape.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.reports.scenes import executed_paths
-        >>> [len(path) for path in executed_paths({"position": np.zeros((2, 9, 2)), "length": np.array([4, 9])})]
-        [4, 9]
     """
-    position = entry(rollouts, "position", [None, None, 2])
-    length = entry(rollouts, "length", [len(position)])
-    paths = [row[: max(int(number), 0)] for row, number in zip(position, length, strict=True)]
-    return [path[np.isfinite(path).all(1)] for path in paths]
+    paths = _paths(rollouts, "position", [None, None, 2])
+    mode, outcome = (entry(rollouts, key, [len(paths)]).astype(int) for key in ("mode", "outcome"))
+    return paths, mode, outcome
 
 
 def body_paths(rollouts: Mapping[str, Any]) -> list[np.ndarray]:
-    """Returns the paths of the bodies of each episode, the state after the last step included.
-
-    Args:
-        rollouts (mapping): ``object_position`` ``[E, T, bodies, 2]`` (m) and ``length`` ``[E]``.
-
-    Returns:
-        list: an array ``[frames, bodies, 2]`` per episode; empty if there is no such entry.
-
-    Raises:
-        ValueError: if an entry has a wrong shape.
-    """
+    """Returns the path ``[frames, bodies, 2]`` (m) of the bodies of each episode, the last state included; or none."""
     if "object_position" not in rollouts:
         return []
-    position = entry(rollouts, "object_position", [None, None, None, 2])
+    return _paths(rollouts, "object_position", [None, None, None, 2], last=1)
+
+
+def _paths(rollouts: Mapping[str, Any], key: str, shape: Sequence[int | None], last: int = 0) -> list[np.ndarray]:
+    position = entry(rollouts, key, shape)
     length = entry(rollouts, "length", [len(position)])
-    paths = [row[: max(int(number), 0) + 1] for row, number in zip(position, length, strict=True)]
-    return [path[np.isfinite(path).all((1, 2))] for path in paths]
+    paths = [row[: max(int(number), 0) + last] for row, number in zip(position, length, strict=True)]
+    return [path[np.isfinite(path).all(tuple(range(1, path.ndim)))] for path in paths]
 
 
 def bodies_of(task: Task | None, number: int) -> tuple[Body, ...]:
@@ -190,9 +166,6 @@ def draw_bodies(
         task (Task, optional): the task.
         good (sequence of bool): whether each episode succeeded: its bodies end in a dot, otherwise in a cross.
         contexts (array, optional): starts ``[E, bodies, 3]``: x, y (m), yaw (rad).
-
-    Raises:
-        ValueError: if the contexts have another shape.
     """
     bodies = bodies_of(task, paths[0].shape[1] if len(paths) else 0)
     if contexts is not None:
@@ -221,9 +194,6 @@ def draw_starts(axes: Axes, contexts: Any, bodies: Sequence[Body]) -> None:
         axes (Axes): where to draw.
         contexts (array): ``[E, bodies, 3]``: x, y (m), yaw (rad).
         bodies (sequence of Body): what to draw.
-
-    Raises:
-        ValueError: if the contexts have another shape.
     """
     contexts = as_array("context", contexts, [None, len(bodies), 3]).astype(float)
     many = len(contexts) > MANY
@@ -248,12 +218,6 @@ def outlines(poses: np.ndarray, half: tuple[float, float]) -> np.ndarray:
     Args:
         poses (np.ndarray): ``[..., 3]``: x, y (m), yaw (rad).
         half (tuple of float): half width and half depth (m).
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.reports.scenes import outlines
-        >>> outlines(np.array([1.0, 2.0, np.pi / 2]), (0.5, 0.25))[2:4].round(6).tolist()
-        [[0.75, 2.5], [0.75, 1.5]]
     """
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half
     cosine, sine = np.cos(poses[..., 2]), np.sin(poses[..., 2])

@@ -30,12 +30,6 @@ def as_array(name: str, value: Any, shape: Sequence[int | None]) -> np.ndarray:
 
     Raises:
         ValueError: if the shape is another one.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.reports.style import as_array
-        >>> as_array("real", torch.ones(3), [None]).tolist()
-        [1.0, 1.0, 1.0]
     """
     value = np.asarray(value)
     if value.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, value.shape, strict=False)):
@@ -78,18 +72,13 @@ def set_title(axes: Axes, text: str) -> None:
 
     Args:
         axes (Axes): the panel.
-        text (str): the title; it may have several lines.
+        text (str): one line or several.
     """
     axes.set_title(text, loc="left", fontsize=9.5, color=INK, linespacing=1.35)
 
 
 def legend_beside(axes: Axes, **options: Any) -> None:
-    """Puts the legend to the right of a panel, where it hides nothing.
-
-    Args:
-        axes (Axes): the panel; artists with a label become entries.
-        **options: further arguments of ``Axes.legend``.
-    """
+    """Puts the legend to the right of a panel, with further options of ``Axes.legend``."""
     place = {"loc": "upper left", "bbox_to_anchor": (1.01, 1), "borderaxespad": 0}
     axes.legend(**({"frameon": False, "fontsize": 8} | place | options))
 
@@ -100,7 +89,7 @@ def legend_below(axes: Axes, offset: float, **options: Any) -> None:
     Args:
         axes (Axes): the panel.
         offset (float): how far below, as a share of its height.
-        **options: further arguments of ``Axes.legend``.
+        **options: further ones of ``Axes.legend``.
     """
     place = {"loc": "upper center", "bbox_to_anchor": (0.5, -offset), "ncols": 2}
     axes.legend(**({"frameon": False, "fontsize": 8} | place | options))

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from torchrl_koap.reports.html import bar, duration
+from torchrl_koap.reports.html import duration
 from torchrl_koap.reports.run_facts import RunFacts, number
 from torchrl_koap.tasks.units import thousandths
 
@@ -15,18 +15,7 @@ _PLAN_BASELINES = ("standing_still", "constant_velocity")
 
 
 def tiles(run: RunFacts) -> list[dict[str, Any]]:
-    """Returns name, value, note and bar (or None) of every headline number.
-
-    Args:
-        run (RunFacts): what is known of the run.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from torchrl_koap.reports.run_facts import RunFacts
-        >>> from torchrl_koap.reports.tiles import tiles
-        >>> tiles(RunFacts(Path("runs/koap"), evaluation={"success_rate": 0.5, "episodes": 8}))
-        [{'name': 'success', 'value': '50.0 %', 'note': '4 of 8 rollouts', 'bar': None}]
-    """
+    """Returns name, value, note and bar (or None) of every headline number of a run."""
     found = [*_offline_errors(run), *_rates(run), _entropy(run), _labels(run), _speed(run)]
     return [item for item in (*found, _time(run)) if item is not None]
 
@@ -68,7 +57,8 @@ def _rates(run: RunFacts) -> list[dict[str, Any]]:
             continue
         notes, interval = [], None
         if low is not None and high is not None:
-            notes, interval = [f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"], bar(rate, low, high)
+            notes = [f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"]
+            interval = tuple(100 * min(max(part, 0.0), 1.0) for part in (rate, low, high))
         total = number(values.get("episodes", episodes))
         if total:
             among = f" in {contexts:g} contexts" if contexts and name == "success" else ""

@@ -53,9 +53,6 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
         rows (sequence): rows of ``metrics.csv`` with ``step`` and any number of ``loss_*``, empty where a term does not
             belong to the row.
         run (RunFacts): the run.
-
-    Raises:
-        ValueError: if there is no row, or no value of any loss.
     """
     if not rows:
         raise ValueError("no row has been logged yet")
@@ -104,20 +101,11 @@ def _column(rows: Sequence[Mapping[str, str]], name: str) -> np.ndarray:
 
 
 def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
-    """Mean of the values at most ``reach`` places away, leaving out NaN; shorter windows at both ends.
+    """Returns the mean of the values at most ``reach`` places away, leaving out NaN; NaN where there is none.
 
     Args:
-        values (np.ndarray): numbers [N].
+        values (np.ndarray): numbers ``[N]``.
         reach (int): places to either side.
-
-    Returns:
-        np.ndarray: means [N]; NaN where there is nothing to average.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.reports.training_plots import running_mean
-        >>> running_mean(np.array([0.0, 3.0, 6.0]), 1).tolist()
-        [1.5, 3.0, 4.5]
     """
     there = np.isfinite(values)
     ahead = np.arange(len(values)) + reach + 1
@@ -147,9 +135,6 @@ def draw_actions(data: Mapping[str, Any], run: RunFacts) -> Figure:
         data (mapping): ``predicted`` and ``true`` actions ``[N, d]``.
         run (RunFacts): the run, whose task names the columns. Those that are no change per step, and those of another
             unit than the first, are left out of the distribution of the errors.
-
-    Raises:
-        ValueError: if shapes differ, or no row is finite in both.
     """
     true = entry(data, "true", [None, None])
     predicted, width = entry(data, "predicted", true.shape), true.shape[1]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,6 @@ from PIL import Image
 from torchrl_koap.files import replacing_file
 
 HOLD_SECONDS = 1.5  # of the last frame of a film
-_VIDEO = "a .mp4 needs imageio with ffmpeg: pip install imageio imageio-ffmpeg, or write a .gif"
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: int = 150) -> Path:
 
     Args:
         figure (Figure): what was drawn.
-        path (str or Path): png to write.
+        path (str or Path): the file.
 
     Keyword Args:
         dpi (int): dots per inch.
@@ -54,35 +52,18 @@ def save_figure(figure: Figure, path: str | Path, *, dpi: int = 150) -> Path:
 
 
 def save_film(film: Film, path: str | Path) -> Path:
-    """Writes a film and returns the file.
+    """Writes a film as gif and returns the file.
 
     Args:
         film (Film): what is shown.
-        path (str or Path): ``.gif``, or ``.mp4`` where imageio and ffmpeg are installed.
-
-    Raises:
-        ValueError: for another kind of file.
-        ModuleNotFoundError: if a ``.mp4`` is wanted and imageio or ffmpeg is not installed.
+        path (str or Path): the file.
     """
-    path, seconds = Path(path), film.seconds
-    if path.suffix not in (".gif", ".mp4"):
-        raise ValueError(f"moving pictures are written as .gif or .mp4, got {str(path)!r}")
-    if path.suffix == ".mp4" and not all(importlib.util.find_spec(name) for name in ("imageio", "imageio_ffmpeg")):
-        raise ModuleNotFoundError(_VIDEO)
-    frames = list(film.frames)
+    path, frames = Path(path), list(film.frames)
     with replacing_file(path) as aside:
-        if path.suffix == ".mp4":
-            import imageio.v2 as imageio
-
-            frames += frames[-1:] * round(HOLD_SECONDS / seconds)
-            with imageio.get_writer(aside, format="FFMPEG", mode="I", fps=1 / seconds, macro_block_size=2) as writer:
-                for frame in frames:
-                    writer.append_data(frame)
-        else:
-            # one palette for all, without dithering: what stands still does not flicker and costs nothing
-            some = Image.fromarray(np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]]))
-            palette = some.quantize(224, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)  # keeps rare colours
-            images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-            times = [round(1000 * seconds)] * (len(images) - 1) + [round(1000 * HOLD_SECONDS)]
-            images[0].save(aside, "GIF", save_all=True, append_images=images[1:], duration=times, loop=0)
+        # one palette for all, without dithering: what stands still does not flicker and costs nothing
+        some = Image.fromarray(np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]]))
+        palette = some.quantize(224, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)  # keeps rare colours
+        images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+        times = [round(1000 * film.seconds)] * (len(images) - 1) + [round(1000 * HOLD_SECONDS)]
+        images[0].save(aside, "GIF", save_all=True, append_images=images[1:], duration=times, loop=0)
     return path
