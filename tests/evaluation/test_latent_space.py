@@ -241,7 +241,8 @@ def test_inspect_the_latent_space_alone(run, capsys):
     assert list(latent["multi_step"]["koopman"]) == ["measured_xy"] and latent["multi_step"]["steps"] == 3
     assert len(latent[OUTSIDE_THE_BUDGET]["probe_r2"]) == 2
     assert latent[OUTSIDE_THE_BUDGET]["held_out_in_budget"] == 0  # 2 of 8 are labelled
-    assert "for evaluation only" in written["findings"] and (run / "plots" / "latent.png").exists()
+    assert "for evaluation only" in written["findings"]
+    assert (run / "plots" / "latent.png").exists() and (run / "plots" / "eigenvalues.png").exists()
     assert not (run / "plots" / "inspect.png").exists()
     assert koap("inspect", run, "--latent-only", "--latent-steps", "0") == 1
     assert "latent_steps must be >= 1, got 0" in capsys.readouterr().err

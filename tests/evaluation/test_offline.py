@@ -75,7 +75,7 @@ def test_its_report_shows_pictures_and_speaks_of_no_rollouts(run):
 
 
 def test_latent_space_and_suggestions(run):
-    found = inspect(run, InspectConfig(latent_only=True, threads=1)).result["findings"]
+    found = inspect(run, InspectConfig(latent_only=True, threads=1))["findings"]
     assert "mrad" in found and " mm" not in found
     assert "On labels of the budget, which the run's decoder was fitted on: a linear probe" in found
     assert {row["episode"] for row in suggest(run, SuggestConfig(count=7)).suggestions} == set(range(3, 10))

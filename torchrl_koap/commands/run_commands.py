@@ -96,13 +96,13 @@ class Inspect(Command):
     config: Options[InspectConfig]
 
     def __call__(self) -> dict[str, Any]:
-        """Inspects, writes ``inspect.json`` and draws."""
-        found = inspect(self.run, self.config)
-        RunDirectory(found.folder).write_json("inspect.json", found.result)
-        draw_pictures(found.folder, names=("inspect.png", "latent.png"))
-        if (found.folder / "index.html").exists():
-            write_report(found.folder, draw=False)
-        return found.result
+        """Inspects and draws."""
+        result = inspect(self.run, self.config)
+        folder = Path(self.run) if self.config.out is None else self.config.out
+        draw_pictures(folder, names=("inspect.png", "latent.png", "eigenvalues.png"))
+        if (folder / "index.html").exists():
+            write_report(folder, draw=False)
+        return result
 
 
 @dataclass(kw_only=True)

@@ -9,7 +9,6 @@ __getattr__ = exports(
     {
         "EvalConfig": "torchrl_koap.evaluation.config",
         "InspectConfig": "torchrl_koap.evaluation.inspection",
-        "Inspection": "torchrl_koap.evaluation.inspection",
         "SuggestConfig": "torchrl_koap.evaluation.active_labelling",
         "SuggestedLabels": "torchrl_koap.evaluation.active_labelling",
         "evaluate": "torchrl_koap.evaluation.closed_loop",
@@ -23,7 +22,6 @@ __getattr__ = exports(
 __all__ = [  # noqa: F822
     "EvalConfig",
     "InspectConfig",
-    "Inspection",
     "SuggestConfig",
     "SuggestedLabels",
     "evaluate",

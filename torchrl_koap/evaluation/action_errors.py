@@ -30,12 +30,7 @@ _MOST_FOLDS = 20  # labelled trajectories that are left out in turn, at most
 
 
 def episodes_outside(data: TensorDictBase, labelled: TensorDictBase) -> Tensor:
-    """Numbers of the trajectories of which no label was in the budget.
-
-    Args:
-        data (TensorDictBase): flat, with all labels that there are.
-        labelled (TensorDictBase): the same, or a part, after the budget was applied.
-    """
+    """Returns the numbers of the trajectories of which no label was in the budget."""
     touched = labelled["episode"][labelled["has_action"].squeeze(-1)].unique()
     every = data["episode"].unique()
     return every[~torch.isin(every, touched.to(every.device))]
@@ -45,18 +40,14 @@ def episodes_outside(data: TensorDictBase, labelled: TensorDictBase) -> Tensor:
 def first_actions(
     controller: nn.Module, data: TensorDictBase, episodes: Tensor | Sequence[int]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Predicted and true actions on the labelled steps of some trajectories: the same steps for every controller.
+    """Decodes actions on the labelled steps of some trajectories: the same steps for every controller.
 
-    The first action decoded from a window of recorded states, ``BEFORE`` frames of history (the first frame of a
-    trajectory repeated where there is none) and ``AFTER`` frames of future.
-
-    Args:
-        controller (nn.Module): writes actions ``[*B, T, act]`` for windows of states ``[*B, T, d]``.
-        data (TensorDictBase): flat, as the controller sees it.
-        episodes (Tensor or sequence of int): the trajectories; those that are too short are left out.
+    The first action is taken of a window of recorded states, ``BEFORE`` frames of history (the first frame of a
+    trajectory repeated where there is none) and ``AFTER`` frames of future. Trajectories that are too short are left
+    out.
 
     Returns:
-        tuple of Tensor: both ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
+        tuple of Tensor: predicted and true actions ``[N, act]``, raw units, and the trajectory of every step ``[N]``.
     """
     wanted = torch.isin(data["episode"], torch.as_tensor(episodes, device=data["episode"].device))
     numbers, lengths = data["episode"][wanted].unique(return_counts=True)
@@ -75,7 +66,7 @@ def first_actions(
 def errors_outside_budget(
     controller: nn.Module, data: TensorDictBase, labelled: TensorDictBase, task: Task
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Errors on the trajectories that have labels of which none was in the budget.
+    """Measures errors on the trajectories that have labels of which none was in the budget.
 
     Args:
         controller (nn.Module): the trained controller.
@@ -103,40 +94,29 @@ def errors_outside_budget(
 
 
 def errors_left_out(
-    controller: nn.Module,
-    labelled: TensorDictBase,
-    task: Task,
-    *,
-    closed_form: bool,
-    columns: Sequence[int],
+    controller: nn.Module, labelled: TensorDictBase, task: Task, columns: Sequence[int]
 ) -> dict[str, Any]:
-    """Errors on labels inside the budget: each labelled trajectory in turn is hidden and the decoder is fitted again.
+    """Measures errors on labels inside the budget: each trajectory in turn is hidden and the decoder fitted again.
 
     What lies before the decoder stays as it was trained; it has seen the states of the trajectory left out, and none of
     its labels where it is trained without any.
 
     Args:
-        controller (nn.Module): the trained controller; not changed.
+        controller (nn.Module): the trained controller, whose decoder is fitted in closed form; not changed.
         labelled (TensorDictBase): flat data after the budget was applied, as the controller sees it.
         task (Task): names and units of the actions.
-
-    Keyword Args:
-        closed_form (bool): the controller's decoder is fitted in closed form. Otherwise it would have to be trained
-            again for each trajectory, and there is only a note.
         columns (sequence of int): state columns that the controller reads.
 
     Returns:
         dict: of :func:`summarise_errors`, or a ``note`` why there is none.
     """
-    if not closed_form:
-        return {"note": "the decoder is not fitted in closed form: leaving a trajectory out would mean to train again"}
     has_action = labelled["has_action"].squeeze(-1)
     episodes = labelled["episode"][has_action].unique()
     if len(episodes) < 2:
         return {"note": "only one trajectory has labels: none can be left out"}
     left_out = episodes[torch.linspace(0, len(episodes) - 1, min(len(episodes), _MOST_FOLDS)).round().long()]
     models: dict[str, list[Tensor]] = {"controller": [], "ridge": [], "mean_action": []}
-    truths, places = [], []
+    truths, numbers = [], []
     for number in left_out:
         fold = labelled.copy()
         hidden = labelled["episode"] == number
@@ -153,11 +133,11 @@ def errors_left_out(
         models["ridge"].append(first_actions(ridge, labelled, [int(number)])[0])
         models["mean_action"].append(fold["action"][fold["has_action"].squeeze(-1)].mean(0).expand_as(true))
         truths.append(true)
-        places.append(episode)
+        numbers.append(episode)
     if not truths:
         return {"note": "no labelled step has enough recorded future to decode its action"}
     joined = {name: torch.cat(parts) for name, parts in models.items()}
-    return summarise_errors(joined, torch.cat(truths), torch.cat(places), task)
+    return summarise_errors(joined, torch.cat(truths), torch.cat(numbers), task)
 
 
 def errors_of_chunks(
@@ -173,21 +153,17 @@ def errors_of_chunks(
     """Errors of sampled actions on the trajectories that have labels of which none was in the budget.
 
     Args:
-        policy (DiffusionPolicy): the trained policy.
-        data (TensorDictBase): flat data ``[N]`` with ``state`` and all labels that there are.
+        policy (DiffusionPolicy): the trained policy, of which ``samples`` chunks are drawn in each situation.
+        data (TensorDictBase): flat data ``[N]`` with ``state`` and all labels that there are; at most ``chunks``
+            situations are looked at, spread evenly over all labelled steps.
         labelled (TensorDictBase): the same after the budget was applied.
         task (Task): names and units of the actions.
 
-    Keyword Args:
-        samples (int): chunks per situation.
-        chunks (int): situations at most, spread evenly over all labelled steps.
-        seed (int): seed of the chunks' noise.
-
     Returns:
-        dict: of :func:`summarise_errors` for the mean of the sampled first
-        actions, where ``"ridge"`` is a linear policy of the same frames; and ``chunk``: a row per unit with energy
-        score and best of all sampled chunks (:func:`~torchrl_koap.evaluation.plan_errors.score_sequences`), where every
-        step of them has a label. Or a ``note`` why there is none.
+        dict: of :func:`summarise_errors` for the mean of the sampled first actions, where ``"ridge"`` is a linear
+        policy of the same frames; and ``chunk``: a row per unit with energy score and best of all sampled chunks
+        (:func:`~torchrl_koap.evaluation.plan_errors.score_sequences`), where every step of them has a label. Or a
+        ``note`` why there is none.
     """
     history, targets = policy.history, list(task.targets)
     episodes = episodes_outside(data, labelled)
@@ -214,9 +190,13 @@ def errors_of_chunks(
     sampled = sampled - past[:, now : now + 1, targets] if targets else sampled
     seen = moved(known)[:, 0]
     mean = seen.mean(0)
+    condition, asked = (
+        policy.encode_history(frames.float().to(device)).cpu() for frames in (known["state"][:, :history], past)
+    )
+    linear = ridge(condition, seen, groups=known["episode"][:, -1], default_penalty=DEFAULT_PENALTY)
     models = {
         "controller": sampled[:, :, 0].mean(0),
-        "ridge": _linear_policy(policy, known, seen, past),
+        "ridge": linear.predict(asked),
         "mean_action": mean.expand(len(true), -1),
     }
     errors = summarise_errors(models, true[:, 0], windows["episode"][:, -1], task)
@@ -226,16 +206,6 @@ def errors_of_chunks(
     sequences = {"policy": sampled[:, whole], "mean_action": mean.expand_as(true[whole])[None]}
     rows, _ = score_sequences(sequences, true[whole], task.action_names, list(task.action_units))
     return errors | {"chunk": {"situations": int(whole.sum()), "samples": samples, "unit": rows}}
-
-
-def _linear_policy(policy: DiffusionPolicy, known: TensorDictBase, action: Tensor, past: Tensor) -> Tensor:
-    """Actions ``[N, act]`` of a ridge regression on what the policy is conditioned on."""
-    device = next(iter(policy.state_dict().values())).device
-    condition, asked = (
-        policy.encode_history(frames.float().to(device)).cpu() for frames in (known["state"][:, : policy.history], past)
-    )
-    fit = ridge(condition, action, groups=known["episode"][:, -1], default_penalty=DEFAULT_PENALTY)
-    return fit.predict(asked)
 
 
 def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, task: Task) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +49,10 @@ class Suggestion:
 
 
 def variance_reduction(latent: Tensor, covariance: Tensor, moment: Tensor) -> float:
-    """Returns by how much the mean leverage over all steps falls if these steps are labelled (A-optimal design).
+    """Returns by how much the mean leverage over all steps falls if the steps ``[T, m]`` are labelled (A-optimal).
 
-    Args:
-        latent (Tensor): latent actions of a trajectory ``[T, m]``.
-        covariance (Tensor): of the decoder, without the noise variance ``[m, m]``.
-        moment (Tensor): second moment of the latent actions of all steps ``[m, m]``.
+    ``covariance [m, m]`` is that of the decoder without the noise variance, ``moment [m, m]`` the second moment of the
+    latent actions of all steps.
     """
     part = _explained_part(latent, covariance)
     return ((part @ moment) * part).sum().item()
@@ -276,12 +274,7 @@ def suggest(run: str | Path, config: SuggestConfig | None = None) -> SuggestedLa
     )
     unlabelled = data[EPISODE][~data[HAS_ACTION].squeeze(-1)]
     rows = [
-        {
-            "rank": rank,
-            "episode": choice.episode,
-            "steps": int((unlabelled == choice.episode).sum()),
-            "score": choice.score,
-        }
+        {"rank": rank, "steps": int((unlabelled == choice.episode).sum()), **asdict(choice)}
         for rank, choice in enumerate(choices, 1)
     ]
     labelled = data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()

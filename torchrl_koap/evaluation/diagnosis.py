@@ -19,7 +19,6 @@ from torch import Tensor, nn
 
 from torchrl_koap.data import trajectory_lengths
 from torchrl_koap.evaluation.rollouts import roll_out
-from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.keys import HAS_ACTION, OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
@@ -29,10 +28,7 @@ RECORDED = "recorded"  # steps whose next state the recording that is followed h
 
 
 class RecordedFutures(TensorDictModuleBase):
-    """Writes the recorded states that follow the current step, for a :class:`RecordedPlanner` to hand on.
-
-    Args:
-        futures (Tensor): for every environment and control step the states that follow ``[E, steps, H, d]``.
+    """Writes the recorded states ``[E, steps, H, d]`` that follow the current step, for a :class:`RecordedPlanner`.
 
     Examples:
         >>> import torch
@@ -58,10 +54,7 @@ class RecordedFutures(TensorDictModuleBase):
 
 
 class RecordedPlanner(nn.Module):
-    """A planner that knows the recorded future: what a controller does under it is its own doing.
-
-    Args:
-        planner (StatePlanner): the planner whose history and horizon it has.
+    """Hands on the recorded future in place of plans, with history and horizon of a planner.
 
     Examples:
         >>> import torch
@@ -85,19 +78,10 @@ class RecordedPlanner(nn.Module):
 
 @torch.no_grad()
 def planner_rollout(planner: StatePlanner, start: Tensor, *, interval: int, max_steps: int, seed: int = 0) -> Tensor:
-    """Lets a planner continue its own plans.
-
-    Args:
-        planner (StatePlanner): the planner.
-        start (Tensor): first states ``[E, d]``.
-
-    Keyword Args:
-        interval (int): planned states that are taken over before the next plan.
-        max_steps (int): states to planner_rollout.
-        seed (int): seed of the planner's noise.
+    """Lets a planner continue its own plans, of each of which ``interval`` states are taken over.
 
     Returns:
-        Tensor: planned states ``[E, max_steps, d]`` (or a few more), the first one the start.
+        Tensor: planned states ``[E, max_steps, d]`` (or a few more), the first one the start ``[E, d]``.
     """
     generator = torch.Generator(start.device).manual_seed(seed)
     states = [start] * planner.history
@@ -109,16 +93,9 @@ def planner_rollout(planner: StatePlanner, start: Tensor, *, interval: int, max_
 
 
 def contexts_of(task: Task, observation: Tensor) -> Tensor:
-    """Contexts that first observations show.
+    """Finds the contexts ``[E, objects, 3]`` (x, y in m, yaw in rad) that first observations ``[E, obs]`` show.
 
     ``tan(yaw)`` gives the yaw of a box up to half a turn, which looks the same.
-
-    Args:
-        task (Task): tells the bodies and the columns of their poses.
-        observation (Tensor): first observation of every episode ``[E, obs]``.
-
-    Returns:
-        Tensor: ``[E, objects, 3]``: x, y (m) and yaw (rad).
     """
     rows = []
     for body in task.bodies:
@@ -134,17 +111,7 @@ def contexts_of(task: Task, observation: Tensor) -> Tensor:
 
 
 def recorded_futures(states: Sequence[Tensor], horizon: int) -> Tensor:
-    """The states that follow every step of recorded trajectories.
-
-    The last state of a trajectory is repeated.
-
-    Args:
-        states (sequence of Tensor): trajectories ``[T_i, d]``.
-        horizon (int): number ``H`` of states ahead.
-
-    Returns:
-        Tensor: ``[E, max T, H, d]``.
-    """
+    """Stacks the states ``[E, max T, H, d]`` after every step of trajectories ``[T_i, d]``, their last one repeated."""
     longest = max(len(path) for path in states)
     ahead = torch.arange(longest)[:, None] + torch.arange(1, horizon + 1)
     return torch.stack([path[ahead.clamp_max(len(path) - 1)] for path in states])
@@ -153,20 +120,13 @@ def recorded_futures(states: Sequence[Tensor], horizon: int) -> Tensor:
 def follow_recordings(
     policy: PlanningPolicy, task: Task, data: TensorDictBase, make_env: Callable[[int], Any], *, episodes: int
 ) -> list[TensorDict]:
-    """Closed-loop episodes in which recorded states take the place of plans.
+    """Rolls out a policy with recorded states in place of plans.
 
-    Args:
-        policy (PlanningPolicy): the policy under test; of its planner history and horizon alone are used.
-        task (Task): the task.
-        data (TensorDictBase): flat demonstrations with ``state``. Where ``has_action`` says that some of them were
-            recorded without any action, by another embodiment, those are not followed.
-        make_env (callable): makes an environment of a number of episodes.
-
-    Keyword Args:
-        episodes (int): demonstrations to follow, spread evenly over the data.
+    Where some demonstrations have no action at all, as those of another embodiment, only the others are followed.
 
     Returns:
-        list: an episode each, with :data:`RECORDED` ``[T, 1]``.
+        list: an episode for each of as many demonstrations, spread evenly over the data, with :data:`RECORDED`
+        ``[T, 1]``.
     """
     lengths = trajectory_lengths(data).tolist()
     own = torch.arange(len(lengths))
@@ -199,16 +159,13 @@ def follow_recordings(
 
 
 def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -> dict[str, list[float]]:
-    """How far executed states lie from the current plan, per part of the state.
+    """Measures how far executed states lie from the current plan, per part of the state.
 
-    Args:
-        task (Task): tells the parts of the state.
-        episodes (sequence of TensorDict): rollouts ``[T]`` with the entry ``plan``; of those that
-            follow a recording the steps count that it has, not the standing at its end.
-        interval (int): control steps per plan.
+    Of rollouts that follow a recording the steps count that it has, not the standing at its end.
 
     Returns:
-        dict: root mean square distance per step ``1 .. interval`` after a plan, in the units of the part.
+        dict: root mean square distance per step ``1 .. interval`` after a plan, in the units of the part; empty for
+        rollouts ``[T]`` without the entry ``plan``.
     """
     errors: dict[str, list[Tensor]] = {name: [] for name in task.state_slices}
     for episode in episodes:
@@ -226,54 +183,22 @@ def tracking_errors(task: Task, episodes: Sequence[TensorDict], interval: int) -
 
 
 def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *, beyond: float) -> int:
-    """How many recorded tool paths a controller leaves: one that runs away does not speak for the others.
+    """Counts the recorded tool paths from which a controller is further than ``beyond`` (m, root mean square).
 
-    Args:
-        task (Task): tells where the tool is in the state.
-        episodes (sequence of TensorDict): rollouts of :func:`follow_recordings`.
-        interval (int): control steps per plan.
-
-    Keyword Args:
-        beyond (float): root mean square distance ``interval`` steps after a plan from which on a path is left (m).
-
-    Returns:
-        int: of the episodes.
+    Looked at is the step ``interval`` after each plan, in rollouts of :func:`follow_recordings`.
     """
     errors = [tracking_errors(task, [episode], interval) for episode in episodes]
     return sum(error[task.position][-1] > beyond for error in errors if task.position in error)
 
 
-def nearest_distances(states: Tensor, others: Tensor, scale: Tensor) -> Tensor:
-    """Distance of every state to the nearest of others.
-
-    Args:
-        states (Tensor): ``[N, d]``.
-        others (Tensor): ``[M, d]``.
-        scale (Tensor): what columns are divided by, ``[d]``.
-
-    Returns:
-        Tensor: ``[N]``.
-    """
-    found = [torch.cdist(part / scale, others / scale).amin(1) for part in states.split(2048)]
-    return torch.cat(found)
-
-
 def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase, *, most: int = 4000) -> dict[str, float]:
-    """Distance of visited states to the nearest demonstrated one, and that among demonstrations, in spreads.
+    """Measures how far visited states are from the nearest demonstrated one, and demonstrated ones, in spreads.
 
-    Every second demonstration is compared with the others, so that both figures are distances to strangers.
-
-    Args:
-        task (Task): tells which columns make up the state.
-        episodes (sequence of TensorDict): rollouts ``[T]``.
-        data (TensorDictBase): flat demonstrations ``[N]`` with ``state`` and ``episode``.
-
-    Keyword Args:
-        most (int): about how many states of each kind are looked at.
+    Every second demonstration is compared with the others, so that both figures are distances to strangers. About
+    ``most`` states of each kind are looked at.
 
     Returns:
-        dict: median and 95 % quantile of the distances of visited and of demonstrated states; empty if there is a
-        single demonstration.
+        dict: median and 95 % quantile of the distances; empty if there is a single demonstration.
     """
     every = data["episode"] % 2 == 0
     known, held_out = data["state"][every], data["state"][~every]
@@ -283,28 +208,13 @@ def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase, *
     visited = torch.cat([task.state_of(episode[OBSERVATION]) for episode in episodes])
     known = known[:: max(1, len(known) // 20000)]
     sample = [states[:: max(1, len(states) // most)] for states in (visited, held_out)]
-    figures = [nearest_distances(states, known, scale) for states in sample]
+    figures = [
+        torch.cat([torch.cdist(part / scale, known / scale).amin(1) for part in states.split(2048)])
+        for states in sample
+    ]
     return {
         "visited_median": figures[0].median().item(),
         "visited_95": figures[0].quantile(0.95).item(),
         "demonstrated_median": figures[1].median().item(),
         "demonstrated_95": figures[1].quantile(0.95).item(),
     }
-
-
-def reaches_goal(task: Task, states: Tensor) -> list[bool]:
-    """Tells which planned episodes reach the goal at any time.
-
-    Args:
-        task (Task): tells the goal.
-        states (Tensor): ``[E, T, d]``.
-
-    Returns:
-        list of bool: one per episode.
-    """
-    return task.goal_reached(states).any(-1).tolist()
-
-
-def executed_success(episodes: Sequence[TensorDict]) -> list[bool]:
-    """Which executed episodes succeed."""
-    return [outcome_of(episode) == "success" for episode in episodes]

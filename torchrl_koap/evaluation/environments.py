@@ -19,29 +19,17 @@ from torchrl_koap.tasks import Task
 def choose_contexts(
     task: Task, episodes: int, rollouts_per_context: int = 1, contexts_file: Path | None = None
 ) -> tuple[list[int] | None, np.ndarray | None]:
-    """Number of the context of every rollout, and the contexts; None for a task in which all episodes start alike.
-
-    Args:
-        task (Task): the task.
-        episodes (int): number of rollouts.
-        rollouts_per_context (int): rollouts in each context.
-        contexts_file (Path, optional): a context file of D3IL instead of the evaluation table.
+    """Returns number and pose of the context of every rollout; None for a task in which all episodes start alike.
 
     Raises:
-        ValueError: if there are too few contexts, or the task has none.
+        ValueError: if there are too few contexts, or they were asked for where the task has none.
     """
     if not task.objects:
-        given = {"contexts_file": contexts_file is not None, "rollouts_per_context": rollouts_per_context != 1}
-        for name, unfit in given.items():
-            if unfit:
-                raise ValueError(f"{name} was given, but task {task.name!r} has no contexts")
+        _refuse_contexts(rollouts_per_context, contexts_file, f"task {task.name!r}")
         return None, None
     from torchrl_koap.envs.contexts import evaluation_contexts, load_contexts  # takes seconds
 
-    if contexts_file is None:
-        table = evaluation_contexts(task)
-    else:
-        table = load_contexts(contexts_file, task)
+    table = evaluation_contexts(task) if contexts_file is None else load_contexts(contexts_file, task)
     needed = (episodes - 1) // rollouts_per_context + 1
     if needed > len(table):
         raise ValueError(
@@ -50,6 +38,13 @@ def choose_contexts(
         )
     numbers = [episode // rollouts_per_context for episode in range(episodes)]
     return numbers, table[numbers]
+
+
+def _refuse_contexts(rollouts_per_context: int, contexts_file: Path | None, where: str) -> None:
+    given = {"contexts_file": contexts_file is not None, "rollouts_per_context": rollouts_per_context != 1}
+    for name, unfit in given.items():
+        if unfit:
+            raise ValueError(f"{name} was given, but {where} has no contexts")
 
 
 @dataclass(frozen=True)
@@ -82,14 +77,10 @@ class EvaluationEnv:
 
 
 def environment_of(task: Task, config: EvalConfig) -> EvaluationEnv:
-    """The task's own environment, or the one of Gymnasium that was asked for.
-
-    Args:
-        task (Task): the task.
-        config (EvalConfig): what was asked for.
+    """Returns the task's own environment, or the one of Gymnasium that was asked for.
 
     Raises:
-        ValueError: if there are too few contexts, or contexts were asked for where there are none.
+        ValueError: if there are too few contexts, or they were asked for where there are none.
     """
     if config.env is None:
         numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
@@ -97,19 +88,10 @@ def environment_of(task: Task, config: EvalConfig) -> EvaluationEnv:
 
         make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
         return EvaluationEnv(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
-    for name, unfit in {
-        "contexts_file": config.contexts_file is not None,
-        "rollouts_per_context": config.rollouts_per_context != 1,
-    }.items():
-        if unfit:
-            raise ValueError(f"{name} was given, but an environment of Gymnasium has no contexts")
+    _refuse_contexts(config.rollouts_per_context, config.contexts_file, "an environment of Gymnasium")
     from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
 
     make_env = partial(GymnasiumBatch, config.env, task, success_key=config.success_key)
     probe = make_env(1)
     probe.close()
-    return EvaluationEnv(make_env, probe.max_steps, _only_mode, 1)
-
-
-def _only_mode(mode: torch.Tensor) -> torch.Tensor:
-    return mode[..., 0]
+    return EvaluationEnv(make_env, probe.max_steps, lambda mode: mode[..., 0], 1)

@@ -22,12 +22,6 @@ _WORSE = 2.0  # from here on a latent model's error is no longer that of a compa
 def unit_circle_sides(magnitudes: Sequence[float], *, tolerance: float = ON_THE_CIRCLE) -> list[str]:
     """Tells whether eigenvalues of these magnitudes lie ``"inside"``, ``"on"`` or ``"outside"`` the unit circle.
 
-    Args:
-        magnitudes (sequence of float): magnitudes ``[m]``.
-
-    Keyword Args:
-        tolerance (float): distance to the circle below which an eigenvalue lies on it.
-
     Examples:
         >>> from torchrl_koap.evaluation.findings import unit_circle_sides
         >>> unit_circle_sides([0.9, 0.9995, 1.2])
@@ -37,11 +31,9 @@ def unit_circle_sides(magnitudes: Sequence[float], *, tolerance: float = ON_THE_
 
 
 def error_unit(part: str, task: Task) -> tuple[str, float]:
-    """Returns the unit in which errors of a part of the state are shown, and the factor to it.
+    """Returns the unit in which errors of a part of the state are shown, none for several units, and the factor to it.
 
-    Args:
-        part (str): the part. Where the task says no units, positions are in m and joints in rad.
-        task (Task): the task. A part whose columns have several units is shown without any.
+    Where the task says no units, positions are in m and joints in rad.
 
     Examples:
         >>> from torchrl_koap.evaluation.findings import error_unit
@@ -56,13 +48,8 @@ def error_unit(part: str, task: Task) -> tuple[str, float]:
 
 
 def describe_inspection(result: Mapping[str, Any], task: Task) -> str:
-    """Says what an inspection found: a sentence on the experiments, if there are any, and one on the latent space.
-
-    Args:
-        result (mapping): of :func:`~torchrl_koap.evaluation.inspection.inspect`.
-        task (Task): the task.
-    """
-    sentences = [describe_experiments(result)] if "both" in result else []
+    """Says what an inspection found: a sentence on the experiments, if there are any, and one on the latent space."""
+    sentences = [_describe_experiments(result)] if "both" in result else []
     latent = result.get("latent", {})
     if "multi_step" in latent:
         sentences.append(_describe_latent(latent, task))
@@ -71,14 +58,11 @@ def describe_inspection(result: Mapping[str, Any], task: Task) -> str:
     return ". ".join(sentences)
 
 
-def describe_experiments(result: Mapping[str, Any]) -> str:
+def _describe_experiments(result: Mapping[str, Any]) -> str:
     """Says which part fails by the three experiments.
 
     Where things are pushed or grasped, recorded tool paths do not answer to where the objects went: there the
     controller is rated by how near the tool stays to them. A planner whose task has no goal is not rated.
-
-    Args:
-        result (mapping): of :func:`~torchrl_koap.evaluation.inspection.inspect`.
     """
     planner, controller, both = (result[name]["rate"] if name in result else None for name in EXPERIMENTS)
     if both >= GOOD:
@@ -114,9 +98,6 @@ def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
         multi_step (mapping): by model of :data:`MODELS` and part of the state the errors after 1, 2, ... steps, as of
             :func:`~torchrl_koap.evaluation.latent_space.prediction_errors`.
 
-    Returns:
-        list of str: a clause per fault, the worst first.
-
     Examples:
         >>> from torchrl_koap.evaluation.findings import latent_faults
         >>> errors = {"koopman": 2.0, "reconstruction": 0.5, "linear": 0.04, "copy_last": 9.0}
@@ -143,9 +124,6 @@ def offline_faults(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[s
     Args:
         plan (mapping): of :func:`~torchrl_koap.evaluation.plan_errors.plan_errors`, or a note.
         action (mapping): by split, of :func:`~torchrl_koap.evaluation.action_errors.summarise_errors`, or a note.
-
-    Returns:
-        list of str: a sentence per fault.
 
     Examples:
         >>> from torchrl_koap.evaluation.findings import offline_faults

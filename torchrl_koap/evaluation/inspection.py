@@ -10,16 +10,13 @@ from typing import Annotated, Any
 import torch
 import tyro
 from tensordict import TensorDictBase
-from torch import Tensor
 
 from torchrl_koap.data import controller_view, trajectory_lengths
 from torchrl_koap.evaluation.diagnosis import (
     coverage,
-    executed_success,
     follow_recordings,
     left_recordings,
     planner_rollout,
-    reaches_goal,
     tracking_errors,
 )
 from torchrl_koap.evaluation.environments import choose_contexts
@@ -27,6 +24,7 @@ from torchrl_koap.evaluation.findings import NEAR, describe_inspection
 from torchrl_koap.evaluation.latent_space import analyse_latent
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out
+from torchrl_koap.evaluation.scores import outcome_of
 from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.modules import ExecutionConfig, KoopmanInverseDynamics
 from torchrl_koap.runs.device import set_up_torch
@@ -34,7 +32,7 @@ from torchrl_koap.runs.plugins import Plugins, load_plugins
 from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.tasks import Task
+from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.training.datasets import label_budget
 from torchrl_koap.training.trained import Trained
 
@@ -57,7 +55,7 @@ class InspectConfig:
 
     Examples:
         >>> from torchrl_koap.evaluation.inspection import InspectConfig, inspect
-        >>> inspect("runs/koap", InspectConfig(latent_only=True)).result["findings"]  # doctest: +SKIP
+        >>> inspect("runs/koap", InspectConfig(latent_only=True))["findings"]  # doctest: +SKIP
     """
 
     episodes: int = 30
@@ -72,33 +70,8 @@ class InspectConfig:
     plugins: Plugins = ()
 
 
-@dataclass(frozen=True)
-class Inspection:
-    """What :func:`inspect` found.
-
-    Args:
-        result (dict): what ``inspect.json`` holds: the three experiments, if they were made, ``latent``, ``findings``.
-        task (Task): the task.
-        eigenvalues (Tensor, optional): of the Koopman operator, complex ``[m]``; None for a method without one.
-        folder (Path): where the run is, or what it is made of was copied to.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from torchrl_koap.evaluation.inspection import Inspection
-        >>> from torchrl_koap.tasks import get_task
-        >>> found = Inspection({"findings": "the planner fails"}, get_task("avoiding"), None, Path("runs/koap"))
-        >>> found.result["findings"]
-        'the planner fails'
-    """
-
-    result: dict[str, Any]
-    task: Task
-    eigenvalues: Tensor | None
-    folder: Path
-
-
-def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
-    """Makes the three experiments and looks into the latent space.
+def inspect(run: str | Path, config: InspectConfig | None = None) -> dict[str, Any]:
+    """Makes the three experiments and looks into the latent space; writes ``inspect.json``.
 
     ``planner_alone`` lets its plans come true, which needs a goal in the states of the task; ``controller_alone``
     follows recorded states (blind to where objects went), ``both`` is the closed loop. Plans are followed as
@@ -110,7 +83,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
         config (InspectConfig, optional): how many episodes, and how.
 
     Returns:
-        Inspection: errors and successes of the parts, and which one fails.
+        dict: what ``inspect.json`` holds: the three experiments, if they were made, ``latent``, and ``findings``.
 
     Raises:
         ValueError: for fewer than one episode or step, or a run without a planner.
@@ -130,7 +103,7 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
         ...     few = {"planner": PlannerConfig(steps=2), "controller": ControllerConfig(steps=2)}
         ...     _ = train(TrainConfig(dataset=str(arm), out=Path(root) / "run", **few))
         ...     found = inspect(root + "/run", InspectConfig(latent_only=True, threads=1))
-        >>> sorted(found.result)
+        >>> sorted(found)
         ['findings', 'latent']
     """
     config = InspectConfig() if config is None else config
@@ -161,8 +134,12 @@ def inspect(run: str | Path, config: InspectConfig | None = None) -> Inspection:
         result = _experiments(config, trained, data)
     result["latent"] = _look_into(config, trained, data)
     result["findings"] = describe_inspection(result, task)
-    koopman = trained.controller if isinstance(trained.controller, KoopmanInverseDynamics) else None
-    return Inspection(result, task, None if koopman is None else koopman.operator.eigenvalues(), directory.path)
+    directory.write_json("inspect.json", result)
+    if isinstance(trained.controller, KoopmanInverseDynamics):
+        values = trained.controller.operator.eigenvalues().detach()
+        parts = {"real": values.real.contiguous(), "imag": values.imag.contiguous()}
+        save_tensors(directory.path / "eigenvalues.safetensors", parts)
+    return result
 
 
 def _experiments(config: InspectConfig, trained: Trained, data: TensorDictBase) -> dict[str, Any]:
@@ -184,16 +161,16 @@ def _experiments(config: InspectConfig, trained: Trained, data: TensorDictBase) 
         if task.goal is not None:
             start = torch.stack([task.state_of(episode["observation"][0]) for episode in closed]).to(config.device)
             steps = max(int(trajectory_lengths(data).max() * 1.5), 50)
-            imagined = planner_rollout(planner, start, interval=interval, max_steps=steps, seed=config.seed).cpu()
-            found["planner_alone"] = rate(reaches_goal(task, imagined))
+            planned = planner_rollout(planner, start, interval=interval, max_steps=steps, seed=config.seed).cpu()
+            found["planner_alone"] = rate(task.goal_reached(planned).any(-1).tolist())
         bar.update()
     tracked = tracking_errors(task, followed, interval)
     if task.objects and task.position in tracked:
         left = left_recordings(task, followed, interval, beyond=NEAR)
         found["recordings_left"] = {"count": left, "episodes": len(followed)}
     return found | {
-        "controller_alone": rate(executed_success(followed)),
-        "both": rate(executed_success(closed)),
+        "controller_alone": rate([outcome_of(episode) == "success" for episode in followed]),
+        "both": rate([outcome_of(episode) == "success" for episode in closed]),
         "plan_to_execution": tracking_errors(task, closed, interval),
         "recording_to_execution": tracked,
         "distance_to_demonstrations": coverage(task, closed, data),

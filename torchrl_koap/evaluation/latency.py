@@ -6,7 +6,6 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from torchrl_koap.evaluation.policies import load_policy
 from torchrl_koap.evaluation.rollouts import device_of
 from torchrl_koap.keys import ACTION
 from torchrl_koap.modules import Agent, AsynchronousAgent, PlanningPolicy
@@ -50,14 +48,7 @@ class LatencyConfig:
 
 @torch.no_grad()
 def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: int = 30) -> dict[str, float]:
-    """Measures median times of a plan and of a control step between plans, at batch 1.
-
-    Args:
-        policy (PlanningPolicy): the policy, on the device to measure on.
-        observation_dim (int): number of observation columns.
-
-    Keyword Args:
-        repeats (int): plans timed, and control steps timed; three of each come before, untimed.
+    """Measures median times of a plan and of a control step between plans, at batch 1; three of each come before.
 
     Returns:
         dict: ``plan_ms``, what a step with a plan takes longer (ms), ``control_ms`` (ms), ``control_hz``, the rate of
@@ -71,7 +62,8 @@ def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: in
     for repeat in range(repeats + 3):
         td["is_init"] = torch.ones(1, 1, dtype=torch.bool, device=device)
         for kind in (with_plan, between):
-            _wait(device)
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
             began = time.perf_counter()
             td = policy(td)
             td[ACTION].sum().item()
@@ -84,55 +76,32 @@ def measure_latency(policy: PlanningPolicy, observation_dim: int, *, repeats: in
     return {"plan_ms": plan, "control_ms": control, "control_hz": rate}
 
 
-def _wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
-def measure_control_loop(run: str | Path, config: LatencyConfig | None = None) -> dict[str, Any]:
-    """Runs a control loop in real time; ``koap latency`` calls this.
-
-    Args:
-        run (str or Path): a run directory.
-        config (LatencyConfig, optional): how long and how fast.
-
-    Returns:
-        dict: ``late_steps`` of ``steps``, ``p50``, ``p99`` and ``max`` of the time from an observation to its action
-        (ms), and the time that a step may take.
+def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, Any]:
+    """Runs :func:`run_control_loop` with a trained policy; ``koap latency`` calls this.
 
     Raises:
         ValueError: for fewer than one step or a rate that is not positive.
         RunDirectoryError: if the folder is no finished run.
     """
-    config = LatencyConfig() if config is None else config
     if config.steps < 1:
         raise ValueError(f"steps must be >= 1, got {config.steps}")
     set_up_torch(config.threads, "cpu")
     load_plugins(config.plugins)
     trained = Trained.load(run)
     rate = trained.task.control_hz if config.control_hz is None else config.control_hz
-    policy = load_policy(trained)
-    if config.async_replan:
-        agent: Any = AsynchronousAgent(policy, control_hz=rate)
-    else:
-        agent = Agent(policy)
     observations = 0.01 * np.random.default_rng(0).standard_normal((config.steps, trained.task.observation_dim))
-    with agent if config.async_replan else nullcontext():
+    if not config.async_replan:
+        return run_control_loop(Agent(trained.policy()), observations, control_hz=rate)
+    with AsynchronousAgent(trained.policy(), control_hz=rate) as agent:
         return run_control_loop(agent, observations, control_hz=rate)
 
 
 def run_control_loop(agent: Agent, observations: np.ndarray, *, control_hz: float) -> dict[str, Any]:
     """Hands an agent an observation per tick of a clock and counts the actions that come after the next tick.
 
-    Args:
-        agent (Agent): the agent; it is reset, with the first observation if it takes one.
-        observations (np.ndarray): ``[steps, obs]``.
-
-    Keyword Args:
-        control_hz (float): ticks per second.
-
     Returns:
-        dict: ``steps``, ``late_steps``, ``step_ms`` (what a step may take), ``p50``, ``p99`` and ``max`` (ms).
+        dict: ``steps``, ``late_steps``, ``step_ms`` (what a step may take), and ``p50``, ``p99`` and ``max`` of the
+        time from an observation to its action (ms).
 
     Raises:
         ValueError: if the rate is not positive.
@@ -175,14 +144,9 @@ def run_control_loop(agent: Agent, observations: np.ndarray, *, control_hz: floa
 def time_calls(
     functions: Mapping[str, Callable[..., Tensor]], inputs: tuple[Tensor, ...], *, repeats: int = 100
 ) -> dict[str, dict[str, float]]:
-    """Time of functions that are called in turn, so that a busy machine slows all of them alike.
+    """Times functions that are called in turn, so that a busy machine slows all of them alike.
 
-    Args:
-        functions (mapping): name to function of the inputs.
-        inputs (tuple of Tensor): handed to each.
-
-    Keyword Args:
-        repeats (int): counted calls of each, after ten that warm up.
+    Ten calls of each come before those that count.
 
     Returns:
         dict: by name ``p50`` and ``p99`` in ms, and ``ratio``, the median of its time over that of the first function

@@ -54,10 +54,6 @@ def spectrum(eigenvalues: Tensor, *, tolerance: float = ON_THE_CIRCLE, slowest: 
 def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> TensorDict:
     """Infers the latent actions of all steps that see their whole look-ahead, each once: those a decoder is fitted on.
 
-    Args:
-        controller (KoopmanInverseDynamics): the model, in evaluation mode.
-        data (TensorDictBase): flat ``[N]`` with ``state``, ``action``, ``has_action`` and ``episode``.
-
     Returns:
         TensorDict: ``[M]`` with ``latent_action [M, m]``, ``state``, ``action``, ``has_action [M]``, ``episode [M]``.
     """
@@ -72,19 +68,13 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
 
 
 def split_trajectories(episode: Tensor, labelled: Tensor, *, seed: int = 0) -> Tensor:
-    """Draws half of the trajectories to fit on, drawn at random, those with a label in the budget first.
+    """Draws the numbers of half of the trajectories, to fit on, those with a label in the budget first.
 
     The other half is then new to a decoder fitted within the budget too, as far as the budget leaves so many.
 
     Args:
         episode (Tensor): trajectory of every step ``[N]``.
         labelled (Tensor): steps labelled in the budget, bool ``[N]``.
-
-    Keyword Args:
-        seed (int): seed of the draw.
-
-    Returns:
-        Tensor: numbers of the trajectories to fit on.
 
     Raises:
         ValueError: if there is only one trajectory.
@@ -119,15 +109,6 @@ def prediction_errors(
     it is no forecast. The linear model is fitted on the trajectories ``fit_on``, and all three are tested on the
     others. The Koopman model was trained on the states of all of them (that takes no label). Where ``v_t`` holds
     ``x_{t+2}``, as by default, the linear model interpolates and owes little to what it predicted before.
-
-    Args:
-        controller (KoopmanInverseDynamics): the model, in evaluation mode.
-        data (TensorDictBase): flat ``[N]`` with raw ``state`` ``[N, d]`` and ``episode``.
-        fit_on (Tensor): numbers of the trajectories to fit the linear model on.
-        parts (mapping): columns of the state by name.
-
-    Keyword Args:
-        horizon (int): steps to predict.
 
     Returns:
         dict: by model and part the root mean square distance after ``1 .. horizon`` steps, in raw units.
@@ -194,14 +175,7 @@ def _roll_linear(controller: KoopmanInverseDynamics, weight: Tensor, states: Ten
 
 
 def explained(predicted: Tensor, true: Tensor) -> list[float]:
-    """Returns the share ``R^2`` of the variance of every column that predictions explain.
-
-    Args:
-        predicted (Tensor): predictions ``[N, a]``.
-        true (Tensor): what they are compared with, ``[N, a]``.
-
-    Returns:
-        list of float: one per column, at most 1; NaN for a column without variance.
+    """Returns the share ``R^2`` of the variance of every column ``[N, a]`` that is explained; NaN without variance.
 
     Examples:
         >>> import torch
@@ -223,12 +197,6 @@ def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[f
         action (Tensor): true actions ``[N, act]``; all of them are read.
         groups (Tensor): trajectory of every step ``[N]``, by which the ridge is chosen.
         fit (Tensor): steps to fit on, bool ``[N]``.
-
-    Returns:
-        list of float: per action dimension.
-
-    Raises:
-        ValueError: if nothing is left to fit or to test on.
     """
     if fit.all() or not fit.any():
         raise ValueError(f"a probe is fitted on some steps and tested on others, got {int(fit.sum())} of {len(fit)}")

@@ -134,26 +134,19 @@ def _left_out(trained: Trained, labelled: TensorDictBase, outside: Mapping[str, 
         return {"note": note + (hint if "note" in outside else "")}
     if trained.method.fit is not None:
         return {"note": _COMMANDS}
+    if not trained.method.closed_form:
+        return {"note": "the decoder is not fitted in closed form: leaving a trajectory out would mean to train again"}
     seen = controller_view(labelled, trained.columns, targets=trained.task.targets)
-    fitted = trained.method.closed_form
-    return errors_left_out(trained.controller.cpu(), seen, trained.task, closed_form=fitted, columns=trained.columns)
+    return errors_left_out(trained.controller.cpu(), seen, trained.task, trained.columns)
 
 
 def _per_trajectory(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[dict[str, Any]]:
-    rows = [{"judged": "plans", **row} for row in plan.get("trajectory", ())]
-    for split in SPLITS:
-        rows += [
-            {"judged": f"actions, {split.replace('_', ' ')}", **row} for row in action[split].get("trajectory", ())
-        ]
-    return rows
+    parts = {"plans": plan} | {f"actions, {split.replace('_', ' ')}": action[split] for split in SPLITS}
+    return [{"judged": name, **row} for name, part in parts.items() for row in part.get("trajectory", ())]
 
 
 def describe_offline(result: Mapping[str, Any]) -> str:
-    """The figures in words, a line per unit, for a terminal.
-
-    Args:
-        result (mapping): of :func:`evaluate_offline`.
-    """
+    """Says the figures of :func:`evaluate_offline` in words, a line per unit, for a terminal."""
     lines = ["judged on recorded data: the task has no environment"]
     plan, action = result["plan_errors"], result["action_errors"]
     lines += [f"plans: {plan['note']}"] if "note" in plan else []

@@ -21,18 +21,10 @@ from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.units import unit_groups
 
 SAMPLES = 16
-BASELINES = ("standing_still", "constant_velocity")
 
 
 def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
-    """What a planner has to beat.
-
-    Args:
-        history (Tensor): observed states ``[*B, h, d]``, the present one last; two of them at least.
-        horizon (int): planned frames ``H``.
-
-    Returns:
-        dict: ``"standing_still"`` and ``"constant_velocity"``, ``[*B, H, d]`` each.
+    """Makes the plans ``[*B, H, d]`` that a planner has to beat, of two or more observed states ``[*B, h, d]``.
 
     Examples:
         >>> import torch
@@ -51,17 +43,10 @@ def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
 def plan_errors(
     planner: StatePlanner, data: TensorDictBase, task: Task, *, samples: int = SAMPLES, plans: int = 500, seed: int = 0
 ) -> dict[str, Any]:
-    """Scores of the planner on trajectories, beside those of standing still and of constant velocity.
+    """Scores a planner on trajectories that it has not seen, beside standing still and constant velocity.
 
-    Args:
-        planner (StatePlanner): in evaluation mode.
-        data (TensorDictBase): flat data ``[N]`` with ``state`` and ``episode``: trajectories that it has not seen.
-        task (Task): names and units of the state columns.
-
-    Keyword Args:
-        samples (int): plans per situation.
-        plans (int): situations at most, spread evenly over all steps that have a whole recorded future.
-        seed (int): seed of the plans' noise.
+    There are ``samples`` plans in each of at most ``plans`` situations, spread evenly over all steps that have a whole
+    recorded future.
 
     Returns:
         dict: ``situations``, ``horizon``, ``samples``, ``unit``: a row per unit of the state columns with their names
@@ -98,13 +83,7 @@ def plan_errors(
 def score_sequences(
     models: Mapping[str, Tensor], true: Tensor, names: Sequence[str], units: Sequence[str]
 ) -> tuple[list[dict[str, Any]], list[dict[str, Tensor]]]:
-    """Energy score and best of the samples, a row per unit.
-
-    Args:
-        models (mapping): name to sampled sequences ``[S, N, H, d]``.
-        true (Tensor): what was recorded, ``[N, H, d]``.
-        names (sequence of str): the columns.
-        units (sequence of str): their units.
+    """Rates sampled sequences ``[S, N, H, d]`` by energy score and best sample, a row per unit of the columns.
 
     Returns:
         tuple: rows as in :func:`plan_errors`, and per unit the energy score of every model in every situation ``[N]``.

@@ -126,7 +126,7 @@ def rollouts_to_tensors(
     objects: Sequence[slice] = (),
     plans_position: bool = True,
 ) -> dict[str, Tensor]:
-    """What the pictures need, padded to the longest episode.
+    """Stacks what the pictures need, padded to the longest episode.
 
     Args:
         episodes (sequence of TensorDict): from :func:`roll_out`.

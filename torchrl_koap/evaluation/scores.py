@@ -111,12 +111,6 @@ def task_scores(
     ``d3il_score`` among them is the single figure D3IL ranks methods by, where it is defined. What the function returns
     as ``rates``, a name in words to a bool per rollout, joins the success in ``rates``, with an interval.
 
-    Args:
-        task (Task): the task.
-        result (dict): from :func:`score`.
-        episodes (sequence of TensorDict): the rollouts.
-        contexts (sequence of int, optional): number of the context of every episode.
-
     Examples:
         >>> from torchrl_koap.evaluation.scores import task_scores
         >>> from torchrl_koap.tasks import get_task
@@ -130,12 +124,7 @@ def task_scores(
 
 
 def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
-    """How many boxes were brought to the zone of Stacking, in how many orders, and D3IL's figure.
-
-    Args:
-        result (dict): from :func:`score`; not looked at.
-        episodes (sequence of TensorDict): rollouts of :class:`~torchrl_koap.envs.stacking.StackingEnv`.
-        contexts (sequence of int): number of the context of every episode.
+    """Tells how many boxes were brought to the zone of Stacking, in how many orders, and D3IL's figure.
 
     Returns:
         dict: ``rates`` of one, two and three boxes, entropies of the first one, two and three letters (bases 3, 6, 6)
@@ -146,16 +135,7 @@ def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], cont
 
 
 def first_box_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:
-    """Stacking's scores of the first box alone, with which episodes of Stacking-1 end.
-
-    Args:
-        result (dict): from :func:`score`; not looked at.
-        episodes (sequence of TensorDict): rollouts of :class:`~torchrl_koap.envs.stacking.StackingEnv`.
-        contexts (sequence of int): number of the context of every episode.
-
-    Returns:
-        dict: the entries of :func:`stacking_scores` about the first box.
-    """
+    """Returns the entries of :func:`stacking_scores` about the first box, with which episodes of Stacking-1 end."""
     return _stacked(episodes, contexts, most=1)
 
 

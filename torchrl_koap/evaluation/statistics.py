@@ -15,17 +15,7 @@ OUTCOMES = ("timeout", "success", "collision")  # of an episode, by number
 
 
 def wilson_interval(successes: int, trials: int, *, level: float = 0.95) -> tuple[float, float]:
-    """Wilson score interval of a success rate.
-
-    Args:
-        successes (int): how many trials succeeded.
-        trials (int): how many there were.
-
-    Keyword Args:
-        level (float): probability that the interval holds.
-
-    Returns:
-        tuple of float: low and high end, in 0..1.
+    """Returns both ends, in 0..1, of the Wilson score interval of a success rate.
 
     Raises:
         ValueError: if there are no trials, or more successes than trials.
@@ -43,9 +33,6 @@ def wilson_interval(successes: int, trials: int, *, level: float = 0.95) -> tupl
 
 def rate(good: Sequence[bool]) -> dict[str, float]:
     """Returns the share of trials that succeeded, its 95 % Wilson interval and their number.
-
-    Args:
-        good (sequence of bool): whether each trial succeeded.
 
     Examples:
         >>> from torchrl_koap.evaluation.statistics import rate
@@ -84,10 +71,6 @@ def expected_entropy(episodes: int, num_modes: int) -> float:
     """Exact mean of the mode entropy of that many episodes whose modes are drawn uniformly.
 
     A few episodes cannot fill all modes evenly, so this is below 1: what a policy without preferences scores.
-
-    Args:
-        episodes (int): number of episodes.
-        num_modes (int): number of modes, and base of the logarithm.
 
     Examples:
         >>> from torchrl_koap.evaluation.statistics import expected_entropy
@@ -144,7 +127,6 @@ def bootstrap_interval(
         units (sequence): what was sampled independently: episodes, or contexts with all their episodes.
         statistic (callable): from a list of units to a number, or None where it is not defined.
         draws (int): number of resamples; the same ones in every call.
-        level (float): probability that the interval holds.
 
     Returns:
         tuple or None: low and high end; None if the statistic is never defined.

@@ -48,6 +48,7 @@ _COMMANDS = {
     "eval.json": "koap eval {run}",
     "actions.safetensors": "koap eval {run}",
     "inspect.json": "koap inspect {run}",
+    "eigenvalues.safetensors": "koap inspect {run}",
 }
 Draw = Callable[[Any, RunFacts], "Figure | Film"]
 

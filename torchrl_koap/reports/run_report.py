@@ -14,7 +14,7 @@ from torchrl_koap.reports.pictures import EVAL, FOLDER, TRAIN, all_pictures, dra
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.tiles import tiles
 
-_SIMULATED = ("rollouts.safetensors", "inspect.json")
+_SIMULATED = ("rollouts.safetensors", "inspect.json", "eigenvalues.safetensors")
 _BESIDE_LABELS = "demonstrations.png"
 _EVAL_ELSEWHERE = ("episode", "command", "trajectory", "faults", "rates", "action_errors")
 _CONFIG_ELSEWHERE = ("versions", "command")
