@@ -24,6 +24,7 @@ from torchrl_koap.training.method import LABELLED_SHARES, Method
 from torchrl_koap.training.methods import get_method
 from torchrl_koap.training.networks import build_controller
 from torchrl_koap.training.planner import augmentation
+from torchrl_koap.training.policy_facts import command_ranges
 
 BATCH_SIZE, LEARNING_RATE = 256, 1e-3
 _KEYS = ["state", "action", "has_action"]
@@ -49,10 +50,11 @@ def learn_controller(
         logger (optional): a TorchRL logger.
 
     Returns:
-        tuple: the module, and for the summary: last losses ``controller``, ``controller_updates``, and what a closed
-        form found ``decoder_fit`` (empty if there is none).
+        tuple: the module, and for the summary: last losses ``controller``, ``controller_updates``, what a closed form
+        found ``decoder_fit`` (empty if there is none), and the ``command_ranges`` of the labels.
     """
     method, loop = get_method(config.method), _Loop(config, run, logger)
+    ranges = command_ranges(task, data)  # of labels, not of what a teacher says
     if method.teacher:
         data = _relabelled(task, config, get_method(method.teacher), data, loop)
     fit, losses = dict[str, Any](), dict[str, float]()
@@ -63,7 +65,12 @@ def learn_controller(
         module, fit, losses = _train_network(task, config, method, data, loop)
     else:
         module, losses = _train_sampler(task, config, method, data, loop)
-    return module, {"controller": losses, "controller_updates": loop.updates, "decoder_fit": fit}
+    return module, {
+        "controller": losses,
+        "controller_updates": loop.updates,
+        "decoder_fit": fit,
+        "command_ranges": ranges,
+    }
 
 
 @dataclass

@@ -6,12 +6,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import torch
+from tensordict import TensorDictBase
+
+from torchrl_koap.keys import ACTION, HAS_ACTION, STATE
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.action_rules import ActionRule
+from torchrl_koap.tasks.units import unit_groups
 
 
 def policy_facts(
-    task: Task, *, columns: Sequence[int] | None = None, gripper: Sequence[int] | None = None
+    task: Task,
+    *,
+    columns: Sequence[int] | None = None,
+    gripper: Sequence[int] | None = None,
+    ranges: Sequence[Sequence[float] | None] | None = None,
 ) -> dict[str, Any]:
     """The facts of a task as keyword arguments of :func:`~torchrl_koap.modules.make_policy`.
 
@@ -22,6 +31,7 @@ def policy_facts(
         columns (sequence of int, optional): columns of the state that the controller reads. Default: all.
         gripper (sequence of int, optional): action column of a gripper and state column of its width, whose number is
             read off the planned widths, where the task has no rule for actions of its own.
+        ranges (sequence, optional): of :func:`command_ranges`.
 
     Examples:
         >>> from torchrl_koap.tasks import get_task
@@ -39,6 +49,7 @@ def policy_facts(
         "action_rule": rule,
         "changes": tuple(task.delta_actions),
         "commanded": None if task.targets else commanded_columns(task),
+        "ranges": ranges,
         "max_steps": task.max_steps,
     }
 
@@ -61,3 +72,42 @@ def commanded_columns(task: Task) -> dict[str, list[int]] | None:
     if not len(actions) == len(moved) == len(commands):
         return None
     return {"states": moved, "commands": commands, "actions": actions}
+
+
+def command_ranges(task: Task, data: TensorDictBase) -> list[list[float] | None]:
+    """Finds the range of the demonstrated commands.
+
+    Few labels show few directions: changes of commands reach as far either way, and on every axis, as the largest one
+    in their unit. An absolute command may be wherever a demonstration took the column that it is the target of.
+
+    Args:
+        task (Task): the task.
+        data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
+
+    Returns:
+        list: least and greatest number of every action column, None for a gripper's and for one that never changes.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_koap.tasks import get_task
+        >>> from torchrl_koap.training.policy_facts import command_ranges
+        >>> action, seen = torch.tensor([[0.5, 0.0], [9.0, 9.0]]), torch.tensor([[True], [False]])
+        >>> data = TensorDict({"action": action, "has_action": seen, "state": torch.zeros(2, 2)}, [2])
+        >>> command_ranges(get_task("avoiding"), data)
+        [[-0.5, 0.5], [-0.5, 0.5]]
+    """
+    labelled, meanings = data[ACTION][data[HAS_ACTION].squeeze(-1)], list(task.actions.values())
+    ranges: list[list[float] | None] = [None] * len(meanings)
+    for columns in unit_groups(task.action_units).values():
+        changes = [column for column in columns if meanings[column].kind == "delta"]
+        if changes:
+            largest = float(labelled[:, changes].abs().max())
+            for column in changes:
+                ranges[column] = [-largest, largest]
+    for column, meaning in enumerate(meanings):
+        if meaning.kind == "absolute":
+            numbers = labelled[:, column]
+            numbers = numbers if meaning.column is None else torch.cat([numbers, data[STATE][:, meaning.column]])
+            ranges[column] = [float(numbers.min()), float(numbers.max())]
+    return [None if ends is None or ends[0] == ends[1] else ends for ends in ranges]

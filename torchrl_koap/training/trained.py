@@ -116,7 +116,8 @@ class Trained:
             hint = f"; it was made with the plugins {', '.join(map(str, needs))}" if needs else ""
             raise CheckpointError(f"{path} cannot be built: {problem}{hint}") from error
         load_parts(path, tensors, {"planner": planner, "controller": controller})
-        return cls(task, config, planner, controller, folder=path)
+        results = {"command_ranges": about.get("command_ranges")}
+        return cls(task, config, planner, controller, results, folder=path)
 
     def save(self, path: str | Path) -> Path:
         """Writes networks and options to one file, from which :meth:`load` makes the same without any data.
@@ -142,6 +143,7 @@ class Trained:
             "version": VERSION,
             "config": to_json(self.config),
             "task_definition": None if self.task.import_strings() else self.task.to_json(),
+            "command_ranges": self.results.get("command_ranges"),
             "versions": versions(),
         }
         save_tensors(path, tensors, about)
@@ -192,7 +194,8 @@ class Trained:
         if self.method.plans and missing:
             raise ValueError(f"a policy needs planner and controller: no {missing[0]} was trained here")
         gripper = decoder_columns(self.task)["gripper"] if isinstance(self.controller, CommandDecoder) else None
-        facts = policy_facts(self.task, columns=self.columns, gripper=gripper)
+        ranges = self.results.get("command_ranges")
+        facts = policy_facts(self.task, columns=self.columns, gripper=gripper, ranges=ranges)
         if self.method.plans:
             return make_policy(self.planner, self.controller, **facts, execution=execution, follower=follower)
         if execution.strategy != "open_loop" or follower is not None:

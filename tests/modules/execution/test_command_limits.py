@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Gain and lead: a command stays near its robot, actions that keep it there are left alone, all policies agree."""
+"""Range, gain and lead: a command stays in its range and near its robot, actions that keep it there are left alone, all policies agree."""
 
 from __future__ import annotations
 
@@ -62,15 +62,34 @@ def observed(batch=(3,)):
     return TensorDict({"observation_history": frames, "is_init": begin}, batch)
 
 
-def policy_of(kind, **execution):
+def policy_of(kind, ranges=None, **execution):
     networks = (CountingSampler(),) if kind == "chunks" else (CountingPlanner(), EchoController())
     return make_policy(
         *networks,
         state_of=(0, 1),
         changes=(2,),
         commanded={"commands": [0], "states": [1]},
+        ranges=ranges,
         execution=Execution("open_loop" if kind == "chunks" else kind, 2, blend=0.0, **execution),
     )
+
+
+@pytest.mark.parametrize("kind", ["feedback", "open_loop", "chunks"])
+def test_commands_stay_in_the_demonstrated_range_and_those_outside_are_counted(kind):
+    plain = policy_of(kind)
+    td = observed()
+    free = plain(td.clone())["action"]
+    low, high = float(free[..., 2].min()), float(free[..., 2].max())
+    ranges = [None, None, (0.0, 0.5 * low), None]
+    held, wide, off = (
+        policy_of(kind, ranges=ranges, limits=margin, gain=2.0) for margin in (0.5, 2 * high / low, float("inf"))
+    )
+    kept = torch.stack([free[..., 0], free[..., 1], torch.full_like(free[..., 2], 2 * 0.75 * low), free[..., 3]], -1)
+    torch.testing.assert_close(held(td.clone())["action"], kept)  # the gain comes after it
+    torch.testing.assert_close(wide(td.clone())["action"], off(td.clone())["action"], rtol=0, atol=0)
+    assert (held.limited.tolist(), wide.limited.tolist(), plain.limited.tolist()) == ([3, 3], [0, 3], [0, 0])
+    exported = held.decode_ahead(td["observation_history"], torch.zeros(3, *plain.noise_shape))
+    assert exported[..., 2].max() <= 2 * 0.75 * low and held.limited.tolist() == [3, 3]
 
 
 @pytest.mark.parametrize("kind", ["feedback", "open_loop", "chunks"])
@@ -126,6 +145,7 @@ def test_those_who_know_what_they_commanded_go_without_gain():
     [
         (lambda: CommandLimits([0], lead=0.1, **COLUMNS), "2, 2 and 1 columns"),
         (lambda: CommandLimits([0], lead=0.1), "lead 0.1 was given, but the observation repeats no command"),
+        (lambda: CommandLimits(ranges=[None])(torch.zeros(1, 1), torch.zeros(2)), "1 action columns .* have 2"),
         (lambda: CommandLimits([0], gain=np.nan), "gain must be a number above 0"),
         (lambda: policy_for("scooping", lead=0.1), "lead 0.1 were given, but no action is a change of a command"),
         (lambda: policy_for("scooping", gain=1.1), "gain 1.1 and .* but no action is a change of a command"),

@@ -33,6 +33,8 @@ def test_what_is_not_asked_for_is_the_defaults():
         ({"gain": float("nan")}, "gain must be a number above 0"),
         ({"candidates": 0}, r"candidates must be an integer in 1..256, got 0"),
         ({"candidates": True}, "candidates must be an integer"),
+        ({"limits": -0.1}, "limits must be a number >= 0, or infinity, got -0.1"),
+        ({"limits": float("nan")}, "limits must be a number >= 0"),
         ({"candidates": 257}, "candidates must be an integer"),
     ],
 )

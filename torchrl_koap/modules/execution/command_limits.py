@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""How fast a robot is told to be, and how far its command may be ahead of it."""
+"""The range of commands, how fast a robot is told to be, and how far its command may be ahead of it."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+Ranges = Sequence[tuple[float, float] | None]  # least and greatest number of every column
+
 
 class CommandLimits(nn.Module):
-    r"""Multiplies changes of a command, and holds back those that would take it too far ahead of the robot.
+    r"""Keeps actions in a range, multiplies changes of a command, and holds back those too far ahead of the robot.
+
+    An action is clipped to its range first; what a planner or controller says far from its data has no bound of its
+    own. Changes of a command follow:
 
     .. math::
         a' = \operatorname{clip}(c + g a - x,\; -l,\; l) - (c - x)
@@ -22,9 +27,10 @@ class CommandLimits(nn.Module):
     is decided from then on hardly moves the robot. With a limit it answers as soon as plans turn back.
 
     Args:
-        actions (sequence of int): action columns that change the command.
+        actions (sequence of int): action columns that change the command; needed for a gain or lead.
 
     Keyword Args:
+        ranges (sequence, optional): least and greatest number of every action column, None for one without limit.
         gain (float): ``g``.
         lead (float, optional): ``l``, in the units of the actions; 0 sets no limit.
         commands (sequence of int): observation columns that repeat the last command; needed for a lead.
@@ -33,8 +39,8 @@ class CommandLimits(nn.Module):
             same.
 
     Raises:
-        ValueError: if no action is a change of a command, for a gain or lead out of range, or columns that differ in
-            number.
+        ValueError: for a gain or lead where no action is a change of a command, one out of range, or columns that
+            differ in number.
 
     Examples:
         >>> import torch
@@ -47,8 +53,9 @@ class CommandLimits(nn.Module):
 
     def __init__(
         self,
-        actions: Sequence[int],
+        actions: Sequence[int] = (),
         *,
+        ranges: Ranges | None = None,
         gain: float = 1.0,
         lead: float = 0.0,
         commands: Sequence[int] = (),
@@ -56,7 +63,7 @@ class CommandLimits(nn.Module):
         state_of: Callable[[Tensor], Tensor] | None = None,
     ):
         super().__init__()
-        if not len(actions):
+        if not len(actions) and (ranges is None or gain != 1 or lead):
             raise ValueError(f"gain {gain:g} and lead {lead:g} were given, but no action is a change of a command")
         if not 0 < gain < math.inf or not 0 <= lead < math.inf:
             raise ValueError(f"gain must be a number above 0 and lead one of at least 0, got {gain} and {lead}")
@@ -68,6 +75,8 @@ class CommandLimits(nn.Module):
                 f" {len(commands)}, {len(positions)} and {len(actions)} columns"
             )
         self.gain, self.lead, self.state_of = gain, lead, state_of
+        ends = None if ranges is None else torch.tensor([(-math.inf, math.inf) if r is None else r for r in ranges])
+        self.register_buffer("ends", ends, persistent=False)  # [act, 2]
         for name, columns in {"actions": actions, "commands": commands, "positions": positions}.items():
             self.register_buffer(name, torch.as_tensor(list(columns), dtype=torch.long), persistent=False)
 
@@ -82,6 +91,7 @@ class CommandLimits(nn.Module):
             Tensor: ``[*B, act]``; what is within the limits keeps its bits, for episodes with contacts turn out
             otherwise for a rounding error.
         """
+        action = self.in_range(action)
         if self.gain != 1:
             factors = torch.ones(action.shape[-1], dtype=action.dtype, device=action.device)
             action = action * factors.index_fill(0, self.actions, self.gain)
@@ -95,3 +105,12 @@ class CommandLimits(nn.Module):
         held = reach.clamp(-self.lead, self.lead)
         action[..., self.actions] = torch.where(held == reach, wanted, held - ahead)
         return action
+
+    def in_range(self, action: Tensor) -> Tensor:
+        """Actions ``[*B, act]`` clipped to their ranges."""
+        if self.ends is None:
+            return action
+        if action.shape[-1] != len(self.ends):
+            raise ValueError(f"ranges of {len(self.ends)} action columns were given, actions have {action.shape[-1]}")
+        low, high = self.ends.to(action.dtype).unbind(-1)
+        return action.clamp(low, high)

@@ -36,6 +36,8 @@ class Execution:
         gain (float): factor of actions that are changes of a command: above 1 the robot is quicker than planned.
         candidates (int): plans (of a Diffusion Policy: action chunks) sampled whenever one is due, of which one that
             goes on with the current one is taken.
+        limits (float): commands stay in the range of the demonstrated ones, widened on both sides by this share of it;
+            infinity: anywhere. Gain and lead come after it.
 
     Raises:
         ValueError: for an unknown strategy, or a number out of range.
@@ -43,7 +45,7 @@ class Execution:
     Examples:
         >>> from torchrl_koap.modules import Execution
         >>> Execution().replaced(strategy="open_loop", blend=None)
-        Execution(strategy='open_loop', replan_interval=4, blend=0.8, lead=0.0, gain=1.0, candidates=1)
+        Execution(strategy='open_loop', replan_interval=4, blend=0.8, lead=0.0, gain=1.0, candidates=1, limits=0.5)
     """
 
     strategy: str = "feedback"
@@ -52,6 +54,7 @@ class Execution:
     lead: float = 0.0
     gain: float = 1.0
     candidates: int = 1
+    limits: float = 0.5
 
     def __post_init__(self):
         lookup(STRATEGIES, self.strategy, "strategy")
@@ -65,6 +68,8 @@ class Execution:
             raise ValueError(f"gain must be a number above 0, got {self.gain}")
         if not _is_integer(self.candidates) or not 1 <= self.candidates <= MOST_CANDIDATES:
             raise ValueError(f"candidates must be an integer in 1..{MOST_CANDIDATES}, got {self.candidates!r}")
+        if not self.limits >= 0:
+            raise ValueError(f"limits must be a number >= 0, or infinity, got {self.limits}")
 
     def replaced(self, **asked: Any) -> Execution:
         """The same with what was asked for; ``None`` leaves a field as it is.
@@ -94,6 +99,8 @@ class ExecutionConfig:
         gain: factor of actions that are changes of a command: above 1 the robot is quicker than planned.
         candidates: plans (of dp: action chunks) sampled whenever one is due, of which one that goes on with the current
             one is taken.
+        limits: commands stay in the range of the demonstrated ones, widened on both sides by this share of it; inf:
+            anywhere.
 
     Raises:
         ValueError: as :class:`Execution`.
@@ -110,6 +117,7 @@ class ExecutionConfig:
     lead: float | None = None
     gain: float | None = None
     candidates: int | None = None
+    limits: float | None = None
 
     def __post_init__(self):
         self.on(Execution())

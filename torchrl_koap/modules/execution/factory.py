@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 from torch import Tensor, nn
 
 from torchrl_koap.modules.execution.command_decoder import CommandDecoder, CommandRegression
-from torchrl_koap.modules.execution.command_limits import CommandLimits
+from torchrl_koap.modules.execution.command_limits import CommandLimits, Ranges
 from torchrl_koap.modules.execution.execution import Execution
 from torchrl_koap.modules.execution.followers import ActionRule, Follower, InverseDynamicsFollower
 from torchrl_koap.modules.execution.mpc import MPC
@@ -26,6 +27,7 @@ def make_policy(
     action_rule: ActionRule | None = None,
     changes: Sequence[int] = (),
     commanded: Mapping[str, Sequence[int]] | None = None,
+    ranges: Ranges | None = None,
     max_steps: int = 400,
     follower: Follower | None = None,
 ) -> PlanningPolicy:
@@ -50,6 +52,8 @@ def make_policy(
         changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
         commanded (mapping, optional): for each of these the observation column that repeats the command
             (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
+        ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
+            may be any; ``execution.limits`` widens them. Default: actions may be any.
         max_steps (int): steps of an episode.
         follower (Follower, optional): follows plans in place of the controller, such as the oracle.
 
@@ -71,11 +75,16 @@ def make_policy(
     execution = Execution() if execution is None else execution
     if follower is None and controller is not None:
         follower = _follow(planner, controller, execution, columns, action_rule)
-    limits = None
-    if execution.gain != 1 or execution.lead:
+    limits, margin = None, execution.limits
+    if ranges is not None and margin < math.inf:
+        ranges = [None if r is None else (r[0] - margin * (r[1] - r[0]), r[1] + margin * (r[1] - r[0])) for r in ranges]
+    else:
+        ranges = None
+    if execution.gain != 1 or execution.lead or ranges is not None:
         own = {} if commanded is None else commanded
         limits = CommandLimits(
             changes,
+            ranges=ranges,
             gain=execution.gain,
             lead=execution.lead,
             commands=own.get("commands", ()),

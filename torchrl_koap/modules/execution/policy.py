@@ -41,7 +41,8 @@ class PlanningPolicy(TensorDictModuleBase):
         state_of (callable, or sequence of int): from observations ``[*B, obs]`` to states ``[*B, d]``, or the columns
             that make up the state.
         execution (Execution, optional): how plans become actions. Default: ``Execution()``.
-        limits (CommandLimits, optional): has the last word on actions.
+        limits (CommandLimits, optional): has the last word on actions. How many of how many left their range is in
+            ``limited``, int64 ``[2]``.
         max_steps (int): steps of an episode, whose start noise is drawn at once.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
@@ -92,6 +93,7 @@ class PlanningPolicy(TensorDictModuleBase):
             )
         self.planner, self.follower, self.limits = planner, follower, limits
         self.execution, self.max_steps = execution, max_steps
+        self.register_buffer("limited", torch.zeros(2, dtype=torch.long), persistent=False)
         self.state_of = state_of if callable(state_of) else _Columns(state_of)
         self.history = max(planner.history, 1 if follower is None else follower.num_frames)
         self._decodes = follower is not None and execution.strategy != "open_loop"  # at every step
@@ -155,7 +157,11 @@ class PlanningPolicy(TensorDictModuleBase):
         left = remaining_plan(plan, age)
         if self._decodes:
             left = self.follower(observations, self.state_of(observations), left)
-        return self._limited(observations, left[..., 0, :])
+        action = left[..., 0, :]
+        if self.limits is not None:
+            outside = (self.limits.in_range(action) != action).any(-1)
+            self.limited += torch.stack([outside.sum(), torch.ones_like(outside).sum()])
+        return self._limited(observations, action)
 
     def decode_ahead(self, observations: Tensor, noise: Tensor) -> Tensor:
         """Plans and decodes the actions of the next steps at once: stateless and without branches on data.
