@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap import ControllerConfig, PlannerConfig, RunConfig, TrainConfig, fit, train
+from torchrl_koap import ControllerConfig, PlannerConfig, RunConfig, TrainConfig, Trained, fit, train
 from torchrl_koap.data import LabelBudget, cut_windows, load_ted, make_demonstrations, save_demonstrations, select_state
 from torchrl_koap.keys import LayoutError
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
@@ -196,6 +196,23 @@ def test_data_in_double_precision_are_fitted_like_others(method):
     fitted = [fit_controller(each, task, method=method, steps=2) for each in (data, wide)]
     assert same_weights(*(each.controller for each in fitted))
     assert wide["observation"].dtype == torch.float64
+
+
+def test_commands_stay_in_the_range_of_the_labels_in_memory_and_in_a_file(tmp_path):
+    """Changes of one unit share their range; targets may be wherever a demonstration was."""
+    states, actions = record()
+    largest = max(np.abs(rows).max() for rows in actions[:2])
+    data, task = make_demonstrations(**few_labels())
+    trained = fit_controller(data, task, steps=0)
+    assert trained.results["command_ranges"] == [pytest.approx([-largest, largest], rel=1e-6)] * 2
+    targets = [np.concatenate([rows[1:, :2], rows[-1:, :2]]) if n < 2 else None for n, rows in enumerate(states)]
+    data, task = make_demonstrations(**few_labels() | {"actions": targets}, action_kind="absolute")
+    trained = fit(data, task, planner={"steps": 1, **SMALL}, controller={"steps": 0}, progress=False)
+    low, high = np.concatenate(states)[:, 0].min(), np.concatenate(states)[:, 0].max()
+    assert trained.results["command_ranges"][0] == pytest.approx([low, high], rel=1e-6)
+    loaded = Trained.load(trained.save(tmp_path / "arm.safetensors"))
+    wider = pytest.approx([low - 0.5 * (high - low), high + 0.5 * (high - low)], rel=1e-5)
+    assert loaded.policy().limits.ends[0].tolist() == wider
 
 
 def drawn_to_a_goal():

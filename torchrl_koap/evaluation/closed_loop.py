@@ -12,6 +12,7 @@ import torch
 from torchrl_koap.evaluation.config import EvalConfig, check_options
 from torchrl_koap.evaluation.environments import choose_contexts, environment_of
 from torchrl_koap.evaluation.latency import measure_latency
+from torchrl_koap.evaluation.loop_on_labels import limited_commands
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.evaluation.rollouts import roll_out, rollouts_to_tensors
@@ -99,7 +100,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     learned = config.execution if policy.execution.strategy != "oracle" else ExecutionConfig()
     timed = policy if learned is config.execution else trained_policy(trained, learned).to(config.device)
     result |= measure_latency(timed, task.observation_dim)
-    result |= actions | {"execution": asdict(policy.execution), "episode": rows}
+    result |= actions | limited_commands(policy) | {"execution": asdict(policy.execution), "episode": rows}
     if config.env is not None:
         result |= {"env": config.env, "success_key": config.success_key}
     rollouts = rollouts_to_tensors(

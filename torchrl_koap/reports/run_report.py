@@ -71,7 +71,7 @@ def write_report(
             (head, shown)
             for head, source, elsewhere in (
                 ("Evaluation", evaluation, _EVAL_ELSEWHERE),
-                ("Training", summary, ("labels",)),
+                ("Training", summary, ("labels", "command_ranges")),
             )
             if (shown := {key: value for key, value in source.items() if key not in elsewhere})
         ],

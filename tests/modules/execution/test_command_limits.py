@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Range, gain and lead: a command stays in its range and near its robot, actions that keep it there are left alone, all policies agree."""
+"""Range, gain and lead: commands stay in range and near their robot, actions that do are left alone, policies agree."""
 
 from __future__ import annotations
 
