@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from tiny_runs import koap
 from torch import nn
 
+from torchrl_koap.data import flatten_trajectories, save_ted
 from torchrl_koap.tasks import get_task
 
 
@@ -103,8 +104,9 @@ def test_too_few_demonstrations_are_named(script, demonstrations):
 
 
 def test_other_tasks_are_refused_before_their_data_are_read(script, tmp_path, monkeypatch):
-    folder = tmp_path / "aligning"
-    assert koap("demos", "--out", folder, "--task", "aligning", "--episodes", 2, "--threads", 1, "--quiet") == 0
+    folder, task = tmp_path / "aligning", get_task("aligning")
+    frames, actions = torch.zeros(3, task.observation_dim), torch.zeros(2, task.action_dim)
+    save_ted(flatten_trajectories([frames], [actions]), folder / "ted", task)
     monkeypatch.setattr(script, "load_positions", None)
     with pytest.raises(ValueError, match="holds demonstrations of aligning"):
         script.main(dataset=folder, rollouts=True)

@@ -14,7 +14,8 @@ from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
 from torchrl_koap.tasks import Action
 
-TINY = ("--steps", 20, "--planner.batch-size", 8, "--planner.width", 8, "--controller.steps", 20)
+TINY = ("--steps", 20, "--planner.batch-size", 8, "--planner.network", "mlp", "--planner.width", 8)
+TINY += ("--controller.steps", 20)
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,6 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "torchrl_koap").rglob("*.py"))
 OLD_NAMES = {
@@ -30,16 +28,16 @@ def words_of(name: str) -> set[str]:
     return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+", name)}
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
-def test_old_words_are_no_public_names_and_open_no_docstring(file):
-    for node in public_definitions(ast.parse(file.read_text())):
+def test_old_words_are_no_public_names_and_open_no_docstring():
+    found = [(file, node) for file in FILES for node in public_definitions(ast.parse(file.read_text()))]
+    for file, node in found:
         names = [node.name]
         if isinstance(node, ast.FunctionDef):
             names += [argument.arg for argument in (*node.args.args, *node.args.kwonlyargs)]
         for name in names:
-            assert not words_of(name) & OLD_NAMES, f"{node.name}: {name}"
+            assert not words_of(name) & OLD_NAMES, f"{file}: {node.name}: {name}"
         first = (ast.get_docstring(node) or "").split("\n\n")[0]
-        assert not OLD_WORDS.search(first), f"{node.name}: {first}"
+        assert not OLD_WORDS.search(first), f"{file}: {node.name}: {first}"
 
 
 def test_the_glossary_has_forty_terms_at_most_and_no_term_twice():

@@ -8,8 +8,9 @@ import json
 import pytest
 import torch
 from publish_pretrained import publish
-from tiny_runs import TINY, koap, write_demonstrations
+from tiny_runs import koap
 
+from torchrl_koap.commands import run_commands
 from torchrl_koap.runs import pretrained
 from torchrl_koap.runs.pretrained import copy_run, find_run
 from torchrl_koap.runs.run_directory import RunDirectoryError
@@ -17,14 +18,9 @@ from torchrl_koap.runs.weights import CheckpointError, load_tensors
 from torchrl_koap.training import Trained
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pretrained")
-    data = write_demonstrations(folder / "data")
-    out = folder / "run"
-    arguments = ("--task", "avoiding", "--dataset", data, "--controller.steps", "5")
-    assert koap("train", "--out", out, *arguments, *TINY) == 0
-    return out
+@pytest.fixture
+def run(trained_run):
+    return trained_run
 
 
 @pytest.fixture
@@ -78,10 +74,11 @@ def test_a_planner_is_taken_over_by_name(run, policies, capsys):
     assert "did you mean 'avoiding'?" in capsys.readouterr().err and not (policies.parent / "other").exists()
 
 
-def test_places_are_left_out_and_what_is_left_is_sealed(run, tmp_path):
+def test_places_are_left_out_and_what_is_left_is_sealed(run, demonstrations, tmp_path):
     folder = publish(run, tmp_path / "mine", "# mine\n", candidates=3)
     config = json.loads((folder / "config.json").read_text())
-    assert (config["out"], config["dataset"], config["execution"]["candidates"]) == ("run", "data", 3)
+    assert (config["out"], config["dataset"]) == (run.name, demonstrations.name)
+    assert config["execution"]["candidates"] == 3
     assert Trained.load(folder).folder == folder
     (folder / "config.json").write_text(json.dumps(config | {"planner": config["planner"] | {"width": 16}}))
     with pytest.raises(CheckpointError, match="planner.safetensors was trained on planner.width 8, not on 16"):
@@ -99,7 +96,8 @@ def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
     assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--no-report") == 0  # again, into the same folder
 
 
-def test_they_are_inspected_exported_and_timed_by_name(policies, tmp_path, capfd):
+def test_they_are_inspected_exported_and_timed_by_name(policies, tmp_path, capfd, monkeypatch):
+    monkeypatch.setattr(run_commands, "export_part", lambda what, file, kind: file.write_bytes(b"a part"))
     out, exported = tmp_path / "mine", tmp_path / "exported"
     assert koap("demos", "--out", tmp_path / "demos", "--episodes", "4", "--threads", "1", "--quiet") == 0
     looked = ("--latent-only", "--threads", "1", "--dataset", tmp_path / "demos")
