@@ -42,6 +42,22 @@ class DataError(ValueError):
         super().__init__(f"{source} cannot be used:{listed}")
 
 
+def some(names: Sequence[str], most: int = 5) -> str:
+    """Joins names for a message, the first few of them.
+
+    Args:
+        names (sequence of str): the names.
+        most (int): how many are named.
+
+    Examples:
+        >>> from torchrl_koap.files import some
+        >>> some(["a.csv", "b.csv", "c.csv"], 2)
+        'a.csv, b.csv and 1 more'
+    """
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
 def check_file(path: str | Path, *, largest: int = LARGEST) -> None:
     """Refuses what is no plain file (a pipe never ends, nor does a device), and files of more than ``largest`` bytes.
 

@@ -63,6 +63,12 @@ def test_what_counts_as_success(name, key, wanted):
     assert over == ([False, False, True, True, True, True] if ends else [False] * 5 + [True])
 
 
+@pytest.mark.parametrize(("said", "wanted"), [("False", False), ("true", True), (np.array([True]), True), (0, False)])
+def test_success_may_be_said_in_words(said, wanted):
+    env = GymnasiumBatch("ToyReach-v0", TASK, 1)
+    assert env._succeeded({"is_success": said}, 0.0, False, False) is wanted
+
+
 def test_who_is_done_waits():
     env = GymnasiumBatch("ToyReach-v0", TASK, 2, max_steps=4)
     assert env.max_steps == 4

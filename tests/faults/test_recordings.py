@@ -109,12 +109,14 @@ KINDS: dict[str, tuple[Callable, str, tuple[str, ...]]] = {
         "episode_id 0 comes back|frames are 0.05 to 0.55 s apart",
         (),
     ),
+    "an action of text": (put("v0", lambda v: v.astype(str) + "!", actions=True), "action", ()),
     "an unknown column": (lambda episode: None, "unknown column in drop_columns", ("--drop-columns", "q9")),
 }
 ELSEWHERE = {  # an HDF5 file and a LeRobot set have their own ends of episodes; LeRobot's names have another form
     ("lerobot", "an episode that comes back"),
     ("lerobot", "stamps in ms"),
     ("hdf5", "an episode that comes back"),
+    ("hdf5", "an action of text"),
 }
 
 

@@ -31,7 +31,7 @@ from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import find_task_of
 
-_READING = ("control_hz", "observations", "action_columns", "action_dim", "state_columns", "drop_columns")
+_READING = ("control_hz", "observations", "episodes", "action_columns", "action_dim", "state_columns", "drop_columns")
 _DESCRIBING = ("name", "robot", "command", "action_kind", "targets", "action_units", "state_units", "max_steps")
 
 
@@ -121,6 +121,7 @@ class Convert(Command):
         control_hz: frames per second (default: as the source says).
         observations: features of a LeRobot data set or entries of an HDF5 file that make up the state (default: all
             that are no images).
+        episodes: which episodes of a LeRobot data set to read, such as those that were downloaded (default: all).
         action_columns: columns of CSV or parquet tables that are actions, if they are not named action...
         action_dim: number of action columns, where nothing has actions.
         state_columns: columns that make up the state, in that order (default: all that are no clock, counter, reward
@@ -143,6 +144,7 @@ class Convert(Command):
     name: str | None = None
     control_hz: float | None = None
     observations: tuple[str, ...] = ()
+    episodes: tuple[int, ...] = ()
     action_columns: tuple[str, ...] = ()
     action_dim: int | None = None
     state_columns: tuple[str, ...] = ()

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
+from torchrl_koap.files import some
 from torchrl_koap.tasks import WINDOW
 
 FARTHEST = 100.0  # m, or rad: no robot on a table gets there
 LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and so many times the usual one
 STILL, MUCH = 2e-3, 0.2  # share of the range within which a robot stands still; share of still frames to be told
-_LISTED = 5  # trajectories that are named, of how many there may be
 
 
 def find_warnings(
@@ -87,7 +87,7 @@ def find_warnings(
     if short:
         warnings.append(
             f"{len(short)} of {len(lengths)} trajectories have fewer steps than a window of {WINDOW}, so training may"
-            f" refuse them: {_some(short)}; `koap convert --drop-short` leaves them out"
+            f" refuse them: {some(short)}; `koap convert --drop-short` leaves them out"
         )
     if seen:
         frames = [part.double().numpy() for part in data.get(keys.STATE).cpu().split(lengths)]
@@ -205,10 +205,6 @@ def constant_columns(actions: np.ndarray) -> list[float | None]:
     """
     steps = actions[np.isfinite(actions).all(-1)]
     return [float(column[0]) if len(column) > 1 and np.ptp(column) == 0 else None for column in steps.T]
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
 
 
 def _digest(*values: Tensor) -> bytes:

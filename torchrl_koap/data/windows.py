@@ -21,6 +21,7 @@ from torchrl.data import ImmutableDatasetWriter, ReplayBuffer, TensorDictReplayB
 
 from torchrl_koap import keys
 from torchrl_koap.data.window_sampler import WindowSampler, WindowUnit
+from torchrl_koap.files import some
 
 
 @dataclass(frozen=True)
@@ -221,12 +222,8 @@ def _check_lengths(episodes: Tensor, lengths: Tensor, windows: Tensor, least: in
     short = windows == 0
     if not short.any():
         return
-    listed = ", ".join(
-        f"{episode} ({length} steps)"
-        for episode, length in zip(episodes[short].tolist()[:10], lengths[short].tolist()[:10], strict=True)
-    )
-    number = int(short.sum())
-    more = ", ..." if number > 10 else ""
+    named = zip(episodes[short].tolist(), lengths[short].tolist(), strict=True)
     raise ValueError(
-        f"{number} of {len(lengths)} trajectories are shorter than a window ({least} steps): {listed}{more}"
+        f"{int(short.sum())} of {len(lengths)} trajectories are shorter than a window ({least} steps):"
+        f" {some([f'{episode} ({length} steps)' for episode, length in named])}"
     )

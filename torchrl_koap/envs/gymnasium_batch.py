@@ -127,6 +127,8 @@ class GymnasiumBatch(EnvBase):
         found = next((key for key in keys if key in info), None)
         if found is not None:
             self.success_keys.add(found)
+            if isinstance(info[found], str):
+                return info[found].strip().lower() in ("true", "1")
             return bool(np.any(info[found]))
         if self.success_key is None:
             return terminated and reward > 0

@@ -90,9 +90,31 @@ def test_the_rate_is_read_in_its_unit_and_compared():
         assemble([Piece("run", {"x": X, "timestamp": np.arange(6) / 50}, {"v": X})], "data", declared_hz=20)
 
 
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
-def test_separators_blank_lines_and_truth_values(separator, tmp_path):
-    rows = [["time", "x", "touch", "action"], ["0", "0.5", "True", "1"], ["0.1", "0.7", "False", "2"]]
-    (tmp_path / "a.csv").write_text("\n".join(separator.join(row) for row in rows) + "\n\n")
+@pytest.mark.parametrize(("separator", "point"), [(",", "."), (";", "."), ("\t", "."), (";", ",")])
+def test_separators_blank_lines_truth_values_and_text(separator, point, tmp_path):
+    rows = [["time", "x", "touch", "phase", "action"], ["0", "0.5", "True", "reach", "1"]]
+    rows += [["0.1", "0.7", "False", "grasp", "2"]]
+    text = "\n".join(separator.join(row).replace(".", point) for row in rows)
+    (tmp_path / "a.csv").write_text(text + "\n\n")
     found = read_recordings(tmp_path)
     assert found.control_hz == pytest.approx(10) and found.states[0].tolist() == [[0.5, 1], [0.7, 0]]
+    assert found.skipped == ("phase", "time") and found.actions[0].tolist() == [[1]]
+
+
+def test_the_same_fault_of_many_files_is_said_once(tmp_path):
+    for number in range(9):
+        (tmp_path / f"{number}.csv").write_text("time x\n0 1\n1 2\n")
+    with pytest.raises(DataError, match=r"4.csv and 4 more: no column holds numbers: time x \(fields lie between"):
+        read_recordings(tmp_path)
+    for number in range(9):
+        (tmp_path / f"{number}.csv").write_text("time,x,action\n0,1,on\n1,2,off\n")
+    with pytest.raises(DataError, match="column 'action' is an action and holds no numbers"):
+        read_recordings(tmp_path)
+
+
+def test_archives_of_truth_values_and_of_lists(tmp_path):
+    np.savez(tmp_path / "a.npz", states=X[:, None] > 0, actions=X[:, None], control_hz=20.0)
+    assert set(np.unique(read_recordings(tmp_path).states)) <= {0.0, 1.0}
+    np.savez(tmp_path / "a.npz", states=np.array([[1], [2, 3]], dtype=object))
+    with pytest.raises(DataError, match="entry 'states' cannot be read: it holds objects"):
+        read_recordings(tmp_path)

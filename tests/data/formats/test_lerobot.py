@@ -188,8 +188,11 @@ def test_faults_of_all_files_come_together(tmp_path):
 def test_missing_episodes_are_told(tmp_path):
     root = write(tmp_path, version="v2.1")
     (root / "data/chunk-000/episode_000000.parquet").unlink()
-    with pytest.raises(DataError, match="1 episodes are missing: 0"):
+    with pytest.raises(DataError, match=r"1 episodes are missing: 0; name in episodes which to read \(here: 1\)"):
         read_lerobot(root)
+    assert read_lerobot(root, episodes=[1]).sources == ("episode 1",)
+    with pytest.raises(DataError, match="1 episodes are missing: 5"):
+        read_lerobot(root, episodes=[1, 5])
     listed = pa.table({"episode_index": [1, 7], "length": [6, 6]})
     (root / "meta/episodes/chunk-000").mkdir(parents=True)
     pq.write_table(listed, root / "meta/episodes/chunk-000/file-000.parquet")

@@ -73,6 +73,12 @@ def test_faults_are_named(states, actions, options, message):
         make_recordings(states, actions, **options)
 
 
+def test_lists_of_different_lengths_and_truth_values():
+    with pytest.raises(DataError, match="trajectory 1: states are lists of different lengths: rows of 1 and 2 numbers"):
+        make_recordings([[[1.0, 2.0], [2.0, 2.0]], [[1.0, 2.0], [2.0]]], action_dim=1)
+    assert make_recordings([[[True], [False]]], action_dim=1).states[0].tolist() == [[1.0], [0.0]]
+
+
 def test_all_faults_are_told_at_once():
     with pytest.raises(DataError) as caught:
         make_recordings([FRAMES[:1], FRAMES.astype(int)], [None, np.ones((9, 1))], sources=["left", "right"])

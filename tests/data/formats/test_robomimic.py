@@ -34,7 +34,7 @@ def test_demonstrations_in_the_order_of_their_numbers(file):
     recordings = read_robomimic(file)
     assert recordings.sources == ("demo_2", "demo_10") and recordings.control_hz == 20
     assert recordings.state_names == ("eef_0", "eef_1", "eef_2", "width")
-    assert recordings.skipped == ("camera",)
+    assert recordings.skipped == ("obs/camera",)
     assert recordings.num_labels == 3 and np.isnan(recordings.actions[1]).all()
     np.testing.assert_array_equal(recordings.states[0][:, 3], np.arange(4.0))
 
@@ -55,7 +55,7 @@ def test_the_frame_behind_the_last_action(file):
 def test_faults(file, tmp_path):
     with pytest.raises(DataError, match="data/demo_2/obs has no entry 'arm'; it has camera, eef, width"):
         read_robomimic(file, observations=["arm"])
-    with pytest.raises(DataError, match=r"camera is \[4, 4, 4, 3\]: an image cannot be part of the state"):
+    with pytest.raises(DataError, match=r"obs/camera is \[4, 4, 4, 3\], no table of numbers: it cannot be part"):
         read_robomimic(file, observations=["camera"])
     with h5py.File(file, "a") as stream:
         del stream["data/demo_10/obs"]
@@ -67,6 +67,38 @@ def test_faults(file, tmp_path):
         read_robomimic(tmp_path / "text.hdf5")
     with pytest.raises(FileNotFoundError):
         read_robomimic(tmp_path / "none.hdf5")
+
+
+@pytest.mark.parametrize(
+    ("entry", "values", "message"),
+    [
+        ("obs/eef", np.zeros((5, 4)), r"data/demo_10/obs/eef is \[5, 4\], data/demo_2/obs/eef is \[4, 3\]"),
+        (
+            "obs/eef",
+            np.zeros((4, 3)),
+            r"data/demo_10/obs: entries have different numbers of frames: eef \[4, 3\], width",
+        ),
+        ("actions", np.zeros((5, 6)), r"data/demo_10/actions is \[5, 6\], data/demo_2/actions is \[4, 7\]"),
+        ("actions", np.zeros((2, 7)), "trajectory demo_10: 2 actions for 5 frames"),
+    ],
+)
+def test_other_shapes_are_named(entry, values, message, file):
+    with h5py.File(file, "a") as stream:
+        if entry in stream["data/demo_10"]:
+            del stream[f"data/demo_10/{entry}"]
+        stream[f"data/demo_10/{entry}"] = values
+    with pytest.raises(DataError, match=message):
+        read_robomimic(file)
+
+
+def test_truth_values_are_numbers_and_the_rest_is_listed(file):
+    with h5py.File(file, "a") as stream:
+        for name in ("demo_2", "demo_10"):
+            stream[f"data/{name}/obs/touch"] = stream[f"data/{name}/obs/width"][:] > 1
+            stream[f"data/{name}/rewards"] = stream[f"data/{name}/obs/width"][:]
+    recordings = read_robomimic(file)
+    assert recordings.state_names[-2:] == ("touch", "width") and recordings.skipped == ("obs/camera", "rewards")
+    assert recordings.states[0][:, 3].tolist() == [0, 0, 1, 1]
 
 
 def test_a_rate_has_to_come_from_somewhere(file):

@@ -61,7 +61,11 @@ FORMATS = {
         ("observations", *COMMON),
     ),
     "lerobot": Format(
-        "a LeRobot data set (meta/info.json)", is_lerobot, read_lerobot, ("observations", *COMMON), write_lerobot
+        "a LeRobot data set (meta/info.json)",
+        is_lerobot,
+        read_lerobot,
+        ("observations", "episodes", *COMMON),
+        write_lerobot,
     ),
     "npz": Format(
         "a folder of *.npz, *.csv or *.parquet files, a trajectory each",
@@ -78,6 +82,7 @@ def read_recordings(
     *,
     control_hz: float | None = None,
     observations: Sequence[str] = (),
+    episodes: Sequence[int] = (),
     action_columns: Sequence[str] = (),
     action_dim: int | None = None,
     state_columns: Sequence[str] = (),
@@ -93,6 +98,7 @@ def read_recordings(
         control_hz (float, optional): frames per second. Default: as the source says.
         observations (sequence of str): features of a LeRobot data set, or entries of an HDF5 file, that make up the
             state. Default: all that are no images.
+        episodes (sequence of int): which episodes of a LeRobot data set to read. Default: all.
         action_columns (sequence of str): columns of CSV and parquet tables that are actions, if they are not named
             ``action...``.
         action_dim (int, optional): number of action columns where nothing has actions.
@@ -112,7 +118,7 @@ def read_recordings(
         >>> from torchrl_koap.data import read_recordings
         >>> read_recordings("/data/so100_pick")  # doctest: +SKIP
     """
-    asked: dict[str, Any] = {"control_hz": control_hz, "observations": list(observations)}
+    asked: dict[str, Any] = {"control_hz": control_hz, "observations": list(observations), "episodes": list(episodes)}
     asked |= {"action_columns": list(action_columns), "action_dim": action_dim}
     asked |= {"state_columns": list(state_columns), "drop_columns": list(drop_columns)}
     given = {name: value for name, value in asked.items() if value not in (None, [])}

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
-from torchrl_koap.files import DataError
+from torchrl_koap.files import DataError, some
 from torchrl_koap.lookup import lookup
 
 # what columns are called that are no state, in lower case, without unit
@@ -177,8 +177,8 @@ def _find_rate(pieces: Sequence[Piece], declared: float | None, otherwise: str, 
     steps = {piece.name: np.diff(piece.states[clock].astype(np.float64)) * kind_of(clock)[1] for piece in pieces}
     back = [name for name, step in steps.items() if not (step > 0).all()]
     if back or not sum(map(len, steps.values())):
-        some = f" in {len(back)} of {len(steps)} trajectories ({', '.join(back[:5])})" if back else ""
-        problems.append(f"time stamps do not increase: column {clock!r}{some}; pass control_hz if they mean nothing")
+        where = f" in {len(back)} of {len(steps)} trajectories ({some(back)})" if back else ""
+        problems.append(f"time stamps do not increase: column {clock!r}{where}; pass control_hz if they mean nothing")
         return None
     usual = float(np.median(np.concatenate(list(steps.values()))))
     if not SLOWEST <= 1 / usual <= FASTEST:
@@ -189,13 +189,12 @@ def _find_rate(pieces: Sequence[Piece], declared: float | None, otherwise: str, 
         return None
     uneven = {name: step for name, step in steps.items() if np.abs(step - usual).max(initial=0) > UNEVEN * usual}
     if uneven:
-        listed = "; ".join(
+        listed = [
             f"{name}: frames are {step.min():.4g} to {step.max():.4g} s apart (frame {np.abs(step - usual).argmax()})"
-            for name, step in list(uneven.items())[:5]
-        )
-        more = f" and {len(uneven) - 5} more" if len(uneven) > 5 else ""
+            for name, step in uneven.items()
+        ]
         problems.append(
-            f"{listed}{more}; the usual step is {usual:.4g} s: resample them to a fixed rate first, or pass control_hz"
+            f"{some(listed)}; the usual step is {usual:.4g} s: resample them to a fixed rate first, or pass control_hz"
             " if the stamps are wrong"
         )
     if declared is not None and abs(declared * usual - 1) > UNEVEN:

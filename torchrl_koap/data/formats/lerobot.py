@@ -25,7 +25,7 @@ import numpy as np
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.columns import Piece, assemble
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError, check_file, read_bytes
+from torchrl_koap.files import DataError, check_file, read_bytes, some
 
 PREFIX, STATE, ACTION = "observation.", "observation.state", "action"
 EPISODE, FRAME, TIME = "episode_index", "frame_index", "timestamp"
@@ -62,7 +62,9 @@ def is_lerobot(folder: str | Path) -> bool:
     return (Path(folder) / _INFO).is_file()
 
 
-def read_lerobot(root: str | Path, *, observations: Sequence[str] | None = None, **options: Any) -> Recordings:
+def read_lerobot(
+    root: str | Path, *, observations: Sequence[str] | None = None, episodes: Sequence[int] = (), **options: Any
+) -> Recordings:
     """Reads states and actions of all episodes; rows without actions have no label.
 
     Args:
@@ -71,6 +73,7 @@ def read_lerobot(root: str | Path, *, observations: Sequence[str] | None = None,
     Keyword Args:
         observations (sequence of str, optional): features that make up the state, in that order. Default: every feature
             named ``observation...`` that holds numbers; images are skipped and listed.
+        episodes (sequence of int): which episodes to read, such as those that were downloaded. Default: all.
         options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the data set declares its rate by ``fps``.
 
     Raises:
@@ -102,7 +105,7 @@ def read_lerobot(root: str | Path, *, observations: Sequence[str] | None = None,
         problems.append(f"no feature {PREFIX}* holds numbers; there are {', '.join(observed) or 'none'}")
     if problems:
         raise DataError(root, problems)
-    rows = read_rows(root, chosen)
+    rows = read_rows(root, chosen, episodes=episodes)
     names = [label for name in chosen for label in _names(known[name], name, rows.columns[name].shape[1])]
     if len(set(names)) < len(names):  # two features with the same names of columns
         names = [label for name in chosen for label in _names({}, name, rows.columns[name].shape[1])]
@@ -159,7 +162,9 @@ def read_info(root: str | Path) -> dict[str, Any]:
     return info | {"features": features}
 
 
-def read_rows(root: str | Path, features: Sequence[str], *, pictures: Sequence[str] = ()) -> Rows:
+def read_rows(
+    root: str | Path, features: Sequence[str], *, pictures: Sequence[str] = (), episodes: Sequence[int] = ()
+) -> Rows:
     """Reads columns of all episodes, and their actions if there are any.
 
     Args:
@@ -168,6 +173,7 @@ def read_rows(root: str | Path, features: Sequence[str], *, pictures: Sequence[s
 
     Keyword Args:
         pictures (sequence of str): columns of pictures.
+        episodes (sequence of int): which episodes to read. Default: all.
 
     Raises:
         DataError: with the problems of all files and episodes.
@@ -190,10 +196,13 @@ def read_rows(root: str | Path, features: Sequence[str], *, pictures: Sequence[s
     episode, frame = (columns.pop(name)[:, 0] for name in (EPISODE, FRAME))
     found, starts = np.unique(episode.astype(int), return_index=True)
     ends, expected = [*starts[1:], len(episode)], _expected_lengths(root)
-    missing = sorted(expected.keys() - {*found.tolist()})
-    problems = [f"{len(missing)} episodes are missing: {', '.join(map(str, missing[:10]))}"] if missing else []
-    spans = [slice(int(start), int(end)) for start, end in zip(starts, ends, strict=True)]
-    for number, span in zip(found.tolist(), spans, strict=True):
+    missing = sorted((set(episodes) or expected.keys()) - {*found.tolist()})
+    if missing:
+        absent, there = (some([str(number) for number in numbers]) for numbers in (missing, found))
+        problems = [f"{len(missing)} episodes are missing: {absent}; name in episodes which to read (here: {there})"]
+    chosen = [index for index, number in enumerate(found) if not episodes or number in episodes]
+    spans = [slice(int(starts[index]), int(ends[index])) for index in chosen]
+    for number, span in zip(found[chosen].tolist(), spans, strict=True):
         length, wanted = span.stop - span.start, expected.get(number)
         if wanted not in (None, length):
             problems.append(f"{files[span.start]}: episode {number} has {length} rows, its description says {wanted}")
@@ -201,7 +210,7 @@ def read_rows(root: str | Path, features: Sequence[str], *, pictures: Sequence[s
             problems.append(f"{files[span.start]}: column {FRAME!r} of episode {number} must count 0, 1, 2, ...")
     if problems:
         raise DataError(root, problems)
-    return Rows(columns, found.tolist(), spans)
+    return Rows(columns, found[chosen].tolist(), spans)
 
 
 def _read_table(root: Path, needed: Sequence[str], pictures: Sequence[str]):

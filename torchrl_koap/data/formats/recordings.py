@@ -147,7 +147,10 @@ def make_recordings(
 
 
 def _frames(value: ArrayLike, name: str, problems: list[str]) -> np.ndarray | None:
-    array = _array(value)
+    array = _array(value, f"{name}: states", problems)
+    if array is None:
+        return None
+    array = array.astype(np.float64) if array.dtype == bool else array
     if array.ndim != 2 or not array.shape[-1]:
         problems.append(f"{name}: states must be [T, d], got {list(array.shape)}")
     elif not np.issubdtype(array.dtype, np.floating):
@@ -166,13 +169,13 @@ def _frames(value: ArrayLike, name: str, problems: list[str]) -> np.ndarray | No
 
 
 def _steps(value: ArrayLike | None, name: str, problems: list[str]) -> np.ndarray | None:
-    if value is None:
+    array = None if value is None else _array(value, f"{name}: actions", problems)
+    if array is None:
         return None
-    array = _array(value)
     if array.ndim != 2 or not array.shape[-1]:
         problems.append(f"{name}: actions must be [T, a] or [T - 1, a], got {list(array.shape)}")
         return None
-    if array.dtype == object or not np.issubdtype(array.dtype, np.number):
+    if array.dtype.kind not in "fiub":
         problems.append(f"{name}: actions are {array.dtype}, wanted numbers")
         return None
     array = array.astype(np.float64)
@@ -184,8 +187,13 @@ def _steps(value: ArrayLike | None, name: str, problems: list[str]) -> np.ndarra
     return array
 
 
-def _array(value: ArrayLike) -> np.ndarray:
-    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+def _array(value: ArrayLike, name: str, problems: list[str]) -> np.ndarray | None:
+    try:
+        return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+    except ValueError:
+        widths = sorted({np.size(row) for row in value})  # type: ignore[union-attr, arg-type]
+        problems.append(f"{name} are lists of different lengths: rows of {' and '.join(map(str, widths))} numbers")
+        return None
 
 
 def _sparse(actions: Sequence[np.ndarray], names: Sequence[str]) -> list[str]:

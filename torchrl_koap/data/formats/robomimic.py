@@ -15,7 +15,6 @@ import importlib.util
 import json
 import re
 from collections.abc import Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -76,60 +75,69 @@ def read_robomimic(
         problems = [f"data/{name} has no group 'obs'" for name in demos if "obs" not in stream[f"data/{name}"]]
         if problems or not demos:
             raise DataError(file, problems or "'data' holds no trajectories")
-        first = stream[f"data/{demos[0]}/obs"]
-        usable = [name for name in sorted(first) if _is_table(first[name])]
-        skipped = [name for name in sorted(first) if name not in usable]
+        first = stream[f"data/{demos[0]}"]
+        usable = [name for name in sorted(first["obs"]) if _is_table(first["obs"][name])]
         chosen = usable if observations is None else list(observations)
         if not chosen:
-            problems.append(f"no entry of obs is a table of numbers; there are {', '.join(skipped)}")
-        for name, entry in product(demos, chosen):
-            group = stream[f"data/{name}/obs"]
-            if entry not in group:
-                problems.append(f"data/{name}/obs has no entry {entry!r}; it has {', '.join(sorted(group))}")
-            elif not _is_table(group[entry]):
-                shape = list(group[entry].shape)
-                problems.append(f"data/{name}/obs/{entry} is {shape}: an image cannot be part of the state")
+            problems.append(f"no entry of obs is a table of numbers; there are {', '.join(first['obs'])}")
         declared = _control_frequency(stream["data"].attrs.get("env_args"))
-        if problems:
-            raise DataError(file, problems)
-        pieces = [_piece(name, stream[f"data/{name}"], chosen, problems) for name in demos]
+        pieces = [_piece(name, stream["data"], chosen, first, problems) for name in demos]
+        skipped = [f"obs/{name}" for name in sorted(first["obs"]) if name not in chosen]
+        skipped += [name for name in sorted(first) if name not in ("obs", "next_obs", "actions")]
     if problems:
         raise DataError(file, problems)
     return assemble(
         pieces,
         str(file),
         declared_hz=declared,
-        skipped=[name for name in skipped if name not in chosen],
+        skipped=skipped,
         no_rate="env_args holds no control_freq: pass control_hz",
         **options,
     )
 
 
-def _piece(name: str, group: Any, chosen: Sequence[str], problems: list[str]) -> Piece:
-    """One demonstration; entries must have a row per frame."""
-    parts = {entry: np.asarray(group["obs"][entry]) for entry in chosen}
-    if "next_obs" in group and all(entry in group["next_obs"] for entry in chosen):
-        for entry, part in parts.items():
+def _piece(name: str, data: Any, chosen: Sequence[str], first: Any, problems: list[str]) -> Piece:
+    """One demonstration of a group; its entries must have a row per frame, as wide as those of the first one."""
+    group, states, lengths = data[name], dict[str, np.ndarray](), dict[str, list[int]]()
+    for entry in chosen:
+        if entry not in group["obs"]:
+            have = ", ".join(sorted(group["obs"]))
+            problems.append(f"data/{name}/obs has no entry {entry!r}; it has {have}")
+            continue
+        place, part = f"obs/{entry}", group["obs"][entry]
+        if not _is_table(part):
+            shape = list(getattr(part, "shape", ()))
+            problems.append(f"data/{name}/{place} is {shape}, no table of numbers: it cannot be part of the state")
+            continue
+        _check_width(name, place, part, first, problems)
+        part = np.asarray(part)
+        if "next_obs" in group and all(other in group["next_obs"] for other in chosen):
             behind = np.asarray(group["next_obs"][entry])
             if behind.shape[1:] != part.shape[1:] or not len(behind):
-                problems.append(
-                    f"data/{name}/next_obs/{entry} is {list(behind.shape)}, obs/{entry} is {list(part.shape)}"
-                )
+                problems.append(f"data/{name}/next_{place} is {list(behind.shape)}, {place} is {list(part.shape)}")
                 continue
-            parts[entry] = np.concatenate([part, behind[-1:]])
-    longest = {len(part) for part in parts.values()}
-    if len(longest) > 1:
-        shapes = ", ".join(f"{entry} {list(part.shape)}" for entry, part in parts.items())
+            part = np.concatenate([part, behind[-1:]])
+        states |= spread(entry, part)
+        lengths[entry] = list(part.shape)
+    if len({shape[0] for shape in lengths.values()}) > 1:
+        shapes = ", ".join(f"{entry} {shape}" for entry, shape in lengths.items())
         problems.append(f"data/{name}/obs: entries have different numbers of frames: {shapes}")
-    states = {column: values for entry, part in parts.items() for column, values in spread(entry, part).items()}
     if "actions" not in group:
         return Piece(name, states)
-    actions = np.asarray(group["actions"])
-    if actions.ndim not in (1, 2) or actions.dtype.kind not in "fiub":
-        problems.append(f"data/{name}/actions must be numbers [T, a], got {actions.dtype} {list(actions.shape)}")
+    if not _is_table(group["actions"]):
+        shape = list(getattr(group["actions"], "shape", ()))
+        problems.append(f"data/{name}/actions must be numbers [T, a], got {shape}")
         return Piece(name, states)
+    _check_width(name, "actions", group["actions"], first, problems)
+    actions = np.asarray(group["actions"])
     columns = actions.reshape(len(actions), -1).T
     return Piece(name, states, {f"action_{index}": values for index, values in enumerate(columns)})
+
+
+def _check_width(name: str, place: str, part: Any, first: Any, problems: list[str]) -> None:
+    if place in first and _is_table(first[place]) and part.shape[1:] != first[place].shape[1:]:
+        wanted = f"{first[place].name.removeprefix('/')} is {list(first[place].shape)}"
+        problems.append(f"data/{name}/{place} is {list(part.shape)}, {wanted}")
 
 
 def _number(name: str) -> tuple[int, str]:

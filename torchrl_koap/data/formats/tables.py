@@ -27,7 +27,7 @@ import numpy as np
 from torchrl_koap.data.formats.arrow import import_pyarrow, number_type, numbers
 from torchrl_koap.data.formats.columns import UNEVEN, Piece, assemble, kind_of
 from torchrl_koap.data.formats.recordings import Recordings
-from torchrl_koap.files import DataError
+from torchrl_koap.files import DataError, some
 from torchrl_koap.lookup import lookup
 
 # what readers of damaged files raise
@@ -85,15 +85,15 @@ def read_tables(
             f"action_columns: not an option for NumPy archives ({archives[0]}), whose actions are the entry"
             f" {' or '.join(map(repr, ACTIONS))}"
         )
-    problems: list[str] = []
+    problems: dict[str, list[str]] = {}
     tables: list[_Table] = []
     for file in files:
         try:
             tables.append(_READERS[file.suffix](file, action_columns))
         except _UNREADABLE as error:
-            problems.append(f"{file}: {error or type(error).__name__}")
+            problems.setdefault(str(error) or type(error).__name__, []).append(str(file))
     if problems:
-        raise DataError(folder, problems)
+        raise DataError(folder, [f"{some(names)}: {said}" for said, names in problems.items()])
     rates = [rate for _, rate, _ in tables if rate]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
         raise DataError(folder, f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second: resample them")
@@ -113,8 +113,14 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
+    entries = {}
     with np.load(file, allow_pickle=False) as archive:
-        entries = {name: archive[name] for name in archive.files}
+        for name in archive.files:
+            try:
+                entries[name] = archive[name]
+            except ValueError as error:
+                what = f"entry {name!r} cannot be read: it holds objects (lists of different lengths?), or is damaged"
+                raise ValueError(what) from error
     key = next((name for name in STATES if name in entries), None)
     if key is None:
         raise ValueError(
@@ -122,7 +128,7 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
         )
     acting = next((name for name in ACTIONS if name in entries), None)
     frames, read = entries[key], {key, acting, "state_names", "action_names", "control_hz"}
-    if frames.ndim != 2 or frames.dtype.kind != "f":
+    if frames.ndim != 2 or frames.dtype.kind not in "fb":
         raise ValueError(f"{key} must be floating-point numbers [T, d], got {frames.dtype} {list(frames.shape)}")
     states, unclear = _named(frames, entries.get("state_names"), "state"), []
     for name in [name for name in entries if name not in read]:
@@ -180,33 +186,38 @@ def _frame_entry(name: str, values: np.ndarray, length: int) -> np.ndarray:
 
 
 def _read_csv(file: Path, action_columns: Sequence[str] | None) -> _Table:
-    with file.open(newline="", encoding="utf-8-sig") as stream:
-        text = stream.read()
-    first = text.partition("\n")[0]
-    separator = max(",;\t", key=first.count)
+    text = file.read_text(encoding="utf-8-sig")
+    separator = max(",;\t", key=text.partition("\n")[0].count)
     rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(field.strip() for field in row)]
     if len(rows) < 2:
         raise ValueError("wanted a header and a row per frame")
     header = [name.strip() for name in rows[0]]
-    if not header[0]:
-        header[0] = "unnamed: 0"  # the index of the rows, as pandas writes and reads it
+    header[0] = header[0] or "unnamed: 0"  # the index of the rows, as pandas writes and reads it
     for number, name in enumerate(header):
         if not name:
             raise ValueError(f"column {number + 1} has no name")
         if header.index(name) != number:
             raise ValueError(f"columns {header.index(name) + 1} and {number + 1} are both named {name!r}")
-    values = np.empty((len(rows) - 1, len(header)))
-    for number, row in enumerate(rows[1:]):
+    for number, row in enumerate(rows[1:], 2):
         if len(row) != len(header):
-            raise ValueError(f"row {number + 2} has {len(row)} fields, the header has {len(header)}")
-        for column, text in enumerate(row):
-            try:
-                values[number, column] = (
-                    _TRUTH[text.strip().lower()] if text.strip().lower() in _TRUTH else float(text.strip() or "nan")
-                )
-            except ValueError:
-                raise ValueError(f"row {number + 2}, column {header[column]!r}: {text!r} is no number") from None
-    return _split(file, {name: values[:, index] for index, name in enumerate(header)}, action_columns, [])
+            raise ValueError(f"row {number} has {len(row)} fields, the header has {len(header)}")
+    columns: dict[str, np.ndarray | None] = {}
+    for name, fields in zip(header, zip(*rows[1:], strict=True), strict=True):
+        values = [_number(field.strip(), comma=separator != ",") for field in fields]
+        odd = [row for row, value in enumerate(values) if value is None]
+        if 0 < len(odd) < len(values):
+            raise ValueError(f"row {odd[0] + 2}, column {name!r}: {fields[odd[0]]!r} is no number")
+        columns[name] = None if odd else np.array(values)
+    return _split(file, columns, action_columns)
+
+
+def _number(field: str, *, comma: bool) -> float | None:
+    """What a field says: NaN if it is empty, 0 or 1 for a truth, None if it is text."""
+    field = field.replace(",", ".") if comma else field
+    try:
+        return _TRUTH[field.lower()] if field.lower() in _TRUTH else float(field or "nan")
+    except ValueError:
+        return None
 
 
 def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
@@ -215,29 +226,37 @@ def _read_parquet(file: Path, action_columns: Sequence[str] | None) -> _Table:
         table = pyarrow.parquet.read_table(file)
     except pyarrow.ArrowException as error:
         raise ValueError(f"cannot be read: {str(error).splitlines()[0]}") from error
-    columns: dict[str, np.ndarray] = {}
-    unread = []
+    columns: dict[str, np.ndarray | None] = {}
     for name in table.column_names:
         values = table[name]
         if pyarrow.types.is_boolean(values.type):
             values = values.cast(pyarrow.int8())
         kind = number_type(values.type)
         if kind is None:  # text, dates, pictures
-            unread.append(name)
+            columns[name] = None
             continue
         block = numbers(values.cast(kind), name)
         alone = not pyarrow.types.is_list(kind)
         columns |= {name if alone else f"{name}_{index}": block[:, index] for index in range(block.shape[1])}
-    return _split(file, columns, action_columns, unread)
+    return _split(file, columns, action_columns)
 
 
 _READERS = {".npz": _read_npz, ".csv": _read_csv, ".parquet": _read_parquet}
 
 
-def _split(file: Path, columns: Mapping[str, np.ndarray], action_columns: Sequence[str] | None, unread: list[str]):
-    """States and actions of a table with named columns."""
+def _split(file: Path, columns: Mapping[str, np.ndarray | None], action_columns: Sequence[str] | None) -> _Table:
+    """States and actions of a table with named columns, None where they hold no numbers."""
     acting = [name for name in columns if name == "action" or name.startswith(("action_", "action."))]
     if action_columns is not None:
         acting = [name for name in action_columns if lookup(columns, name, "action column") is not None]
-    states = {name: values for name, values in columns.items() if name not in acting}
-    return Piece(file.name, states, {name: columns[name] for name in acting} or None), None, unread
+    unread = [name for name, values in columns.items() if values is None]
+    for name in unread:
+        if name in acting:
+            raise ValueError(f"column {name!r} is an action and holds no numbers")
+    known = {name: values for name, values in columns.items() if values is not None}
+    if not known:
+        raise ValueError(
+            f"no column holds numbers: {', '.join(columns)} (fields lie between commas, semicolons or tabs)"
+        )
+    states = {name: values for name, values in known.items() if name not in acting}
+    return Piece(file.name, states, {name: known[name] for name in acting} or None), None, unread
