@@ -10,21 +10,22 @@ from small_koopman import HISTORY, LOSSES, NETWORKS, K, T, make_batch, make_netw
 from tensordict import TensorDict
 
 from torchrl_koap.modules import LatentActionLSTM, LatentActionMLP
-from torchrl_koap.objectives import KOAPLoss, KoopmanDynamicsLoss, KoopmanReconstructionLoss, LatentActionLoss
+from torchrl_koap.objectives import KOAPLoss, KoopmanReconstructionLoss, LatentActionLoss
 
 
 def span(clamped):
     return range(HISTORY, T - 2 if clamped else T - K)
 
 
-class KoopmanLossTests(LossTestBase):
+class TestKOAP(LossTestBase):
     default_keys = {"state": "state", "action": "action", "has_action": "has_action", "padded": "padded"}
+    in_names = ("state", "action", "has_action")
+    out_keys = ("loss_reconstruction", "loss_koopman", "loss_action")
+    coefficients = {"koopman_coeff": "loss_koopman", "action_coeff": "loss_action"}
     learning_rate = 1e-2
-    loss_class: type
 
     def make_loss(self, seed=0, **options):
-        kind = options.pop("kind", "fourier")
-        return self.loss_class(make_network(kind, seed=seed), **options)
+        return KOAPLoss(make_network("fourier", seed=seed), **options)
 
     def make_batch(self, *batch):
         data = make_batch(*batch)
@@ -43,36 +44,9 @@ class KoopmanLossTests(LossTestBase):
         return count.sum()
 
 
-class TestReconstruction(KoopmanLossTests):
-    loss_class = KoopmanReconstructionLoss
-    in_names, out_keys = ("state",), ("loss_reconstruction",)
-    test_compiled_equals_eager = None  # TestKOAP compiles the same terms
-
-
-class TestDynamics(KoopmanLossTests):
-    loss_class = KoopmanDynamicsLoss
-    in_names, out_keys = ("state",), ("loss_koopman",)
-    test_compiled_equals_eager = None  # TestKOAP compiles the same terms
-
-
-class TestLatentAction(KoopmanLossTests):
-    loss_class = LatentActionLoss
-    in_names, out_keys = ("state", "action", "has_action"), ("loss_action",)
-    decrease = 0.8
-    test_compiled_equals_eager = None
-
-
-class TestKOAP(KoopmanLossTests):
-    loss_class = KOAPLoss
-    in_names = ("state", "action", "has_action")
-    out_keys = ("loss_reconstruction", "loss_koopman", "loss_action")
-    coefficients = {"koopman_coeff": "loss_koopman", "action_coeff": "loss_action"}
-
-
-@pytest.mark.parametrize("kind", ["mlp", "lstm"])
-def test_compiled_equals_eager_for_the_other_networks(kind):
+def test_compiled_equals_eager_for_the_lstm():
     torch._dynamo.reset()
-    loss, batch = KOAPLoss(make_network(kind)), make_batch(3)
+    loss, batch = KOAPLoss(make_network("lstm")), make_batch(3)
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")(batch)
     for key, value in loss(batch).items():
         torch.testing.assert_close(compiled[key], value)
@@ -134,12 +108,19 @@ def test_values_in_plain_loops(kind, clamped):
     assert (elements["loss_action"][~labelled] == 0).all()
 
 
-def test_single_losses_are_the_terms_of_the_sum():
-    network, batch = make_network(), make_batch(4)
-    together = KOAPLoss(network)(batch)
-    for loss_class in LOSSES[:3]:
-        for key, value in loss_class(network)(batch).items():
-            assert torch.equal(value, together[key])
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+@pytest.mark.parametrize("loss_class", LOSSES[:3])
+def test_single_losses_are_the_terms_of_the_sum_and_read_no_more(loss_class, reduction):
+    batch = make_batch(4)
+    single, together = loss_class(make_network(), reduction=reduction), KOAPLoss(make_network(), reduction=reduction)
+    labels = ["action", "has_action"] if loss_class is LatentActionLoss else []
+    assert single.in_keys == ["state", *labels]
+    found = single(batch.select(*single.in_keys))
+    assert list(found.keys()) == single.out_keys and len(single.out_keys) == 1
+    for key, value in found.items():
+        assert torch.equal(value, together(batch)[key])
+    with pytest.raises(KeyError, match="state.*there are"):
+        single(batch.exclude("state"))
 
 
 @pytest.mark.parametrize("kind", NETWORKS)

@@ -132,8 +132,8 @@ def test_every_picture_has_words_and_a_command():
         assert (
             item.title
             and len(item.caption_for(RunFacts(Path("run")))) > 40
-            and item.command.startswith("koap ")
-            and "{run}" in item.command
+            and item.made_by.startswith("koap ")
+            and "{run}" in item.made_by
         )
 
 

@@ -128,10 +128,6 @@ class Normalizer(nn.Module):
         offset, scale = self._statistics(values)
         return values * scale + offset
 
-    def extra_repr(self) -> str:
-        """Returns the size, for printing."""
-        return f"{len(self.offset)} columns"
-
     def _statistics(self, values: Tensor) -> tuple[Tensor, Tensor]:
         if values.shape[-1:] != self.offset.shape:
             raise ValueError(f"wanted {len(self.offset)} columns, got shape {list(values.shape)}")

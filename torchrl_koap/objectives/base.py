@@ -23,7 +23,7 @@ def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         key (NestedKey): the entry.
 
     Raises:
-        KeyError: if it is not; the message lists what is.
+        KeyError: if it is not there.
     """
     value = tensordict.get(key, None)
     if value is None:

@@ -94,9 +94,8 @@ class KoopmanDynamicsLoss(_KoopmanLoss):
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
         >>> from torchrl_koap.objectives import KoopmanDynamicsLoss
-        >>> batch = TensorDict({"state": torch.randn(4, 16, 2)}, [4])
         >>> loss = KoopmanDynamicsLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
-        >>> loss(batch)["loss_koopman"].shape
+        >>> loss(TensorDict({"state": torch.randn(4, 16, 2)}, [4]))["loss_koopman"].shape
         torch.Size([])
     """
 
@@ -107,20 +106,18 @@ class KoopmanDynamicsLoss(_KoopmanLoss):
 class LatentActionLoss(_KoopmanLoss):
     """Computes the error of the decoded actions, ``loss_action``, over the labelled frames that count.
 
-    Args and keywords as of :class:`KoopmanReconstructionLoss`. A batch without labels gives exactly 0, and exactly zero
-    gradients.
+    Args and keywords as of :class:`KoopmanDynamicsLoss`.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
         >>> from torchrl_koap.objectives import LatentActionLoss
-        >>> batch = TensorDict({"state": torch.randn(4, 16, 2)}, [4])
         >>> loss = LatentActionLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8))
-        >>> batch["action"] = torch.full((4, 16, 2), torch.nan)
-        >>> batch["has_action"] = torch.zeros(4, 16, 1, dtype=torch.bool)
-        >>> loss(batch)["loss_action"].item()
-        0.0
+        >>> batch = TensorDict({"state": torch.randn(4, 16, 2), "action": torch.randn(4, 16, 2),
+        ...                     "has_action": torch.ones(4, 16, 1, dtype=torch.bool)}, [4])
+        >>> loss(batch)["loss_action"].shape
+        torch.Size([])
     """
 
     terms = (ACTION,)
@@ -129,11 +126,10 @@ class LatentActionLoss(_KoopmanLoss):
 
 
 class KOAPLoss(_KoopmanLoss):
-    """Computes the weighted sum of the three terms, from one pass through the networks.
+    """Computes the three terms from one pass through the networks; their sum is the total, coefficients applied.
 
-    The coefficients are already applied to the returned terms, so their sum is the total. The reconstruction averages
-    over all frames, the dynamics over those of :meth:`InverseDynamics.valid_frames`, the actions over the labelled ones
-    of these.
+    The reconstruction averages over all frames, the dynamics over those of :meth:`InverseDynamics.valid_frames`, the
+    actions over the labelled ones of these.
 
     Args:
         network (KoopmanInverseDynamics or NonlinearInverseDynamics): the model.

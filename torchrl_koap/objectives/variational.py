@@ -83,7 +83,7 @@ class VariationalLoss(WindowLoss):
         with self.network_params.to_module(self.network, preserve_module_state=False):
             read, mean, log_variance = self.network.posterior(state, span)
             sample = mean + (0.5 * log_variance).exp() * self._noise(tensordict, mean)
-            error = (self.network.reconstruct(sample) - read).square().mean(-1)
+            error = (self.network.decoder(sample) - read).square().mean(-1)
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1)
         losses = {
             "loss_reconstruction": self._reduce(error, counts),

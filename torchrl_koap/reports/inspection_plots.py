@@ -13,13 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 from safetensors.numpy import load_file
 
-from torchrl_koap.evaluation.findings import (
-    MODELS,
-    ON_THE_CIRCLE,
-    OUTSIDE_THE_BUDGET,
-    error_unit,
-    unit_circle_sides,
-)
+from torchrl_koap.evaluation.findings import MODELS, ON_THE_CIRCLE, OUTSIDE_THE_BUDGET, error_unit, unit_circle_sides
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import (

@@ -15,17 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import (
-    BLUE,
-    FAINT,
-    MUTED,
-    ORANGE,
-    PALE_BLUE,
-    RED,
-    legend_beside,
-    set_title,
-    tidy,
-)
+from torchrl_koap.reports.style import BLUE, FAINT, MUTED, ORANGE, PALE_BLUE, RED, legend_beside, set_title, tidy
 from torchrl_koap.tasks.units import thousandths
 
 _PLANS = {

@@ -71,7 +71,8 @@ class Picture:
         title (str): its heading in the report.
         caption (str or callable): what it shows and how to read it, or a function of the run that says so.
         draw (callable): from the content of the source and the run to a figure or film.
-        command (str): the ``koap`` command that leaves the source, ``{run}`` stands for the directory.
+        command (str): the ``koap`` command that leaves the source, ``{run}`` stands for the directory. Default: by the
+            source.
         order (int): pictures stand in the report in this order.
         empty (str): what the report says where the source holds nothing to draw; nothing if it is empty.
         offline (bool): it is of tasks without an environment alone, which are evaluated on recorded data.
@@ -87,10 +88,15 @@ class Picture:
     title: str
     caption: str | Callable[[RunFacts], str]
     draw: Draw
-    command: str
+    command: str = ""
     order: int = 1000
     empty: str = ""
     offline: bool = False
+
+    @property
+    def made_by(self) -> str:
+        """The command that leaves the source."""
+        return self.command or _COMMANDS.get(self.source, TRAIN)
 
     def caption_for(self, run: RunFacts) -> str:
         """Returns the caption for a run."""
@@ -105,24 +111,15 @@ class Picture:
 _PICTURES: dict[str, Picture] = {}
 
 
-def picture(
-    name: str,
-    *,
-    source: str,
-    title: str,
-    caption: str | Callable[[RunFacts], str],
-    command: str | None = None,
-    order: int = 1000,
-    empty: str = "",
-    offline: bool = False,
-) -> Callable[[Draw], Draw]:
+def picture(name: str, **facts: Any) -> Callable[[Draw], Draw]:
     """Registers the decorated function as the one that draws a picture of a run; the function stays as it is.
 
     Of the source, ``.safetensors`` comes as a dictionary of arrays, ``.json`` as what it holds, ``.csv`` as a list of
     rows.
 
     Args:
-        name (str): file of the picture; it and all other arguments are those of :class:`Picture`.
+        name (str): file of the picture.
+        **facts: the other arguments of :class:`Picture`.
 
     Raises:
         ValueError: if there is a picture of that name already.
@@ -133,8 +130,7 @@ def picture(
         if known is not None:
             first, second = (f"{item.__module__}.{item.__qualname__}" for item in (known.draw, draw))
             raise ValueError(f"a picture {name!r} is registered already, by {first}; {second} needs another name")
-        usual = command or _COMMANDS.get(source, TRAIN)
-        _PICTURES[name] = Picture(name, source, title, caption, draw, usual, order, empty, offline)
+        _PICTURES[name] = Picture(name=name, draw=draw, **facts)
         return draw
 
     return register

@@ -112,7 +112,7 @@ def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str,
         elif item.source == "actions.safetensors" and not source and isinstance(no_actions, str):
             figures.append(figure | {"empty": no_actions})  # no command would make it
         elif not source:
-            missing.setdefault(_filled(item.command, run), []).append(item.title)
+            missing.setdefault(_filled(item.made_by, run), []).append(item.title)
         elif item.empty:
             figures.append(figure | {"empty": item.empty})
     return figures, missing

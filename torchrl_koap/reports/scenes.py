@@ -14,18 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.reports.style import (
-    BLUE,
-    FAILURE_MARKS,
-    FAINT,
-    GREEN,
-    INK,
-    MUTED,
-    RED,
-    as_array,
-    entry,
-    tidy,
-)
+from torchrl_koap.reports.style import BLUE, FAILURE_MARKS, FAINT, GREEN, INK, MUTED, RED, as_array, entry, tidy
 from torchrl_koap.tasks import Body, Shape, Task
 
 # how a role is drawn; a shape's own colour goes before the role's

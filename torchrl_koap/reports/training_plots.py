@@ -14,17 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from torchrl_koap.reports.pictures import picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import (
-    BLUE,
-    FAINT,
-    MUTED,
-    SERIES,
-    WARNING,
-    entry,
-    legend_beside,
-    set_title,
-    tidy,
-)
+from torchrl_koap.reports.style import BLUE, FAINT, MUTED, SERIES, WARNING, entry, legend_beside, set_title, tidy
 from torchrl_koap.tasks.units import thousandths
 
 _ROUND = (1, 2, 5, 10)
@@ -108,12 +98,9 @@ def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
         reach (int): places to either side.
     """
     there = np.isfinite(values)
-    ahead = np.arange(len(values)) + reach + 1
-    first, last = np.maximum(ahead - 2 * reach - 1, 0), np.minimum(ahead, len(values))
-    total = np.concatenate([[0.0], np.cumsum(np.where(there, values, 0.0))])
-    count = np.concatenate([[0], np.cumsum(there)])
-    number = count[last] - count[first]
-    return np.where(number > 0, (total[last] - total[first]) / np.maximum(number, 1), np.nan)
+    sums = [np.convolve(part, np.ones(2 * reach + 1)) for part in (np.where(there, values, 0.0), there)]
+    total, count = (part[reach : reach + len(values)] for part in sums)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 @picture(

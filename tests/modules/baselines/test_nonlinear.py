@@ -132,7 +132,7 @@ def test_it_learns_curved_actions_from_some_labels_beside_unlabelled_windows():
     loss, unseen = KOAPLoss(network), data[1024:]
     before = loss(unseen)
     optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
-    for _ in range(400):
+    for _ in range(250):
         sum(loss(data[torch.randint(1024, (64,), generator=generator)]).values()).backward()
         optimizer.step()
         optimizer.zero_grad()

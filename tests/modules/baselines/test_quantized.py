@@ -131,8 +131,8 @@ def test_two_stages_learn_actions_from_few_labels():
     train(
         network,
         data,
-        (QuantizedDynamicsLoss(network), 400, 1024),
-        (ActionLoss(network, freeze_latents=True), 300, 32),
+        (QuantizedDynamicsLoss(network), 200, 1024),
+        (ActionLoss(network, freeze_latents=True), 200, 32),
     )
     error = QuantizedDynamicsLoss(network)(unseen)["loss_dynamics"]
     assert error < 0.1, error  # without a code 0.97 is the best, that of -0.1 x_t

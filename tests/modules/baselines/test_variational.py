@@ -149,7 +149,7 @@ def test_two_stages_learn_actions_from_few_labels():
     network = VariationalInverseDynamics(2, 2, window=12, hidden_dim=32)
     network.prepare(data["state"][:1024])
     decoder = ActionLoss(network, freeze_latents=True, sample=True)
-    train(network, data, (VariationalLoss(network), 400, 1024), (decoder, 300, 32))
+    train(network, data, (VariationalLoss(network), 200, 1024), (decoder, 200, 32))
     unseen = data[1024:]
     error = (network(unseen.select("state"))["action"] - unseen["action"])[:, 1:10].square().mean()
     assert error < 0.2, error  # the mean action has error 1

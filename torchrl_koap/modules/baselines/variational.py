@@ -85,10 +85,6 @@ class VariationalInverseDynamics(LatentInverseDynamics):
         mean, log_variance = self.encoder(context).chunk(2, -1)
         return read, mean, log_variance.clamp(-10.0, 10.0)  # one odd window must not overflow the exponential
 
-    def reconstruct(self, latent: Tensor) -> Tensor:
-        """Maps latents ``[*B, T, m]`` back to what their frames read ``[*B, T, 3 d]``."""
-        return self.decoder(latent)
-
     def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
         """Infers the means ``[*B, len(frames), m]`` of the latents of a window of raw states ``[*B, T, d]``."""
         return self.posterior(state, frames)[1]

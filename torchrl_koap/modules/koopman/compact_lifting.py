@@ -20,6 +20,7 @@ MIN_NOISE = 0.5  # no sum of columns is believed to have less than so much of th
 MIN_RATIO = 2.0  # a component with less variance than so many times the noise's is left out
 AVERAGED, MEANS = 5, 2000  # frames of each mean, and means, that Isomap finds coordinates of
 PRETRAINING_UPDATES, PRETRAINING_RATE = 1000, 3e-3  # with which the networks learn these coordinates
+BATCH = 2048  # windows that are lifted at once
 GAIN = 0.7  # twice the coordinates are read if they leave less than this share of the reconstruction error
 
 
@@ -77,14 +78,7 @@ class NoiseAdjustedComponents(nn.Module):
 
     @torch.no_grad()
     def fit(self, windows: Tensor) -> None:
-        """Fits the components; no label is read.
-
-        Args:
-            windows (Tensor): ``[N, T, d]`` of frames one control step apart, in the networks' units.
-
-        Raises:
-            ValueError: for windows of less than five frames.
-        """
+        """Fits the components to windows ``[*B, T >= 5, d]`` in the networks' units; no label is read."""
         windows = windows.flatten(0, -3)
         noise = _credible(noise_covariance(windows[:: -(-len(windows) // MOST_WINDOWS)]))
         states = windows.flatten(0, -2).double()
@@ -110,8 +104,7 @@ class NoiseAdjustedComponents(nn.Module):
 def _credible(noise: Tensor) -> Tensor:
     """The covariance ``[d, d]`` of noise without directions that are free of it by the chance of few windows.
 
-    An estimate of many columns has such directions nearly always, and components that are ordered by how far they stand
-    out of the noise would follow them before all others.
+    An estimate of many columns nearly always has such directions, and they would come first among the components.
     """
     spread = noise.diagonal().clamp_min(1e-12).sqrt()
     values, vectors = torch.linalg.eigh(noise / spread / spread[:, None])
@@ -198,11 +191,7 @@ class CompactLifting(TensorDictModuleBase):
 
     @torch.no_grad()
     def prepare(self, windows: Tensor) -> None:
-        """Fits the components, and sets the linear part of both networks to the first of them; before training.
-
-        Args:
-            windows (Tensor): ``[*B, T, d]`` in the networks' units; no label is read.
-        """
+        """Fits the components to windows ``[*B, T, d]``, and sets the linear part of both networks to the first."""
         self.kept.fill_(1.0)
         self.components.fit(windows)
         components, size = self.components(windows), self.components.weights.sqrt()
@@ -219,13 +208,12 @@ class CompactLifting(TensorDictModuleBase):
     def pretrain(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
         """Trains both networks to Isomap coordinates and back, before any loss does.
 
-        A state that is a nonlinear picture of a few coordinates may be folded up so much that no gradient of the losses
-        unfolds it: an encoder that starts at linear components leaves states together that are far apart. These start
-        at :func:`~torchrl_koap.modules.koopman.isomap.isomap` of means of a few successive frames, which have less
-        noise than any of them.
+        An encoder that starts at linear components leaves states of a folded surface together that are far apart, and
+        no gradient of the losses unfolds it. These start at :func:`~torchrl_koap.modules.koopman.isomap.isomap` of
+        means of a few successive frames, which have less noise.
 
         Args:
-            windows (Tensor): ``[*B, T, d]`` in the networks' units, ``T >= 5``; no label is read.
+            windows (Tensor): ``[*B, T >= 5, d]`` in the networks' units; no label is read.
             updates (int): of each network, at most; more than 1000 are not made.
             progress (callable, optional): called with the number of updates done and wanted, of both networks.
         """
@@ -252,18 +240,11 @@ class CompactLifting(TensorDictModuleBase):
             optimizer.zero_grad()
 
     @torch.no_grad()
-    def finish(self, windows: Tensor, *, batch_size: int = 2048) -> None:
-        """Keeps the coordinates of one network, by what both leave of the state; after training.
-
-        Args:
-            windows (Tensor): ``[*B, T, d]`` in the networks' units; no label is read.
-
-        Keyword Args:
-            batch_size (int): windows lifted at once.
-        """
+    def finish(self, windows: Tensor) -> None:
+        """Keeps the coordinates of one network, by what both leave of windows ``[*B, T, d]``; after training."""
         self.kept.fill_(1.0)
         sums = torch.zeros(2, dtype=torch.float64)
-        for part in windows.flatten(0, -3).split(batch_size):
+        for part in windows.flatten(0, -3).split(BATCH):
             target = self.components(part)
             for index, made in enumerate(self._decoded(self.encode(part))):
                 sums[index] += ((made - target).square() * self.components.weights).sum().double().cpu()

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
+from torchrl_koap.modules.koopman.compact_lifting import BATCH, CompactLifting
 from torchrl_koap.modules.koopman.latent_action import LatentActionFourier, LatentActionModule
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
 from torchrl_koap.modules.koopman.smoothing import WienerSmoother
@@ -127,12 +127,12 @@ class LatentActionSmoothed(LatentActionModule):
         self.finish(windows)
 
     @torch.no_grad()
-    def finish(self, windows: Tensor, *, batch_size: int = 2048) -> None:
+    def finish(self, windows: Tensor) -> None:
         """Fits to windows ``[*B, T, d]`` what depends on the lifting: spread, smoother, spread of the steps."""
         windows = windows.flatten(0, -3)
         now = self.reader.valid_frames(windows.shape[-2])[:1]
         self.spread.fill_(1.0)
-        lifted = torch.cat([self._lift(part) for part in windows.split(batch_size)])
+        lifted = torch.cat([self._lift(part) for part in windows.split(BATCH)])
         spread = lifted.flatten(0, 1).std(0)
         self.spread.copy_(torch.where(spread > 1e-9, spread, torch.ones_like(spread)))
         lifted = lifted / self.spread
