@@ -73,13 +73,7 @@ def machine_facts() -> dict[str, str]:
 
 
 def check_run(folder: Path) -> dict[str, str]:
-    """Reads every file of a run that a command would read, checksums included.
-
-    Args:
-        folder (Path): run directory.
-
-    Returns:
-        dict: file to what was found.
+    """Reads every file of a run that a command would read, checksums included; returns what was found by file.
 
     Raises:
         RunDirectoryError: with all problems.

@@ -62,9 +62,6 @@ def as_typed() -> str:
 def check_options(options: Any) -> None:
     """Checks the options of a command, those of its configurations included.
 
-    Args:
-        options (dataclass): the command.
-
     Raises:
         ValueError: for numbers that are NaN, infinite or beyond 2^53, and an ``out`` that lies below a file.
 
@@ -102,9 +99,6 @@ def _check_folder(path: Path, option: str) -> None:
 
 def expand(words: Sequence[str]) -> list[str]:
     """Replaces short options by those that they stand for, and ``--config FILE`` by the options in the file.
-
-    Args:
-        words (sequence of str): what follows ``koap train``.
 
     Raises:
         RunDirectoryError: if the file is not there, or holds other things than options.

@@ -32,17 +32,7 @@ _MEAN_SPREAD = 30.0  # prior deviation of a fitted mean against that of what the
 
 @dataclass(frozen=True)
 class Suggestion:
-    """A demonstration to label.
-
-    Args:
-        episode (int): its number.
-        score (float): what it is chosen by when its turn comes, in units of the noise variance.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.active_labelling import Suggestion
-        >>> Suggestion(episode=57, score=0.31).episode
-        57
-    """
+    """A demonstration to label, and what it is chosen by when its turn comes, in units of the noise variance."""
 
     episode: int
     score: float

@@ -31,7 +31,8 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     """Evaluates a run in closed loop; writes ``eval.json`` and ``rollouts.safetensors``. ``koap eval`` calls this.
 
     A task without an environment is judged on recorded data instead
-    (:func:`~torchrl_koap.evaluation.offline.evaluate_offline`), and there is ``eval.json`` alone.
+    (:func:`~torchrl_koap.evaluation.offline.evaluate_offline`), and there is ``eval.json`` alone. Actions outside the
+    label budget are read, for evaluation only (``actions.safetensors``).
 
     Args:
         run (str or Path): a run directory, or ``pretrained:NAME``, a trained policy of the repository.
@@ -71,10 +72,11 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         return _judge_offline(trained, config)
     if config.execution.strategy == "oracle" and config.env is not None:
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
-    actions = evaluate_actions(trained, config.dataset)
-    policy = trained_policy(trained, config.execution).to(config.device)
+    policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
     where = environment_of(task, config)
+    errors, actions = evaluate_actions(trained, config.dataset)
+    policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
         episodes = roll_out(
             policy,
@@ -85,14 +87,13 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
             contexts=where.contexts,
             progress=count_up_to(bar),
         )
-    unsolved = "zero" if task.modes.entropy == "contexts" else "skip"
     result = score(
         episodes,
         seeds,
         num_modes=where.num_modes,
         mode_index=where.mode_index,
         contexts=where.numbers,
-        unsolved=unsolved,
+        unsolved="zero" if task.modes.entropy == "contexts" else "skip",
     )
     if config.env is None:
         result = task_scores(task, result, episodes, where.numbers)
@@ -100,7 +101,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     learned = config.execution if policy.execution.strategy != "oracle" else ExecutionConfig()
     timed = policy if learned is config.execution else trained_policy(trained, learned).to(config.device)
     result |= measure_latency(timed, task.observation_dim)
-    result |= actions | limited_commands(policy) | {"execution": asdict(policy.execution), "episode": rows}
+    result |= errors | limited_commands(policy) | {"execution": asdict(policy.execution), "episode": rows}
     if config.env is not None:
         result |= {"env": config.env, "success_key": config.success_key}
     rollouts = rollouts_to_tensors(
@@ -114,6 +115,8 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     if where.contexts is not None:  # in full precision: a film of the same episode starts from it
         rollouts["context"] = torch.from_numpy(where.contexts)
     save_tensors(directory.path / "rollouts.safetensors", rollouts, {"task": task.name})
+    if actions:
+        save_tensors(directory.path / "actions.safetensors", actions)
     directory.write_json("eval.json", result)
     return result
 
@@ -122,8 +125,11 @@ def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
     """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
     choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
     policy = trained_policy(trained, config.execution)
-    result = evaluate_offline(trained, dataset=config.dataset, samples=config.samples, seed=config.seed)
+    asked = {"dataset": config.dataset, "samples": config.samples, "seed": config.seed}
+    result, actions = evaluate_offline(trained, **asked)
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
     result["seed"] = config.seed
+    if actions:
+        save_tensors(trained.folder / "actions.safetensors", actions)
     RunDirectory(trained.folder).write_json("eval.json", result)
     return result

@@ -28,16 +28,7 @@ RECORDED = "recorded"  # steps whose next state the recording that is followed h
 
 
 class RecordedFutures(TensorDictModuleBase):
-    """Writes the recorded states ``[E, steps, H, d]`` that follow the current step, for a :class:`RecordedPlanner`.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.evaluation.diagnosis import RecordedFutures
-        >>> futures = RecordedFutures(torch.arange(6.0).reshape(1, 2, 3, 1))
-        >>> [futures(TensorDict(batch_size=[1]))["recorded_future"].flatten().tolist() for _ in range(2)]
-        [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]]
-    """
+    """Writes the recorded states ``[E, steps, H, d]`` that follow the current step, for a :class:`RecordedPlanner`."""
 
     def __init__(self, futures: Tensor):
         super().__init__()
@@ -54,16 +45,7 @@ class RecordedFutures(TensorDictModuleBase):
 
 
 class RecordedPlanner(nn.Module):
-    """Hands on the recorded future in place of plans, with history and horizon of a planner.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.evaluation.diagnosis import RecordedPlanner
-        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet
-        >>> planner = RecordedPlanner(StatePlanner(TemporalUnet(2, 4), state_dim=2))
-        >>> planner.sample(torch.zeros(3, 2, 2), torch.ones(3, 14, 2)).shape
-        torch.Size([3, 14, 2])
-    """
+    """Hands on the recorded future in place of plans, with history and horizon of a planner."""
 
     noise_key = RECORDED_FUTURE  # what a policy hands over is no noise here
 

@@ -49,30 +49,13 @@ def _refuse_contexts(rollouts_per_context: int, contexts_file: Path | None, wher
 
 @dataclass(frozen=True)
 class EvaluationEnv:
-    """Where a run is rolled out.
+    """Where a run is rolled out."""
 
-    Args:
-        make_env (callable): an environment of a number of parallel episodes.
-        max_steps (int): control steps of an episode at most.
-        mode_index (callable): number of the mode, from the environment's leaf ``mode``.
-        num_modes (int): number of modes.
-        numbers (list of int, optional): number of the context of every rollout.
-        contexts (np.ndarray, optional): the contexts.
-
-    Examples:
-        >>> from torchrl_koap.evaluation import EvalConfig
-        >>> from torchrl_koap.evaluation.environments import environment_of
-        >>> from torchrl_koap.tasks import get_task
-        >>> where = environment_of(get_task("avoiding"), EvalConfig(episodes=2))
-        >>> where.max_steps, where.num_modes, where.numbers
-        (250, 24, None)
-    """
-
-    make_env: Callable[[int], Any]
+    make_env: Callable[[int], Any]  # of a number of parallel episodes
     max_steps: int
-    mode_index: Callable[[torch.Tensor], torch.Tensor]
+    mode_index: Callable[[torch.Tensor], torch.Tensor]  # from the environment's leaf ``mode``
     num_modes: int
-    numbers: list[int] | None = None
+    numbers: list[int] | None = None  # of the context of every rollout
     contexts: np.ndarray | None = None
 
 

@@ -33,10 +33,6 @@ class LatencyConfig:
         async_replan: make the next plan in a thread while the present one is executed.
         threads: torch threads.
         plugins: modules that register tasks, methods or pictures, besides those that the run was trained with.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.latency import LatencyConfig, measure_control_loop
-        >>> measure_control_loop("runs/koap", LatencyConfig(steps=100, control_hz=20.0))  # doctest: +SKIP
     """
 
     steps: int = 300

@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import cut_windows, trajectory_lengths
-from torchrl_koap.evaluation.findings import MODELS, ON_THE_CIRCLE, OUTSIDE_THE_BUDGET, unit_circle_sides
+from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET, unit_circle_sides
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, STATE
 from torchrl_koap.modules import KoopmanInverseDynamics
 from torchrl_koap.modules.ridge import ridge
@@ -23,15 +23,10 @@ from torchrl_koap.modules.ridge import ridge
 _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
 
 
-def spectrum(eigenvalues: Tensor, *, tolerance: float = ON_THE_CIRCLE, slowest: int = 5) -> dict[str, Any]:
+def spectrum(eigenvalues: Tensor, *, slowest: int = 5) -> dict[str, Any]:
     r"""Tells where the eigenvalues of an operator lie, and in how many steps its slowest parts fade to 1/e.
 
-    Args:
-        eigenvalues (Tensor): complex ``[m]``.
-
-    Keyword Args:
-        tolerance (float): distance to the unit circle below which an eigenvalue lies on it.
-        slowest (int): decay times :math:`-1 / \ln |\lambda|` to list, of those inside.
+    The decay times are :math:`-1 / \ln |\lambda|` of the ``slowest`` of those inside the unit circle.
 
     Examples:
         >>> import math
@@ -41,7 +36,7 @@ def spectrum(eigenvalues: Tensor, *, tolerance: float = ON_THE_CIRCLE, slowest: 
         {'spectral_radius': 1.25, 'inside': 1, 'on': 1, 'outside': 1, 'slowest_decay_steps': [1.0]}
     """
     size = eigenvalues.detach().abs().double().sort(descending=True).values
-    sides = unit_circle_sides(size.tolist(), tolerance=tolerance)
+    sides = unit_circle_sides(size.tolist())
     inside = size[[side == "inside" for side in sides]]
     return {
         "spectral_radius": size[0].item(),
@@ -243,10 +238,8 @@ def analyse_latent(
     if not known.all():  # the data lack labels themselves
         steps = steps[known]
         if len(steps[EPISODE].unique()) < 2:
-            result[OUTSIDE_THE_BUDGET] = {
-                "note": "fewer than two trajectories have labels to probe latent actions with"
-            }
-            return result
+            note = "fewer than two trajectories have labels to probe latent actions with"
+            return result | {OUTSIDE_THE_BUDGET: {"note": note}}
         fit_on = split_trajectories(steps[EPISODE], torch.zeros(len(steps), dtype=torch.bool), seed=seed)
     latent, action, fit = steps["latent_action"], steps[ACTION], torch.isin(steps[EPISODE], fit_on)
     budget = data[EPISODE][labelled].unique()

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from torchrl_koap.data import controller_view, select_trajectories
 from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chunks, errors_outside_budget
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.runs.run_directory import RunDirectoryError
-from torchrl_koap.runs.weights import save_tensors
 from torchrl_koap.tasks.units import thousandths
 
 if TYPE_CHECKING:
@@ -21,13 +21,15 @@ if TYPE_CHECKING:
 
 KIND = "offline"
 SPLITS = ("outside_budget", "left_out")
+_PLANS = ("planner", "standing_still", "constant_velocity")
+_ACTIONS = ("controller", "ridge", "mean_action")
 _CHUNKS = ("policy", "mean_action")
 _COMMANDS = "the controller decodes no recorded states: it follows plans by the command that it gave"
 
 
 def evaluate_offline(
     trained: Trained, *, dataset: str | None = None, samples: int = 16, plans: int = 500, seed: int = 0
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Judges a run on recorded data.
 
     Plans are scored on the validation trajectories, which the planner has not seen
@@ -45,9 +47,10 @@ def evaluate_offline(
         seed (int): seed of the plans' noise.
 
     Returns:
-        dict: ``kind`` ``"offline"``, ``plan_errors`` and ``action_errors``, ``relative_plan_error`` (1: no better than
+        tuple: ``kind`` ``"offline"``, ``plan_errors`` and ``action_errors``, ``relative_plan_error`` (1: no better than
         standing still), ``relative_action_error`` (1: no better than always giving the mean action), ``faults`` in
-        words, and a row per trajectory in ``trajectory``.
+        words, and a row per trajectory in ``trajectory``; ``predicted`` and ``true`` actions ``[N, act]`` outside the
+        budget, if there are any.
 
     Raises:
         RunDirectoryError: if the data set has moved, or is another one.
@@ -56,11 +59,10 @@ def evaluate_offline(
     labelled, _ = trained.hide_labels(data)
     plan = _plans(trained, data, samples=samples, plans=plans, seed=seed)
     if trained.planner is None:
-        outside = errors_of_chunks(
-            trained.controller, data, labelled, trained.task, samples=samples, chunks=plans, seed=seed
-        )
+        asked = {"samples": samples, "chunks": plans, "seed": seed}
+        outside, tensors = errors_of_chunks(trained.controller, data, labelled, trained.task, **asked), {}
     else:
-        outside = _outside_budget(trained, data, labelled)
+        outside, tensors = _outside_budget(trained, data, labelled)
     action = {"outside_budget": outside, "left_out": _left_out(trained, labelled, outside)}
     return {
         "kind": KIND,
@@ -69,10 +71,10 @@ def evaluate_offline(
         "plan_errors": plan,
         **_summary_of(action),
         "trajectory": _per_trajectory(plan, action),
-    }
+    }, tensors
 
 
-def evaluate_actions(trained: Trained, dataset: str | None = None) -> dict[str, Any]:
+def evaluate_actions(trained: Trained, dataset: str | None = None) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Compares decoded actions with labels outside the budget, for evaluation only, beside rollouts in an environment.
 
     Args:
@@ -80,27 +82,28 @@ def evaluate_actions(trained: Trained, dataset: str | None = None) -> dict[str, 
         dataset (str, optional): where its data set is now. Default: where it was; if it is not there, nothing is read.
 
     Returns:
-        dict: ``action_errors`` and what they come to, as of :func:`evaluate_offline`.
+        tuple: ``action_errors`` and what they come to, and the actions, as of :func:`evaluate_offline`.
 
     Raises:
         RunDirectoryError: if the data set that was named is not that of the training.
     """
     try:
         data = trained.data(dataset)
-        outside = _outside_budget(trained, data, trained.hide_labels(data)[0])
+        outside, tensors = _outside_budget(trained, data, trained.hide_labels(data)[0])
     except RunDirectoryError as error:
         if dataset is not None:
             raise
-        outside = {"note": str(error)}
-    return _summary_of({"outside_budget": outside})
+        outside, tensors = {"note": str(error)}, {}
+    return _summary_of({"outside_budget": outside}), tensors
 
 
 def _summary_of(action: Mapping[str, Any]) -> dict[str, Any]:
     split = next((name for name in SPLITS if "relative" in action.get(name, {})), None)
+    outside = action["outside_budget"]
     return {
         "relative_action_error": None if split is None else action[split]["relative"],
         "action_errors_on": split,
-        "labels_read_outside_budget": action["outside_budget"].get("labels", 0),
+        "labels_read_outside_budget": outside.get("labels_read", outside.get("labels", 0)),
         "action_errors": dict(action),
     }
 
@@ -114,17 +117,15 @@ def _plans(trained: Trained, data: TensorDictBase, **options: Any) -> dict[str, 
     return {"trajectories": len(trained.held_out)} | plan_errors(trained.planner, unseen, trained.task, **options)
 
 
-def _outside_budget(trained: Trained, data: TensorDictBase, labelled: TensorDictBase) -> dict[str, Any]:
-    """Errors of decoded actions; writes ``actions.safetensors``."""
+def _outside_budget(
+    trained: Trained, data: TensorDictBase, labelled: TensorDictBase
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if trained.planner is None:
-        return {"note": f"method {trained.config.method!r} samples actions: it decodes no recorded states"}
+        return {"note": f"method {trained.config.method!r} samples actions: it decodes no recorded states"}, {}
     if trained.method.fit is not None:
-        return {"note": _COMMANDS}
+        return {"note": _COMMANDS}, {}
     view, seen = (controller_view(part, trained.columns, targets=trained.task.targets) for part in (data, labelled))
-    errors, tensors = errors_outside_budget(trained.controller.cpu(), view, seen, trained.task)
-    if tensors:
-        save_tensors(trained.folder / "actions.safetensors", tensors)
-    return errors
+    return errors_outside_budget(trained.controller.cpu(), view, seen, trained.task)
 
 
 def _left_out(trained: Trained, labelled: TensorDictBase, outside: Mapping[str, Any]) -> dict[str, Any]:
@@ -150,32 +151,22 @@ def describe_offline(result: Mapping[str, Any]) -> str:
     lines = ["judged on recorded data: the task has no environment"]
     plan, action = result["plan_errors"], result["action_errors"]
     lines += [f"plans: {plan['note']}"] if "note" in plan else []
-    for row in plan.get("unit", ()):
-        shown, factor = thousandths(row["unit"])
-        values = [
-            f"{name.replace('_', ' ')} {factor * row[name]['energy_score']['overall']:.4g}"
-            for name in ("planner", "standing_still", "constant_velocity")
-        ]
-        lines.append(f"plans, energy score{f' ({shown})' if shown else ''}: {', '.join(values)}")
+    lines += [_line("plans, energy score", row, _energies(row, *_PLANS)) for row in plan.get("unit", ())]
     for split in SPLITS:
-        head = f"actions, {split.replace('_', ' ')}"
-        lines += [f"{head}: {action[split]['note']}"] if "note" in action[split] else []
-        for row in action[split].get("unit", ()):
-            shown, factor = thousandths(row["unit"])
-            values = [
-                f"{name.replace('_', ' ')} {factor * row[name]:.4g}" for name in ("controller", "ridge", "mean_action")
-            ]
-            lines.append(f"{head}, RMSE{f' ({shown})' if shown else ''}: {', '.join(values)}")
-        lines += _describe_chunks(action[split].get("chunk", {}))
+        head, part = f"actions, {split.replace('_', ' ')}", action[split]
+        lines += [f"{head}: {part['note']}"] if "note" in part else []
+        lines += [_line(f"{head}, RMSE", row, {name: row[name] for name in _ACTIONS}) for row in part.get("unit", ())]
+        for row in part.get("chunk", {}).get("unit", ()):
+            best = {f"best of {part['chunk']['samples']}": row["policy"]["best_of"]["overall"]}
+            lines.append(_line("whole chunks of actions, energy score", row, _energies(row, *_CHUNKS) | best))
     return "\n".join([*lines, *(f"FAULT: {fault}" for fault in result["faults"])])
 
 
-def _describe_chunks(chunk: Mapping[str, Any]) -> list[str]:
-    lines = []
-    for row in chunk.get("unit", ()):
-        shown, factor = thousandths(row["unit"])
-        values = [f"{name.replace('_', ' ')} {factor * row[name]['energy_score']['overall']:.4g}" for name in _CHUNKS]
-        best = f"best of {chunk['samples']} {factor * row['policy']['best_of']['overall']:.4g}"
-        unit = f" ({shown})" if shown else ""
-        lines.append(f"whole chunks of actions, energy score{unit}: {', '.join(values)}; {best}")
-    return lines
+def _energies(row: Mapping[str, Any], *names: str) -> dict[str, float]:
+    return {name: row[name]["energy_score"]["overall"] for name in names}
+
+
+def _line(head: str, row: Mapping[str, Any], values: Mapping[str, float]) -> str:
+    shown, factor = thousandths(row["unit"])
+    figures = ", ".join(f"{name.replace('_', ' ')} {factor * value:.4g}" for name, value in values.items())
+    return f"{head}{f' ({shown})' if shown else ''}: {figures}"

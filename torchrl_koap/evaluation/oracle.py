@@ -78,14 +78,7 @@ class OracleFollower(Follower):
         self._env: EnvBase | None = None
 
     def attach(self, env: EnvBase) -> None:
-        """Tells the environment whose episodes are about to begin.
-
-        Args:
-            env (EnvBase): a batch of environments, whose rows are those of the tensordicts to come.
-
-        Raises:
-            ValueError: if it cannot be looked ahead in.
-        """
+        """Tells the environment whose episodes are about to begin; it must be one that can be looked ahead in."""
         base = env.base_env if isinstance(env, TransformedEnv) else env
         if not isinstance(base, EpisodeState):
             raise ValueError(

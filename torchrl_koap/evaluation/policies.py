@@ -49,12 +49,7 @@ def load_policy(
 
 
 def trained_policy(trained: Trained, asked: ExecutionConfig) -> PlanningPolicy:
-    """Makes a policy of what was trained.
-
-    Args:
-        trained (Trained): the training.
-        asked (ExecutionConfig): how plans are to become actions; what is not asked for is as it was trained for.
-    """
+    """Makes a policy of what was trained; what is not asked for is as it was trained for."""
     execution, follower = trained.execution, None
     if asked.strategy == "oracle" and trained.method.plans:
         from torchrl_koap.evaluation.oracle import OracleFollower
