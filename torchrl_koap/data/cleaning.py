@@ -12,18 +12,7 @@ from torchrl_koap.tasks import WINDOW
 
 
 def trim_still(recordings: Recordings) -> Recordings:
-    """Cuts the frames at both ends of trajectories in which nothing moves; ``skipped`` counts them.
-
-    Args:
-        recordings (Recordings): what was read.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.data import make_recordings
-        >>> from torchrl_koap.data.cleaning import trim_still
-        >>> trim_still(make_recordings([np.r_[np.zeros(9), np.arange(5.0)][:, None]], action_dim=1)).states[0].T
-        array([[0., 1., 2., 3., 4.]])
-    """
+    """Cuts the frames at both ends of trajectories in which nothing moves; ``skipped`` counts them."""
     ends = still_ends(recordings.states)
     spans = [(start, len(frames) - end) for frames, (start, end) in zip(recordings.states, ends, strict=True)]
     return replace(
@@ -36,9 +25,6 @@ def trim_still(recordings: Recordings) -> Recordings:
 
 def drop_short(recordings: Recordings) -> Recordings:
     """Leaves out trajectories with fewer steps than a window; ``skipped`` names them.
-
-    Args:
-        recordings (Recordings): what was read.
 
     Raises:
         DataError: if none is left.

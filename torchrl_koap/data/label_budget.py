@@ -84,14 +84,12 @@ class LabelBudget:
 
     The draw depends on the seed alone. With the same seed a larger budget contains every smaller one.
 
-    Data that lack labels already are a budget themselves: units without a label are passed over, units with some keep
-    those they have, and what is drawn cannot be more than there is. Fractions are of all units, labelled or not, but
-    for ``1.0``, which draws every unit that has a label.
+    Units without a label are passed over, units with some keep those they have. Fractions are of all units, labelled
+    or not, but for ``1.0``, which draws every unit that has a label.
 
-    * ``"trajectory"``: whole demonstrations. The honest default: a robot records whole demonstrations.
+    * ``"trajectory"``: whole demonstrations, as robots record them.
     * ``"window"``: the unit of the first public code. Windows of 16 steps are drawn without replacement from all
-      windows of all trajectories, and of each the 14 inner frames keep their label. A window costs 14 labels where
-      windows overlap less, and the windows of a small share touch most trajectories: read the report.
+      trajectories, and of each the 14 inner frames keep their label.
     * ``"transition"``: single steps.
 
     Args:
@@ -143,16 +141,14 @@ class LabelBudget:
         """Hides all labels outside the budget.
 
         Args:
-            data (TensorDictBase): flat data ``[N]``, labelled throughout or in part; not changed. Without
-                ``has_action``, actions that are NaN throughout are taken to be missing (:func:`mark_labels`).
-            command (slice, optional): columns of the observation that repeat the command; they are blanked where they
-                would give hidden actions away, see :func:`hide_commands`. Default: the observation has none.
+            data (TensorDictBase): flat data ``[N]``; not changed. Without ``has_action``, actions that are NaN
+                throughout are taken to be missing (:func:`mark_labels`).
+            command (slice, optional): columns of the observation that repeat the command, for :func:`hide_commands`.
 
         Returns:
             tuple: a copy of the data within the budget, and what was spent.
 
         Raises:
-            LayoutError: if the data do not follow the storage layout.
             ValueError: if there is no label at all, if the budget selects nothing, or more than there is.
         """
         data = data if keys.HAS_ACTION in data.keys() else mark_labels(data)

@@ -20,13 +20,8 @@ RELABELLED = "relabelled"
 def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_size: int = 4096) -> TensorDict:
     """Gives every unlabelled step the action that an inverse dynamics reads off the recorded states.
 
-    Afterwards a method that knows labelled steps only, such as the
-    :class:`~torchrl_koap.modules.DiffusionPolicy`, learns from all demonstrations. Only states are read: what is stored
-    as the action of an unlabelled step cannot reach the outcome.
-
-    An action is read at frame ``controller.num_past`` of a window, where the controller sees its whole past and
-    look-ahead. Over the ends of a trajectory the first state is repeated, as at the start of an episode, and the last
-    ones go on at their velocity (:func:`~torchrl_koap.data.extrapolate_ends`)::
+    An action is read at frame ``controller.num_past`` of a window. Over the ends of a trajectory the first state is
+    repeated, and the last ones go on at their velocity (:func:`~torchrl_koap.data.extrapolate_ends`)::
 
         frame            0      1      2      ...    window - 1         (history = 1)
         action of step 0 x_0    x_0    x_1    ...
@@ -35,22 +30,19 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
     Args:
         controller (nn.Module): reads a window of raw states ``[B, T, d]``, its first in-key, and writes actions
             ``[B, T, act]``, its last out-key; has ``num_past`` and ``num_window_frames``. It runs in evaluation mode.
-        data (TensorDictBase): flat data ``[N]`` with ``state``, as the controller sees it, ``action``, ``has_action``
-            and ``episode``; not changed.
+        data (TensorDictBase): flat data ``[N]`` with ``state``, as the controller sees it; not changed.
 
     Keyword Args:
         window (int): frames per window.
         batch_size (int): windows per forward pass. Defaults to 4096.
 
     Returns:
-        TensorDict: a shallow copy of ``data`` in which every step has an action and ``has_action``; labelled steps keep
-        theirs bit for bit. The new entry ``relabelled`` ``[N, 1]`` tells them apart: True where the action is the
-        controller's.
+        TensorDict: a shallow copy in which every step has an action; labelled steps keep theirs bit for bit. The new
+        entry ``relabelled`` ``[N, 1]`` is True where the action is the controller's.
 
     Raises:
         KeyError: if an entry is missing.
-        ValueError: if the window is too short for the controller, the batch size is below 1, or the controller's
-            actions are not finite or of another width than the data's.
+        ValueError: if the window is too short for the controller, or its actions are not finite or of another width.
 
     Examples:
         >>> import torch

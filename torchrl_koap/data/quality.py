@@ -30,7 +30,11 @@ def find_warnings(
     seen: Sequence[str] = (),
     actions: Sequence[str] = (),
 ) -> list[str]:
-    """Finds trajectories and columns that say nothing or say it twice, and trajectories that cannot have happened.
+    """Finds what is unlikely in demonstrations, a sentence each.
+
+    Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, or reach a
+    place beyond 100 m or rad; seen columns that never change, equal another one, or leap; frames at both ends in which
+    nothing moves; actions that never change.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` in the storage layout.
@@ -40,14 +44,8 @@ def find_warnings(
         units (sequence of str): unit of every observation column; positions in m and angles in rad are looked at.
             Default: no column is.
         columns (sequence of str): what to call the observation columns. Default: their numbers.
-        seen (sequence of str): what to call the columns of ``state``, those that are seen. Default: none is looked at.
+        seen (sequence of str): what to call the columns of ``state``. Default: none is looked at.
         actions (sequence of str): what to call the action columns. Default: none is looked at.
-
-    Returns:
-        list of str: a sentence each: a trajectory that repeats another one, one without any movement, one whose labels
-        are all zero, one that reaches a place beyond 100 m or rad, those that are shorter than a window; a seen column
-        that never changes, that is the same as another one in every step, or that leaps; frames at both ends in which
-        nothing moves; an action that is the same in all labels.
 
     Examples:
         >>> import torch
@@ -56,8 +54,6 @@ def find_warnings(
         >>> path, still = torch.arange(40.0).reshape(20, 2), torch.zeros(19, 2)
         >>> find_warnings(flatten_trajectories([path, path], [still + 1, still + 1]), names=["a.pkl", "b.pkl"])
         ['b.pkl repeats a.pkl: every step is the same']
-        >>> find_warnings(flatten_trajectories([1e6 * path, path], [still + 1, still]), units=["m", "m"])
-        ['trajectory 0: column 0 reaches 3.6e+07 m', 'trajectory 1: all 19 labelled actions are zero']
     """
     warnings: list[str] = []
     first: dict[bytes, str] = {}
@@ -160,19 +156,10 @@ def _cause(values: np.ndarray, near: float, flipped: bool, most: bool) -> str:
 
 
 def still_ends(trajectories: Sequence[np.ndarray]) -> np.ndarray:
-    """Frames at the start and at the end of every trajectory, int ``[n, 2]``, in which no column moves.
+    """Frames at both ends of trajectories ``[T_i, d]`` in which no column moves, int ``[n, 2]``.
 
     The last still frame before the movement and the first one behind it are not counted. A trajectory in which nothing
     ever moves has none.
-
-    Args:
-        trajectories (sequence of np.ndarray): frames ``[T_i, d]`` of each.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.data.quality import still_ends
-        >>> still_ends([np.array([[0.0], [0.0], [0.0], [1.0], [2.0], [2.0]])])
-        array([[2, 1]])
     """
     room = STILL * np.ptp(np.concatenate(trajectories), axis=0)
     found = np.zeros((len(trajectories), 2), dtype=int)
@@ -198,11 +185,7 @@ def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> lis
 
 
 def constant_columns(actions: np.ndarray) -> list[float | None]:
-    """Of every action column what it is in all labels; None where it differs, or is known once at most.
-
-    Args:
-        actions (np.ndarray): actions ``[N, act]``, NaN where there is no label.
-    """
+    """What every column of actions ``[N, act]`` is in all labels; None where it differs, or is known once at most."""
     steps = actions[np.isfinite(actions).all(-1)]
     return [float(column[0]) if len(column) > 1 and np.ptp(column) == 0 else None for column in steps.T]
 

@@ -79,9 +79,6 @@ def open_dataset(
 def find_stored(source: str | Path) -> Path | None:
     """Where a folder holds a data set of this library; None if it may hold D3IL's raw pickles.
 
-    Args:
-        source (str or Path): the folder.
-
     Raises:
         FileNotFoundError: if there is no such folder.
         DataError: if it holds recordings that are to be converted first.
@@ -122,20 +119,7 @@ def with_noise(data: TensorDictBase, columns: slice, sigma: float, *, seed: int 
         data (TensorDictBase): flat data ``[N]``; not changed.
         columns (slice): observation columns that are disturbed.
         sigma (float): standard deviation of the noise, in the units of the columns.
-
-    Keyword Args:
-        seed (int): seed of the noise: every reader of the same data meets the same. Defaults to ``0``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import flatten_trajectories
-        >>> from torchrl_koap.data.sources import with_noise
-        >>> data = flatten_trajectories([torch.zeros(4, 3)] * 2, [torch.zeros(3, 1)] * 2)
-        >>> noisy = with_noise(data, slice(1, 3), 0.002)
-        >>> bool((noisy["next", "observation"][0] == noisy["observation"][1]).all())
-        True
-        >>> noisy["observation"].count_nonzero(dim=0).tolist()
-        [0, 6, 6]
+        seed (int): seed of the noise: every reader of the same data meets the same.
     """
     generator = torch.Generator().manual_seed(seed)
     now, following = data["observation"].clone(), data["next", "observation"].clone()

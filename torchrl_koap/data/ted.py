@@ -4,7 +4,7 @@
 ::
 
     folder/
-      about.json           task, number of trajectories and steps, lengths, statistics, checksum, and the caller's notes
+      about.json           task, number of trajectories and steps, lengths, checksum, and the caller's notes
       steps.safetensors    the entries in the storage layout of ``torchrl_koap.keys``, nested ones as ``next/done``
 
 The folder is written aside and renamed.
@@ -77,11 +77,6 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
         "steps": len(data),
         "lengths": lengths,
         "labelled_steps": int(data.get(keys.HAS_ACTION).sum()),
-        "statistics": {
-            name: _statistics(entries[name])
-            for name in (keys.OBSERVATION, keys.STATE, keys.ACTION)
-            if name in entries and entries[name].isfinite().all(-1).any()
-        },
         "notes": dict(notes or {}),
     }
     with replacing_folder(folder) as aside:
@@ -97,11 +92,7 @@ def is_ted(folder: str | Path) -> bool:
 
 
 def stored_folder(folder: str | Path) -> Path | None:
-    """Where a folder holds a data set of this library: in ``ted`` inside it, or itself; None if nowhere.
-
-    Args:
-        folder (str or Path): the folder.
-    """
+    """Where a folder holds a data set of this library: in ``ted`` inside it, or itself; None if nowhere."""
     inside = Path(folder) / "ted"
     if inside.is_dir():
         return inside
@@ -116,7 +107,7 @@ def read_about(folder: str | Path) -> dict[str, Any]:
 
     Returns:
         dict: ``task``, ``definition`` (None of a task that is only named), ``trajectories``, ``steps``, ``lengths``,
-        ``labelled_steps``, ``statistics``, ``notes``, and size and checksum of the steps.
+        ``labelled_steps``, ``notes``, and size and checksum of the steps.
 
     Raises:
         DataError: if the folder holds no data set, or one in another format.
@@ -146,8 +137,7 @@ def read_about(folder: str | Path) -> dict[str, Any]:
 def load_ted(folder: str | Path) -> tuple[TensorDict, Task]:
     """Reads a data set that :func:`save_ted` wrote, and the task that its data are of.
 
-    A task that came with the data is plain facts. One that names code to import (an environment, rules) is refused: a
-    folder that somebody sent must not decide what is run.
+    A task that names code to import is refused: a folder that somebody sent must not decide what is run.
 
     Args:
         folder (str or Path): the folder.
@@ -199,14 +189,7 @@ def stored_task(folder: str | Path) -> Task:
 
 
 def read_steps(folder: str | Path) -> TensorDict:
-    """Reads the data of a data set ``[N]``, whatever their task.
-
-    Args:
-        folder (str or Path): folder of the data set.
-
-    Raises:
-        DataError: if files are missing, changed or damaged.
-    """
+    """Reads the data of a data set ``[N]``, whatever their task, or says what is damaged."""
     about, path = read_about(folder), Path(folder) / _STEPS
     try:
         changed = path.stat().st_size != about["bytes"] or sha256_of(path) != about["sha256"]
@@ -226,10 +209,3 @@ def read_steps(folder: str | Path) -> TensorDict:
 
 def _joined(key: str | tuple[str, ...]) -> str:
     return key if isinstance(key, str) else "/".join(key)
-
-
-def _statistics(values: torch.Tensor) -> dict[str, list[float]]:
-    """Column statistics ``[N, d]`` of the rows that are known, for people who look at the file."""
-    values = values[values.isfinite().all(-1)].double().cpu()
-    found = {"mean": values.mean(0), "std": values.std(0, correction=0), "min": values.amin(0), "max": values.amax(0)}
-    return {name: value.tolist() for name, value in found.items()}

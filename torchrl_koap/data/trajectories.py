@@ -39,8 +39,7 @@ def flatten_trajectories(
         TensorDict: flat data ``[sum(T_i - 1)]``.
 
     Raises:
-        ValueError: if the numbers of trajectories, frames, actions or columns do not fit each other, or an action is
-            infinite, or NaN in some of its entries only.
+        ValueError: if numbers of trajectories, frames or columns do not fit each other, or an action is not finite.
 
     Examples:
         >>> import torch
@@ -48,8 +47,6 @@ def flatten_trajectories(
         >>> data = flatten_trajectories([torch.arange(8.0).reshape(4, 2)], [torch.ones(3, 1)])
         >>> data["observation"][1], data["next", "observation"][1], data["next", "done"].squeeze(-1)
         (tensor([2., 3.]), tensor([4., 5.]), tensor([False, False,  True]))
-        >>> flatten_trajectories([torch.zeros(3, 2)] * 2, [None, torch.ones(2, 1)])["has_action"].flatten().tolist()
-        [False, False, True, True]
     """
     observations = [torch.as_tensor(frames) for frames in observations]
     actions = [None] * len(observations) if actions is None else list(actions)
@@ -121,8 +118,6 @@ def mark_labels(data: TensorDictBase, *, action_dim: int | None = None) -> Tenso
         >>> from torchrl_koap.data import mark_labels
         >>> mark_labels(TensorDict({"action": torch.tensor([[1.0], [torch.nan]])}, [2]))["has_action"].flatten()
         tensor([ True, False])
-        >>> mark_labels(TensorDict(batch_size=[2]), action_dim=3)["action"].shape
-        torch.Size([2, 3])
     """
     data, action = data.copy(), data.get(keys.ACTION, None)
     if action is None:

@@ -69,7 +69,6 @@ class WindowTable:
             pad_after (int): frames by which a window may end after its trajectory (the last frame is repeated).
 
         Raises:
-            KeyError: if there is no ``episode``.
             ValueError: if an argument is out of range, or a trajectory is too short.
         """
         if not 1 <= history < window:
@@ -181,8 +180,7 @@ def make_window_buffer(
 
     Raises:
         KeyError: if a selected entry does not exist.
-        ValueError: if an option is out of range, a trajectory is too short for a window, or labelled windows are asked
-            for and there are none.
+        ValueError: if an option is out of range, or a trajectory is too short for a window.
 
     Examples:
         >>> import torch

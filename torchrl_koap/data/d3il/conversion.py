@@ -32,11 +32,6 @@ class Converter:
         convert (callable): from a raw episode of ``T`` rows to observations ``[T, obs]`` and actions ``[T - 1, act]``,
             as float64 arrays.
         unread (tuple of str): objects that may be logged as well and are not read.
-
-    Examples:
-        >>> from torchrl_koap.data.d3il.conversion import CONVERTERS
-        >>> CONVERTERS["avoiding"].robot, CONVERTERS["avoiding"].folder
-        (('des_c_pos', 'c_pos'), 'avoiding/data')
     """
 
     robot: tuple[str, ...]
@@ -110,15 +105,7 @@ CONVERTERS = {
 
 
 def find_raw_files(converter: Converter, root: str | Path) -> list[Path]:
-    """Finds raw demonstrations, without D3IL's lists of files and contexts.
-
-    Args:
-        converter (Converter): that of the task.
-        root (str or Path): the folder of the pickles or one above it, as D3IL lays them out (``<task>/data``,
-            ``environments/dataset/data/<task>/data``).
-
-    Returns:
-        list of Path: the files in the order of their names.
+    """Finds raw demonstrations below a folder, as D3IL lays them out, in the order of their names.
 
     Raises:
         FileNotFoundError: if nothing is there; the message lists the folders looked at.
@@ -139,17 +126,7 @@ def find_raw_files(converter: Converter, root: str | Path) -> list[Path]:
 def read_raw(
     converter: Converter, root: str | Path, *, progress: Callable[[int, int], None] | None = None
 ) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """Reads a folder of raw demonstrations, one trajectory per file.
-
-    Args:
-        converter (Converter): that of the task.
-        root (str or Path): as for :func:`find_raw_files`.
-
-    Keyword Args:
-        progress (callable, optional): called with the number of files read and that of all.
-
-    Returns:
-        tuple: of every trajectory its frames ``[T, obs]`` and its actions ``[T - 1, act]``, float64.
+    """Reads raw demonstrations, one trajectory per file: frames ``[T, obs]`` and actions ``[T - 1, act]``, float64.
 
     Raises:
         DataError: with the problems of all files.

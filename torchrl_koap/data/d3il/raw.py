@@ -53,12 +53,6 @@ class RawEpisode:
     Args:
         robot (mapping): arrays ``[T, ...]`` by name, see the module's table.
         objects (mapping): for each object of the scene its arrays ``[T, ...]`` by name.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.data.d3il.raw import RawEpisode
-        >>> RawEpisode(robot={"des_c_pos": np.zeros((40, 3)), "c_pos": np.zeros((40, 3))}).objects
-        {}
     """
 
     robot: Mapping[str, np.ndarray]
@@ -66,17 +60,10 @@ class RawEpisode:
 
 
 def read_raw_episode(path: str | Path, *, robot: Sequence[str] = (), objects: Sequence[str] = ()) -> RawEpisode:
-    """Reads and checks one demonstration.
-
-    Args:
-        path (str or Path): a pickle in D3IL's raw layout; read by the restricted unpickler.
-        robot (sequence of str): entries of ``robot`` that must be there.
-        objects (sequence of str): objects that must be there, with ``pos`` and ``quat``.
+    """Reads and checks a pickle, in which entries ``robot`` and poses of ``objects`` must be there.
 
     Raises:
-        DataError: with all problems: unsafe or damaged file, missing keys, wrong shapes, unequal lengths, NaN or
-            infinite values, too few rows.
-        OSError: if the file cannot be read.
+        DataError: with all problems.
     """
     content = load_pickle(path)
     if not isinstance(content, dict) or not isinstance(content.get("robot"), dict):

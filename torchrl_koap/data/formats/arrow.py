@@ -42,18 +42,13 @@ def number_type(kind: Any) -> Any:
 
 
 def numbers(column: Any, name: str, *, announced: int = 1, files: Sequence[str] | None = None) -> np.ndarray:
-    """A column as float64 ``[rows, width]``; rows that are empty are NaN.
+    """A column of a type of :func:`number_type` as float64 ``[rows, width]``; rows that are empty are NaN.
 
     Args:
-        column (pyarrow.ChunkedArray): of a type of :func:`number_type`.
+        column (pyarrow.ChunkedArray): the column.
         name (str): what messages call it.
-
-    Keyword Args:
         announced (int): width of lists that are all empty.
         files (sequence of str, optional): of every row its file, for messages.
-
-    Raises:
-        ValueError: if lists differ in their length.
     """
     pyarrow, column = import_pyarrow(), column.combine_chunks()
     if not pyarrow.types.is_list(column.type):

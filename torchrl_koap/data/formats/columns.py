@@ -58,12 +58,7 @@ class Piece:
 
 
 def spread(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Spreads a table into columns, numbered if there are several.
-
-    Args:
-        name (str): of the table.
-        values (np.ndarray): ``[T]`` or ``[T, d]``.
-    """
+    """Columns of a table ``[T]`` or ``[T, d]``, numbered if there are several."""
     table = np.asarray(values).reshape(len(values), -1)
     alone = table.shape[1] == 1
     return {name if alone else f"{name}_{index}": table[:, index] for index in range(table.shape[1])}

@@ -43,13 +43,6 @@ class Rows:
             ``N`` cells of pictures. ``action`` is missing where no file has it.
         numbers (list of int): of every episode its ``episode_index``.
         spans (list of slice): of every episode its rows.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.data.formats.lerobot import Rows
-        >>> rows = Rows({"observation.state": np.zeros((5, 2))}, numbers=[0, 1], spans=[slice(0, 2), slice(2, 5)])
-        >>> rows.columns["observation.state"][rows.spans[1]].shape
-        (3, 2)
     """
 
     columns: dict[str, Any]
@@ -65,26 +58,14 @@ def is_lerobot(folder: str | Path) -> bool:
 def read_lerobot(
     root: str | Path, *, observations: Sequence[str] | None = None, episodes: Sequence[int] = (), **options: Any
 ) -> Recordings:
-    """Reads states and actions of all episodes; rows without actions have no label.
+    """Reads a data set in format 2.x or 3.0; rows without actions have no label, images are skipped and listed.
 
     Args:
-        root (str or Path): folder of a data set in format 2.x or 3.0.
-
-    Keyword Args:
+        root (str or Path): its folder.
         observations (sequence of str, optional): features that make up the state, in that order. Default: every feature
-            named ``observation...`` that holds numbers; images are skipped and listed.
+            named ``observation...`` that holds numbers.
         episodes (sequence of int): which episodes to read, such as those that were downloaded. Default: all.
         options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the data set declares its rate by ``fps``.
-
-    Raises:
-        DataError: with all problems: features that do not exist, or an image is asked for; files that are unreadable,
-            columns that are missing, states that are not finite, rows or episodes that are missing.
-        FileNotFoundError: if the folder is no LeRobot data set.
-        RuntimeError: if pyarrow is not installed (extra ``lerobot``).
-
-    Examples:
-        >>> from torchrl_koap.data.formats.lerobot import read_lerobot
-        >>> read_lerobot("/data/so100_pick", observations=["observation.state"])  # doctest: +SKIP
     """
     info = read_info(root)
     known = info["features"]
@@ -141,12 +122,7 @@ def read_lerobot(
 
 
 def read_info(root: str | Path) -> dict[str, Any]:
-    """Reads the description of a data set.
-
-    Raises:
-        FileNotFoundError: if the folder is no LeRobot data set.
-        DataError: if the description is no JSON dictionary, or its features are none.
-    """
+    """Reads the description of a data set, or says what is wrong with it."""
     file = Path(root).expanduser() / _INFO
     if not file.is_file():
         raise FileNotFoundError(f"no LeRobot data set in {root}: it has no {_INFO}")
@@ -165,20 +141,10 @@ def read_info(root: str | Path) -> dict[str, Any]:
 def read_rows(
     root: str | Path, features: Sequence[str], *, pictures: Sequence[str] = (), episodes: Sequence[int] = ()
 ) -> Rows:
-    """Reads columns of all episodes, and their actions if there are any.
-
-    Args:
-        root (str or Path): folder of the data set.
-        features (sequence of str): columns of numbers.
-
-    Keyword Args:
-        pictures (sequence of str): columns of pictures.
-        episodes (sequence of int): which episodes to read. Default: all.
+    """Reads columns of numbers and of pictures, and actions if there are any.
 
     Raises:
         DataError: with the problems of all files and episodes.
-        FileNotFoundError: if there are no files.
-        RuntimeError: if pyarrow is not installed (extra ``lerobot``).
     """
     root = Path(root).expanduser()
     table = _read_table(root, (*features, EPISODE, FRAME), pictures)

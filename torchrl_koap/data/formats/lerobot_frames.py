@@ -27,12 +27,6 @@ class ImageEpisode:
         state (np.ndarray): what else is known ``[T + 1, d]``.
         action (np.ndarray, optional): ``[T, act]``; None for an embodiment without.
         embodiment (str): who demonstrates.
-
-    Examples:
-        >>> import numpy as np
-        >>> from torchrl_koap.data.formats.lerobot_frames import ImageEpisode
-        >>> len(ImageEpisode(np.zeros((5, 8, 8, 3), np.uint8), np.zeros((5, 3)), None, "hand"))
-        4
     """
 
     frames: np.ndarray
@@ -47,20 +41,13 @@ class ImageEpisode:
 def read_image_episodes(
     folder: str | Path, *, camera: str | None = None, episodes: int | None = None, embodiment: str | None = None
 ) -> list[ImageEpisode]:
-    """Reads episodes with their frames.
+    """Reads episodes of a LeRobot data set with their frames.
 
     Args:
-        folder (str or Path): a LeRobot data set with a camera, such as ``koap demos --embodiment`` writes.
-
-    Keyword Args:
+        folder (str or Path): the data set, such as ``koap demos --embodiment`` writes.
         camera (str, optional): feature of the frames. Default: the only camera.
         episodes (int, optional): only so many, from the first. Default: all.
         embodiment (str, optional): refuse demonstrations of another one.
-
-    Raises:
-        DataError: if the folder holds no finished data set, no such camera, too few episodes, or those of another
-            embodiment; or if an episode is damaged.
-        RuntimeError: if pyarrow, or what decodes videos, is not installed.
     """
     if not is_lerobot(folder):
         raise DataError(folder, "it holds no finished data set (meta/info.json is missing); `koap demos` makes one")

@@ -22,20 +22,8 @@ def read_minari(source: str, **options: Any) -> Recordings:
     Args:
         source (str): ``minari:`` and the id of the data set, such as ``"minari:D4RL/door/human-v2"``. Dictionary
             observations are laid side by side in the order of their names; images are skipped.
-
-    Keyword Args:
         options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the rate is declared by ``render_fps`` of the
             data set's environment.
-
-    Raises:
-        DataError: if the data set holds no usable observations, actions are no vectors of numbers, or no rate is
-            known.
-        FileNotFoundError: if there is no such data set on this machine.
-        RuntimeError: if Minari is not installed (extra ``minari``).
-
-    Examples:
-        >>> from torchrl_koap.data.formats.minari import read_minari
-        >>> read_minari("minari:D4RL/door/human-v2", control_hz=50)  # doctest: +SKIP
     """
     if importlib.util.find_spec("minari") is None:
         raise RuntimeError("Minari data sets are read with an extra: pip install 'torchrl_koap[minari]'")

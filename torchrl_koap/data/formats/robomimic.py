@@ -36,26 +36,14 @@ def read_robomimic(
     observations: Sequence[str] | None = None,
     **options: Any,
 ) -> Recordings:
-    """Reads trajectories from an HDF5 file in robomimic's layout.
+    """Reads trajectories from an HDF5 file.
 
     Args:
         file (str or Path): the file.
-
-    Keyword Args:
         observations (sequence of str, optional): entries of ``obs`` that make up the state, in that order. Default: all
             that are no images, by name.
         options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the file declares its rate by ``control_freq``
             of ``env_args``.
-
-    Raises:
-        DataError: with all faults: a trajectory without ``obs``, entries that are missing or of other widths, no
-            rate.
-        FileNotFoundError: if there is no such file.
-        RuntimeError: if h5py is not installed (extra ``hdf5``).
-
-    Examples:
-        >>> from torchrl_koap.data.formats.robomimic import read_robomimic
-        >>> read_robomimic("low_dim.hdf5", observations=["robot0_eef_pos", "object"])  # doctest: +SKIP
     """
     if importlib.util.find_spec("h5py") is None:
         raise RuntimeError("HDF5 files are read with an extra: pip install 'torchrl_koap[hdf5]'")

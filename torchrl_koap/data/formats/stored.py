@@ -18,14 +18,7 @@ def is_stored(source: str) -> bool:
 
 
 def read_stored(source: str) -> Recordings:
-    """Reads all observation columns of a data set, the command included, and the labels that there are.
-
-    Args:
-        source (str): the folder.
-
-    Raises:
-        DataError: if the data set is damaged.
-    """
+    """Reads all observation columns of a data set, the command included, and the labels that there are."""
     data, task = load_ted(stored_folder(source) or source)
     lengths = trajectory_lengths(data).tolist()
     observed, behind = data[keys.OBSERVATION].double(), data[keys.NEXT_OBSERVATION].double()

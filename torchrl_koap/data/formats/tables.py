@@ -49,31 +49,13 @@ def read_tables(
     action_columns: Sequence[str] | None = None,
     **options: Any,
 ) -> Recordings:
-    """Reads a folder of ``*.npz``, ``*.csv`` or ``*.parquet`` files.
+    """Reads a folder of tables, in the order of their names.
 
     Args:
-        folder (str or Path): the folder; files are taken in the order of their names.
-
-    Keyword Args:
+        folder (str or Path): the folder.
         action_columns (sequence of str, optional): columns of CSV and parquet files that are actions, if they are not
             named ``action...``. In NumPy archives actions are an entry of their own.
         options: of :func:`~torchrl_koap.data.formats.columns.assemble`.
-
-    Raises:
-        ValueError: for ``action_columns`` where a file is a NumPy archive.
-        DataError: with the faults of all files, named: unreadable, without states, of other columns, or without
-            a rate in time.
-        FileNotFoundError: if the folder holds no such file.
-
-    Examples:
-        >>> import tempfile
-        >>> from pathlib import Path
-        >>> import numpy as np
-        >>> from torchrl_koap.data.formats.tables import read_tables
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     np.savez(Path(folder) / "run.npz", states=np.zeros((5, 2)), actions=np.ones((4, 1)), control_hz=30.0)
-        ...     read_tables(folder).control_hz
-        30.0
     """
     folder = Path(folder)
     files = _files(folder)
@@ -97,10 +79,9 @@ def read_tables(
     rates = [rate for _, rate, _ in tables if rate]
     if rates and max(rates) > (1 + UNEVEN) * min(rates) and "control_hz" not in options:
         raise DataError(folder, f"the files have {min(rates):.4g} to {max(rates):.4g} frames per second: resample them")
-    pieces = _named_alike([piece for piece, _, _ in tables])
     unread = [f"{path.name} (no table)" for path in sorted(folder.iterdir()) if path not in files]
     return assemble(
-        pieces,
+        _named_alike([piece for piece, _, _ in tables]),
         str(folder),
         declared_hz=float(np.median(rates)) if rates else None,
         skipped=[*(name for _, _, names in tables for name in names), *unread],

@@ -22,12 +22,7 @@ _CHUNK = 1000  # files in a folder
 
 
 def write_npz(recordings: Recordings, out: Path) -> None:
-    """Writes a folder of ``*.npz`` files, one per trajectory.
-
-    Args:
-        recordings (Recordings): what to write.
-        out (Path): folder to create.
-    """
+    """Writes a folder of ``*.npz`` files, one per trajectory."""
     out.mkdir(parents=True)
     digits = len(str(len(recordings.states)))
     about: dict[str, Any] = {"state_names": recordings.state_names, "action_names": recordings.action_names}
@@ -39,16 +34,7 @@ def write_npz(recordings: Recordings, out: Path) -> None:
 
 
 def write_lerobot(recordings: Recordings, out: Path) -> None:
-    """Writes a LeRobot data set; float64 becomes float32.
-
-    Args:
-        recordings (Recordings): what to write.
-        out (Path): folder to create.
-
-    Raises:
-        DataError: if the rate is not known.
-        RuntimeError: if pyarrow is not installed (extra ``lerobot``).
-    """
+    """Writes a LeRobot data set; float64 becomes float32. The rate must be known."""
     if recordings.control_hz is None:
         raise DataError(out, "the rate is not known: pass control_hz")
     states, actions = recordings.state_names, recordings.action_names
@@ -72,18 +58,6 @@ class LeRobotWriter:
 
     Raises:
         FileExistsError: if the folder holds anything.
-        RuntimeError: if pyarrow is not installed (extra ``lerobot``).
-
-    Examples:
-        >>> import tempfile
-        >>> import numpy as np
-        >>> from torchrl_koap.data.formats.lerobot_frames import read_image_episodes
-        >>> from torchrl_koap.data.formats.writers import LeRobotWriter
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     writer = LeRobotWriter(folder, fps=10, state_names=["x"], camera="observation.images.front")
-        ...     writer.add(np.zeros((4, 1)), frames=np.zeros((4, 8, 8, 3), np.uint8))
-        ...     read_image_episodes(writer.close())[0].frames.shape
-        (4, 8, 8, 3)
     """
 
     def __init__(
