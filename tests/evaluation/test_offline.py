@@ -25,6 +25,11 @@ from torchrl_koap.training import Trained
 FEW = EvalConfig(samples=4, threads=1)
 
 
+@pytest.fixture(autouse=True)
+def short_loops(monkeypatch):
+    monkeypatch.setattr("torchrl_koap.evaluation.loop_on_labels.STEPS", 10)
+
+
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
     return save_arm(tmp_path_factory.mktemp("data") / "arm")
@@ -87,7 +92,7 @@ def test_the_command_says_it_in_words(run, capsys):
     assert main(["eval", str(run), "--samples", "2", "--threads", "1", "--no-report"]) == 0
     out = capsys.readouterr().out
     assert "plans, energy score (mrad): planner" in out and "actions, left out, RMSE (mrad): controller" in out
-    assert "FAULT: plans are worse than standing still" in out
+    assert "FAULT: plans are worse than standing still" in out and "closed loop by a linear model of the labels" in out
 
 
 def test_a_single_column_with_labels_outside_the_budget(tmp_path):

@@ -1,11 +1,135 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The closed loop of a policy without a simulator: how many commands leave their range."""
+"""The closed loop of a policy without a simulator: labels say how states follow actions, by a linear model."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from torchrl_koap.modules import PlanningPolicy
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from torchrl_koap.evaluation.policies import trained_policy
+from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
+from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
+from torchrl_koap.modules.ridge import ridge
+from torchrl_koap.training.policy_facts import command_ranges
+from torchrl_koap.training.trained import Trained
+
+STEPS, ROBOTS = 300, 16
+UNSTABLE = 3.0  # times the largest demonstrated command, in the last third of the loop
+FAR = 3.0  # standard deviations of the recorded states from the nearest of them
+_EXPLAINED = 0.5  # of the variance of changes, below which labels do not say how states follow actions
+_DRIFT = 1.0  # standard deviations that recorded actions may end beside their recording
+_ROWS = 4000  # recorded states that distances are measured to
+_PREFERRED = 100.0  # weight of actions: in smooth motions the state alone tells how it goes on
+
+
+@dataclass
+class _Response:
+    """Changes of the observation, linear in action, observation and the change before."""
+
+    scales: tuple[Tensor, Tensor, Tensor]  # of actions, observations and changes
+    weight: Tensor
+    bias: Tensor
+    explained: float
+
+    def step(self, observed: Tensor, change: Tensor, action: Tensor) -> Tensor:
+        """The next change ``[n, obs]``."""
+        inputs = _inputs(self.scales, observed, change, action)
+        return torch.nn.functional.linear(inputs, self.weight, self.bias)
+
+
+def check_loop(
+    trained: Trained,
+    data: TensorDictBase,
+    labelled: TensorDictBase,
+    *,
+    execution: ExecutionConfig | None = None,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Rolls a policy out on a ridge regression of the change of states, from recorded starts.
+
+    The policy acts without limits first, which says whether it is stable by itself; if a command leaves its range, it
+    acts once more with them.
+
+    Args:
+        trained (Trained): the run.
+        data (TensorDictBase): flat data ``[N]`` with all labels that there are, which the ridge is fitted to.
+        labelled (TensorDictBase): the same after the label budget was applied: its commands are the demonstrated ones.
+
+    Keyword Args:
+        execution (ExecutionConfig, optional): how plans are to become actions. Default: as it was trained for.
+        seed (int): seed of the plans' noise.
+
+    Returns:
+        dict: ``steps``, ``robots``, ``explained`` (share of the changes' variance on labels left out),
+        ``largest_command`` and ``largest_command_late`` (in the last third), over the largest demonstrated one,
+        ``distance_to_demonstrations`` (late, 95 % quantile, standard deviations), ``limited_commands``, ``commands``,
+        and sentences in ``faults``; or a ``note`` that says why there is none.
+    """
+    asked, task = execution or ExecutionConfig(), trained.task
+    ranges = command_ranges(task, labelled)
+    if not any(ranges):
+        return {"note": "no command changes in the labels", "faults": []}
+    response = _fit(data)
+    if response.explained < _EXPLAINED:
+        share = f"{max(response.explained, 0):.0%}"
+        return {"note": f"labels explain {share} of how states follow actions, linearly", "faults": []}
+    if not _replay_error(response, data) < _DRIFT:
+        return {"note": "recorded actions do not lead along their recording in the linear model", "faults": []}
+    free = trained_policy(trained, ExecutionConfig(**vars(asked) | {"limits": math.inf}))
+    steps = min(STEPS, task.max_steps)
+    commands, distance = _roll(free, response, data, steps, seed)
+    ends = torch.tensor([(-math.inf, math.inf) if r is None else r for r in ranges])
+    growth = ((commands - ends.mean(-1)) / (ends.diff(dim=-1).squeeze(-1) / 2)).nan_to_num(math.inf).abs()
+    growth = growth[..., [column for column, r in enumerate(ranges) if r is not None]].amax(-1)  # [steps, n]
+    late = float(growth[2 * len(growth) // 3 :].max()) if len(growth) == steps else math.inf
+    policy = trained_policy(trained, asked)
+    if policy.limits is not None and growth.max() > 1:
+        _, distance = _roll(policy, response, data, steps, seed)
+    limited = int(policy.limited[0])
+    found = {
+        "steps": steps,
+        "robots": commands.shape[1],
+        "explained": response.explained,
+        "largest_command": min(float(growth.max()), 1e30),
+        "largest_command_late": min(late, 1e30),
+        "distance_to_demonstrations": distance,
+        "limited_commands": limited,
+        "commands": steps * commands.shape[1],
+    }
+    return found | {"faults": _faults(found)}
+
+
+def _faults(found: Mapping[str, Any]) -> list[str]:
+    late, distance, faults = found["largest_command_late"], found["distance_to_demonstrations"], []
+    if late > UNSTABLE:
+        faults.append(
+            f"this policy is unstable: within {found['steps']} steps of a closed loop, by a linear model of how states"
+            f" follow actions, commands grow to {late:.3g} times the largest demonstrated one"
+        )
+    if distance > FAR:
+        faults.append(
+            f"this policy leaves its demonstrations: its closed loop ends {distance:.3g} standard deviations from the"
+            " nearest recorded state"
+        )
+    return faults
+
+
+def describe_loop(found: Mapping[str, Any]) -> str:
+    """Returns a line about :func:`check_loop`."""
+    if "note" in found:
+        return f"closed loop: not looked at ({found['note']})"
+    return (
+        f"closed loop by a linear model of the labels, {found['steps']} steps: largest command"
+        f" {found['largest_command']:.3g}, late {found['largest_command_late']:.3g} times the largest demonstrated one,"
+        f" {found['limited_commands']} of {found['commands']} limited, distance to the nearest recorded state"
+        f" {found['distance_to_demonstrations']:.2g} standard deviations"
+    )
 
 
 def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
@@ -26,3 +150,87 @@ def limited_commands(policy: PlanningPolicy) -> dict[str, Any]:
         " were held there (limits)"
     )
     return {"limited_commands": limited, "faults": [fault]}
+
+
+def _fit(data: TensorDictBase) -> _Response:
+    """The ridge of all labelled steps that have one before them."""
+    episode, observed = data[EPISODE], data[OBSERVATION].double()
+    changes = data["next", OBSERVATION].double() - observed
+    rows = (data[HAS_ACTION].squeeze(-1) & ~_first(data)).nonzero().squeeze(-1)
+    action = data[ACTION][rows].double()
+    scales = tuple(
+        torch.where(size > 0, size, 1.0)
+        for size in (
+            action.square().mean(0).sqrt() / _PREFERRED,
+            observed[rows].std(0, correction=0),
+            changes[rows].square().mean(0).sqrt(),
+        )
+    )
+    inputs = _inputs(scales, observed[rows], changes[rows - 1], action)
+    size = changes[rows].std(0, correction=0)
+    moving = size > 1e-9 * observed[rows].abs().amax(0)
+    wanted = changes[rows]
+    fit = ridge(inputs, wanted[:, moving] / size[moving], groups=episode[rows], penalties=[1e-9, 1e-7, 1e-5, 1e-3, 0.1])
+    weight, bias = torch.zeros(observed.shape[-1], inputs.shape[-1]).double(), wanted.mean(0)
+    weight[moving], bias[moving] = fit.weight * size[moving, None], fit.bias * size[moving]
+    return _Response(scales, weight, bias, 1 - fit.error**2)
+
+
+def _inputs(scales: tuple[Tensor, ...], observed: Tensor, change: Tensor, action: Tensor) -> Tensor:
+    return torch.cat([part / size for part, size in zip((action, observed, change), scales, strict=True)], -1)
+
+
+def _replay_error(response: _Response, data: TensorDictBase) -> float:
+    """How far recorded actions end beside their recordings, in standard deviations: the median of trajectories."""
+    spread = _spread(data)
+    apart = []
+    for number in data[EPISODE][data[HAS_ACTION].squeeze(-1)].unique().tolist()[:ROBOTS]:
+        rows = data[(data[EPISODE] == number) & data[HAS_ACTION].squeeze(-1)][:STEPS]
+        frames, action = rows[OBSERVATION].double(), rows[ACTION].double()
+        if len(rows) < 3:
+            continue
+        now, change = frames[1], frames[1] - frames[0]
+        for step in range(1, len(rows) - 1):
+            change = response.step(now, change, action[step])
+            now = now + change
+        apart.append(float(((now - frames[-1]) / spread).square().mean().sqrt()))
+    return sorted(apart)[len(apart) // 2] if apart else math.inf
+
+
+def _roll(
+    policy: PlanningPolicy, response: _Response, data: TensorDictBase, steps: int, seed: int
+) -> tuple[Tensor, float]:
+    """Commands ``[steps, n, act]``, fewer where they are no numbers any more, and the distance to recorded states."""
+    observed, first = data[OBSERVATION].double(), _first(data)
+    starts = (first.roll(1) & ~first & (observed + observed.roll(1, 0)).isfinite().all(-1)).nonzero().squeeze(-1)
+    starts = starts[torch.linspace(0, len(starts) - 1, min(ROBOTS, len(starts))).round().long()]
+    now, change = observed[starts], observed[starts] - observed[starts - 1]
+    agent, commands, visited = Agent(policy, seed=seed), [], []
+    agent.reset()
+    for _ in range(steps):
+        if not (now.abs() < 1e30).all():
+            break
+        action = agent.act(now.float()).double().cpu()
+        change = response.step(now, change, action)
+        now = now + change
+        commands.append(action)
+        visited.append(now)
+    if not (now.abs() < 1e30).all():
+        return torch.stack(commands), math.inf
+    spread, recorded = _spread(data), observed[observed.isfinite().all(-1)]
+    recorded = recorded[:: -(-len(recorded) // _ROWS)] / spread
+    last = torch.cat(visited[2 * steps // 3 :: 5]) / spread
+    nearest = torch.cdist(last, recorded).amin(-1) / math.sqrt(recorded.shape[-1])
+    return torch.stack(commands), float(nearest.quantile(0.95))
+
+
+def _first(data: TensorDictBase) -> Tensor:
+    """Which steps begin a trajectory, bool ``[N]``."""
+    return data[EPISODE].diff(prepend=data[EPISODE][:1] - 1) != 0
+
+
+def _spread(data: TensorDictBase) -> Tensor:
+    """Standard deviations of the recorded observations ``[obs]``, 1 for a column that never changes."""
+    observed = data[OBSERVATION].double()
+    spread = observed[observed.isfinite().all(-1)].std(0, correction=0)
+    return torch.where(spread > 0, spread, 1.0)

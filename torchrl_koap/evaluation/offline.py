@@ -12,11 +12,13 @@ from torch import Tensor
 from torchrl_koap.data import controller_view, select_trajectories
 from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chunks, errors_outside_budget
 from torchrl_koap.evaluation.findings import offline_faults
+from torchrl_koap.evaluation.loop_on_labels import check_loop, describe_loop
 from torchrl_koap.evaluation.plan_errors import plan_errors
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.tasks.units import thousandths
 
 if TYPE_CHECKING:
+    from torchrl_koap.modules import ExecutionConfig
     from torchrl_koap.training.trained import Trained
 
 KIND = "offline"
@@ -28,7 +30,13 @@ _COMMANDS = "the controller decodes no recorded states: it follows plans by the 
 
 
 def evaluate_offline(
-    trained: Trained, *, dataset: str | None = None, samples: int = 16, plans: int = 500, seed: int = 0
+    trained: Trained,
+    *,
+    dataset: str | None = None,
+    samples: int = 16,
+    plans: int = 500,
+    seed: int = 0,
+    execution: ExecutionConfig | None = None,
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Judges a run on recorded data.
 
@@ -36,6 +44,8 @@ def evaluate_offline(
     (:func:`~torchrl_koap.evaluation.plan_errors.plan_errors`). Actions are decoded from recorded states and compared
     with labels outside the budget, if there are any, and with those inside it, a trajectory left out at a time
     (:mod:`~torchrl_koap.evaluation.action_errors`). A policy of its own samples chunks of actions outside the budget.
+    The whole policy acts in a linear model of how states follow actions
+    (:func:`~torchrl_koap.evaluation.loop_on_labels.check_loop`).
 
     Args:
         trained (Trained): the run.
@@ -45,12 +55,13 @@ def evaluate_offline(
         samples (int): plans per situation.
         plans (int): situations at most.
         seed (int): seed of the plans' noise.
+        execution (ExecutionConfig, optional): how plans become actions. Default: as it was trained for.
 
     Returns:
-        tuple: ``kind`` ``"offline"``, ``plan_errors`` and ``action_errors``, ``relative_plan_error`` (1: no better than
-        standing still), ``relative_action_error`` (1: no better than always giving the mean action), ``faults`` in
-        words, and a row per trajectory in ``trajectory``; ``predicted`` and ``true`` actions ``[N, act]`` outside the
-        budget, if there are any.
+        tuple: ``kind`` ``"offline"``, ``plan_errors``, ``action_errors`` and ``loop``, ``relative_plan_error`` (1: no
+        better than standing still), ``relative_action_error`` (1: no better than always giving the mean action),
+        ``faults`` in words, and a row per trajectory in ``trajectory``; ``predicted`` and ``true`` actions ``[N, act]``
+        outside the budget, if there are any.
 
     Raises:
         RunDirectoryError: if the data set has moved, or is another one.
@@ -64,10 +75,12 @@ def evaluate_offline(
     else:
         outside, tensors = _outside_budget(trained, data, labelled)
     action = {"outside_budget": outside, "left_out": _left_out(trained, labelled, outside)}
+    loop = check_loop(trained, data, labelled, execution=execution, seed=seed)
     return {
         "kind": KIND,
         "relative_plan_error": plan.get("relative"),
-        "faults": offline_faults(plan, action),
+        "faults": offline_faults(plan, action) + loop.pop("faults"),
+        "loop": loop,
         "plan_errors": plan,
         **_summary_of(action),
         "trajectory": _per_trajectory(plan, action),
@@ -159,6 +172,7 @@ def describe_offline(result: Mapping[str, Any]) -> str:
         for row in part.get("chunk", {}).get("unit", ()):
             best = {f"best of {part['chunk']['samples']}": row["policy"]["best_of"]["overall"]}
             lines.append(_line("whole chunks of actions, energy score", row, _energies(row, *_CHUNKS) | best))
+    lines.append(describe_loop(result["loop"]))
     return "\n".join([*lines, *(f"FAULT: {fault}" for fault in result["faults"])])
 
 

@@ -1,0 +1,61 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""A closed loop on the labels finds a policy whose commands grow, and says where labels do not allow one."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_koap import ExecutionConfig, fit
+from torchrl_koap.data import make_demonstrations
+from torchrl_koap.evaluation.loop_on_labels import check_loop, describe_loop
+
+TINY = {"planner": {"network": "mlp", "steps": 2, "batch_size": 8, "width": 8}, "controller": {"steps": 0}}
+
+
+def recordings(noise=0.0):
+    """Two joints that go 3 % of the way to one goal in every frame, by commands in twice their units."""
+    random = np.random.default_rng(0)
+    goal, starts = random.uniform(-1, 1, 2), random.uniform(-1, 1, (8, 2))
+    states = [goal + 0.97 ** np.arange(80)[:, None] * (start - goal) for start in starts]
+    actions = [2 * np.diff(rows, axis=0) + noise * random.normal(size=(79, 2)) for rows in states]
+    return make_demonstrations(states, actions[:4] + [None] * 4, control_hz=100)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    data, task = recordings()
+    return fit(data, task, **TINY, progress=False), data
+
+
+def test_a_policy_that_goes_to_the_goal(trained):
+    found = check_loop(*trained, trained[1])
+    assert found["steps"] == 120 and found["robots"] == 8 and found["explained"] > 0.999
+    assert found["largest_command"] < 3 and found["faults"] == []
+    assert found["limited_commands"] == 0 and found["commands"] == 8 * 120
+    assert found["distance_to_demonstrations"] < 0.5 and json.dumps(found)
+    assert "0 of 960 limited" in describe_loop(found)
+
+
+def test_a_policy_that_feeds_on_its_own_velocity_is_unstable(trained):
+    model, data = trained
+    grown = replace(model, planner=fit(data, model.task, **TINY, progress=False).planner)
+    with torch.no_grad():
+        grown.planner.forecast.weight[:, :2] *= 20  # of the velocity
+    found = check_loop(grown, data, data)
+    assert found["largest_command_late"] > 100 and found["limited_commands"] > 100
+    assert found["faults"][0].startswith("this policy is unstable: within 120 steps of a closed loop")
+    free = check_loop(grown, data, data, execution=ExecutionConfig(limits=float("inf")))
+    assert free["limited_commands"] == 0 and free["distance_to_demonstrations"] > found["distance_to_demonstrations"]
+
+
+def test_labels_that_say_little_are_named():
+    data, task = recordings(noise=1.0)
+    noisy = data.copy()
+    noisy["next", "observation"] = noisy["observation"] + torch.randn(noisy["observation"].shape)
+    found = check_loop(fit(data, task, **TINY, progress=False), noisy, noisy)
+    assert "of how states follow actions, linearly" in describe_loop(found) and found["faults"] == []
