@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torchrl.collectors import Collector
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
 
@@ -185,3 +186,31 @@ def test_a_default_of_float64_draws_the_same_noise():
         assert torch.equal(NoiseStreams([7], (3, 2), block=2).draw(), usual)
     finally:
         torch.set_default_dtype(before)
+
+
+@pytest.mark.parametrize("make", POLICIES, ids=["feedback", "open loop", "chunks"])
+@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+def test_a_compiled_policy_makes_every_plan_that_is_due(make, backend):
+    """Three plans and a step, in an agent, in a collector, and with the denoiser compiled in place."""
+    policy = make()
+    path = np.random.default_rng(0).normal(size=(STEPS, 2))
+
+    def acted(policy):
+        agent = Agent(policy, seed=7)
+        agent.reset()
+        return np.stack([agent.act(row) for row in path])
+
+    def collected(compiled):
+        env = PolicyEnv(Drift(2), policy)
+        env.set_seed(7)
+        options = {"frames_per_batch": 2 * STEPS, "total_frames": 2 * STEPS, "compile_policy": compiled}
+        collector = Collector(env, policy, **options)
+        actions = next(iter(collector))["action"].clone()
+        collector.shutdown()
+        return actions
+
+    plain = acted(policy)
+    np.testing.assert_array_equal(acted(torch.compile(policy, backend=backend)), plain)
+    assert torch.equal(collected({"backend": backend}), collected(None))
+    policy.compile(backend=backend)
+    np.testing.assert_allclose(acted(policy), plain, rtol=1e-4, atol=1e-6)

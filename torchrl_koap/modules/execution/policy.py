@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -32,6 +33,9 @@ class PlanningPolicy(TensorDictModuleBase):
     shape, ``[]`` of a single environment included. The current plan travels in the tensordict; where it is lost on the
     way (a :class:`torchrl.envs.ParallelEnv` whose workers reset by themselves hands on its own entries alone), the
     policy remembers what it wrote last.
+
+    :func:`torch.compile` leaves a policy as it is, since plans are made where data say so; :meth:`compile` compiles its
+    denoiser in place.
 
     Args:
         planner (StatePlanner or DiffusionPolicy): samples plans from the last observed states.
@@ -186,6 +190,11 @@ class PlanningPolicy(TensorDictModuleBase):
         if self.follower is not None:
             self.follower.attach(env)
 
+    def compile(self, *args: Any, **kwargs: Any) -> None:
+        """Compiles the denoiser, which takes most of the time; arguments as for :func:`torch.compile`."""
+        self.planner.denoiser.compile(*args, **kwargs)
+
+    @torch.compiler.disable  # a graph would keep the counter of its first call; torch.compile(policy) acts as it is
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action of the current step, and the plan that the next one continues from."""
         observed = tensordict.get(self.in_keys[0], None)
