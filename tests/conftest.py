@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 from tiny_runs import TINY, koap, write_demonstrations
@@ -23,3 +25,9 @@ def trained_run(tmp_path_factory, demonstrations):
     folder = tmp_path_factory.mktemp("runs") / "trained"
     assert koap("train", "--out", folder, "--dataset", demonstrations, *TINY) == 0
     return folder
+
+
+@pytest.fixture
+def copied_run(trained_run, tmp_path):
+    """The same, for a test that writes to it."""
+    return shutil.copytree(trained_run, tmp_path / "run")

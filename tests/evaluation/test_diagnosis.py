@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -118,9 +117,8 @@ def test_states_beside_the_demonstrations_are_far():
     assert coverage(AVOIDING, [far], data)["visited_median"] > 5
 
 
-def test_inspect_from_the_shell(trained_run, tmp_path, capsys):
-    run = tmp_path / "run"
-    shutil.copytree(trained_run, run)
+def test_inspect_from_the_shell(copied_run, capsys):
+    run = copied_run
     assert koap("inspect", run, "--episodes", "2", "--threads", "1") == 0
     written = json.loads((run / "inspect.json").read_text())
     assert {"planner_alone", "controller_alone", "both", "plan_to_execution", "findings"} <= set(written)
@@ -129,8 +127,8 @@ def test_inspect_from_the_shell(trained_run, tmp_path, capsys):
     assert "episodes must be >= 1, got 0" in capsys.readouterr().err
 
 
-def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_goal(trained_run, monkeypatch, tmp_path):
-    trained = Trained.load(trained_run)
+def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_goal(copied_run, monkeypatch, tmp_path):
+    trained = Trained.load(copied_run)
     own = {"strategy": "open_loop", "replan_interval": 8, "blend": 0.0, "gain": 1.2, "lead": 0.05}
     task = replace(trained.task, goal=None)
     config = replace(trained.config, execution=ExecutionConfig(**own))
@@ -145,9 +143,7 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
     for module in (inspection, diagnosis):
         monkeypatch.setattr(module, "roll_out", noted)
     asked = inspection.InspectConfig(episodes=2, threads=1)
-    run = tmp_path / "run"
-    shutil.copytree(trained_run, run)
-    result = inspection.inspect(run, asked)
+    result = inspection.inspect(copied_run, asked)
     for policy in policies:  # recordings are followed by the same actions as plans
         assert policy.execution == Execution(**own)
         assert policy.limits.gain == 1.2 and policy.limits.lead == 0.05
@@ -155,12 +151,12 @@ def test_plans_are_followed_as_the_task_says_and_no_planner_is_rated_without_a_g
     assert "planner_alone" not in result and result["both"]["episodes"] == 2
     assert result["plan_to_execution"] == {}  # actions are kept, not plans
     assert len(draw_experiments(result, RunFacts(tmp_path, task)).axes) == 2
-    inspection.inspect(run, replace(asked, execution=ExecutionConfig(replan_interval=4)))
+    inspection.inspect(copied_run, replace(asked, execution=ExecutionConfig(replan_interval=4)))
     assert policies[-1].execution == Execution(**own | {"replan_interval": 4})
     config = replace(trained.config, execution=ExecutionConfig(candidates=3))
     several = replace(trained, config=config)
     monkeypatch.setattr(Trained, "load", lambda run: several)
-    inspection.inspect(run, asked)
+    inspection.inspect(copied_run, asked)
     assert [policy.execution.candidates for policy in policies[-2:]] == [3, 1]  # a recording is one plan
 
 

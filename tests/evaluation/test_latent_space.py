@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 
 import pytest
 import torch
@@ -224,27 +223,21 @@ def test_findings_without_experiments_says_whose_labels_were_read():
     )
 
 
-@pytest.fixture
-def run(trained_run, tmp_path):
-    shutil.copytree(trained_run, tmp_path / "run")
-    return tmp_path / "run"
-
-
-def test_inspect_the_latent_space_alone(run, capsys):
-    (run / "inspect.json").write_text(
+def test_inspect_the_latent_space_alone(copied_run, capsys):
+    (copied_run / "inspect.json").write_text(
         json.dumps({"controller_alone": {"rate": 0.5}, "findings": "old", "latent": "old"})
     )
-    assert koap("inspect", run, "--latent-only", "--latent-steps", "3", "--threads", "1") == 0
-    written = json.loads((run / "inspect.json").read_text())
+    assert koap("inspect", copied_run, "--latent-only", "--latent-steps", "3", "--threads", "1") == 0
+    written = json.loads((copied_run / "inspect.json").read_text())
     assert written["controller_alone"] == {"rate": 0.5}  # an earlier experiment is kept
     latent = written["latent"]
     assert list(latent["multi_step"]["koopman"]) == ["measured_xy"] and latent["multi_step"]["steps"] == 3
     assert len(latent[OUTSIDE_THE_BUDGET]["probe_r2"]) == 2
     assert latent[OUTSIDE_THE_BUDGET]["held_out_in_budget"] == 0  # 2 of 8 are labelled
     assert "for evaluation only" in written["findings"]
-    assert (run / "plots" / "latent.png").exists() and (run / "plots" / "eigenvalues.png").exists()
-    assert not (run / "plots" / "inspect.png").exists()
-    assert koap("inspect", run, "--latent-only", "--latent-steps", "0") == 1
+    assert (copied_run / "plots" / "latent.png").exists() and (copied_run / "plots" / "eigenvalues.png").exists()
+    assert not (copied_run / "plots" / "inspect.png").exists()
+    assert koap("inspect", copied_run, "--latent-only", "--latent-steps", "0") == 1
     assert "latent_steps must be >= 1, got 0" in capsys.readouterr().err
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny_runs import TINY, koap, write_demonstrations
+from tiny_runs import TINY, koap
 
 from torchrl_koap.envs import AvoidingEnv
 from torchrl_koap.evaluation.diagnosis import RecordedFutures, RecordedPlanner
@@ -92,37 +92,26 @@ def test_wrong_uses():
         policy.attach(object())
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    root = tmp_path_factory.mktemp("oracle")
-    write_demonstrations(root / "raw")
-    for method in ("koap", "dp"):
-        options = ("--method", method, "--controller.steps", 20, *TINY)
-        assert koap("train", "--out", root / method, "--dataset", root / "raw", *options) == 0
-    return root
-
-
-def test_the_command(runs):
-    options = ("--episodes", 1, "--threads", 1, "--no-report", "--strategy", "oracle", "--out", runs / "out")
-    assert koap("eval", runs / "koap", *options) == 0
-    result = json.loads((runs / "out" / "eval.json").read_text())
+def test_the_command(copied_run, tmp_path):
+    options = ("--episodes", 1, "--threads", 1, "--no-report", "--strategy", "oracle", "--out", tmp_path / "out")
+    assert koap("eval", copied_run, *options) == 0
+    result = json.loads((tmp_path / "out" / "eval.json").read_text())
     execution = result["execution"]
     assert execution["strategy"] == "oracle" and execution["blend"] == 0.8 and result["plan_ms"] > 0
 
 
-@pytest.mark.parametrize(
-    ("run", "option", "message"),
-    [
-        ("dp", (), "strategy 'oracle' was asked of method 'dp', which samples actions"),
-        ("koap", ("--env", "CartPole-v1"), "reads the task's own simulation; it cannot be combined with env"),
-    ],
-)
-def test_where_there_is_nothing_to_follow(runs, capsys, run, option, message):
-    assert koap("eval", runs / run, "--strategy", "oracle", *option) == 1
-    assert message in capsys.readouterr().err
-    assert not (runs / run / "eval.json").exists()
+def test_where_there_is_nothing_to_follow(demonstrations, copied_run, tmp_path, capsys):
+    dp = ("--out", tmp_path / "dp", "--dataset", demonstrations, "--method", "dp", *TINY)
+    assert koap("train", *dp) == 0
+    for run, option, message in (
+        (tmp_path / "dp", (), "strategy 'oracle' was asked of method 'dp', which samples actions"),
+        (copied_run, ("--env", "CartPole-v1"), "reads the task's own simulation; it cannot be combined with env"),
+    ):
+        assert koap("eval", run, "--strategy", "oracle", *option) == 1
+        assert message in capsys.readouterr().err
+        assert not (run / "eval.json").exists()
 
 
-def test_an_unknown_strategy(runs, capsys):
-    assert koap("eval", runs / "koap", "--strategy", "oracel") == 1
+def test_an_unknown_strategy(trained_run, capsys):
+    assert koap("eval", trained_run, "--strategy", "oracel") == 1
     assert "unknown strategy 'oracel'; did you mean 'oracle'" in capsys.readouterr().err

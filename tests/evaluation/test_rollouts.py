@@ -118,12 +118,6 @@ def test_nothing_to_roll_out_is_refused(seeds, size):
         toy_rollouts(seeds, batch_size=size)
 
 
-def test_history_is_that_of_the_longer_sighted():
-    short = make_policy(CountingPlanner(), EchoController(num_past=0), state_of=(1, 2))
-    long = make_policy(CountingPlanner(), EchoController(num_past=4), state_of=(1, 2))
-    assert (short.history, long.history) == (2, 5)
-
-
 def test_pictures_get_padded_paths_and_the_plans_that_were_made():
     episodes = [episode_of(6, success=True, mode=1), episode_of(3, collision=True, mode=-1, start=50.0)]
     tensors = rollouts_to_tensors(episodes, position=slice(2, 4), mode_index=number, interval=4)
