@@ -108,7 +108,7 @@ def errors_left_out(
         columns (sequence of int): state columns that the controller reads.
 
     Returns:
-        dict: of :func:`summarise_errors`, or a ``note`` why there is none.
+        dict: as of :func:`errors_outside_budget`.
     """
     has_action = labelled["has_action"].squeeze(-1)
     episodes = labelled["episode"][has_action].unique()
@@ -210,7 +210,7 @@ def errors_of_chunks(
 
 
 def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, task: Task) -> dict[str, Any]:
-    """Root mean squared errors by column and by unit, and as shares of those of the mean action.
+    """Takes root mean squared errors by column and by unit, and as shares of those of the mean action.
 
     Args:
         models (dict): name to predicted actions ``[N, act]``; ``"mean_action"`` is what ``"controller"`` has to beat.

@@ -125,7 +125,7 @@ def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
     """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
     choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
     policy = trained_policy(trained, config.execution)
-    asked = {"dataset": config.dataset, "samples": config.samples, "seed": config.seed}
+    asked: dict[str, Any] = {"dataset": config.dataset, "samples": config.samples, "seed": config.seed}
     result, actions = evaluate_offline(trained, **asked, execution=config.execution)
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
     result["seed"] = config.seed

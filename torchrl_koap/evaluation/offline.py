@@ -47,15 +47,8 @@ def evaluate_offline(
     The whole policy acts in a linear model of how states follow actions
     (:func:`~torchrl_koap.evaluation.loop_on_labels.check_loop`).
 
-    Args:
-        trained (Trained): the run.
-
-    Keyword Args:
-        dataset (str, optional): where its data set is now. Default: where it was.
-        samples (int): plans per situation.
-        plans (int): situations at most.
-        seed (int): seed of the plans' noise.
-        execution (ExecutionConfig, optional): how plans become actions. Default: as it was trained for.
+    There are ``samples`` plans or chunks in each of at most ``plans`` situations. The data set is where it was, unless
+    ``dataset`` says where it is now.
 
     Returns:
         tuple: ``kind`` ``"offline"``, ``plan_errors``, ``action_errors`` and ``loop``, ``relative_plan_error`` (1: no
@@ -90,9 +83,7 @@ def evaluate_offline(
 def evaluate_actions(trained: Trained, dataset: str | None = None) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Compares decoded actions with labels outside the budget, for evaluation only, beside rollouts in an environment.
 
-    Args:
-        trained (Trained): the run.
-        dataset (str, optional): where its data set is now. Default: where it was; if it is not there, nothing is read.
+    If the data set is not where it was, and ``dataset`` does not say where it is now, nothing is read.
 
     Returns:
         tuple: ``action_errors`` and what they come to, and the actions, as of :func:`evaluate_offline`.

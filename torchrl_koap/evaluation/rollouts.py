@@ -43,8 +43,7 @@ def roll_out(
 
     Keyword Args:
         max_steps (int): control steps at most.
-        batch_size (int, optional): episodes at a time. Default: all, but for :data:`AT_ONCE` at most, so that memory is
-            bounded. Outcomes do not depend on it.
+        batch_size (int, optional): episodes at a time, on which outcomes do not depend. Default: :data:`AT_ONCE`.
         contexts (array, optional): context ``[objects, 3]`` of every episode, for a task that has them.
         given (callable, optional): ``given(episodes)`` writes what the planner reads in those episodes in place of
             start noise.
@@ -52,9 +51,6 @@ def roll_out(
 
     Returns:
         list of TensorDict: one per episode, ``[steps]``, cut at its end.
-
-    Raises:
-        ValueError: if there are no seeds, the batch size is below 1, or contexts and seeds differ in number.
     """
     if not len(seeds) or (batch_size is not None and batch_size < 1):
         raise ValueError(f"at least one seed and a batch size >= 1 are needed, got {len(seeds)} and {batch_size}")
@@ -128,13 +124,8 @@ def rollouts_to_tensors(
 ) -> dict[str, Tensor]:
     """Stacks what the pictures need, padded to the longest episode.
 
-    Args:
-        episodes (sequence of TensorDict): from :func:`roll_out`.
-        position (slice): columns of the observation that are drawn; the first two count.
-        mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
-        interval (int): steps per plan.
-        objects (sequence of slice): columns of the objects that are drawn, likewise.
-        plans_position (bool): the first two columns of a plan are that position; otherwise plans are left out.
+    Of the columns ``position`` and ``objects`` of the observation the first two are drawn, and of plans where
+    ``plans_position`` says that they are that position.
 
     Returns:
         dict: ``position`` ``[E, T, 2]`` (NaN behind the end), ``length``, ``mode``, ``outcome`` ``[E]``, ``action``

@@ -43,8 +43,6 @@ def score(
     Args:
         episodes (sequence of TensorDict): from :func:`~torchrl_koap.evaluation.rollouts.roll_out`.
         seeds (sequence of int): one per episode.
-
-    Keyword Args:
         num_modes (int): base of the logarithm of the entropy, which is None for a single mode.
         mode_index (callable): leaf ``mode`` to a number, -1 if incomplete.
         contexts (sequence of int, optional): number of the context of every episode. With it ``mode_entropy`` is the
@@ -52,9 +50,6 @@ def score(
             successful episodes together.
         unsolved (str): what contexts without success count, see
             :func:`~torchrl_koap.evaluation.statistics.conditional_entropy`.
-
-    Raises:
-        ValueError: if the numbers of episodes, seeds or contexts differ.
     """
     rows: list[dict[str, Any]] = []
     for seed, episode in zip(seeds, episodes, strict=True):
