@@ -62,11 +62,11 @@ def evaluate_offline(
     data = trained.data(dataset)
     labelled, _ = trained.hide_labels(data)
     plan = _plans(trained, data, samples=samples, plans=plans, seed=seed)
-    if trained.planner is None:
+    if trained.planner is not None:
+        outside, tensors = _outside_budget(trained, data, labelled)
+    else:
         asked = {"samples": samples, "chunks": plans, "seed": seed}
         outside, tensors = errors_of_chunks(trained.controller, data, labelled, trained.task, **asked), {}
-    else:
-        outside, tensors = _outside_budget(trained, data, labelled)
     action = {"outside_budget": outside, "left_out": _left_out(trained, labelled, outside)}
     loop = check_loop(trained, data, labelled, execution=execution, seed=seed)
     return {
