@@ -23,7 +23,6 @@ _WORDS = {
     "success_low": "success, 95 % from",
     "success_high": "success, 95 % to",
     "labels_read_outside_budget": "labels read outside the budget, for evaluation only",
-    "held_out_error_mm": "error on held-out labelled steps (mm)",
 }
 
 
@@ -99,8 +98,7 @@ def templates() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    filters = {"show": show, "label": label, "columns": columns, "duration": duration}
-    environment.filters.update(filters | {"all_mappings": lambda items: all(isinstance(i, Mapping) for i in items)})
+    environment.filters.update(show=show, label=label, columns=columns, duration=duration)
     return environment
 
 

@@ -73,11 +73,16 @@ PRESETS: dict[str, dict[str, Any]] = {
 # a smoothed lifting keeps states of at most so many columns as they are
 NARROW = 8
 
-_KERNEL: dict[str, Any] = {"num_features": 256, "curvature": 0.1, "motion_scale": 1.0, "position_scale": 4.0}
 # what only one kind of latent-action network takes, and its value where a preset does not name it
 NETWORK_OPTIONS: dict[str, dict[str, Any]] = {
-    "fourier": _KERNEL | {"position_weight": 0.0},
-    "smoothed": _KERNEL,
+    "fourier": {
+        "num_features": 256,
+        "curvature": 0.1,
+        "motion_scale": 1.0,
+        "position_scale": 4.0,
+        "position_weight": 0.0,
+    },
+    "smoothed": {"num_features": 256},
     "lstm": {"relative": False},
 }
 

@@ -38,7 +38,6 @@ class LatentActionSmoothed(LatentActionModule):
         num_features (int): Fourier features of each block.
 
     Keyword Args:
-        curvature, motion_scale, position_scale (float): as for :class:`LatentActionFourier`, for both blocks.
         **kwargs: ``num_past``, ``look_ahead`` (of the lifted block; no shorter than the raw one's) and keys, see
             :class:`LatentActionModule`.
 
@@ -65,9 +64,6 @@ class LatentActionSmoothed(LatentActionModule):
         lifting: KoopmanLifting | CompactLifting,
         num_features: int,
         *,
-        curvature: float = 0.1,
-        motion_scale: float = 1.0,
-        position_scale: float = 4.0,
         num_past: int = 8,
         look_ahead: Sequence[int] = (2, 3, 4, 5, 6, 7, 8),
         **kwargs,
@@ -78,14 +74,11 @@ class LatentActionSmoothed(LatentActionModule):
                 f" as many, got {num_past} and {max(look_ahead)}"
             )
         dim = lifting.latent_dim
-        # random features as they are: training them was measured to change nothing
-        kernel: dict[str, Any] = {"curvature": curvature, "motion_scale": motion_scale, "trainable": False}
-        kernel["position_scale"] = position_scale
         frames: dict[str, Any] = {"num_past": num_past, "look_ahead": look_ahead}
-        lifted = LatentActionFourier(dim, num_features, **frames, **kernel)
-        raw = LatentActionFourier(
-            lifting.state_dim, num_features, num_past=RAW_PAST, look_ahead=RAW_LOOK_AHEAD, **kernel
-        )
+        raw_frames: dict[str, Any] = {"num_past": RAW_PAST, "look_ahead": RAW_LOOK_AHEAD}
+        # random features as they are: training them was measured to change nothing
+        lifted = LatentActionFourier(dim, num_features, trainable=False, **frames)
+        raw = LatentActionFourier(lifting.state_dim, num_features, trainable=False, **raw_frames)
         super().__init__(lifting.state_dim, lifted.latent_dim + raw.latent_dim, **frames, **kwargs)
         self.reader = WindowReader(dim, relative=False, **frames)  # of lifted frames, which are smoothed together
         self.keeps_state = lifting.keeps_state
