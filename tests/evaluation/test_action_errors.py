@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
 from torchrl_koap.evaluation.action_errors import AFTER, BEFORE, episodes_outside, errors_outside_budget, first_actions
-from torchrl_koap.tasks import get_task
+from torchrl_koap.tasks import Action, Task, get_task
 
 LENGTHS = (25, 18, 31, 13, 22, 9)  # the last one is too short
 
@@ -116,3 +116,17 @@ def test_with_a_label_in_every_trajectory_there_is_nothing_to_measure():
     labelled, _ = LabelBudget(fraction=1.0).apply(data)
     result, tensors = errors_outside_budget(Copy(1), data, labelled, get_task("avoiding"))
     assert set(result) == {"note"} and not tensors
+
+
+def test_an_action_that_never_changes_is_commanded_right_whatever_is_decoded():
+    data = counting()
+    data["action"][:, 1] = 7.0
+    labelled, _ = LabelBudget(count=2).apply(data)
+    task = Task(
+        name="arm",
+        observation_parts={"robot": 4},
+        actions={"step": Action("m"), "grip": Action("N", constant=7.0)},
+        position="robot",
+    )
+    found, _ = errors_outside_budget(Copy(1, shift=1), data, labelled, task)
+    assert [row["controller"] for row in found["column"]] == [1.0, 0.0]

@@ -23,14 +23,15 @@ TASK = Task(
 class Planner(nn.Module):
     """Moves by +- ``size`` per step, with a sign that the noise draws."""
 
-    history, horizon, noise_shape = 2, 4, (4, 2)
+    horizon, noise_shape = 4, (4, 2)
 
-    def __init__(self, size: float):
+    def __init__(self, size: float, history: int = 2):
         super().__init__()
+        self.history = history
         self.register_buffer("size", torch.tensor(size))
 
     def split_window(self, window):
-        return window[:, :2], window[:, 2:]
+        return window[:, : self.history], window[:, self.history :]
 
     def sample(self, history, noise):
         sign = torch.where(noise[:, :1, :1] > 0, 1.0, -1.0) * torch.tensor([1.0, 0.0])
@@ -63,6 +64,10 @@ def test_both_ways_of_a_fork_are_no_mistake_and_units_stay_apart():
     assert plan_errors(Planner(0.0), data(), TASK)["relative"] == pytest.approx(1)
     assert force["planner"]["energy_score"]["overall"] == 0 and found["situations"] == 500
     assert len(found["trajectory"]) == 20
+
+
+def test_a_planner_that_sees_one_frame_is_compared_with_constant_velocity_too():
+    assert plan_errors(Planner(1.0, history=1), data(), TASK) == plan_errors(Planner(1.0), data(), TASK)
 
 
 def test_the_same_seed_gives_the_same_figures():

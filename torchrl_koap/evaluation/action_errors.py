@@ -86,11 +86,16 @@ def errors_outside_budget(
     ridge = LinearInverseDynamics(data["state"].shape[-1], task.action_dim).to(data["state"].dtype)
     fit_closed_form(ridge, labelled)
     models = {
-        "controller": predicted,
+        "controller": _commanded(predicted, true, task),
         "ridge": first_actions(ridge, data, outside)[0],
         "mean_action": known.mean(0).expand_as(true),
     }
     return summarise_errors(models, true, episode, task), {"predicted": predicted, "true": true}
+
+
+def _commanded(decoded: Tensor, true: Tensor, task: Task) -> Tensor:
+    """Actions ``[N, act]`` as a policy commands them: those that never change are what they were."""
+    return torch.where(torch.tensor([action.constant is not None for action in task.actions.values()]), true, decoded)
 
 
 def errors_left_out(
@@ -129,7 +134,7 @@ def errors_left_out(
         predicted, true, episode = first_actions(again, labelled, [int(number)])
         if not len(true):  # its labels lie too near its end
             continue
-        models["controller"].append(predicted)
+        models["controller"].append(_commanded(predicted, true, task))
         models["ridge"].append(first_actions(ridge, labelled, [int(number)])[0])
         models["mean_action"].append(fold["action"][fold["has_action"].squeeze(-1)].mean(0).expand_as(true))
         truths.append(true)

@@ -55,16 +55,16 @@ def plan_errors(
         still, the mean over units; ``relative_of_velocity``: the same of constant velocity; ``trajectory``: the
         relative score per trajectory.
     """
-    horizon, history = planner.horizon, planner.history
+    horizon, history = planner.horizon, max(planner.history, 2)  # constant velocity needs two frames
     windows = cut_windows(data, history + horizon, select=["state", "episode"], pad_before=history - 1)
     if len(windows) > plans:
         windows = windows[torch.linspace(0, len(windows) - 1, plans).round().long()]
-    past, future = planner.split_window(windows["state"].float())
+    states = windows["state"].float().cpu()
+    past, future = planner.split_window(states[:, history - planner.history :])
     episode = windows["episode"][:, -1].cpu()
     device = next(iter(planner.state_dict().values())).device
     models = {"planner": sample_sequences(planner, past.to(device), samples=samples, seed=seed).cpu()}
-    past, future = past.cpu(), future.cpu()
-    models |= {name: plan[None] for name, plan in baseline_plans(past, horizon).items()}
+    models |= {name: plan[None] for name, plan in baseline_plans(states[:, :history], horizon).items()}
     rows, scores = score_sequences(models, future, task.state_names, task.state_units)
     return {
         "situations": len(past),
