@@ -103,11 +103,9 @@ def test_a_single_column_with_labels_outside_the_budget(tmp_path):
     assert result["action_errors_on"] == "outside_budget" and outside["trajectories"] == 8
     # the method is that ridge itself
     assert outside["column"][0]["controller"] == pytest.approx(outside["column"][0]["ridge"], rel=1e-4)
-    assert (
-        result["labels_read_outside_budget"]
-        == outside["labels"]
-        == len(load_tensors(run / "actions.safetensors")[0]["true"])
-    )
+    assert len(load_tensors(run / "actions.safetensors")[0]["true"]) == outside["labels"]
+    labels = json.loads((run / "summary.json").read_text())["labels"]
+    assert result["labels_read_outside_budget"] == labels["available_transitions"] - labels["labelled_transitions"] > 0
     page = write_report(run).read_text()
     assert "action_errors.png" in page and "None" not in page
 
@@ -131,7 +129,7 @@ def test_a_policy_of_its_own_is_judged_by_its_chunks(tmp_path, capsys):
     result = json.loads((run / "eval.json").read_text())
     outside = result["action_errors"]["outside_budget"]
     assert result["action_errors_on"] == "outside_budget" and outside["trajectories"] == 3
-    assert result["labels_read_outside_budget"] == outside["labels_read"] >= outside["labels"] == 3 * 26
+    assert result["labels_read_outside_budget"] >= outside["labels"] == 3 * 26
     assert result["relative_action_error"] == outside["relative"] > 0
     (row,) = outside["chunk"]["unit"]
     assert row["columns"] == ["dq0", "dq1"] and len(row["policy"]["best_of"]["per_step"]) == 14

@@ -205,7 +205,6 @@ def errors_of_chunks(
         "mean_action": mean.expand(len(true), -1),
     }
     errors = summarise_errors(models, true[:, 0], windows["episode"][:, -1], task)
-    errors["labels_read"] = int(data["has_action"][torch.isin(data["episode"], episodes)].sum())
     whole = windows["has_action"][:, now:].all(1).squeeze(-1)
     if not whole.any():
         return errors

@@ -14,6 +14,7 @@ from torchrl_koap.evaluation.action_errors import errors_left_out, errors_of_chu
 from torchrl_koap.evaluation.findings import offline_faults
 from torchrl_koap.evaluation.loop_on_labels import check_loop, describe_loop
 from torchrl_koap.evaluation.plan_errors import plan_errors
+from torchrl_koap.keys import HAS_ACTION
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.tasks.units import thousandths
 
@@ -76,6 +77,8 @@ def evaluate_offline(
         "loop": loop,
         "plan_errors": plan,
         **_summary_of(action),
+        # the linear model of the loop is fitted to all labels
+        "labels_read_outside_budget": int(data[HAS_ACTION].sum() - labelled[HAS_ACTION].sum()),
         "trajectory": _per_trajectory(plan, action),
     }, tensors
 
@@ -107,7 +110,7 @@ def _summary_of(action: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "relative_action_error": None if split is None else action[split]["relative"],
         "action_errors_on": split,
-        "labels_read_outside_budget": outside.get("labels_read", outside.get("labels", 0)),
+        "labels_read_outside_budget": outside.get("labels", 0),
         "action_errors": dict(action),
     }
 
