@@ -19,6 +19,7 @@ from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings
 from torchrl_koap.data.quality import find_warnings
 from torchrl_koap.data.ted import stored_folder
+from torchrl_koap.data.window_length import plan_coverage
 from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE
 from torchrl_koap.envs.experts.recording import expert_of
@@ -183,6 +184,7 @@ class Convert(Command):
             "steps": len(data),
             **_contents(recordings),
             "skipped": ", ".join(recordings.skipped) or "nothing",
+            "a plan covers": plan_coverage(data, task.control_hz)[0],
             **_warnings(data, task, recordings.sources),
             "next": f"koap train --dataset {shlex.quote(str(folder))} --out runs/{task.name}",
         }
@@ -259,6 +261,8 @@ def _warnings(data: TensorDictBase, task: Task, names: Sequence[str]) -> dict[st
     """What is unlikely in data, numbered."""
     units, columns, actions = task.observation_units or _metres(task), task.observation_names, task.action_names
     found = find_warnings(data, names=names, units=units, columns=columns, seen=task.state_names, actions=actions)
+    short = plan_coverage(data, task.control_hz)[1]
+    found += [] if short is None else [short]
     return {f"warning {number}": warning for number, warning in enumerate(found, 1)}
 
 

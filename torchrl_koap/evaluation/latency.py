@@ -86,9 +86,11 @@ def measure_control_loop(run: str | Path, config: LatencyConfig) -> dict[str, An
     trained = Trained.load(run)
     rate = trained.task.control_hz if config.control_hz is None else config.control_hz
     observations = 0.01 * np.random.default_rng(0).standard_normal((config.steps, trained.task.observation_dim))
+    policy = trained.policy()
     if not config.async_replan:
-        return run_control_loop(Agent(trained.policy()), observations, control_hz=rate)
-    with AsynchronousAgent(trained.policy(), control_hz=rate) as agent:
+        policy.check_rate(rate)
+        return run_control_loop(Agent(policy), observations, control_hz=rate)
+    with AsynchronousAgent(policy, control_hz=rate) as agent:
         return run_control_loop(agent, observations, control_hz=rate)
 
 

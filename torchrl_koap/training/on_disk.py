@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from contextlib import ExitStack
 from typing import Any
 
@@ -12,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import LabelReport, WindowTable, select_trajectories, subsample_trajectories
+from torchrl_koap.data.window_length import plan_coverage
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import to_json, versions
@@ -111,6 +113,9 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             command = run.read_json("config.json").get("command") or command
         # not before the data are known to be good: a wrong call leaves nothing
         run.write_json("config.json", content | ({"command": command} if command else {}))
+        covers, short = plan_coverage(used, task.control_hz)
+        if short is not None:
+            warnings.warn(short, stacklevel=2)
         began = time.perf_counter()
         with open_logger(config.run.logger, config.out) as logger:
             torch.manual_seed(config.run.seed)
@@ -125,6 +130,7 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             save_weights(run.path / "controller.safetensors", controller, facts_of("controller", task, config))
         summary = {
             "labels": report.as_dict(),
+            "plan_covers": covers,
             "trajectories_used": len(data["episode"].unique()),
             "planner_parameters": 0 if planner is None else sum(p.numel() for p in planner.parameters()),
             "controller_parameters": sum(p.numel() for p in controller.parameters()),

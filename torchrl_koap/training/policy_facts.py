@@ -51,6 +51,7 @@ def policy_facts(
         "commanded": None if task.targets else commanded_columns(task),
         "ranges": ranges,
         "max_steps": task.max_steps,
+        "control_hz": task.control_hz,
     }
 
 

@@ -129,6 +129,16 @@ def test_actions_have_the_gain_of_the_policy():
         agent.close()
 
 
+def test_another_rate_than_that_of_the_data_is_warned_of(recwarn):
+    networks = make_agent().policy
+    policy = make_policy(networks.planner, networks.follower.controller, state_of=(0, 1), control_hz=20.0)
+    with pytest.warns(UserWarning, match="control_hz is 500, the policy was trained on data of 20 Hz"):
+        AsynchronousAgent(policy, control_hz=500).close()
+    recwarn.clear()
+    AsynchronousAgent(policy, control_hz=24).close()
+    assert not recwarn.list
+
+
 def test_refusals():
     with pytest.raises(ValueError, match="control_hz must be a positive number"):
         AsynchronousAgent(policy_of(), control_hz=0)

@@ -36,7 +36,8 @@ class AsynchronousAgent(Agent):
         policy (PlanningPolicy): one that follows plans with strategy ``"feedback"``.
 
     Keyword Args:
-        control_hz (float): control steps per second, by which a plan's time becomes a number of steps.
+        control_hz (float): control steps per second, by which a plan's time becomes a number of steps. One that differs
+            from that of the policy by more than a fifth is warned of.
         seed (int): as for :class:`Agent`.
 
     Raises:
@@ -65,6 +66,7 @@ class AsynchronousAgent(Agent):
             raise ValueError(f"plans are made asynchronously one at a time, not of {policy.execution.candidates}")
         if not (math.isfinite(control_hz) and control_hz > 0):
             raise ValueError(f"control_hz must be a positive number of steps per second, got {control_hz}")
+        policy.check_rate(control_hz)
         self.control_hz = control_hz
         self._delay = 1  # steps that a plan takes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="planner")

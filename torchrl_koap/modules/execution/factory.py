@@ -29,6 +29,7 @@ def make_policy(
     commanded: Mapping[str, Sequence[int]] | None = None,
     ranges: Ranges | None = None,
     max_steps: int = 400,
+    control_hz: float | None = None,
     follower: Follower | None = None,
 ) -> PlanningPolicy:
     """Makes a policy of planner and controller: observations in, an action per control step out.
@@ -55,6 +56,7 @@ def make_policy(
         ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
             may be any; ``execution.limits`` widens them. Default: actions may be any.
         max_steps (int): steps of an episode.
+        control_hz (float, optional): frames per second of the data. Default: not known.
         follower (Follower, optional): follows plans in place of the controller, such as the oracle.
 
     Returns:
@@ -92,7 +94,13 @@ def make_policy(
             state_of=state_of if callable(state_of) else lambda observed: observed[..., list(state_of)],
         )
     policy = PlanningPolicy(
-        planner, follower, state_of=state_of, execution=execution, limits=limits, max_steps=max_steps
+        planner,
+        follower,
+        state_of=state_of,
+        execution=execution,
+        limits=limits,
+        max_steps=max_steps,
+        control_hz=control_hz,
     )
     return policy.eval()
 

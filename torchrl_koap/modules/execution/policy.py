@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -48,6 +49,7 @@ class PlanningPolicy(TensorDictModuleBase):
         limits (CommandLimits, optional): has the last word on actions. How many of how many left their range is in
             ``limited``, int64 ``[2]``.
         max_steps (int): steps of an episode, whose start noise is drawn at once.
+        control_hz (float, optional): frames per second of the data. Default: not known.
         history_key (NestedKey): observations ``[*B, history, obs]`` (:func:`~torchrl_koap.modules.policy_transforms`).
         action_key (NestedKey): action of the current step ``[*B, act]``.
 
@@ -77,6 +79,7 @@ class PlanningPolicy(TensorDictModuleBase):
         execution: Execution | None = None,
         limits: CommandLimits | None = None,
         max_steps: int = 400,
+        control_hz: float | None = None,
         history_key: NestedKey = OBSERVATION_HISTORY,
         action_key: NestedKey = ACTION,
     ):
@@ -96,7 +99,7 @@ class PlanningPolicy(TensorDictModuleBase):
                 f"replan_interval must be in 1..{planner.horizon} (the horizon), got {execution.replan_interval}"
             )
         self.planner, self.follower, self.limits = planner, follower, limits
-        self.execution, self.max_steps = execution, max_steps
+        self.execution, self.max_steps, self.control_hz = execution, max_steps, control_hz
         self.register_buffer("limited", torch.zeros(2, dtype=torch.long), persistent=False)
         self.state_of = state_of if callable(state_of) else _Columns(state_of)
         self.history = max(planner.history, 1 if follower is None else follower.num_frames)
@@ -117,6 +120,15 @@ class PlanningPolicy(TensorDictModuleBase):
         """Shape of everything that is drawn for one environment whenever a plan is due."""
         candidates = self.execution.candidates
         return (*((candidates,) if candidates > 1 else ()), *self.planner.noise_shape)
+
+    def check_rate(self, control_hz: float) -> None:
+        """Warns of a control rate (Hz) that differs by more than a fifth from that of the data."""
+        if self.control_hz is not None and not 0.8 <= control_hz / self.control_hz <= 1.25:
+            warnings.warn(
+                f"control_hz is {control_hz:g}, the policy was trained on data of {self.control_hz:g} Hz: its plans and"
+                " commands are for steps of that length",
+                stacklevel=3,
+            )
 
     def plan(
         self,
