@@ -80,7 +80,7 @@ def test_absolute_targets(arrays, tmp_path):
     assert koap(*command, "--action-kind", "absolute") == 0
     assert koap("train", "--dataset", tmp_path / "arm", "--out", tmp_path / "run", "--method", "linear", *TINY) == 0
     data, _ = load_ted(tmp_path / "arm" / "ted")
-    agent = Agent(load_policy(tmp_path / "run"))
+    agent = Agent(load_policy(tmp_path / "run", limits=float("inf")))
     agent.reset()
     far = data["observation"][0].numpy() + np.array([5.0, 5.0, 5.0, 5.0])
     near = agent.act(data["observation"][0].numpy())
@@ -88,6 +88,9 @@ def test_absolute_targets(arrays, tmp_path):
     moved = agent.act(far)
     # what is learnt is the distance to the target: a robot that starts elsewhere is sent elsewhere
     assert np.abs(moved - near).min() > 2
+    limited = Agent(load_policy(tmp_path / "run"))  # by default not that far
+    limited.reset()
+    assert limited.act(far).max() < moved.max() and limited.policy.limited.tolist() == [1, 1]
 
 
 def test_a_missing_data_set_is_named(run, tmp_path, capsys):
