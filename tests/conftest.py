@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import shutil
+from multiprocessing import forkserver
 
 import pytest
 import torch
@@ -11,6 +13,15 @@ from tiny_runs import TINY, koap, write_demonstrations
 
 # two processes with two threads each on two cores wait for each other most of the time
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def job_server():
+    """The server whose copies do the jobs of studies has imported what cells need, whichever test starts it."""
+    rooms = ("studies.launchers", "studies.cells", "evaluation.closed_loop", "envs.avoiding")
+    forkserver.set_forkserver_preload([f"torchrl_koap.{room}" for room in rooms])
+    process = multiprocessing.get_context("forkserver").Process(target=len, args=("",))
+    process.start(), process.join()  # now it is there
 
 
 @pytest.fixture(scope="session")

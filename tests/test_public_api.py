@@ -57,10 +57,10 @@ def test_python_trains_and_evaluates_what_the_shell_does(trained_run, demonstrat
         assert next(weights).read_bytes() == next(weights).read_bytes()
     assert json.loads((mine / "config.json").read_text())["command"] == "as called"
 
-    result = evaluate(mine, EvalConfig(episodes=2, threads=1))
+    result = evaluate(mine, EvalConfig(episodes=1, threads=1))
     assert result == json.loads((mine / "eval.json").read_text()) and not (mine / "index.html").exists()
     mine.rename(its)
-    assert koap("eval", its, "--episodes", 2, "--threads", 1, "--no-report") == 0
+    assert koap("eval", its, "--episodes", 1, "--threads", 1, "--no-report") == 0
     assert json.loads((its / "eval.json").read_text())["episode"] == result["episode"]
 
 

@@ -4,18 +4,19 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 from tiny_runs import koap
 
+from torchrl_koap.commands import run_commands
 from torchrl_koap.data import load_ted, stored_task
 from torchrl_koap.evaluation import load_policy
 from torchrl_koap.modules import Agent
 from torchrl_koap.tasks import Action
 
-TINY = ("--steps", 20, "--planner.batch-size", 8, "--planner.network", "mlp", "--planner.width", 8)
-TINY += ("--controller.steps", 20)
+TINY = ("--steps", 20, "--planner.batch-size", 8, "--planner.width", 8, "--controller.steps", 20)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def arrays(tmp_path_factory):
 def run(arrays, tmp_path_factory):
     root = tmp_path_factory.mktemp("own")
     assert koap("convert", arrays, "--out", root / "arm", "--robot", "q1", "q2", "--action-units", "rad") == 0
-    assert koap("train", "--dataset", root / "arm", "--out", root / "run", *TINY) == 0
+    assert koap("train", "--dataset", root / "arm", "--out", root / "run", *TINY, "--planner.network", "mlp") == 0
     return root / "run"
 
 
@@ -100,7 +101,8 @@ def test_a_missing_data_set_is_named(run, tmp_path, capsys):
     assert "arn does not fit" in capsys.readouterr().err
 
 
-def test_export_and_latency(run, tmp_path, capsys):
+def test_export_and_latency(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(run_commands, "time_calls", partial(run_commands.time_calls, repeats=3))
     assert koap("export", run, "--out", tmp_path / "exported") == 0
     assert {file.name for file in (tmp_path / "exported").iterdir()} == {
         "policy.pt2",

@@ -86,7 +86,7 @@ def test_a_plugin_that_is_nowhere_is_named_with_where_it_was_looked_for(run, tmp
     assert str(tmp_path) in line and "KOAP_TRACEBACK=1" in line
 
 
-def test_a_study_goes_on_with_the_plugin_in_every_cell(tmp_path, demonstrations, search_path):
+def test_a_study_goes_on_with_the_plugin_in_every_cell(tmp_path, demonstrations, search_path, job_server):
     """Cells are processes of their own; the second call does not name the plugin, its folder does."""
     search_path.append(str(PLUGINS))
     out = tmp_path / "curve"

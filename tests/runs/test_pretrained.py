@@ -88,10 +88,10 @@ def test_places_are_left_out_and_what_is_left_is_sealed(run, demonstrations, tmp
 
 def test_evaluation_in_a_folder_of_ones_own(policies, tmp_path, capfd):
     out = tmp_path / "mine"
-    rolled = ("--episodes", "2", "--threads", "1", "--no-animate")
+    rolled = ("--episodes", "1", "--threads", "1", "--no-animate")
     assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--candidates", "3") == 0
     result = json.loads((out / "eval.json").read_text())
-    assert result["episodes"] == 2 and result["execution"]["candidates"] == 3
+    assert result["episodes"] == 1 and result["execution"]["candidates"] == 3
     assert (out / "index.html").exists() and not (policies / "avoiding" / "eval.json").exists()
     assert koap("eval", "pretrained:avoiding", "--out", out, *rolled, "--no-report") == 0  # again, into the same folder
 

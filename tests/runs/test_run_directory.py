@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
-
 import pytest
 
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
@@ -100,23 +97,6 @@ def test_missing_json_says_what_was_wanted(tmp_path):
         RunDirectory(tmp_path).read_json("config.json")
 
 
-@pytest.mark.parametrize("what", ["json", "metrics"])
-def test_a_full_disk_leaves_what_was_there(run, monkeypatch, what):
-    run.write_json("config.json", {"task": "avoiding"})
-    before = {file.name: file.read_bytes() for file in run.path.iterdir()}
-
-    def full(*arguments):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(OSError, match="No space left"):
-        if what == "json":
-            run.write_json("config.json", {"task": "other"})
-        else:
-            run.rewind_metrics("planner", 0)
-    assert {file.name: file.read_bytes() for file in run.path.iterdir()} == before
-
-
 def test_content_that_json_cannot_hold_leaves_what_was_there(run):
     run.write_json("config.json", {"task": "avoiding"})
     with pytest.raises(TypeError):
@@ -137,18 +117,6 @@ def test_a_new_value_gets_a_column_and_earlier_rows_stay(tmp_path):
         "controller,100,,0.125,0.5",
     ]
     assert run.last_metrics("controller") == {"loss_mine": 0.125, "learning_rate": 0.5}
-
-
-def test_a_log_with_the_columns_of_before_is_read_and_goes_on(tmp_path):
-    """Earlier versions had the same columns in every run."""
-    head = "phase,step,loss_planner,loss_reconstruction,loss_koopman,loss_kl,learning_rate\n"
-    (tmp_path / "metrics.csv").write_text(head + "planner,50,0.5,,,,0.001\nplanner,100,0.25,,,,0.0")
-    run = RunDirectory(tmp_path)
-    assert steps_of(run) == [("planner", 50)]  # the second row was cut off
-    run.log("controller", 50, {"loss_mine": 2.0})
-    assert steps_of(run) == [("planner", 50), ("controller", 50)]
-    assert run.last_metrics("planner") == {"loss_planner": 0.5, "learning_rate": 0.001}
-    assert run.last_metrics("controller") == {"loss_mine": 2.0}
 
 
 def test_a_half_written_checkpoint_is_taken_away_by_the_next_one_who_works_there(tmp_path):

@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
-
 import pytest
 import torch
 from torch import nn
@@ -106,29 +103,6 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     weights.save_file({"x": torch.ones(1)}, tmp_path / "facts", metadata={"about": "[1]"})
     with pytest.raises(CheckpointError, match="its facts are no object"):
         load_tensors(tmp_path / "facts")
-
-
-@pytest.mark.parametrize("place", ["writing", "renaming"])
-def test_a_full_disk_leaves_what_was_there(saved, monkeypatch, place):
-    path, _ = saved
-    before = path.read_bytes()
-
-    def half_written(tensors, file, metadata):
-        with open(file, "wb") as stream:
-            stream.write(b"half")
-        raise OSError(errno.ENOSPC, "No space left on device", str(file))
-
-    def no_rename(*arguments):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    if place == "writing":
-        monkeypatch.setattr(weights, "save_file", half_written)
-    else:
-        monkeypatch.setattr(os, "replace", no_rename)
-    with pytest.raises(OSError, match="No space left"):
-        save_weights(path, Model(seed=3), {"task": "avoiding"})
-    assert path.read_bytes() == before
-    assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
 def test_no_bit_of_the_header_can_change_unseen(tmp_path):

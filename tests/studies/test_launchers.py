@@ -17,6 +17,8 @@ import pytest
 
 from torchrl_koap.studies.launchers import Job, Machines, launch, run_logged
 
+pytestmark = pytest.mark.usefixtures("job_server")
+
 
 def say(folder):
     with open(Path(folder).parent / "said", "a") as out:

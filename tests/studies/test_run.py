@@ -14,19 +14,20 @@ from pathlib import Path
 import pytest
 from tiny_runs import koap
 
-from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig
+from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig
 from torchrl_koap.studies import Machines, Study, run_study
 from torchrl_koap.studies import run as run_module
 from torchrl_koap.studies.cells import Cell
 from torchrl_koap.studies.run import _Table
 from torchrl_koap.studies.table import read_cells
 
+pytestmark = pytest.mark.usefixtures("job_server")
 DP, LINEAR = "cells/avoiding/dp-0.25-1-seed0", "cells/avoiding/linear-0.25-1-seed0"
 PLANNER = "planners/avoiding/1-seed0"
 # two methods, one of them without a planner, of which everything is over in seconds
 TINY = {"methods": ("linear", "dp"), "labels": (0.25,), "seeds": 1, "planner.steps": 3, "evaluation.episodes": 1}
 TINY |= {"evaluation.threads": 1, "planner.network": "unet", "planner.width": 8}
-TINY |= {"controller.steps": 3}
+TINY |= {"controller.steps": 3, "execution.replan_interval": 14}
 
 
 def run(out, dataset, /, **options):
@@ -34,6 +35,7 @@ def run(out, dataset, /, **options):
     tiny = {name: value for name, value in asked.items() if "." not in name}
     tiny |= {"planner": PlannerConfig(steps=asked["planner.steps"], network="unet", width=8)}
     tiny |= {"controller": ControllerConfig(steps=asked["controller.steps"])}
+    tiny |= {"execution": ExecutionConfig(replan_interval=asked["execution.replan_interval"])}
     tiny |= {"evaluation": EvalConfig(episodes=asked["evaluation.episodes"], threads=1)}
     data = {} if dataset is None else {"datasets": (str(dataset),)}
     result = run_study(Study(out=Path(out), **data, **tiny), Machines(workers=2))
