@@ -152,6 +152,53 @@ def first_successes(name: str, task: str, method: str, *, most_labels: bool = Fa
     return f"{row['successes']} of {row['episodes']}"
 
 
+def few_labels_table(name: str) -> str:
+    """A row per task: success with the fewest labels of KOAP and what it is compared with, all seeds together.
+
+    The last column is Diffusion Policy with the most labels of the task.
+
+    Args:
+        name (str): file of cells without its ending.
+    """
+    known, body = _done(name), []
+    for task in PAPER_TASKS:
+        shares = sorted({row["labels"] for row in known if row["task"] == task})
+        cells = [(method, shares[0]) for method in ("koap", "koap_untrained", "linear_steps", "dp")]
+        text = [_pooled(known, task, *cell) for cell in (*cells, ("dp", shares[-1]))]
+        name = task.replace("po_", "partially observed ").replace("_unobserved_joints", ", joints hidden")
+        body.append([f"{name.capitalize()}", share(shares[0]), *text[:-1], f"{text[-1]} with {share(shares[-1])}"])
+    head = ["task", "labelled", "KOAP", "random features", "ridge regression", "Diffusion Policy"]
+    return table([*head, "Diffusion Policy, most labels"], body)
+
+
+def bench_rollouts(name: str) -> str:
+    """Rollouts of all seeds together in the cells with the fewest labels."""
+    known = _done(name)
+    least = {task: min(row["labels"] for row in known if row["task"] == task) for task in PAPER_TASKS}
+    counts = Counter[str]()
+    for row in known:
+        if row["method"] == "koap" and row["labels"] == least.get(row["task"]):
+            counts[row["task"]] += row["episodes"]
+    (number,) = set(counts.values())
+    return str(number)
+
+
+def bench_pooled(name: str, task: str, method: str) -> str:
+    """Success of all seeds of a method with the fewest labels of a task."""
+    known = [row for row in _done(name) if row["task"] == task]
+    return _pooled(known, task, method, min(row["labels"] for row in known)) + " %"
+
+
+def _pooled(rows: Sequence[Mapping[str, Any]], task: str, method: str, labels: float) -> str:
+    """Success of all seeds of a method in whole percent with its Wilson interval."""
+    counts: Counter[str] = Counter()
+    for row in rows:
+        if (row["task"], row["method"], row["labels"]) == (task, method, labels):
+            counts.update(successes=row["successes"], n=row["episodes"])
+    low, high = (100 * end for end in wilson_interval(counts["successes"], counts["n"]))
+    return f"{100 * counts['successes'] / counts['n']:.0f} ({low:.0f}-{high:.0f})"
+
+
 def bench_size(name: str) -> str:
     """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
     cells = _done(name)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import re
 import shlex
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -91,7 +90,8 @@ def test_python_runs(code, demonstrations, tmp_path, monkeypatch):
     monkeypatch.setattr(torchrl_koap, "train", train_shortly, raising=False)
     monkeypatch.setattr(torchrl_koap, "evaluate", evaluate_shortly, raising=False)
     few = {"planner": {"steps": 1, "batch_size": 2, "width": 8}, "controller": {"steps": 0}}
-    monkeypatch.setattr(torchrl_koap, "fit", partial(torchrl_koap.fit, **few), raising=False)
+    fit = torchrl_koap.fit
+    monkeypatch.setattr(torchrl_koap, "fit", lambda *data, **asked: fit(*data, **(asked | few)), raising=False)
     monkeypatch.setattr(pictures, "_PICTURES", dict(pictures.all_pictures()))
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
@@ -116,9 +116,20 @@ def test_paths_named_in_the_text_exist():
 
 def test_usage_comes_before_any_figure():
     """The first screen says what it is and how it is used; results follow."""
-    shell, plot = README.index("koap train"), README.index("success_and_entropy.png")
-    assert README.index("docs/pictures/pipeline.svg") < README.index("import") < shell < plot
-    assert len(README[:plot].splitlines()) < 50
+    shell, plot = README.index("koap train"), README.index("paper_average.png")
+    assert README.index("docs/pictures/pipeline.svg") < shell < README.index("import numpy") < plot
+    assert len(README[:plot].splitlines()) < 70
+
+
+def test_the_readme_is_short_and_plain():
+    """At most 520 words of prose, with at most 16 in the mean sentence; it names the paper and who wrote it."""
+    prose = re.sub(r"^```.*?^```|^\|.*?$|^!\[.*?$|^#.*?$|<!--.*?-->", "", README, flags=re.MULTILINE | re.DOTALL)
+    prose = re.sub(r"\]\([^)]*\)", "]", prose)
+    sentences = [each for each in re.split(r"(?<=[.:;!?])\s+|\n\s*\n|\n\* ", prose) if len(each.split()) > 1]
+    words = [len(each.split()) for each in sentences]
+    assert sum(words) <= 520
+    assert sum(words) / len(words) <= 16
+    assert "arxiv.org/abs/2410.07584" in README and "Bi et al." in README
 
 
 def test_options_named_in_the_text_exist():

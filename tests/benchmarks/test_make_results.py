@@ -29,15 +29,19 @@ def test_pages_are_those_of_the_figures(results):
 def test_figures_of_the_readme_are_those_of_the_cells():
     """Read back independently of the generator: successes, n and a Wilson interval from its formula."""
     readme = (ROOT / "README.md").read_text()
-    with (SOURCE / "label_curves.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["study"] == "avoiding"]
-    cells = {row["method"]: row for row in rows if float(row["label_fraction"]) == 0.01}
-    found = re.findall(r"^\| `(\w+)` \| ([\d.]+) \((\d+)-(\d+)\), ([\d.]+) \|", readme, re.MULTILINE)
-    assert len(found) >= 5
-    for method, rate, low, high, entropy in found:
-        successes, n = int(cells[method]["successes"]), int(cells[method]["n"])
-        assert f"{100 * successes / n:.1f}" == rate and float(cells[method]["entropy"]) == float(entropy)
-        assert [f"{100 * end:.0f}" for end in wilson(successes, n)] == [low, high]
+    with (SOURCE / "cells" / "table_1.csv").open() as file:
+        cells = list(csv.DictReader(file))
+    names = {"Avoiding": "avoiding", "Aligning": "aligning", "Sorting": "sorting"}
+    methods = ("koap", "koap_untrained", "linear_steps", "dp")
+    lines = re.findall(r"^\| (\w+) \| (\d+) % \|(.*)\|$", readme, re.MULTILINE)
+    assert {name for name, *_ in lines} == set(names)
+    for name, percent, rest in lines:
+        for method, text in zip(methods, rest.split("|"), strict=False):
+            mine = [row for row in cells if (row["task"], row["method"]) == (names[name], method)]
+            mine = [row for row in mine if float(row["labels"]) == int(percent) / 100]
+            successes, n = (sum(int(row[key]) for row in mine) for key in ("successes", "episodes"))
+            low, high = wilson(successes, n)
+            assert text.strip() == f"{100 * successes / n:.0f} ({100 * low:.0f}-{100 * high:.0f})"
     assert "58 of 60 rollouts" in readme and "88.6-99.1" in readme and "0.846" in readme
 
 
