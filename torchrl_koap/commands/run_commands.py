@@ -213,4 +213,6 @@ class Bench(Curve):
 
     def __call__(self) -> dict[str, Any]:
         """Does what is missing of the table and writes its report."""
+        if self.config.preset is not None:
+            raise ValueError(f"preset {self.config.preset!r} is for `koap curve`; a table is chosen with --table")
         return Curve(config=replace(self.config, preset=f"table{self.table}"), machines=self.machines)()

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -220,14 +220,13 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
     )
     for name in study.tasks:
         study.task(name)
-    planners = [
-        (task, str(find_run(run).absolute())) for task, run in _by_task("planners", study.planners, study.tasks)
-    ]
-    datasets = [(task, os.path.abspath(path)) for task, path in _by_task("datasets", study.datasets, study.tasks)]
-    planners, datasets = (
-        tuple(f"{task}={path}" for task, path in dict(pairs).items()) for pairs in (planners, datasets)
-    )
-    return replace(study, planners=planners, datasets=datasets)
+    planners = {task: str(find_run(run).absolute()) for task, run in _by_task("planners", study.planners, study.tasks)}
+    datasets = {task: os.path.abspath(path) for task, path in _by_task("datasets", study.datasets, study.tasks)}
+    return replace(study, planners=_named(planners), datasets=_named(datasets))
+
+
+def _named(paths: Mapping[str, str]) -> tuple[str, ...]:
+    return tuple(f"{task}={path}" for task, path in paths.items())
 
 
 def _asked(section: PlannerConfig | ControllerConfig) -> dict[str, Any]:
@@ -276,6 +275,8 @@ def check_study(study: Study) -> list[Cell]:
     for name, number in (("seeds", study.seeds), ("record", study.record), ("planner_seeds", study.planner_seeds)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be >= 1, got {number}")
+    if any(level < 1 for level in study.first_seed_only or ()):
+        raise ValueError(f"first_seed_only must be label levels >= 1, got {list(study.first_seed_only or ())}")
     for given, name, why in (
         (study.run.seed != RunConfig.seed, "run.seed", "cells have the seeds 0, 1, ..., as many as --seeds says"),
         (study.run.resume, "run.resume", "it goes on by itself"),
