@@ -120,7 +120,7 @@ results = {}
 planner = None
 for method in ("linear", "koap_untrained", "koap"):
     run = folder / method
-    shared = PlannerConfig(source=planner) if planner else PlannerConfig(steps=800, width=32)
+    shared = PlannerConfig(source=planner) if planner else PlannerConfig(steps=800)
     options = {"planner": shared, "controller": ControllerConfig(steps=200)}
     train(TrainConfig(dataset=str(data), out=run, method=method, **options))
     planner = planner or run

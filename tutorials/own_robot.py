@@ -76,7 +76,7 @@ data, task = torchrl_koap.make_demonstrations(
     states, actions, control_hz=30, state_names=NAMES, state_units="rad", action_units="rad/s", robot=NAMES[:2]
 )
 print(f"{len(states)} trajectories, {int(data['has_action'].sum())} of {len(data)} steps with their command")
-trained, planner = {}, {"steps": 500, "width": 32}
+trained, planner = {}, {"steps": 500}
 for name in ("linear", "dd", "koap"):
     trained[name] = torchrl_koap.fit(
         data, task, method=name, planner=planner, controller={"steps": 200}, progress=False

@@ -139,10 +139,10 @@ def test_a_policy_of_its_own_is_judged_by_its_chunks(tmp_path, capsys):
 
 
 def test_all_trajectories_labelled(tmp_path):
-    """One is held out from the planner; its labels still count."""
+    """Two are held out from the planner; their labels still count."""
     arm = save_arm(tmp_path / "arm", labelled=10, joints=2)
     result = evaluate(train_arm(tmp_path / "run", arm), FEW)  # every label there is
-    assert result["plan_errors"]["trajectories"] == 1 and result["action_errors"]["left_out"]["trajectories"] == 10
+    assert result["plan_errors"]["trajectories"] == 2 and result["action_errors"]["left_out"]["trajectories"] == 10
 
 
 def test_a_single_trajectory(tmp_path):
@@ -162,7 +162,7 @@ def test_a_data_set_that_has_moved_or_changed(tmp_path):
     with pytest.raises(RunDirectoryError, match=r"arm' of .*run is not there \(moved.*--dataset"):
         evaluate(run, FEW)
     moved = EvalConfig(samples=2, threads=1, dataset=str(tmp_path / "elsewhere"))
-    assert evaluate(run, moved)["plan_errors"]["trajectories"] == 1
+    assert evaluate(run, moved)["plan_errors"]["trajectories"] == 2
     shutil.rmtree(tmp_path / "elsewhere")
     save_arm(tmp_path / "elsewhere", joints=2, labelled=4)
     with pytest.raises(RunDirectoryError, match="is not the one that .* trajectories or labels differ"):

@@ -8,17 +8,13 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
+from torchrl_koap import PlannerConfig
 from torchrl_koap.modules import MLPDenoiser, StatePlanner
 from torchrl_koap.objectives import PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
-from torchrl_koap.training import best_weights
 from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import train_phase
-
-
-@pytest.fixture(autouse=True)
-def often(monkeypatch):
-    monkeypatch.setattr(best_weights, "LEAST", 10)
+from torchrl_koap.training.planner import check_interval
 
 
 def sample():
@@ -31,7 +27,7 @@ def training(path, score, *, stop=None, num_steps=100, **options):
     planner = StatePlanner(MLPDenoiser(2, 4, horizon=6, width=8, depth=1), state_dim=2, horizon=6)
     planner.fit_normalizers(torch.randn(64, 8, 2).cumsum(1))
     loss = PlannerLoss(planner)
-    average, best = SoftUpdate(loss, eps=0.9), BestWeights(loss, score, num_steps)
+    average, best = SoftUpdate(loss, eps=0.9), BestWeights(loss, score, every=10)
 
     def progress(done, values):
         if done == stop:
@@ -105,3 +101,11 @@ def test_noise_on_the_condition_changes_the_loss_alone():
     batch = sample().update({"planner_noise": torch.randn(4, 6, 2), "planner_time": torch.rand(4)})
     plain, none, noisy = (PlannerLoss(planner, condition_noise=size)(batch)["loss_planner"] for size in (0, 0, 0.5))
     assert torch.equal(plain, none) and not torch.equal(plain, noisy)
+
+
+@pytest.mark.parametrize(("steps", "batch_size", "every"), [(20_000, 512, 500), (4000, 256, 134), (100, 64, 100)])
+def test_scores_take_a_twentieth_of_the_training(steps, batch_size, every):
+    section = PlannerConfig(steps=steps, batch_size=batch_size)
+    assert check_interval(section, solver_steps=10) == every
+    forward_passes = 128 * 4 * 10 / every, 3 * batch_size
+    assert every == steps or forward_passes[0] <= 0.05 * forward_passes[1]

@@ -16,6 +16,7 @@ from torchrl_koap.keys import LayoutError
 from torchrl_koap.modules.koopman.compact_lifting import CompactLifting
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.tasks import WINDOW, Action
+from torchrl_koap.training import planner as planner_training
 
 NAMES = ["q1", "q2", "goal_1", "goal_2"]
 SMALL = {"batch_size": 8, "width": 8}
@@ -57,7 +58,7 @@ def same_weights(module, other):
 
 def test_the_weights_of_a_training_bit_for_bit(tmp_path):
     folder = save_demonstrations(tmp_path / "arm", **few_labels())
-    sections = {"planner": PlannerConfig(steps=30, held_out=0.0, **SMALL), "controller": ControllerConfig(steps=20)}
+    sections = {"planner": PlannerConfig(steps=30, **SMALL), "controller": ControllerConfig(steps=20)}
     train(TrainConfig(dataset=str(folder), out=tmp_path / "run", run=RunConfig(seed=3), **sections))
     data, task = load_ted(folder / "ted")[0], make_demonstrations(name="arm", **few_labels())[1]
     before = torch.get_rng_state()
@@ -80,8 +81,17 @@ def test_a_planner_is_shared():
     first = fit(data, task, method="linear", planner={"steps": 2, "frames": 1, **SMALL}, progress=False)
     other = fit(data, task, method="koap_untrained", planner=first.planner, progress=False)
     assert other.planner is first.planner
-    built = {name: getattr(other.config.planner, name) for name in ("network", "width", "frames")}
-    assert built == {"network": "unet", "width": 8, "frames": 1}
+    built = {name: getattr(other.config.planner, name) for name in ("network", "width", "octaves", "frames")}
+    assert built == {"network": "mlp", "width": 8, "octaves": 0, "frames": 1}
+
+
+def test_one_trajectory_is_told_to_be_too_few_to_hold_any_out(monkeypatch):
+    monkeypatch.setattr(planner_training, "BLIND", 3)
+    states, actions = record(1)
+    data, task = make_demonstrations(**few_labels(states=states, actions=actions))
+    with pytest.warns(UserWarning, match=r"one trajectory is too few .* trains for 3 updates and nothing tells"):
+        trained = fit(data, task, method="linear", planner={"steps": 9, **SMALL}, progress=False)
+    assert trained.held_out == () and "held_out_score" not in trained.results["planner"]
 
 
 def test_labels_marked_missing_or_found():
@@ -207,7 +217,7 @@ def test_commands_stay_in_the_range_of_the_labels_in_memory_and_in_a_file(tmp_pa
     assert trained.results["command_ranges"] == [pytest.approx([-largest, largest], rel=1e-6)] * 2
     targets = [np.concatenate([rows[1:, :2], rows[-1:, :2]]) if n < 2 else None for n, rows in enumerate(states)]
     data, task = make_demonstrations(**few_labels() | {"actions": targets}, action_kind="absolute")
-    trained = fit(data, task, planner={"steps": 1, **SMALL}, controller={"steps": 0}, progress=False)
+    trained = fit(data, task, planner={"steps": 1, "held_out": 0.0, **SMALL}, controller={"steps": 0}, progress=False)
     low, high = np.concatenate(states)[:, 0].min(), np.concatenate(states)[:, 0].max()
     assert trained.results["command_ranges"][0] == pytest.approx([low, high], rel=1e-6)
     loaded = Trained.load(trained.save(tmp_path / "arm.safetensors"))

@@ -32,8 +32,8 @@ TERMS = {
     source="metrics.csv",
     title="Losses",
     caption="Pale: logged values; line: running mean, its last value in the corner. Logarithmic. Of the plan error,"
-    " standing still has 1; the weights with the least one are kept. A planner's loss says little about its rollouts:"
-    " look at the pictures above.",
+    " standing still has 1; the weights with the least one (dot) are kept. A planner's loss says little about its"
+    " rollouts: look at the pictures above.",
     order=100,
 )
 def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
@@ -65,7 +65,13 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
         if (y > 0).any():
             y = np.where(y > 0, y, np.nan)
             smooth = running_mean(y, max(1, len(y) // 40))
-            last = smooth[np.isfinite(smooth)][-1]
+            note = f"{smooth[np.isfinite(smooth)][-1]:.3g}"
+            if name == "held_out_score":
+                best = int(np.nanargmin(y))
+                axes.plot(x[best], y[best], "o", color=BLUE, markersize=5)
+                note = f"kept: {y[best]:.3g}, update {x[best]:,.0f}" + (
+                    f"; last: {y[-1]:.3g}" if y[-1] > y[best] else ""
+                )
             axes.plot(x, y, color=BLUE, alpha=0.25, linewidth=0.7)
             axes.plot(x, smooth, color=BLUE, linewidth=1.6)
             axes.set_yscale("log")
@@ -73,9 +79,7 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
             widen = max(1.0, 4 * low / high) ** 0.5  # a flat curve looks flat
             axes.set_ylim(low / widen / 1.15, high * widen * 1.15)
             axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
-            axes.annotate(
-                f"{last:.3g}", (1, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize=9, color=BLUE
-            )
+            axes.annotate(note, (1, 0.97), xycoords="axes fraction", ha="right", va="top", fontsize=9, color=BLUE)
         else:
             axes.text(
                 0.5, 0.5, "0 throughout: no label entered this loss", transform=axes.transAxes, ha="center", color=MUTED

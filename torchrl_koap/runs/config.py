@@ -67,6 +67,7 @@ class PlannerConfig:
         steps: updates at most.
         network: "unet" or "mlp".
         width: channels of the first level of "unet" (the second has twice as many), or hidden width of "mlp".
+        octaves: octaves of the Fourier features of what it sees; with 0 it sees the plain numbers.
         batch_size: windows per update.
         learning_rate: peak learning rate.
         weight_decay: decoupled weight decay (AdamW).
@@ -89,6 +90,7 @@ class PlannerConfig:
     steps: int | None = None
     network: str | None = None
     width: int | None = None
+    octaves: int | None = None
     batch_size: int | None = None
     learning_rate: float | None = None
     weight_decay: float | None = None
@@ -100,7 +102,7 @@ class PlannerConfig:
     def __post_init__(self):
         _check("planner", self, steps=(1, None), width=(1, None), batch_size=(1, None), frames=(1, HISTORY))
         _check("planner", self, learning_rate=(0, None, False), held_out=(0, 1, True, False))
-        _check("planner", self, weight_decay=(0, None), noise=(0, None))
+        _check("planner", self, octaves=(0, None), weight_decay=(0, None), noise=(0, None))
         if self.source is not None:
             object.__setattr__(self, "source", find_run(self.source))
 

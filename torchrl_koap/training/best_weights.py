@@ -12,8 +12,6 @@ import torch
 from torch import nn
 from torchrl.objectives import LossModule
 
-CHECKS = 40  # scores in the longest training
-LEAST = 100  # updates between two scores
 PATIENCE = 1.5  # a training ends after that many times the updates of the best score
 
 
@@ -25,7 +23,7 @@ class BestWeights(nn.Module):
     Args:
         loss (LossModule): a loss of ``network`` with ``target_network_params``.
         score (callable): ``score(network)`` on held-out trajectories; smaller is better.
-        num_steps (int): updates of the training at most.
+        every (int): updates between two scores.
 
     Examples:
         >>> import torch
@@ -33,20 +31,20 @@ class BestWeights(nn.Module):
         >>> from torchrl_koap.objectives import PlannerLoss
         >>> from torchrl_koap.training.best_weights import BestWeights
         >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2)
-        >>> best = BestWeights(PlannerLoss(planner), lambda network: 0.5, 1000)
-        >>> best.every, best.check(100), best.step.item()
-        (100, {'held_out_score': 0.5, 'best_held_out_score': 0.5, 'kept_update': 100}, 100)
+        >>> best = BestWeights(PlannerLoss(planner), lambda network: 0.5, every=100)
+        >>> best.check(100), best.step.item()
+        ({'held_out_score': 0.5, 'best_held_out_score': 0.5, 'kept_update': 100}, 100)
     """
 
     best: torch.Tensor
     step: torch.Tensor
 
-    def __init__(self, loss: LossModule, score: Callable[[nn.Module], float], num_steps: int):
+    def __init__(self, loss: LossModule, score: Callable[[nn.Module], float], every: int):
         super().__init__()
         self._loss, self._score = (loss,), score  # a tuple: the loss is no part of this module
         self._now = (copy.deepcopy(loss.network),)
         self.network = copy.deepcopy(loss.network)
-        self.every = min(max(num_steps // CHECKS, LEAST), num_steps)
+        self.every = every
         self.seconds = 0.0
         self.register_buffer("best", torch.tensor(math.inf, dtype=torch.float64))
         self.register_buffer("step", torch.tensor(0))

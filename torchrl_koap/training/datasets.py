@@ -113,8 +113,8 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
     """Numbers of the trajectories to hold out from the planner: those without a label first.
 
     Trajectories with labels are taken only where the others do not suffice. They lose no label: the planner does not
-    see them, the controller does. At least one trajectory is held out, and at least one is left; of a single trajectory
-    none can be.
+    see them, the controller does. At least one trajectory is held out, of ten or more at least two, and at least one is
+    left; of a single trajectory none can be.
 
     Args:
         data (TensorDictBase): flat data ``[N]`` after the label budget was applied.
@@ -131,9 +131,9 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
         >>> from torchrl_koap.data import LabelBudget, flatten_trajectories
         >>> from torchrl_koap.training.datasets import choose_held_out
         >>> data = flatten_trajectories([torch.zeros(5, 2)] * 10, [torch.zeros(4, 1)] * 10)
-        >>> labelled, _ = LabelBudget(episodes=range(1, 10)).apply(data)
+        >>> labelled, _ = LabelBudget(episodes=range(2, 10)).apply(data)
         >>> choose_held_out(labelled, 0.1)
-        [0]
+        [0, 1]
     """
     if not fraction:
         return []
@@ -141,7 +141,7 @@ def choose_held_out(data: TensorDictBase, fraction: float | None, *, seed: int =
         raise ValueError(f"planner.held_out must be in [0, 1), got {fraction}")
     lengths = trajectory_lengths(data)
     total = len(lengths)
-    number = min(max(math.floor(fraction * total + 0.5), 1), total - 1)
+    number = min(max(math.floor(fraction * total + 0.5), 1 if total < 10 else 2), total - 1)
     episodes = data["episode"][torch.cumsum(lengths, 0) - lengths].cpu()
     labelled = torch.stack([part.any() for part in data["has_action"].split(lengths.tolist())]).cpu()
     order = torch.randperm(total, generator=torch.Generator().manual_seed(seed))

@@ -20,7 +20,15 @@ from torchrl_koap.training.networks import NETWORKS
 
 CONTROLLER_UPDATES = 500
 PLACES = "absolute"  # what the default preset is where actions are places
-HELD_OUT = 0.1  # share that is held out by default where no rollout can tell what a planner is worth
+# a planner for the hundred or so demonstrations that people record: one that does not overfit them
+OWN_DATA: dict[str, Any] = {
+    "steps": 3000,
+    "network": "mlp",
+    "octaves": 0,
+    "weight_decay": 0.1,
+    "noise": 0.1,
+    "held_out": 0.1,
+}
 Section = TypeVar("Section", PlannerConfig, ControllerConfig, ExecutionConfig)
 
 
@@ -70,14 +78,19 @@ def _planner(asked: PlannerConfig, method: Method, task: Task) -> PlannerConfig:
                 raise ValueError(f"planner.{name}: method {method.name!r} samples actions and has no planner")
     if asked.source is not None:
         return _taken_over(asked)
-    own = {"network": "unet", **task.defaults.planner}
-    if asked.network not in (None, own["network"]):  # another network comes with its own sizes
-        own = {name: value for name, value in own.items() if name in ("steps", "frames")}
+    own, usual = dict(task.defaults.planner), OWN_DATA if task.env is None else {"network": "unet"}
+    theirs = own.get("network", usual["network"])
+    network = asked.network or theirs
     if not method.plans:
         own |= {"frames": HISTORY, "held_out": 0.0}
-    network = asked.network or own["network"]
-    library = {"steps": 12000, "frames": HISTORY, "held_out": HELD_OUT if task.env is None else 0.0}
-    return _filled(asked, own, lookup(NETWORKS, network, "planner.network"), library)
+    layers = [own if network == theirs else _unsized(own), usual if network == usual["network"] else _unsized(usual)]
+    library = {"steps": 12000, "frames": HISTORY, "held_out": 0.0, "network": network}
+    return _filled(asked, *layers, lookup(NETWORKS, network, "planner.network"), library)
+
+
+def _unsized(layer: Mapping[str, Any]) -> dict[str, Any]:
+    """A layer without what belongs to its network: another one comes with its own."""
+    return {name: value for name, value in layer.items() if name in ("steps", "frames", "held_out")}
 
 
 def _taken_over(asked: PlannerConfig) -> PlannerConfig:
@@ -85,7 +98,7 @@ def _taken_over(asked: PlannerConfig) -> PlannerConfig:
     if all(getattr(asked, field.name) is not None for field in fields(asked)):  # of a run that is resumed
         return asked
     theirs = read_config(RunDirectory(asked.source)).planner
-    for name in ("network", "width", "frames"):
+    for name in ("network", "width", "octaves", "frames"):
         if getattr(asked, name) not in (None, getattr(theirs, name)):
             raise ValueError(
                 f"planner.{name} {getattr(asked, name)!r} was asked for, but that of {asked.source} is"

@@ -99,8 +99,9 @@ def fit(
     """
     data, task = _prepared(data, task)
     shared = planner if isinstance(planner, StatePlanner) else None
-    # all trajectories are learnt from, unless asked otherwise
-    options = {"held_out": 0.0} | (dict(planner or {}) if shared is None else sizes_of(shared))
+    # a planner from elsewhere may have seen all trajectories
+    given = {"held_out": 0.0} | ({} if shared is None else sizes_of(shared))
+    options = given if shared is not None or planner is False else dict(planner or {})
     config = resolve(
         TrainConfig(
             out=Path(),

@@ -18,8 +18,8 @@ from torchrl_koap.training.method import Method
 CLIP = 1.2  # of normalised sequences, which lie in [-1, 1] in the data
 # the networks of planners, and what they are built and trained with where nothing else is asked for
 NETWORKS: dict[str, dict[str, Any]] = {
-    "unet": {"width": 64, "batch_size": 128, "learning_rate": 3e-3, "weight_decay": 1e-4, "noise": 0.0},
-    "mlp": {"width": 512, "batch_size": 512, "learning_rate": 1e-3, "weight_decay": 1e-4, "noise": 0.0},
+    "unet": {"width": 64, "octaves": 4, "batch_size": 128, "learning_rate": 3e-3, "weight_decay": 1e-4, "noise": 0.0},
+    "mlp": {"width": 512, "octaves": 1, "batch_size": 512, "learning_rate": 1e-3, "weight_decay": 1e-4, "noise": 0.0},
 }
 
 
@@ -55,9 +55,11 @@ def _diffusion(task: Task, section: PlannerConfig, size: int) -> dict[str, Any]:
     features = relative_features(task.relative_columns())
     seen = section.frames * task.state_dim + (0 if features is None else features.num_features)
     if section.network == "unet":
-        network: nn.Module = TemporalUnet(size, seen, channels=(section.width, 2 * section.width))
+        network: nn.Module = TemporalUnet(
+            size, seen, channels=(section.width, 2 * section.width), frequencies=section.octaves
+        )
     else:
-        network = MLPDenoiser(size, seen, horizon=HORIZON, width=section.width)
+        network = MLPDenoiser(size, seen, horizon=HORIZON, width=section.width, frequencies=section.octaves)
     return {
         "denoiser": network,
         "state_dim": task.state_dim,
@@ -104,8 +106,9 @@ def forecasts(task: Task) -> bool:
 
 
 def sizes_of(planner: StatePlanner) -> dict[str, Any]:
-    """Network, width and frames that a planner was built with."""
+    """Options that a planner was built with."""
     network = planner.denoiser
     unet = isinstance(network, TemporalUnet)
     width = network.shrink[0].out_channels if unet else network.first.out_features
-    return {"network": "unet" if unet else "mlp", "width": width, "frames": planner.history}
+    octaves = len(network.encoder.frequencies)
+    return {"network": "unet" if unet else "mlp", "width": width, "octaves": octaves, "frames": planner.history}

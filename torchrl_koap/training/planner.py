@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -23,7 +26,7 @@ from torchrl_koap.data import (
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.modules.planning.energy_score import relative_score, sample_sequences
 from torchrl_koap.objectives import PlannerLoss
-from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.runs.config import PlannerConfig, TrainConfig
 from torchrl_koap.runs.device import training_dtype
 from torchrl_koap.runs.progress import progress_bar, show_losses
 from torchrl_koap.runs.run_directory import RunDirectory
@@ -33,7 +36,10 @@ from torchrl_koap.training.best_weights import BestWeights
 from torchrl_koap.training.loop import moving_average, train_phase
 from torchrl_koap.training.networks import build_planner
 
-SITUATIONS, SAMPLES = 256, 4  # held out, and plans in each, that weights are chosen by
+SITUATIONS, SAMPLES = 128, 4  # held out, and plans in each, that weights are chosen by
+CHECKS = 40  # scores in a training at most
+COST = 0.05  # share of the training time that they may take
+BLIND = 1000  # updates at most where there is nothing to hold out
 
 
 def learn_planner(
@@ -57,10 +63,20 @@ def learn_planner(
         run (RunDirectory, optional): where metrics and checkpoints go. Default: nowhere.
         logger (optional): a TorchRL logger.
 
+    Warns:
+        UserWarning: if trajectories are to be held out and there is only one.
+
     Returns:
         tuple: the planner, which has the average of its parameters, and its last losses.
     """
     section = config.planner
+    if section.held_out and held_out is None:
+        section = replace(section, steps=min(section.steps, BLIND))
+        warnings.warn(
+            f"one trajectory is too few to hold any out (planner.held_out {section.held_out:g}): the planner trains for"
+            f" {section.steps} updates and nothing tells when it overfits",
+            stacklevel=2,
+        )
     planner = build_planner(task, section).to(config.run.device)
     # a plan made near the end of a demonstration needs a future, one made at its start a repeated first frame
     # windows hold two observed frames, which tell augmentations the present one, also for a planner that sees only one
@@ -80,7 +96,9 @@ def learn_planner(
     loss = PlannerLoss(
         planner, condition_noise=section.noise, dtype=training_dtype(config.run.precision, config.run.device)
     )
-    best = None if held_out is None else BestWeights(loss, plan_score(planner, held_out, task), section.steps)
+    best = None
+    if held_out is not None:
+        best = BestWeights(loss, plan_score(planner, held_out, task), check_interval(section, planner.num_steps))
     with progress_bar(section.steps, "planner", smoothing=0.05, mininterval=0.5) as bar:
         values = train_phase(
             "planner",
@@ -101,6 +119,17 @@ def learn_planner(
         planner.load_state_dict(best.network.state_dict())
         values["held_out_seconds"] = best.seconds
     return planner, values
+
+
+def check_interval(section: PlannerConfig, solver_steps: int) -> int:
+    """Updates between two scores, such that scores take a twentieth of the time; an update costs three forward passes.
+
+    Args:
+        section (PlannerConfig): nothing left open.
+        solver_steps (int): forward passes of a plan.
+    """
+    updates = SITUATIONS * SAMPLES * solver_steps / (3 * section.batch_size)
+    return min(max(section.steps // CHECKS, math.ceil(updates / COST)), section.steps)
 
 
 def plan_score(planner: StatePlanner, data: TensorDictBase, task: Task) -> Callable[[StatePlanner], float]:
