@@ -88,12 +88,6 @@ def _by_observations(name: str) -> dict[float, dict[str, Counter[str]]]:
     return found
 
 
-def bench_share(name: str, method: str, observations: float) -> str:
-    """Success of a method with a share of the trajectories, all seeds together."""
-    counts = _by_observations(name)[observations][method]
-    return f"{percent(counts, 0)} of {counts['n']} rollouts"
-
-
 def bench_entropy(name: str, method: str, observations: float) -> str:
     """Mean entropy of the modes over the seeds of a method with a share of the trajectories."""
     found = [
@@ -144,14 +138,6 @@ def draw_bench_average(name: str, path: Path) -> Path:
     return draw_average(_entries(name), path)
 
 
-def first_successes(name: str, task: str, method: str, *, most_labels: bool = False) -> str:
-    """Successes of a method with seed 0 at the lowest (or highest) label level of a task, of how many rollouts."""
-    wanted = (task, method, 0)
-    rows = [row for row in _done(name) if (row["task"], row["method"], row["seed"]) == wanted]
-    row = (max if most_labels else min)(rows, key=lambda row: row["labels"])
-    return f"{row['successes']} of {row['episodes']}"
-
-
 def few_labels_table(name: str) -> str:
     """A row per task: success with the fewest labels of KOAP and what it is compared with, all seeds together.
 
@@ -160,41 +146,45 @@ def few_labels_table(name: str) -> str:
     Args:
         name (str): file of cells without its ending.
     """
-    known, body = _done(name), []
+    body = []
     for task in PAPER_TASKS:
-        shares = sorted({row["labels"] for row in known if row["task"] == task})
-        cells = [(method, shares[0]) for method in ("koap", "koap_untrained", "linear_steps", "dp")]
-        text = [_pooled(known, task, *cell) for cell in (*cells, ("dp", shares[-1]))]
-        name = task.replace("po_", "partially observed ").replace("_unobserved_joints", ", joints hidden")
-        body.append([f"{name.capitalize()}", share(shares[0]), *text[:-1], f"{text[-1]} with {share(shares[-1])}"])
+        shares = _shares(name, task)
+        text = [_pooled(name, task, method, shares[0]) for method in ("koap", "koap_untrained", "linear_steps", "dp")]
+        most = f"{_pooled(name, task, 'dp', shares[-1])} with {share(shares[-1])}"
+        called = task.replace("po_", "partially observed ").replace("_unobserved_joints", ", joints hidden")
+        body.append([called.capitalize(), share(shares[0]), *text, most])
     head = ["task", "labelled", "KOAP", "random features", "ridge regression", "Diffusion Policy"]
     return table([*head, "Diffusion Policy, most labels"], body)
 
 
 def bench_rollouts(name: str) -> str:
-    """Rollouts of all seeds together in the cells with the fewest labels."""
-    known = _done(name)
-    least = {task: min(row["labels"] for row in known if row["task"] == task) for task in PAPER_TASKS}
-    counts = Counter[str]()
-    for row in known:
-        if row["method"] == "koap" and row["labels"] == least.get(row["task"]):
-            counts[row["task"]] += row["episodes"]
-    (number,) = set(counts.values())
+    """Rollouts of all seeds together of KOAP with the fewest labels, the same number for every task."""
+    (number,) = {_counts(name, task, "koap", _shares(name, task)[0])["n"] for task in PAPER_TASKS}
     return str(number)
 
 
 def bench_pooled(name: str, task: str, method: str) -> str:
     """Success of all seeds of a method with the fewest labels of a task."""
-    known = [row for row in _done(name) if row["task"] == task]
-    return _pooled(known, task, method, min(row["labels"] for row in known)) + " %"
+    return _pooled(name, task, method, _shares(name, task)[0]) + " %"
 
 
-def _pooled(rows: Sequence[Mapping[str, Any]], task: str, method: str, labels: float) -> str:
-    """Success of all seeds of a method in whole percent with its Wilson interval."""
+def _shares(name: str, task: str) -> list[float]:
+    """The shares of labels of a task, the fewest first."""
+    return sorted({row["labels"] for row in _done(name) if row["task"] == task})
+
+
+def _counts(name: str, task: str, method: str, labels: float) -> Counter[str]:
+    """Successes and rollouts of all seeds of a method."""
     counts: Counter[str] = Counter()
-    for row in rows:
+    for row in _done(name):
         if (row["task"], row["method"], row["labels"]) == (task, method, labels):
             counts.update(successes=row["successes"], n=row["episodes"])
+    return counts
+
+
+def _pooled(name: str, task: str, method: str, labels: float) -> str:
+    """Success of all seeds of a method in whole percent with its Wilson interval."""
+    counts = _counts(name, task, method, labels)
     low, high = (100 * end for end in wilson_interval(counts["successes"], counts["n"]))
     return f"{100 * counts['successes'] / counts['n']:.0f} ({low:.0f}-{high:.0f})"
 

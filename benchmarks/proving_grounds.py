@@ -72,8 +72,6 @@ def run_cell(
     seconds = time.process_time() - began
     rows = []
     for name, execution in executions.items():
-        if name != "default" and not plans:
-            continue  # a chunk of sampled actions is always executed in open loop
         episodes = roll_out(
             load_policy(trained, **{k: v for k, v in vars(execution).items() if v is not None}),
             lambda count: GymnasiumBatch(here.ENV, trained.task, count, max_steps=here.STEPS),
@@ -131,7 +129,8 @@ def main(
     for seed in range(seeds):
         for method in methods:
             cell = (ground, method, labels, seed)
-            asked = {name: way for name, way in executions.items() if tuple(map(str, (*cell, name, n))) not in done}
+            ways = executions if get_method(method).plans else {"default": ExecutionConfig()}  # sampled actions
+            asked = {name: way for name, way in ways.items() if tuple(map(str, (*cell, name, n))) not in done}
             first = run_folder(folder, ground, methods[0], labels, seed)
             for row in run_cell(*cell, asked, n, folder, None if method == methods[0] else first) if asked else ():
                 write(row)

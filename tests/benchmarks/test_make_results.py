@@ -42,6 +42,9 @@ def test_figures_of_the_readme_are_those_of_the_cells():
             successes, n = (sum(int(row[key]) for row in mine) for key in ("successes", "episodes"))
             low, high = wilson(successes, n)
             assert text.strip() == f"{100 * successes / n:.0f} ({100 * low:.0f}-{100 * high:.0f})"
+    with (SOURCE / "facts.csv").open() as file:
+        facts = {row["key"]: f"{row['value']} {row['unit']}".strip() for row in csv.DictReader(file)}
+    assert f"The demo takes {facts['demo_total']}." in readme and f"about {facts['own_data_fit']} on" in readme
     assert "58 of 60 rollouts" in readme and "88.6-99.1" in readme and "0.846" in readme
 
 

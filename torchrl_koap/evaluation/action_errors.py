@@ -83,14 +83,19 @@ def errors_outside_budget(
     if not len(true):
         return {"note": "no trajectory outside the budget has labels"}, {}
     known = labelled["action"][labelled["has_action"].squeeze(-1)]
-    ridge = LinearInverseDynamics(data["state"].shape[-1], task.action_dim).to(data["state"].dtype)
-    fit_closed_form(ridge, labelled)
     models = {
         "controller": _commanded(predicted, true, task),
-        "ridge": first_actions(ridge, data, outside)[0],
+        "ridge": first_actions(_ridge_on(labelled, task), data, outside)[0],
         "mean_action": known.mean(0).expand_as(true),
     }
     return summarise_errors(models, true, episode, task), {"predicted": predicted, "true": true}
+
+
+def _ridge_on(labelled: TensorDictBase, task: Task) -> LinearInverseDynamics:
+    """A ridge regression on raw frames, fitted to the labels that are left."""
+    ridge = LinearInverseDynamics(labelled["state"].shape[-1], task.action_dim).to(labelled["state"].dtype)
+    fit_closed_form(ridge, labelled)
+    return ridge
 
 
 def _commanded(decoded: Tensor, true: Tensor, task: Task) -> Tensor:
@@ -129,13 +134,11 @@ def errors_left_out(
         fold["action"] = torch.where(fold["has_action"], labelled["action"], math.nan)
         again = copy.deepcopy(controller)
         fit_closed_form(again, fold, **axes_of(task, columns))
-        ridge = LinearInverseDynamics(labelled["state"].shape[-1], task.action_dim).to(labelled["state"].dtype)
-        fit_closed_form(ridge, fold)
         predicted, true, episode = first_actions(again, labelled, [int(number)])
         if not len(true):  # its labels lie too near its end
             continue
         models["controller"].append(_commanded(predicted, true, task))
-        models["ridge"].append(first_actions(ridge, labelled, [int(number)])[0])
+        models["ridge"].append(first_actions(_ridge_on(fold, task), labelled, [int(number)])[0])
         models["mean_action"].append(fold["action"][fold["has_action"].squeeze(-1)].mean(0).expand_as(true))
         truths.append(true)
         numbers.append(episode)

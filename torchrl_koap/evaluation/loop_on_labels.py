@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl_koap.evaluation.policies import trained_policy
 from torchrl_koap.keys import ACTION, EPISODE, HAS_ACTION, OBSERVATION
 from torchrl_koap.modules import Agent, ExecutionConfig, PlanningPolicy
+from torchrl_koap.modules.execution.command_limits import ends_of
 from torchrl_koap.modules.ridge import ridge
 from torchrl_koap.training.policy_facts import command_ranges
 from torchrl_koap.training.trained import Trained
@@ -84,7 +85,7 @@ def check_loop(
     free = trained_policy(trained, ExecutionConfig(**vars(asked) | {"limits": math.inf}))
     steps = min(STEPS, task.max_steps)
     commands, distance = _roll(free, response, data, steps, seed)
-    ends = torch.tensor([(-math.inf, math.inf) if r is None else r for r in ranges])
+    ends = ends_of(ranges)
     growth = ((commands - ends.mean(-1)) / (ends.diff(dim=-1).squeeze(-1) / 2)).nan_to_num(math.inf).abs()
     growth = growth[..., [column for column, r in enumerate(ranges) if r is not None]].amax(-1)  # [steps, n]
     late = float(growth[2 * len(growth) // 3 :].max()) if len(growth) == steps else math.inf

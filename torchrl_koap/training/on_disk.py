@@ -99,17 +99,13 @@ def train(config: TrainConfig, *, command: str | None = None, planner_only: bool
             content["held_out_episodes"] = held_out
         if not planner_only:  # trajectories that are too short are found now rather than after the planner was trained
             WindowTable.build(used, frames[0], pad_before=frames[1])
-        for_planner, unseen = (
-            without_held_out(used, held_out),
-            select_trajectories(used, held_out) if held_out else None,
-        )
+        for_planner = without_held_out(used, held_out)
+        unseen = select_trajectories(used, held_out) if held_out else None
         data = used if planner_only else without_held_out(used, held_out, keep_labelled=True)
         if not mine:
             held.enter_context(run.locked("koap train"))
             check_resume(run, config)  # another one may have begun here in the meantime
-        if (
-            run.path / "config.json"
-        ).exists():  # what a run was begun with says what it is; going on leaves options out
+        if (run.path / "config.json").exists():  # what it was begun with says what it is; going on leaves options out
             command = run.read_json("config.json").get("command") or command
         # not before the data are known to be good: a wrong call leaves nothing
         run.write_json("config.json", content | ({"command": command} if command else {}))

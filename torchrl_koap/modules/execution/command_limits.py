@@ -12,6 +12,11 @@ from torch import Tensor, nn
 Ranges = Sequence[tuple[float, float] | None]  # least and greatest number of every column
 
 
+def ends_of(ranges: Ranges) -> Tensor:
+    """Least and greatest number of every column ``[act, 2]``, infinite where there is no range."""
+    return torch.tensor([(-math.inf, math.inf) if r is None else r for r in ranges])
+
+
 class CommandLimits(nn.Module):
     r"""Keeps actions in a range, multiplies changes of a command, and holds back those too far ahead of the robot.
 
@@ -75,8 +80,7 @@ class CommandLimits(nn.Module):
                 f" {len(commands)}, {len(positions)} and {len(actions)} columns"
             )
         self.gain, self.lead, self.state_of = gain, lead, state_of
-        ends = None if ranges is None else torch.tensor([(-math.inf, math.inf) if r is None else r for r in ranges])
-        self.register_buffer("ends", ends, persistent=False)  # [act, 2]
+        self.register_buffer("ends", None if ranges is None else ends_of(ranges), persistent=False)
         for name, columns in {"actions": actions, "commands": commands, "positions": positions}.items():
             self.register_buffer(name, torch.as_tensor(list(columns), dtype=torch.long), persistent=False)
 
