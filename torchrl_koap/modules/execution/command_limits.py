@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-Ranges = Sequence[tuple[float, float] | None]  # least and greatest number of every column
+Ranges = Sequence[Sequence[float] | None]  # least and greatest number of every column
 
 
 def ends_of(ranges: Ranges) -> Tensor:
