@@ -10,25 +10,36 @@ import pytest
 import torch
 
 from torchrl_koap.data import flatten_trajectories
-from torchrl_koap.data.quality import constant_columns, find_warnings, still_ends
+from torchrl_koap.data.quality import constant_columns, find_warnings, plan_coverage, still_ends
+from torchrl_koap.tasks import Action, Task
 
 PATH = torch.arange(40.0).reshape(20, 2)
 ACTIONS = torch.ones(19, 1)
+STEPS = torch.linspace(0, 1, 19)[:, None]
+TIME = np.linspace(0, 2, 60)[:, None]
 
 
-def warnings(observations, actions, **options):
-    return find_warnings(flatten_trajectories(observations, actions), units=["m", "m"], **options)
+def warnings(states, actions=None, *, columns=("x", "y"), units=("m", "m"), names=(), acting=("v",)):
+    frames = [torch.as_tensor(path) for path in states]
+    task = Task(
+        name="arm",
+        observation_parts={"arm": tuple(columns)},
+        observation_units=tuple(units),
+        actions={name: Action() for name in acting},
+        position="arm",
+    )
+    data = flatten_trajectories(frames, actions, action_dim=len(acting), dtype=torch.float64)
+    return find_warnings(data.set("state", data["observation"]), task, names)
 
 
 def test_sound_demonstrations_raise_none():
-    assert warnings([PATH, PATH + 1, PATH], [ACTIONS, ACTIONS, 2 * ACTIONS]) == []
+    assert warnings([PATH, PATH + 1, PATH], [STEPS, STEPS, 2 * STEPS]) == []
 
 
 def test_each_warning_is_said_once_and_names_its_trajectory():
     names = [f"{letter}.pkl" for letter in "abcdef"]
     paths = [PATH, PATH, PATH * 0, PATH * 1e36, PATH + 1, PATH + 2]
-    actions = [ACTIONS, ACTIONS, ACTIONS, ACTIONS, 0 * ACTIONS, None]
-    assert warnings(paths, actions, names=names, columns=["x", "y"]) == [
+    assert warnings(paths, [STEPS, STEPS, STEPS, STEPS, 0 * STEPS, None], names=names) == [
         "b.pkl repeats a.pkl: every step is the same",
         "c.pkl: nothing moves in its 19 steps",
         "d.pkl: x reaches 3.6e+37 m",
@@ -37,46 +48,43 @@ def test_each_warning_is_said_once_and_names_its_trajectory():
 
 
 def test_columns_without_a_unit_are_not_looked_at():
-    data = flatten_trajectories([PATH * 1e6, PATH], [ACTIONS, ACTIONS])
-    assert find_warnings(data) == [] and len(find_warnings(data, units=["", "rad"])) == 1
+    assert warnings([PATH * 1e6, PATH], units=["", ""]) == []
+    assert len(warnings([PATH * 1e6, PATH], units=["", "rad"])) == 1
 
 
 def test_columns_that_say_nothing_are_named():
     states = [torch.cat([path, path[:, :1], torch.full((20, 1), 3.0)], -1) for path in (PATH, PATH + 1)]
-    data = flatten_trajectories(states, [ACTIONS, ACTIONS])
-    data["state"] = data["observation"]
-    assert find_warnings(data) == []
-    assert find_warnings(data, seen=["x", "y", "again", "shelf"]) == [
+    assert warnings(states, columns=["x", "y", "again", "shelf"], units=()) == [
         "columns 'x' and 'again' are the same in every step",
         "column 'shelf' is 3 in all 38 steps: it says nothing",
     ]
 
 
 def test_short_trajectories_are_named():
-    (warning,) = warnings([PATH, PATH[:6], PATH[:9]], [ACTIONS, ACTIONS[:5], ACTIONS[:8]])
+    (warning,) = warnings([PATH, PATH[:6], PATH[:9]])
     assert "2 of 3 trajectories have fewer steps than a window of 16" in warning
     assert "trajectory 1 (5), trajectory 2 (8); `koap convert --drop-short`" in warning
 
 
 def test_actions_that_never_change_are_named():
-    data = flatten_trajectories([PATH], [torch.cat([PATH[1:, :1], ACTIONS], 1)])
-    assert find_warnings(data, actions=["v", "grip"]) == [
+    assert warnings([PATH], [torch.cat([PATH[1:, :1], ACTIONS], 1)], acting=["v", "grip"]) == [
         "action 'grip' is 1 in all labels: a policy always commands that"
     ]
     assert constant_columns(np.array([[1.0, np.nan], [2.0, 5.0], [2.0, 5.0]])) == [2.0, 5.0]
 
 
-TIME = np.linspace(0, 2, 60)[:, None]
+def test_a_plan_that_is_short_against_the_motion():
+    data = flatten_trajectories([torch.zeros(1001, 2)] * 3, None, action_dim=1)
+    covers, short = plan_coverage(data, 500.0)
+    assert covers == "14 frames, 28 ms; demonstrations last 2000 ms (median)"
+    assert "covers 14 frames, 28 ms, 1.4% of a demonstration" in short and "125 Hz (one frame in 4)" in short
+    assert plan_coverage(data[:2000:4], 125.0)[1] is None
 
 
 def seen(*trajectories):
     """Warnings about smooth states, by name."""
-    frames = [
-        torch.from_numpy(np.hstack([np.sin(TIME + index), columns])) for index, columns in enumerate(trajectories)
-    ]
-    data = flatten_trajectories(frames, None, action_dim=1, dtype=torch.float64)
-    data["state"] = data["observation"]
-    return find_warnings(data, seen=["sine", *(f"q{index}" for index in range(trajectories[0].shape[1]))])
+    frames = [np.hstack([np.sin(TIME + index), columns]) for index, columns in enumerate(trajectories)]
+    return warnings(frames, columns=["sine", *(f"q{index}" for index in range(trajectories[0].shape[1]))], units=())
 
 
 def leaping(frames, at, change):
@@ -111,7 +119,5 @@ def test_switches_and_smooth_columns_do_not_leap():
 def test_stillness_is_told():
     frames = [np.concatenate([np.zeros((40, 1)), TIME[:20]]) + index for index in range(2)]
     assert still_ends(frames).tolist() == [[40, 0], [40, 0]]
-    data = flatten_trajectories([torch.from_numpy(part) for part in frames], None, action_dim=1, dtype=torch.float64)
-    data["state"] = data["observation"]
-    (warning,) = find_warnings(data, seen=["q"])
+    (warning,) = warnings(frames, columns=["q"], units=())
     assert warning.startswith("nothing moves in 68% of all frames at the start and 0% at the end")

@@ -17,9 +17,8 @@ from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations
 from torchrl_koap.data.cleaning import drop_short, trim_still
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings
-from torchrl_koap.data.quality import find_warnings
+from torchrl_koap.data.quality import find_warnings, plan_coverage
 from torchrl_koap.data.ted import stored_folder
-from torchrl_koap.data.window_length import plan_coverage
 from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE
 from torchrl_koap.envs.experts.recording import expert_of
@@ -259,14 +258,5 @@ def _contents(recordings: Recordings) -> dict[str, Any]:
 
 def _warnings(data: TensorDictBase, task: Task, names: Sequence[str]) -> dict[str, str]:
     """What is unlikely in data, numbered."""
-    units, columns, actions = task.observation_units or _metres(task), task.observation_names, task.action_names
-    found = find_warnings(data, names=names, units=units, columns=columns, seen=task.state_names, actions=actions)
-    short = plan_coverage(data, task.control_hz)[1]
-    found += [] if short is None else [short]
+    found = find_warnings(data, task, names)
     return {f"warning {number}": warning for number, warning in enumerate(found, 1)}
-
-
-def _metres(task: Task) -> list[str]:
-    """Metres for the columns that are positions for certain; the others have units of their own."""
-    inside = range(*task.observation[task.position].indices(task.observation_dim))
-    return ["m" if task.env is not None and column in inside else "" for column in range(task.observation_dim)]

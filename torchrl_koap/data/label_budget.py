@@ -158,38 +158,20 @@ class LabelBudget:
             raise ValueError(f"none of the {len(available)} steps has an action: there are no labels to spend")
         lengths = trajectory_lengths(data).cpu().numpy()
         starts = np.cumsum(lengths) - lengths
-
-        if self.unit == "trajectory":
-            units, labels = starts, None
-        elif self.unit == "transition":
-            units, labels = np.arange(lengths.sum()), range(1)
-        else:
-            counts = np.maximum(lengths - WINDOW + 1, 0)
-            if not counts.any():
-                raise ValueError(f"no trajectory is as long as a window of {WINDOW} steps (longest: {lengths.max()})")
-            units = np.concatenate([start + np.arange(count) for start, count in zip(starts, counts, strict=True)])
-            labels = range(HISTORY - 1, WINDOW - 1)
-
-        if labels is None:
-            usable = np.logical_or.reduceat(available, starts)
-        else:
-            usable = available[units[:, None] + np.asarray(labels)].any(1)
+        first, end = self._units(starts, lengths)
+        before = np.concatenate([[0], available.cumsum()])  # labels ahead of every step
+        usable = before[end] > before[first]
         if self.episodes is None:
-            order = np.random.default_rng(self.seed).permutation(len(units))
-            chosen = order[usable[order]][: self._number_of(len(units), int(usable.sum()))]
+            order = np.random.default_rng(self.seed).permutation(len(first))
+            chosen = order[usable[order]][: self._number_of(len(first), int(usable.sum()))]
         else:
             chosen = _positions(data.get(keys.EPISODE).cpu().numpy()[starts], usable, tuple(self.episodes))
-        kept = np.zeros(lengths.sum(), dtype=bool)
-        if labels is None:
-            for index in chosen:
-                kept[starts[index] : starts[index] + lengths[index]] = True
-        else:
-            kept[units[chosen][:, None] + np.asarray(labels)] = True
-        kept &= available
+        kept = np.zeros_like(available)
+        for begin, behind in zip(first[chosen], end[chosen], strict=True):
+            kept[begin:behind] = available[begin:behind]
 
         has_action = torch.from_numpy(kept).to(data.get(keys.ACTION).device).unsqueeze(-1)
-        labelled = data.clone()
-        labelled.set(keys.HAS_ACTION, has_action)
+        labelled = data.clone().set(keys.HAS_ACTION, has_action)
         labelled.set(keys.ACTION, torch.where(has_action, data.get(keys.ACTION), math.nan))
         if command is not None:
             labelled = hide_commands(labelled, command)
@@ -198,7 +180,7 @@ class LabelBudget:
             unit=self.unit,
             requested=next((asked for asked in (self.fraction, self.count) if asked is not None), len(chosen)),
             selected_units=len(chosen),
-            total_units=len(units),
+            total_units=len(first),
             labelled_transitions=int(kept.sum()),
             total_transitions=len(kept),
             trajectories_touched=int(touched.sum()),
@@ -208,6 +190,19 @@ class LabelBudget:
             available_transitions=int(available.sum()),
         )
         return labelled, report
+
+    def _units(self, starts: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The steps of every unit whose labels it shows: the first, and the one behind the last, int ``[units]``."""
+        if self.unit == "trajectory":
+            return starts, starts + lengths
+        if self.unit == "transition":
+            steps = np.arange(lengths.sum())
+            return steps, steps + 1
+        counts = np.maximum(lengths - WINDOW + 1, 0)
+        if not counts.any():
+            raise ValueError(f"no trajectory is as long as a window of {WINDOW} steps (longest: {lengths.max()})")
+        windows = np.concatenate([start + np.arange(count) for start, count in zip(starts, counts, strict=True)])
+        return windows + HISTORY - 1, windows + WINDOW - 1
 
     def _number_of(self, total: int, usable: int) -> int:
         """Units to draw, of ``total`` of which ``usable`` have a label."""

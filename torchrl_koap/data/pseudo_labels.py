@@ -34,7 +34,7 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
 
     Keyword Args:
         window (int): frames per window.
-        batch_size (int): windows per forward pass. Defaults to 4096.
+        batch_size (int): windows per forward pass.
 
     Returns:
         TensorDict: a shallow copy in which every step has an action; labelled steps keep theirs bit for bit. The new
@@ -43,17 +43,6 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
     Raises:
         KeyError: if an entry is missing.
         ValueError: if the window is too short for the controller, or its actions are not finite or of another width.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import LabelBudget, flatten_trajectories, select_state
-        >>> from torchrl_koap.modules import LinearInverseDynamics
-        >>> from torchrl_koap.data.pseudo_labels import relabel
-        >>> data = flatten_trajectories([torch.rand(21, 2)] * 4, [torch.rand(20, 3)] * 4)
-        >>> data, _ = LabelBudget(count=1).apply(select_state(data, (0, 1)))
-        >>> relabelled = relabel(LinearInverseDynamics(2, 3), data, window=10)
-        >>> int(relabelled["has_action"].sum()), int(relabelled["relabelled"].sum())
-        (80, 60)
     """
     for key in (STATE, ACTION, HAS_ACTION, EPISODE):
         if data.get(key, None) is None:
@@ -74,9 +63,7 @@ def relabel(controller: nn.Module, data: TensorDictBase, *, window: int, batch_s
         if bad.any():
             raise ValueError(f"the controller's actions are not finite in {int(bad.sum())} of {len(bad)} steps")
         action[hidden] = predicted.to(action)
-    result = data.copy()
-    result.set(ACTION, action)
-    result.set(HAS_ACTION, torch.ones_like(data.get(HAS_ACTION)))
+    result = data.copy().set(ACTION, action).set(HAS_ACTION, torch.ones_like(data.get(HAS_ACTION)))
     return result.set(RELABELLED, hidden.reshape(data.get(HAS_ACTION).shape))
 
 

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -14,51 +15,61 @@ from torch import Tensor
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.files import some
-from torchrl_koap.tasks import WINDOW
+from torchrl_koap.tasks import HORIZON, WINDOW, Task
 
 FARTHEST = 100.0  # m, or rad: no robot on a table gets there
 LEAP, UNUSUAL = 1 / 3, 20.0  # a leap: a step above this share of the range, and so many times the usual one
 STILL, MUCH = 2e-3, 0.2  # share of the range within which a robot stands still; share of still frames to be told
+SHORT, ENOUGH = 0.02, 0.05  # share of a demonstration that a plan covers: too little, and what would do
 
 
-def find_warnings(
-    data: TensorDictBase,
-    *,
-    names: Sequence[str] = (),
-    units: Sequence[str] = (),
-    columns: Sequence[str] = (),
-    seen: Sequence[str] = (),
-    actions: Sequence[str] = (),
-) -> list[str]:
+def find_warnings(data: TensorDictBase, task: Task, names: Sequence[str] = ()) -> list[str]:
     """Finds what is unlikely in demonstrations, a sentence each.
 
     Trajectories that repeat another one, never move, are shorter than a window, have only zero labels, or reach a
-    place beyond 100 m or rad; seen columns that never change, equal another one, or leap; frames at both ends in which
-    nothing moves; actions that never change.
+    place beyond 100 m or rad; state columns that never change, equal another one, or leap; frames at both ends in which
+    nothing moves; actions that never change; plans that are short against the motion.
 
     Args:
-        data (TensorDictBase): flat data ``[N]`` in the storage layout.
-
-    Keyword Args:
+        data (TensorDictBase): flat data ``[N]`` in the storage layout, with ``state``.
+        task (Task): what they are of.
         names (sequence of str): what to call each trajectory, such as its file. Default: their numbers.
-        units (sequence of str): unit of every observation column; positions in m and angles in rad are looked at.
-            Default: no column is.
-        columns (sequence of str): what to call the observation columns. Default: their numbers.
-        seen (sequence of str): what to call the columns of ``state``. Default: none is looked at.
-        actions (sequence of str): what to call the action columns. Default: none is looked at.
 
     Examples:
         >>> import torch
-        >>> from torchrl_koap.data import flatten_trajectories
+        >>> from torchrl_koap.data import make_demonstrations, select_state
         >>> from torchrl_koap.data.quality import find_warnings
-        >>> path, still = torch.arange(40.0).reshape(20, 2), torch.zeros(19, 2)
-        >>> find_warnings(flatten_trajectories([path, path], [still + 1, still + 1]), names=["a.pkl", "b.pkl"])
-        ['b.pkl repeats a.pkl: every step is the same']
+        >>> path = torch.arange(40.0).reshape(20, 2)
+        >>> data, task = make_demonstrations([path, path], control_hz=10, action_dim=1)
+        >>> find_warnings(select_state(data, (0, 1)), task, ["a.csv", "b.csv"])
+        ['b.csv repeats a.csv: every step is the same']
     """
-    warnings: list[str] = []
-    first: dict[bytes, str] = {}
     lengths = trajectory_lengths(data).tolist()
     called = [*names, *(f"trajectory {index}" for index in range(len(names), len(lengths)))]
+    state = data.get(keys.STATE).cpu()
+    frames = [part.double().numpy() for part in state.split(lengths)]
+    constants = zip(task.action_names, constant_columns(data.get(keys.ACTION).cpu().numpy()), strict=True)
+    _, short_plans = plan_coverage(data, task.control_hz)
+    return [
+        *_trajectory_warnings(data, task, lengths, called),
+        *_short(lengths, called),
+        *_column_warnings(state, task.state_names),
+        *_leaps(frames, called, task.state_names),
+        *_stillness(frames, called),
+        *(
+            f"action {name!r} is {value:g} in all labels: a policy always commands that"
+            for name, value in constants
+            if value is not None
+        ),
+        *([] if short_plans is None else [short_plans]),
+    ]
+
+
+def _trajectory_warnings(
+    data: TensorDictBase, task: Task, lengths: Sequence[int], called: Sequence[str]
+) -> Iterator[str]:
+    first: dict[bytes, str] = {}
+    names, units = task.observation_names, task.observation_units or _metres(task)
     looked_at = [column for column, unit in enumerate(units) if unit in ("m", "rad")]
     entries = [data.get(key) for key in (keys.OBSERVATION, keys.ACTION, keys.HAS_ACTION, keys.NEXT_OBSERVATION)]
     for name, observed, steps, has_action, last in zip(
@@ -66,34 +77,32 @@ def find_warnings(
     ):
         same = first.setdefault(_digest(observed, steps, last[-1:]), name)
         if same is not name:
-            warnings.append(f"{name} repeats {same}: every step is the same")
+            yield f"{name} repeats {same}: every step is the same"
             continue
         labelled = steps[has_action.squeeze(-1)]
         if len(labelled) and not labelled.any():
-            warnings.append(f"{name}: all {len(labelled)} labelled actions are zero")
+            yield f"{name}: all {len(labelled)} labelled actions are zero"
         if bool((observed == observed[:1]).all()) and bool((last == observed[:1]).all()):
-            warnings.append(f"{name}: nothing moves in its {len(observed)} steps")
-        for column in looked_at:
-            farthest = observed[:, column].abs().max()
-            if farthest > FARTHEST:
-                what = columns[column] if column < len(columns) else f"column {column}"
-                warnings.append(f"{name}: {what} reaches {farthest:.3g} {units[column]}")
-                break
+            yield f"{name}: nothing moves in its {len(observed)} steps"
+        farthest = observed.abs().amax(0)
+        far = next((column for column in looked_at if farthest[column] > FARTHEST), None)
+        if far is not None:
+            yield f"{name}: {names[far]} reaches {farthest[far]:.3g} {units[far]}"
+
+
+def _metres(task: Task) -> list[str]:
+    """Metres for the columns that are positions for certain; the others have units of their own."""
+    inside = range(*task.observation[task.position].indices(task.observation_dim))
+    return ["m" if task.env is not None and column in inside else "" for column in range(task.observation_dim)]
+
+
+def _short(lengths: Sequence[int], called: Sequence[str]) -> list[str]:
     short = [f"{name} ({length})" for name, length in zip(called, lengths, strict=True) if length < WINDOW]
-    if short:
-        warnings.append(
-            f"{len(short)} of {len(lengths)} trajectories have fewer steps than a window of {WINDOW}, so training may"
-            f" refuse them: {some(short)}; `koap convert --drop-short` leaves them out"
-        )
-    if seen:
-        frames = [part.double().numpy() for part in data.get(keys.STATE).cpu().split(lengths)]
-        warnings += _column_warnings(data.get(keys.STATE), seen) + _leaps(frames, called, seen)
-        warnings += _stillness(frames, called)
-    constants = zip(actions, constant_columns(entries[1].cpu().numpy()), strict=False)
-    return warnings + [
-        f"action {name!r} is {value:g} in all labels: a policy always commands that"
-        for name, value in constants
-        if value is not None
+    if not short:
+        return []
+    return [
+        f"{len(short)} of {len(lengths)} trajectories have fewer steps than a window of {WINDOW}, so training may"
+        f" refuse them: {some(short)}; `koap convert --drop-short` leaves them out"
     ]
 
 
@@ -182,6 +191,35 @@ def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> lis
         f" (most in {called[longest]}: {ends[longest, 0]} and {ends[longest, 1]} of {lengths[longest]}), so a policy"
         " may learn to stand still; `koap convert --trim-still` cuts them"
     ]
+
+
+def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | None]:
+    """Says how long a plan is beside the demonstrations.
+
+    Args:
+        data (TensorDictBase): flat data ``[N]``.
+        control_hz (float): frames per second.
+
+    Returns:
+        tuple: both in milliseconds, and a warning where a plan is short against the motion, else None.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl_koap.data import flatten_trajectories
+        >>> from torchrl_koap.data.quality import plan_coverage
+        >>> plan_coverage(flatten_trajectories([torch.zeros(29, 2)], None, action_dim=1), 14.0)
+        ('14 frames, 1000 ms; demonstrations last 2000 ms (median)', None)
+    """
+    frames = float(trajectory_lengths(data).double().median())
+    covers = f"{HORIZON} frames, {1e3 * HORIZON / control_hz:.4g} ms"
+    lasts = f"demonstrations last {1e3 * frames / control_hz:.4g} ms (median)"
+    if HORIZON >= SHORT * frames:
+        return f"{covers}; {lasts}", None
+    every = math.ceil(ENOUGH * frames / HORIZON)
+    return f"{covers}; {lasts}", (
+        f"a plan covers {covers}, {HORIZON / frames:.1%} of a demonstration: short against the motion. A rate of"
+        f" {control_hz / every:.3g} Hz (one frame in {every}) would let it look farther"
+    )
 
 
 def constant_columns(actions: np.ndarray) -> list[float | None]:

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap.data import LabelReport, WindowTable, select_trajectories, subsample_trajectories
-from torchrl_koap.data.window_length import plan_coverage
+from torchrl_koap.data.quality import plan_coverage
 from torchrl_koap.modules import StatePlanner
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.runs.config_files import to_json, versions

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torchrl_koap.data import make_recordings, read_recordings, write_recordings
+from torchrl_koap.data import make_recordings, read_recordings, save_demonstrations, write_recordings
 from torchrl_koap.data.formats import FORMATS
 from torchrl_koap.files import DataError
 
@@ -35,6 +35,17 @@ def test_an_hdf5_file(tmp_path):
         stream["data/demo_0/obs/q"] = np.zeros((5, 2))
         stream["data/demo_0/actions"] = np.ones((5, 1))
     assert read_recordings(tmp_path / "a.hdf5", control_hz=10).state_names == ("q_0", "q_1")
+
+
+@pytest.mark.parametrize("below", ["", "ted"])
+def test_a_data_set_of_this_library(below, recordings, tmp_path):
+    save_demonstrations(tmp_path / "arm", recordings, robot=("x",))
+    again = read_recordings(tmp_path / "arm" / below)
+    assert (again.state_names, again.control_hz, again.num_labels) == (STATES, 20.0, 9)
+    np.testing.assert_allclose(again.states[2], recordings.states[2], rtol=1e-6)
+    np.testing.assert_allclose(again.actions[2], recordings.actions[2], rtol=1e-6)
+    with pytest.raises(ValueError, match="control_hz: not an option for a data set of this library"):
+        read_recordings(tmp_path / "arm", control_hz=3)
 
 
 def test_nothing_to_read(tmp_path):

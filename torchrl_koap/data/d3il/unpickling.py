@@ -215,17 +215,13 @@ def _no_call(*_args):
     raise _RefusedError("calls numpy.ndarray directly")
 
 
-def _empty_bytes():
-    return b""
-
-
 _STAND_INS = {
     ("numpy", "ndarray"): _no_call,
     ("numpy", "dtype"): _ElementType,
     ("collections", "OrderedDict"): dict,
     ("_codecs", "encode"): _encode,
-    ("builtins", "bytes"): _empty_bytes,
-    ("__builtin__", "bytes"): _empty_bytes,
+    ("builtins", "bytes"): lambda: b"",
+    ("__builtin__", "bytes"): lambda: b"",
 }
 for _core in ("numpy.core", "numpy._core"):  # numpy 1.x and 2.x
     _STAND_INS[f"{_core}.multiarray", "_reconstruct"] = _reconstruct

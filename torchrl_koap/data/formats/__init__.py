@@ -8,13 +8,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchrl_koap.data.formats import stored
+import numpy as np
+import torch
+
+from torchrl_koap import keys
 from torchrl_koap.data.formats.lerobot import is_lerobot, read_lerobot
 from torchrl_koap.data.formats.minari import PREFIX, read_minari
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.formats.robomimic import is_hdf5, read_robomimic
 from torchrl_koap.data.formats.tables import is_table_folder, read_tables
 from torchrl_koap.data.formats.writers import write_lerobot, write_npz
+from torchrl_koap.data.ted import load_ted, stored_folder
+from torchrl_koap.data.trajectories import trajectory_lengths
 from torchrl_koap.lookup import lookup
 
 __all__ = ["FORMATS", "Format", "Recordings", "make_recordings", "read_recordings", "write_recordings"]
@@ -44,6 +49,24 @@ class Format:
     write: Callable[[Recordings, Path], None] | None = None
 
 
+def _read_stored(source: str) -> Recordings:
+    """All observation columns of a data set of this library, the command included, and the labels that there are."""
+    data, task = load_ted(stored_folder(source) or source)
+    lengths = trajectory_lengths(data).tolist()
+    observed, behind = data[keys.OBSERVATION].double(), data[keys.NEXT_OBSERVATION].double()
+    actions = torch.where(data[keys.HAS_ACTION], data[keys.ACTION].double(), torch.nan)
+    pairs = zip(observed.split(lengths), behind.split(lengths), strict=True)
+    return make_recordings(
+        [torch.cat([frames, following[-1:]]) for frames, following in pairs],
+        actions.split(lengths),
+        state_names=task.observation_names,
+        action_names=task.action_names,
+        sources=np.arange(len(lengths)).astype(str),
+        control_hz=task.control_hz,
+        source=source,
+    )
+
+
 COMMON = ("control_hz", "action_dim", "state_columns", "drop_columns")  # options of all but this library's own
 
 FORMATS = {
@@ -53,7 +76,7 @@ FORMATS = {
         read_minari,
         COMMON,
     ),
-    "ted": Format("a data set of this library", stored.is_stored, stored.read_stored),
+    "ted": Format("a data set of this library", lambda source: stored_folder(source) is not None, _read_stored),
     "robomimic": Format(
         "an HDF5 file in robomimic's layout (*.hdf5)",
         is_hdf5,

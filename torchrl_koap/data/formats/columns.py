@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -100,12 +100,8 @@ def assemble(
 
     Keyword Args:
         declared_hz (float, optional): frames per second that the source declares; time stamps must agree.
-        control_hz (float, optional): frames per second, whatever source and time stamps say.
-        state_columns (sequence of str): columns that make up the state, in that order. Default: all that are no clock,
-            counter, reward or flag of an episode.
-        drop_columns (sequence of str): state and action columns that are left out.
-        action_dim (int, optional): number of action columns, where nothing has actions.
-        action_names (sequence of str, optional): their names, where nothing has actions.
+        control_hz, state_columns, drop_columns, action_dim: as for :func:`~torchrl_koap.data.read_recordings`.
+        action_names (sequence of str, optional): names of the action columns, where nothing has actions.
         skipped (sequence of str): entries that the reader left out.
         no_rate (str): what is said where nothing tells the rate.
 
@@ -114,22 +110,14 @@ def assemble(
     """
     if not pieces:
         raise DataError(source, "there are no trajectories")
-    problems: list[str] = []
-    _check_names(pieces, problems)
+    problems = [*_other_names(pieces), *_other_lengths(pieces)]
     if problems:
         raise DataError(source, problems)
     pieces = [part for piece in pieces for part in _episodes(piece, problems)]
     names = list(pieces[0].states)
-    acting = next((list(piece.actions) for piece in pieces if piece.actions is not None), None)
-    for option, asked, known in (
-        ("state_columns", state_columns, names),
-        ("drop_columns", drop_columns, [*names, *(acting or [])]),
-    ):
-        for column in asked:
-            try:
-                lookup(known, column, f"column in {option}:")
-            except ValueError as error:
-                problems.append(str(error))
+    acting = next((list(piece.actions) for piece in pieces if piece.actions is not None), [])
+    problems += unknown(state_columns, names, "column in state_columns:")
+    problems += unknown(drop_columns, [*names, *acting], "column in drop_columns:")
     problems += [
         f"{name!r} has a number for every frame: does it say which episode a frame is of, or where episodes end? call"
         " it episode_index or timeouts then; else name the state's columns in state_columns, or drop it in drop_columns"
@@ -142,16 +130,15 @@ def assemble(
     unused = [name for name in names if name not in observed]
     left_out = [*skipped, *(f"{name} (it rises evenly: a clock)" if name in even else name for name in unused)]
     if not observed:
-        problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*(acting or []), *names])}")
-    if acting is not None:
-        left_out += [name for name in acting if name in drop_columns]
-        acting = [name for name in acting if name not in drop_columns]
+        problems.append(f"{pieces[0].name}: has no state columns, only {', '.join([*acting, *names])}")
+    left_out += [name for name in acting if name in drop_columns]
+    acting = [name for name in acting if name not in drop_columns]
     rate = control_hz if control_hz is not None else _find_rate(pieces, declared_hz, no_rate, problems)
     if problems:
         raise DataError(source, problems)
     return make_recordings(
-        [np.stack([_float(piece.states[name]) for name in observed], 1) for piece in pieces],
-        [None if not piece.actions or not acting else _stack(piece, acting) for piece in pieces],
+        [_stack(piece.states, observed) for piece in pieces],
+        [_stack(piece.actions, acting) if piece.actions and acting else None for piece in pieces],
         action_dim=action_dim,
         state_names=observed,
         action_names=acting or action_names,
@@ -160,6 +147,21 @@ def assemble(
         skipped=left_out,
         source=source,
     )
+
+
+def unknown(asked: Sequence[str], known: Sequence[str], what: str) -> list[str]:
+    """What is to be said of names that are none of those known."""
+    said = []
+    for name in asked:
+        try:
+            lookup(known, name, what)
+        except ValueError as error:
+            said.append(str(error))
+    return said
+
+
+def _stack(columns: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
+    return np.stack([columns[name] for name in names], 1).astype(np.float64)
 
 
 def _find_rate(pieces: Sequence[Piece], declared: float | None, otherwise: str, problems: list[str]) -> float | None:
@@ -201,45 +203,13 @@ def _find_rate(pieces: Sequence[Piece], declared: float | None, otherwise: str, 
 
 
 def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
-    """The episodes of a piece: by their number, by a frame counter that starts again, by flags of their end."""
-    length = len(next(iter(piece.states.values()), ()))
-    found = {kind_of(name)[0]: name for name in reversed(piece.states)}
-    number, frame = (piece.states[found[kind]] if kind in found else None for kind in ("episode", "frame"))
-    ends = [values for name, values in piece.states.items() if kind_of(name)[0] == "end"]
-    order = np.arange(length)
-    if number is not None:
-        starts = np.r_[True, number[1:] != number[:-1]]
-        sorting = frame if frame is not None else piece.states[found["clock"]] if "clock" in found else None
-        if starts.sum() > len(np.unique(number)):
-            pairs = None if sorting is None else np.unique(np.stack([number, sorting], 1), axis=0)
-            if pairs is None or len(pairs) < length:
-                again = next(value for value in number[starts] if (number[starts] == value).sum() > 1)
-                problems.append(
-                    f"{piece.name}: {found['episode']} {again:g} comes back after another one, and no frame index or"
-                    " time says how its rows follow each other"
-                )
-                return [piece]
-        if sorting is not None:
-            order = np.lexsort((sorting, number))
-        number = number[order]
-        starts = np.r_[True, number[1:] != number[:-1]]
-    elif frame is not None and (np.diff(frame) <= 0).any():
-        starts = np.r_[True, np.diff(frame) < 0]
-        if len(np.unique(frame)) == length:  # one episode, out of order
-            order, starts = np.argsort(frame), order == 0
-        elif not (frame[starts] == frame[0]).all() or (np.diff(frame) == 0).any():
-            problems.append(
-                f"{piece.name}: column {found['frame']!r} neither counts on nor starts again: a column 'episode' says"
-                " which rows belong together"
-            )
-            return [piece]
-    else:
-        starts = order == 0
-        for flag in ends:  # an episode ends where a flag falls
-            starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]
-        if ends and any(set(np.unique(flag)) - {0, 1} for flag in ends):
-            problems.append(f"{piece.name}: columns of the ends of episodes must be 0 or 1")
-    starts = np.flatnonzero(starts)
+    """The episodes of a piece; the piece itself if it is one, or they cannot be told apart."""
+    try:
+        order, begins = _order(piece)
+    except ValueError as error:
+        problems.append(f"{piece.name}: {error}")
+        return [piece]
+    starts, length = np.flatnonzero(begins), len(order)
     if len(starts) < 2 and np.array_equal(order, np.arange(length)):
         return [piece]
     if piece.actions is not None and any(len(values) != length for values in piece.actions.values()):
@@ -250,13 +220,56 @@ def _episodes(piece: Piece, problems: list[str]) -> list[Piece]:
     spans = [order[start:end] for start, end in zip(starts, [*starts[1:], length], strict=True)]
     names = [piece.name] if len(spans) == 1 else [f"{piece.name}[{index}]" for index in range(len(spans))]
     return [
-        Piece(name, _rows(piece.states, span), piece.actions and _rows(piece.actions, span), piece.unclear)
+        replace(piece, name=name, states=_cut(piece.states, span), actions=piece.actions and _cut(piece.actions, span))
         for name, span in zip(names, spans, strict=True)
     ]
 
 
-def _rows(columns: Mapping[str, np.ndarray], span: np.ndarray) -> dict[str, np.ndarray]:
+def _cut(columns: Mapping[str, np.ndarray], span: np.ndarray) -> dict[str, np.ndarray]:
     return {name: values[span] for name, values in columns.items()}
+
+
+def _order(piece: Piece) -> tuple[np.ndarray, np.ndarray]:
+    """The order of the rows of a piece, and which of them, so ordered, begin an episode.
+
+    Told by the number of the episode, by a frame counter that starts again, or by flags of the ends.
+    """
+    rows = np.arange(len(next(iter(piece.states.values()), ())))
+    called = {kind_of(name)[0]: name for name in reversed(piece.states)}
+    columns = {kind: piece.states[name] for kind, name in called.items()}
+    number, frame = columns.get("episode"), columns.get("frame")
+    if number is not None:
+        sorting = columns.get("clock") if frame is None else frame
+        starts = _changes(number)
+        sorted_by = number[:, None] if sorting is None else np.stack([number, sorting], 1)
+        if starts.sum() > len(np.unique(number)) and len(np.unique(sorted_by, axis=0)) < len(rows):
+            again = next(value for value in number[starts] if (number[starts] == value).sum() > 1)
+            raise ValueError(
+                f"{called['episode']} {again:g} comes back after another one, and no frame index or time says how its"
+                " rows follow each other"
+            )
+        order = rows if sorting is None else np.lexsort((sorting, number))
+        return order, _changes(number[order])
+    if frame is not None and (np.diff(frame) <= 0).any():
+        if len(np.unique(frame)) == len(rows):  # one episode, out of order
+            return np.argsort(frame), rows == 0
+        starts = np.r_[True, np.diff(frame) < 0]
+        if not (frame[starts] == frame[0]).all() or (np.diff(frame) == 0).any():
+            raise ValueError(
+                f"column {called['frame']!r} neither counts on nor starts again: a column 'episode' says which rows"
+                " belong together"
+            )
+        return rows, starts
+    starts = rows == 0
+    for flag in (values for name, values in piece.states.items() if kind_of(name)[0] == "end"):
+        if set(np.unique(flag)) - {0, 1}:
+            raise ValueError("columns of the ends of episodes must be 0 or 1")
+        starts = starts | np.r_[False, (flag[:-1] > 0) & (flag[1:] == 0)]  # an episode ends where a flag falls
+    return rows, starts
+
+
+def _changes(numbers: np.ndarray) -> np.ndarray:
+    return np.r_[True, numbers[1:] != numbers[:-1]]
 
 
 def _even(pieces: Sequence[Piece]) -> set[str]:
@@ -264,33 +277,26 @@ def _even(pieces: Sequence[Piece]) -> set[str]:
     found = set()
     states = [name for name in pieces[0].states if kind_of(name)[0] is None]
     for name in states:
-        steps = np.concatenate([np.diff(_float(piece.states[name])) for piece in pieces])
+        steps = np.concatenate([np.diff(piece.states[name].astype(np.float64)) for piece in pieces])
         first = steps[0] if len(steps) >= _LONG else 0.0
         if first > 0 and np.allclose(steps, first, rtol=1e-6, atol=0):
             found.add(name)
     return found if len(found) < len(states) else set()
 
 
-def _check_names(pieces: Sequence[Piece], problems: list[str]) -> None:
+def _other_names(pieces: Sequence[Piece]) -> Iterator[str]:
     for kind in ("state", "action"):
         named = [(piece.name, piece.states if kind == "state" else piece.actions) for piece in pieces]
         found = [(name, list(columns)) for name, columns in named if columns is not None]
-        problems += [
-            f"{name}: {kind} columns are {', '.join(columns)}; those of {found[0][0]} are {', '.join(found[0][1])}"
-            for name, columns in found
-            if columns != found[0][1]
-        ]
+        for name, columns in found:
+            if columns != found[0][1]:
+                first, wanted = found[0][0], ", ".join(found[0][1])
+                yield f"{name}: {kind} columns are {', '.join(columns)}; those of {first} are {wanted}"
+
+
+def _other_lengths(pieces: Sequence[Piece]) -> Iterator[str]:
     for piece in pieces:
         for columns in (piece.states, piece.actions or {}):
-            lengths = {len(values) for values in columns.values()}
-            if len(lengths) > 1:
+            if len({len(values) for values in columns.values()}) > 1:
                 shapes = ", ".join(f"{name} {len(values)}" for name, values in columns.items())
-                problems.append(f"{piece.name}: its columns have different numbers of rows: {shapes}")
-
-
-def _float(values: np.ndarray) -> np.ndarray:
-    return values.astype(np.float64) if values.dtype.kind in "fiub" else values
-
-
-def _stack(piece: Piece, names: Sequence[str]) -> np.ndarray:
-    return np.stack([_float((piece.actions or {})[name]) for name in names], 1)
+                yield f"{piece.name}: its columns have different numbers of rows: {shapes}"

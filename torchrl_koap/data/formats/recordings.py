@@ -74,15 +74,12 @@ def make_recordings(
 
     Keyword Args:
         action_dim (int, optional): number of action columns, needed where no trajectory has actions.
-        state_names (sequence of str, optional): names of the state columns. Default: ``state_0``, ...
-        action_names (sequence of str, optional): names of the action columns. Default: ``action_0``, ...
-        sources (sequence of str, optional): what messages call each trajectory. Default: its number.
-        control_hz (float, optional): frames per second.
-        skipped (sequence of str): entries that the caller left out.
+        state_names, action_names, sources, control_hz, skipped: as of :class:`Recordings`. Columns and trajectories
+            without a name are numbered.
         source (str): what messages call the whole.
 
     Returns:
-        Recordings: checked, with names and units.
+        Recordings: checked, with names.
 
     Raises:
         DataError: with all faults: no trajectories, other widths than in the first, fewer than two frames,
@@ -98,62 +95,58 @@ def make_recordings(
     """
     problems: list[str] = []
     if not len(states):
-        raise DataError(source, ["there are no trajectories"])
-    if actions is None:
-        actions = [None] * len(states)
+        raise DataError(source, "there are no trajectories")
+    actions = [None] * len(states) if actions is None else actions
     if len(actions) != len(states):
-        raise DataError(source, [f"{len(states)} trajectories of states, {len(actions)} of actions"])
+        raise DataError(source, f"{len(states)} trajectories of states, {len(actions)} of actions")
     labels = [str(index) for index in range(len(states))] if sources is None else list(sources)
     what = [f"trajectory {label}" for label in labels]
     frames = [_frames(value, name, problems) for value, name in zip(states, what, strict=True)]
     width = next((array.shape[1] for array in frames if array is not None), 0)
-    steps = [_steps(value, name, problems) for value, name in zip(actions, what, strict=True)]
-    whole = list(steps)
-    wide = next((array.shape[1] for array in steps if array is not None), action_dim)
-    if wide is None:
-        wide = len(action_names) if action_names is not None else None
+    known = [_steps(value, name, problems) for value, name in zip(actions, what, strict=True)]
+    wide = next((array.shape[1] for array in known if array is not None), action_dim)
+    if wide is None and action_names is not None:
+        wide = len(action_names)
     if wide is None:
         problems.append("no trajectory has actions: action_dim says how many columns an action has")
         wide = 1
     elif action_dim is not None and action_dim != wide:
         problems.append(f"actions have {wide} columns, action_dim says {action_dim}")
-    for index, name in enumerate(what):
-        if frames[index] is None:
+    for name, seen, done in zip(what, frames, known, strict=True):
+        if seen is None:
             continue
-        length = len(frames[index])
-        if frames[index].shape[1] != width:
-            problems.append(f"{name}: states have {frames[index].shape[1]} columns, those before have {width}")
-        if steps[index] is None:
-            steps[index] = np.full((length - 1, wide), np.nan)
-        elif steps[index].shape[1] != wide:
-            problems.append(f"{name}: actions have {steps[index].shape[1]} columns, those before have {wide}")
-        elif len(steps[index]) not in (length - 1, length):
+        length = len(seen)
+        if seen.shape[1] != width:
+            problems.append(f"{name}: states have {seen.shape[1]} columns, those before have {width}")
+        if done is not None and done.shape[1] != wide:
+            problems.append(f"{name}: actions have {done.shape[1]} columns, those before have {wide}")
+        elif done is not None and len(done) not in (length - 1, length):
             problems.append(
-                f"{name}: {len(steps[index])} actions for {length} frames; wanted one per frame ({length}) or one per"
+                f"{name}: {len(done)} actions for {length} frames; wanted one per frame ({length}) or one per"
                 f" transition ({length - 1})"
             )
-        else:
-            steps[index] = _without_rest(steps[index][: length - 1])
     given_states = _names(state_names, width, "state", problems)
     given_actions = _names(action_names, wide, "action", problems)
-    problems += _sparse([array for array in whole if array is not None and array.shape[1] == wide], given_actions)
+    problems += _sparse([array for array in known if array is not None and array.shape[1] == wide], given_actions)
     if control_hz is not None and not (np.isfinite(control_hz) and control_hz > 0):
         problems.append(f"control_hz must be a positive number of frames per second, got {control_hz!r}")
     if problems:
         raise DataError(source, problems)
+    steps = [
+        np.full((len(seen) - 1, wide), np.nan) if done is None else _whole(done[: len(seen) - 1])
+        for seen, done in zip(frames, known, strict=True)
+    ]
     return Recordings(
         frames, steps, given_states, given_actions, tuple(labels), control_hz, tuple(dict.fromkeys(skipped))
     )
 
 
 def _frames(value: ArrayLike, name: str, problems: list[str]) -> np.ndarray | None:
-    array = _array(value, f"{name}: states", problems)
+    array = _table(value, f"{name}: states", "[T, d]", problems)
     if array is None:
         return None
     array = array.astype(np.float64) if array.dtype == bool else array
-    if array.ndim != 2 or not array.shape[-1]:
-        problems.append(f"{name}: states must be [T, d], got {list(array.shape)}")
-    elif not np.issubdtype(array.dtype, np.floating):
+    if not np.issubdtype(array.dtype, np.floating):
         problems.append(
             f"{name}: states are {array.dtype}; wanted floating-point numbers in the unit that the robot reports"
         )
@@ -169,11 +162,8 @@ def _frames(value: ArrayLike, name: str, problems: list[str]) -> np.ndarray | No
 
 
 def _steps(value: ArrayLike | None, name: str, problems: list[str]) -> np.ndarray | None:
-    array = None if value is None else _array(value, f"{name}: actions", problems)
+    array = None if value is None else _table(value, f"{name}: actions", "[T, a] or [T - 1, a]", problems)
     if array is None:
-        return None
-    if array.ndim != 2 or not array.shape[-1]:
-        problems.append(f"{name}: actions must be [T, a] or [T - 1, a], got {list(array.shape)}")
         return None
     if array.dtype.kind not in "fiub":
         problems.append(f"{name}: actions are {array.dtype}, wanted numbers")
@@ -187,13 +177,17 @@ def _steps(value: ArrayLike | None, name: str, problems: list[str]) -> np.ndarra
     return array
 
 
-def _array(value: ArrayLike, name: str, problems: list[str]) -> np.ndarray | None:
+def _table(value: ArrayLike, name: str, wanted: str, problems: list[str]) -> np.ndarray | None:
     try:
-        return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+        array = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
     except ValueError:
         widths = sorted({np.size(row) for row in value})  # type: ignore[union-attr, arg-type]
         problems.append(f"{name} are lists of different lengths: rows of {' and '.join(map(str, widths))} numbers")
         return None
+    if array.ndim == 2 and array.shape[-1]:
+        return array
+    problems.append(f"{name} must be {wanted}, got {list(array.shape)}")
+    return None
 
 
 def _sparse(actions: Sequence[np.ndarray], names: Sequence[str]) -> list[str]:
@@ -210,7 +204,7 @@ def _sparse(actions: Sequence[np.ndarray], names: Sequence[str]) -> list[str]:
     ]
 
 
-def _without_rest(steps: np.ndarray) -> np.ndarray:
+def _whole(steps: np.ndarray) -> np.ndarray:
     """An action of which some columns are unknown is unknown."""
     return np.where(np.isnan(steps).any(-1, keepdims=True), np.nan, steps)
 
