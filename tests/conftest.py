@@ -17,11 +17,20 @@ torch.set_num_threads(1)
 
 @pytest.fixture(scope="session")
 def job_server():
-    """The server whose copies do the jobs of studies has imported what cells need, whichever test starts it."""
+    """The server whose copies do the jobs of tests has imported what they need, whichever test starts it."""
     rooms = ("studies.launchers", "studies.cells", "evaluation.closed_loop", "envs.avoiding")
-    forkserver.set_forkserver_preload([f"torchrl_koap.{room}" for room in rooms])
+    forkserver.set_forkserver_preload(["torchrl.collectors", *(f"torchrl_koap.{room}" for room in rooms)])
     process = multiprocessing.get_context("forkserver").Process(target=len, args=("",))
     process.start(), process.join()  # now it is there
+
+
+@pytest.fixture
+def copied_processes(job_server):
+    """TorchRL's processes are copies of that server; what they are handed is pickled as for spawned ones."""
+    before = torch.multiprocessing.get_start_method(allow_none=True)
+    torch.multiprocessing.set_start_method("forkserver", force=True)
+    yield
+    torch.multiprocessing.set_start_method(before, force=True)
 
 
 @pytest.fixture(scope="session")

@@ -248,7 +248,7 @@ def test_every_action_in_environments_of_any_make(kind, name):
     collector.shutdown()
 
 
-def test_every_action_of_parallel_workers_that_reset_by_themselves():
+def test_every_action_of_parallel_workers_that_reset_by_themselves(copied_processes):
     env = ParallelEnv(2, transformed)
     check("feedback", env.rollout(15, policy_of(columns=(0, 1)), break_when_any_done=False))
     env.close()

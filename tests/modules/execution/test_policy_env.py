@@ -128,8 +128,8 @@ def test_environments_in_processes_give_the_numbers_of_a_serial_one(make_policy,
     _in_processes(make_policy, layout)
 
 
-def test_environments_in_processes(layout="inside"):
-    _in_processes(feedback, layout)
+def test_environments_in_processes(copied_processes):
+    _in_processes(feedback, "inside")
 
 
 def _in_processes(make_policy, layout):
@@ -170,7 +170,7 @@ def test_an_agent_with_the_same_seed_acts_alike(make_policy):
 
 
 @POLICIES
-def test_in_processes_of_a_collector(make_policy):
+def test_in_processes_of_a_collector(make_policy, copied_processes):
     policy = make_policy()
     collector = MultiSyncCollector(
         [partial(make_env, make_policy)] * 2, policy, frames_per_batch=24, total_frames=24, cat_results="stack"

@@ -19,48 +19,23 @@ SHARE = 0.25  # of the candidates, any of which may be taken
 
 
 def steps_apart(candidates: Tensor, previous: Tensor) -> Tensor:
-    """Mean square distance to what is left of a chunk, step by step.
-
-    Args:
-        candidates (Tensor): ``[*B, N, H, w]``.
-        previous (Tensor): ``[*B, K, w]``.
-
-    Args:
-        candidates (Tensor): ``[*B, N, H, w]``.
-        previous (Tensor): ``[*B, K, w]``.
-
-    Returns:
-        Tensor: ``[*B, N]``.
-    """
+    """Mean square distances ``[*B, N]`` of ``[*B, N, H, w]`` to what is left of a chunk ``[*B, K, w]``, by step."""
     return (candidates[..., : previous.shape[-2], :] - previous.unsqueeze(-3)).square().mean((-2, -1))
 
 
 def paths_apart(candidates: Tensor, previous: Tensor) -> Tensor:
-    """Mean square distance of the first half of candidates to the nearest states of a plan.
+    """Mean square distances ``[*B, N]`` of the first half of ``[*B, N, H, w]`` to the nearest states of a plan.
 
-    Each state is compared with the nearest one of the plan, at whatever time it was meant: a robot that lags behind
-    its plan goes on with it by going the same way, not by being where the plan is. The second half would reach beyond
-    the end of the plan.
-
-    Args:
-        candidates (Tensor): ``[*B, N, H, w]``.
-        previous (Tensor): ``[*B, L, w]``.
-
-    Returns:
-        Tensor: ``[*B, N]``.
+    Each state is compared with the nearest one of the plan ``[*B, L, w]``, at whatever time it was meant: a robot that
+    lags behind its plan goes on with it by going the same way, not by being where the plan is. The second half would
+    reach beyond the end of the plan.
     """
     first = candidates[..., : (candidates.shape[-2] + 1) // 2, :]
     return torch.cdist(first, previous.unsqueeze(-3)).amin(-1).square().mean(-1)
 
 
 def first_of_nearest(distance: Tensor) -> Tensor:
-    """The first of the nearest quarter.
-
-    Args:
-        distance (Tensor): of every candidate to the current plan ``[*B, N]``.
-
-    Returns:
-        Tensor: its index ``[*B]``.
+    """Index ``[*B]`` of the first of the nearest quarter, by distances to the current plan ``[*B, N]``.
 
     Examples:
         >>> import torch
@@ -81,7 +56,7 @@ def sample_coherent(
     distance: Callable[[Tensor], Tensor] | None = None,
     started: Tensor | None = None,
 ) -> Tensor:
-    """Samples plans (or action chunks) and returns the chosen one of each environment.
+    """Samples plans (or action chunks) and returns the chosen one of each environment, ``[*B, H, w]``.
 
     Args:
         sample (callable): ``sample(history [*B, h, d], noise) -> [*B, H, w]``.
@@ -94,9 +69,6 @@ def sample_coherent(
             is none, and the first candidate is taken.
         started (Tensor, optional): where an episode begins, bool ``[*B]``: the first candidate is taken there too, so
             that the choice of a mode stays the planner's.
-
-    Returns:
-        Tensor: ``[*B, H, w]``.
     """
     plans = sample(history.unsqueeze(-3).expand(*history.shape[:-2], candidates, *history.shape[-2:]), noise)
     if distance is None:

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torchrl.modules import MLP
 
-from torchrl_koap.modules.execution.followers import ActionRule, Follower, blend_plan, command_rest
+from torchrl_koap.modules.execution.followers import Follower, blend_plan, command_rest
 from torchrl_koap.modules.normalizer import Normalizer
 
 FEEDBACK_GAIN = 0.3  # share of the distance to the decoded command that is gone at every step
@@ -68,12 +70,11 @@ class CommandDecoder(nn.Module):
         self.commands, self.actions = list(commands), list(actions)
         self.action_dim = len(self.actions) if action_dim is None else action_dim
         self.features = features
-        inputs = size = state_dim + (0 if features is None else features.num_features)
-        layers: list[nn.Module] = []
-        for _ in range(depth):
-            layers += [nn.Linear(size, width), nn.SiLU()]
-            size = width
-        self.lifting, self.decoder = nn.Sequential(*layers), nn.Linear(size, len(actions))
+        inputs = state_dim + (0 if features is None else features.num_features)
+        self.lifting = MLP(
+            inputs, width, num_cells=[width] * (depth - 1), activation_class=nn.SiLU, activate_last_layer=True
+        )
+        self.decoder = nn.Linear(width, len(actions))
         self.inputs, self.outputs = Normalizer(inputs), Normalizer(len(actions))
 
     @property
@@ -113,8 +114,8 @@ class CommandRegression(Follower):
 
     Keyword Args:
         feedback_gain (float): ``rho``. Defaults to ``0.3``.
-        blend (float): share of the distance to the plan that remains after each frame.
-        action_rule (callable, optional): tells the other entries of the action, such as a gripper's.
+        **options: ``blend`` and ``action_rule``, which tells the other entries of the action, see
+            :class:`~torchrl_koap.modules.Follower`.
 
     Raises:
         ValueError: if the feedback gain is not in [0, 1].
@@ -130,18 +131,11 @@ class CommandRegression(Follower):
 
     knows_command = True
 
-    def __init__(
-        self,
-        decoder: CommandDecoder,
-        *,
-        feedback_gain: float = FEEDBACK_GAIN,
-        blend: float = 0.8,
-        action_rule: ActionRule | None = None,
-    ):
-        super().__init__(decoder)
+    def __init__(self, decoder: CommandDecoder, *, feedback_gain: float = FEEDBACK_GAIN, **options: Any):
+        super().__init__(decoder, **options)
         if not 0 <= feedback_gain <= 1:
             raise ValueError(f"feedback_gain must be in [0, 1], got {feedback_gain}")
-        self.feedback_gain, self.blend, self.action_rule = feedback_gain, blend, action_rule
+        self.feedback_gain = feedback_gain
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
         """The actions of the next steps; arguments as for :class:`Follower`."""

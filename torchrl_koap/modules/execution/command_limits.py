@@ -95,7 +95,19 @@ class CommandLimits(nn.Module):
             Tensor: ``[*B, act]``; what is within the limits keeps its bits, for episodes with contacts turn out
             otherwise for a rounding error.
         """
-        action = self.in_range(action)
+        return self.paced(observations, self.in_range(action))
+
+    def in_range(self, action: Tensor) -> Tensor:
+        """Actions ``[*B, act]`` clipped to their ranges."""
+        if self.ends is None:
+            return action
+        if action.shape[-1] != len(self.ends):
+            raise ValueError(f"ranges of {len(self.ends)} action columns were given, actions have {action.shape[-1]}")
+        low, high = self.ends.to(action.dtype).unbind(-1)
+        return action.clamp(low, high)
+
+    def paced(self, observations: Tensor, action: Tensor) -> Tensor:
+        """Actions ``[*B, act]`` with gain and lead; the other arguments are those of :meth:`forward`."""
         if self.gain != 1:
             factors = torch.ones(action.shape[-1], dtype=action.dtype, device=action.device)
             action = action * factors.index_fill(0, self.actions, self.gain)
@@ -109,12 +121,3 @@ class CommandLimits(nn.Module):
         held = reach.clamp(-self.lead, self.lead)
         action[..., self.actions] = torch.where(held == reach, wanted, held - ahead)
         return action
-
-    def in_range(self, action: Tensor) -> Tensor:
-        """Actions ``[*B, act]`` clipped to their ranges."""
-        if self.ends is None:
-            return action
-        if action.shape[-1] != len(self.ends):
-            raise ValueError(f"ranges of {len(self.ends)} action columns were given, actions have {action.shape[-1]}")
-        low, high = self.ends.to(action.dtype).unbind(-1)
-        return action.clamp(low, high)

@@ -24,20 +24,10 @@ class Execution:
         feedback        a(x_0,P)   a(x_1,P)   a(x_2,P)   a(x_3,P)   a(x_4,P')
         open_loop       a_0(x_0,P) a_1(x_0,P) a_2(x_0,P) a_3(x_0,P) a_0(x_4,P')
 
+    ``"open_loop"`` is the paper's strategy. Gain and lead come after the limits.
+
     Args:
-        strategy (str): ``"feedback"`` decodes at every step from the history observed by then and the current plan,
-            ``"open_loop"`` (the paper) decodes a chunk of actions once per plan; ``"oracle"`` takes, instead of a
-            learned controller, the simulator's own inverse map.
-        replan_interval (int): control steps per plan.
-        blend (float): share of the distance between robot and plan that remains after each step; 0 leaves plans as
-            they are.
-        lead (float): farthest that the command may be ahead of the robot along each axis, in the units of the actions;
-            0 sets no limit.
-        gain (float): factor of actions that are changes of a command: above 1 the robot is quicker than planned.
-        candidates (int): plans (of a Diffusion Policy: action chunks) sampled whenever one is due, of which one that
-            goes on with the current one is taken.
-        limits (float): commands stay in the range of the demonstrated ones, widened on both sides by this share of it;
-            infinity: anywhere. Gain and lead come after it.
+        strategy, ..., limits: the attributes of :class:`ExecutionConfig`, each with a default.
 
     Raises:
         ValueError: for an unknown strategy, or a number out of range.
@@ -73,9 +63,6 @@ class Execution:
 
     def replaced(self, **asked: Any) -> Execution:
         """The same with what was asked for; ``None`` leaves a field as it is.
-
-        Args:
-            **asked: fields by name.
 
         Raises:
             ValueError: for an unknown field, which suggests the nearest, or as for the class.

@@ -56,20 +56,7 @@ class _Controller(nn.Module):
 
 @dataclass(frozen=True)
 class Exportable:
-    """A part of a policy as a plain module, with inputs to trace it by.
-
-    Args:
-        module (nn.Module): takes and returns tensors.
-        inputs (dict): an example of every input, by name.
-        output (str): name of the output.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.execution.export import Exportable
-        >>> part = Exportable(torch.nn.Linear(2, 1), {"states": torch.zeros(1, 2)}, "actions")
-        >>> part.module(*part.inputs.values()).shape
-        torch.Size([1, 1])
-    """
+    """A part of a policy as a plain module on tensors, an example of every input by name, and the output's name."""
 
     module: nn.Module
     inputs: dict[str, Tensor]
@@ -124,11 +111,7 @@ def exportable(policy: PlanningPolicy, part: str = "policy", *, observation_dim:
 
 
 def export_part(what: Exportable, file: str | Path, *, kind: str = "torch", tolerance: float = 1e-5) -> Callable:
-    """Writes a part of a policy and compares what is read back with the original.
-
-    Args:
-        what (Exportable): from :func:`exportable`.
-        file (str or Path): file to write.
+    """Writes a part of a policy, of :func:`exportable`, and compares what is read back with the original.
 
     Keyword Args:
         kind (str): ``"torch"`` (``torch.export``), ``"onnx"`` (ONNX Runtime; extra ``onnx``) or ``"aoti"``
@@ -141,18 +124,14 @@ def export_part(what: Exportable, file: str | Path, *, kind: str = "torch", tole
     Raises:
         ValueError: for another kind.
         ExportError: if a package or compiler is missing, or the numbers differ.
-
-    Examples:
-        See :func:`exportable`; ``export_part(exportable(policy, observation_dim=4), "policy.pt2")``.
     """
     write, read = lookup(_KINDS, kind, "export format")
-    file = Path(file)
-    module = what.module.eval()
-    inputs = tuple(what.inputs.values())
+    file, inputs = Path(file), tuple(what.inputs.values())
+    what.module.eval()
     with torch.no_grad():
-        expected = module(*inputs)
-        write(module, what, file)
-        loaded = read(file, what)
+        expected = what.module(*inputs)
+        write(what, file)
+        loaded = read(what, file)
         found = loaded(*inputs)
     gap = float((found - expected).abs().max() / expected.abs().max().clamp_min(1))
     if not gap <= tolerance:
@@ -160,20 +139,16 @@ def export_part(what: Exportable, file: str | Path, *, kind: str = "torch", tole
     return loaded
 
 
-def _write_torch(module: nn.Module, what: Exportable, file: Path) -> None:
-    torch.export.save(torch.export.export(module, tuple(what.inputs.values())), file)
+def _write_torch(what: Exportable, file: Path) -> None:
+    torch.export.save(torch.export.export(what.module, tuple(what.inputs.values())), file)
 
 
-def _read_torch(file: Path, what: Exportable) -> Callable:
-    return torch.export.load(file).module()
-
-
-def _write_onnx(module: nn.Module, what: Exportable, file: Path) -> None:
+def _write_onnx(what: Exportable, file: Path) -> None:
     for name in ("onnx", "onnxscript", "onnxruntime"):
         if importlib.util.find_spec(name) is None:
             raise ExportError(f"{name} is not installed: pip install 'torchrl_koap[onnx]'")
     program = torch.onnx.export(
-        module,
+        what.module,
         tuple(what.inputs.values()),
         dynamo=True,
         input_names=list(what.inputs),
@@ -183,7 +158,7 @@ def _write_onnx(module: nn.Module, what: Exportable, file: Path) -> None:
     program.save(str(file))
 
 
-def _read_onnx(file: Path, what: Exportable) -> Callable:
+def _read_onnx(what: Exportable, file: Path) -> Callable:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -198,8 +173,8 @@ def _read_onnx(file: Path, what: Exportable) -> Callable:
     return run
 
 
-def _write_aoti(module: nn.Module, what: Exportable, file: Path) -> None:
-    program = torch.export.export(module, tuple(what.inputs.values()))
+def _write_aoti(what: Exportable, file: Path) -> None:
+    program = torch.export.export(what.module, tuple(what.inputs.values()))
     try:
         torch._inductor.aoti_compile_and_package(program, package_path=str(file))
     except Exception as error:  # the compiler is asked in many places
@@ -208,12 +183,8 @@ def _write_aoti(module: nn.Module, what: Exportable, file: Path) -> None:
         raise
 
 
-def _read_aoti(file: Path, what: Exportable) -> Callable:
-    return torch._inductor.aoti_load_package(str(file))
-
-
 _KINDS = {
-    "torch": (_write_torch, _read_torch),
+    "torch": (_write_torch, lambda what, file: torch.export.load(file).module()),
     "onnx": (_write_onnx, _read_onnx),
-    "aoti": (_write_aoti, _read_aoti),
+    "aoti": (_write_aoti, lambda what, file: torch._inductor.aoti_load_package(str(file))),
 }

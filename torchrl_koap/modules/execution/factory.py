@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -44,19 +45,15 @@ def make_policy(
             :class:`~torchrl_koap.modules.CommandDecoder` (:class:`~torchrl_koap.modules.CommandRegression`).
 
     Keyword Args:
-        state_of (callable, or sequence of int): from observations ``[*B, obs]`` to states ``[*B, d]``, or the columns
-            that make up the state.
-        execution (Execution, optional): how plans become actions. Default: ``Execution()``.
+        state_of (callable, or sequence of int): as for :class:`~torchrl_koap.modules.PlanningPolicy`, like
+            ``execution``, ``max_steps`` and ``control_hz``.
         columns (sequence of int, optional): columns of the state that an inverse dynamics reads. Default: all.
-        action_rule (callable, optional): ``action_rule(states [*B, T, d], actions [*B, T, act]) -> actions`` has the
-            last word on the actions of a window, such as a gripper's number, which is read off the planned widths.
+        action_rule (callable, optional): as for :class:`~torchrl_koap.modules.Follower`.
         changes (sequence of int): action columns that are changes of a command; what the gain multiplies.
         commanded (mapping, optional): for each of these the observation column that repeats the command
             (``"commands"``) and the state column that it moves (``"states"``); needed for a lead.
         ranges (sequence, optional): least and greatest demonstrated number of every action column, None for one that
             may be any; ``execution.limits`` widens them. Default: actions may be any.
-        max_steps (int): steps of an episode.
-        control_hz (float, optional): frames per second of the data. Default: not known.
         follower (Follower, optional): follows plans in place of the controller, such as the oracle.
 
     Returns:
@@ -78,10 +75,7 @@ def make_policy(
     if follower is None and controller is not None:
         follower = _follow(planner, controller, execution, columns, action_rule)
     limits, margin = None, execution.limits
-    if ranges is not None and margin < math.inf:
-        ranges = [None if r is None else (r[0] - margin * (r[1] - r[0]), r[1] + margin * (r[1] - r[0])) for r in ranges]
-    else:
-        ranges = None
+    ranges = None if ranges is None or margin == math.inf else [_widened(r, margin) for r in ranges]
     if execution.gain != 1 or execution.lead or ranges is not None:
         own = {} if commanded is None else commanded
         limits = CommandLimits(
@@ -105,6 +99,13 @@ def make_policy(
     return policy.eval()
 
 
+def _widened(ends: Sequence[float] | None, margin: float) -> tuple[float, float] | None:
+    if ends is None:
+        return None
+    low, high = ends
+    return low - margin * (high - low), high + margin * (high - low)
+
+
 def _follow(
     planner: nn.Module,
     controller: nn.Module,
@@ -112,9 +113,10 @@ def _follow(
     columns: Sequence[int] | None,
     action_rule: ActionRule | None,
 ) -> Follower:
+    options: dict[str, Any] = {"blend": execution.blend, "action_rule": action_rule}
     if isinstance(controller, ResponseModel):
         look_ahead = planner.horizon - execution.replan_interval + 1  # what every plan tells at its last step
-        return MPC(controller, look_ahead=look_ahead, blend=execution.blend, action_rule=action_rule)
+        return MPC(controller, look_ahead=look_ahead, **options)
     if isinstance(controller, CommandDecoder):
-        return CommandRegression(controller, blend=execution.blend, action_rule=action_rule)
-    return InverseDynamicsFollower(controller, blend=execution.blend, columns=columns, action_rule=action_rule)
+        return CommandRegression(controller, **options)
+    return InverseDynamicsFollower(controller, columns=columns, **options)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -23,6 +24,9 @@ class Follower(nn.Module):
 
     Keyword Args:
         num_frames (int): observed frames that it reads, the present one included.
+        blend (float): share of the distance to the plan that remains after each frame (:func:`blend_plan`).
+        action_rule (callable, optional): ``action_rule(states [*B, T, d], actions [*B, T, act]) -> actions`` has the
+            last word on the actions of a window, such as a gripper's number; ``task.action_rule``.
 
     Attributes:
         knows_command (bool): it reads the last command. It then looks at every step, and its actions take no gain.
@@ -39,9 +43,17 @@ class Follower(nn.Module):
 
     knows_command = False
 
-    def __init__(self, controller: nn.Module | None = None, *, num_frames: int = 1):
+    def __init__(
+        self,
+        controller: nn.Module | None = None,
+        *,
+        num_frames: int = 1,
+        blend: float = 0.8,
+        action_rule: ActionRule | None = None,
+    ):
         super().__init__()
         self.controller, self.num_frames = controller, num_frames
+        self.blend, self.action_rule = blend, action_rule
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
         """The actions of the next steps.
@@ -72,10 +84,8 @@ class InverseDynamicsFollower(Follower):
             and writes actions ``[*B, T, act]``.
 
     Keyword Args:
-        blend (float): share of the distance to the plan that remains after each frame.
         columns (sequence of int, optional): columns of the state that the controller reads. Default: all.
-        action_rule (callable, optional): ``action_rule(states [*B, T, d], actions [*B, T, act]) -> actions`` has the
-            last word on the actions of a window, such as ``task.action_rule``.
+        **options: ``blend`` and ``action_rule``, see :class:`Follower`.
 
     Examples:
         >>> import torch
@@ -85,16 +95,8 @@ class InverseDynamicsFollower(Follower):
         torch.Size([3, 1, 2])
     """
 
-    def __init__(
-        self,
-        controller: InverseDynamics,
-        *,
-        blend: float = 0.8,
-        columns: Sequence[int] | None = None,
-        action_rule: ActionRule | None = None,
-    ):
-        super().__init__(controller, num_frames=controller.num_past + 1)
-        self.blend, self.action_rule = blend, action_rule
+    def __init__(self, controller: InverseDynamics, *, columns: Sequence[int] | None = None, **options: Any):
+        super().__init__(controller, num_frames=controller.num_past + 1, **options)
         self.register_buffer("columns", None if columns is None else torch.as_tensor(columns), persistent=False)
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
@@ -113,12 +115,7 @@ class InverseDynamicsFollower(Follower):
 def command_rest(action_rule: ActionRule | None, states: Tensor, plan: Tensor, width: int, steps: int) -> Tensor:
     """Actions ``[*B, steps, width]`` that a rule alone tells from observed and planned states; zero where it does not.
 
-    Args:
-        action_rule (callable, optional): as for :class:`InverseDynamicsFollower`.
-        states (Tensor): observed states ``[*B, history, d]``.
-        plan (Tensor): planned states ``[*B, H, d]``.
-        width (int): action entries.
-        steps (int): number of actions.
+    The other arguments are those of :class:`Follower`.
     """
     if action_rule is None:
         return plan.new_zeros(*plan.shape[:-2], steps, width)
@@ -127,14 +124,7 @@ def command_rest(action_rule: ActionRule | None, states: Tensor, plan: Tensor, w
 
 
 def remaining_plan(plan: Tensor, age: Tensor | int) -> Tensor:
-    """What is left of plans, their last state repeated.
-
-    Args:
-        plan (Tensor): ``[*B, H, w]``.
-        age (Tensor or int): steps since they were made ``[*B]``.
-
-    Returns:
-        Tensor: ``[*B, H, w]``.
+    """What is left of plans ``[*B, H, w]`` that were made ``age [*B]`` steps ago, their last state repeated.
 
     Examples:
         >>> import torch

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
-from torchrl_koap.modules.execution.followers import ActionRule, Follower, blend_plan, command_rest
+from torchrl_koap.modules.execution.followers import Follower, blend_plan, command_rest
 from torchrl_koap.modules.execution.response_model import ResponseModel
 
 SMOOTHNESS = 3.0  # weight of a change of the commanded velocity against a distance from the plan
@@ -33,10 +35,10 @@ class MPC(Follower):
 
     Keyword Args:
         look_ahead (int): ``N``, planned states that are looked at.
-        blend (float): share of the distance to the plan that remains after each frame.
-        action_rule (callable, optional): tells the action entries that the response does not know, such as a gripper's.
         smoothness (float): ``lambda``.
         end_speed (float): ``gamma``.
+        **options: ``blend`` and ``action_rule``, which tells the entries that the response does not know, see
+            :class:`~torchrl_koap.modules.Follower`.
 
     Raises:
         ValueError: for a look-ahead below 2, or weights out of range.
@@ -57,27 +59,38 @@ class MPC(Follower):
         response: ResponseModel,
         *,
         look_ahead: int,
-        blend: float = 0.8,
-        action_rule: ActionRule | None = None,
         smoothness: float = SMOOTHNESS,
         end_speed: float = END_SPEED,
+        **options: Any,
     ):
-        super().__init__(response, num_frames=response.history)
+        super().__init__(response, num_frames=response.history, **options)
         if look_ahead < 2:
             raise ValueError(f"look_ahead must be at least 2, got {look_ahead}")
         if smoothness <= 0 or end_speed < 0:
             raise ValueError(f"smoothness must be > 0 and end_speed >= 0, got {smoothness} and {end_speed}")
-        self.look_ahead, self.blend, self.action_rule = look_ahead, blend, action_rule
-        self.smoothness, self.end_speed = smoothness, end_speed
-        follow, keep = tracking_gains(response, look_ahead, smoothness, end_speed)
-        self.register_buffer("follow_gain", follow, persistent=False)
-        self.register_buffer("keep_gain", keep, persistent=False)
+        self.look_ahead, self.smoothness, self.end_speed = look_ahead, smoothness, end_speed
+        for name in ("follow_gain", "keep_gain"):
+            self.register_buffer(name, None, persistent=False)
+        self.refresh()
         self.register_load_state_dict_post_hook(lambda self, _: self.refresh())
 
     def refresh(self) -> None:
-        """Computes the gains anew, for a response that was fitted again; loading weights does so by itself."""
-        gains = tracking_gains(self.controller, self.look_ahead, self.smoothness, self.end_speed)
-        self.follow_gain, self.keep_gain = gains
+        """Solves the quadratic problem once for all plans, anew for another response; loading weights does so too.
+
+        The gain of the distance from the plan if the command is held is ``[(N - 1) J, N J]``, that of the last change
+        of the command ``[(N - 1) J, J]``; both float64.
+        """
+        axes, steps = self.controller.num_axes, self.look_ahead
+        effect = self.controller.impulse_matrix(steps).reshape(steps * axes, (steps - 1) * axes)
+        own = torch.eye(axes).to(effect)
+        end = self.end_speed * torch.cat([-own, own], 1)
+        measured = torch.eye(steps * axes).to(effect)
+        measured = torch.cat([measured, torch.cat([end.new_zeros(axes, (steps - 2) * axes), end], 1)])
+        effect = measured @ effect
+        rough = torch.eye(steps - 1) - torch.diag(torch.ones(steps - 2), -1)
+        rough = torch.kron(rough.to(effect), own)
+        inverse = torch.linalg.inv(effect.T @ effect + self.smoothness * rough.T @ rough)
+        self.follow_gain, self.keep_gain = inverse @ effect.T @ measured, self.smoothness * inverse[:, :axes]
 
     def forward(self, observations: Tensor, states: Tensor, plan: Tensor, steps: int = 1) -> Tensor:
         """The actions of the next steps, as if the robot answered as predicted; beyond the look-ahead it is held."""
@@ -91,15 +104,9 @@ class MPC(Follower):
         return actions
 
     def track(self, observations: Tensor, states: Tensor, plan: Tensor) -> Tensor:
-        """The next actions of the entries that the response knows.
+        """The next actions ``[*B, look_ahead - 1, J]`` of the entries that the response knows.
 
-        Args:
-            observations (Tensor): ``[*B, history, obs]``, raw units.
-            states (Tensor): their states ``[*B, history, d]``.
-            plan (Tensor): planned states ``[*B, H, d]``, the next one first.
-
-        Returns:
-            Tensor: ``[*B, look_ahead - 1, J]``, changes of the command, or commands where actions are absolute.
+        They are changes of the command, or commands where actions are absolute; arguments as for :class:`Follower`.
         """
         model = self.controller
         positions, goal = states[..., model.states], plan[..., model.states]
@@ -113,29 +120,3 @@ class MPC(Follower):
         future = missing @ self.follow_gain.to(goal).T + changes[..., -1, :] @ self.keep_gain.to(goal).T
         future = future.unflatten(-1, (self.look_ahead - 1, model.num_axes))
         return command.unsqueeze(-2) + future.cumsum(-2) if model.absolute else future
-
-
-def tracking_gains(response: ResponseModel, steps: int, smoothness: float, end_speed: float) -> tuple[Tensor, Tensor]:
-    """Solves the quadratic problem of :class:`MPC` once for all plans.
-
-    Args:
-        response (ResponseModel): the robot's response.
-        steps (int): ``N``.
-        smoothness (float): ``lambda``.
-        end_speed (float): ``gamma``.
-
-    Returns:
-        tuple: gain of the distance from the plan if the command is held ``[(N - 1) J, N J]``, and of the last change of
-        the command ``[(N - 1) J, J]``; float64.
-    """
-    axes = response.num_axes
-    effect = response.impulse_matrix(steps).reshape(steps * axes, (steps - 1) * axes)
-    own = torch.eye(axes).to(effect)
-    measured = torch.eye(steps * axes).to(effect)
-    end = end_speed * torch.cat([-own, own], 1)
-    measured = torch.cat([measured, torch.cat([end.new_zeros(axes, (steps - 2) * axes), end], 1)])
-    effect = measured @ effect
-    rough = torch.eye(steps - 1) - torch.diag(torch.ones(steps - 2), -1)
-    rough = torch.kron(rough.to(effect), own)
-    inverse = torch.linalg.inv(effect.T @ effect + smoothness * rough.T @ rough)
-    return inverse @ effect.T @ measured, smoothness * inverse[:, :axes]

@@ -53,6 +53,11 @@ class NoiseStreams:
         self._left -= 1
         return self._draws[:, self.block - 1 - self._left]
 
+    def write(self, tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
+        """Writes the noise of the next step, a stream for every element of the batch."""
+        noise = self.draw().reshape(*tensordict.batch_size, *self.shape)
+        return tensordict.set(key, noise.to(tensordict.device or noise.device))
+
 
 class StartNoise(TensorDictModuleBase):
     """Writes the noise of the next step, in front of a policy.
@@ -77,8 +82,7 @@ class StartNoise(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the noise."""
-        noise = self.streams.draw().reshape(*tensordict.batch_size, *self.streams.shape)
-        return tensordict.set(self.out_keys[0], noise.to(tensordict.device or noise.device))
+        return self.streams.write(tensordict, self.out_keys[0])
 
 
 class NoiseTransform(Transform):
@@ -88,25 +92,17 @@ class NoiseTransform(Transform):
     transform too.
 
     Args:
-        shape (sequence of int): shape of one draw, ``policy.noise_shape``.
+        shape (sequence of int): as for :class:`NoiseStreams`.
 
     Keyword Args:
-        seed (int): seed until :meth:`set_seed`.
-        block (int): steps that are drawn at once, ``policy.max_steps``.
+        block (int): as for :class:`NoiseStreams`.
         noise_key (NestedKey): entry that is written, ``planner.noise_key``. Defaults to ``"noise"``.
-
-    Examples:
-        >>> from torchrl_koap.modules.execution.noise import NoiseTransform
-        >>> noise = NoiseTransform((14, 2), seed=3, block=100)
-        >>> noise.set_seed(4)
-        >>> noise.seed
-        4
     """
 
-    def __init__(self, shape: Sequence[int], *, seed: int = 0, block: int, noise_key: NestedKey = NOISE):
+    def __init__(self, shape: Sequence[int], *, block: int, noise_key: NestedKey = NOISE):
         super().__init__(in_keys=[], out_keys=[noise_key])
         self.shape, self.block = tuple(shape), block
-        self.set_seed(seed)
+        self.set_seed(0)
 
     def set_seed(self, seed: int) -> None:
         """Begins all streams anew."""
@@ -114,12 +110,10 @@ class NoiseTransform(Transform):
         self._streams = NoiseStreams([], self.shape, block=self.block)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        batch = next_tensordict.batch_size
-        if len(self._streams) != batch.numel():
-            seeds = range(self.seed, self.seed + batch.numel())
-            self._streams = NoiseStreams(seeds, self.shape, block=self.block)
-        noise = self._streams.draw().reshape(*batch, *self.shape)
-        return next_tensordict.set(self.out_keys[0], noise.to(next_tensordict.device or noise.device))
+        count = next_tensordict.batch_size.numel()
+        if len(self._streams) != count:
+            self._streams = NoiseStreams(range(self.seed, self.seed + count), self.shape, block=self.block)
+        return self._streams.write(next_tensordict, self.out_keys[0])
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)

@@ -19,11 +19,11 @@ from torchrl_koap.modules.execution.candidates import paths_apart, sample_cohere
 from torchrl_koap.modules.execution.command_limits import CommandLimits
 from torchrl_koap.modules.execution.execution import Execution
 from torchrl_koap.modules.execution.followers import Follower, remaining_plan
+from torchrl_koap.modules.planning.diffusion_policy import ACTION_CHUNK
 
 OBSERVATION_HISTORY = "observation_history"
 IS_INIT = "is_init"
 PLANNED_STATE = "planned_state"
-ACTION_CHUNK = "action_chunk"
 
 
 class PlanningPolicy(TensorDictModuleBase):
@@ -160,42 +160,40 @@ class PlanningPolicy(TensorDictModuleBase):
         return self.follower(observations, states, chunk, self.execution.replan_interval)
 
     def act(self, observations: Tensor, plan: Tensor, age: Tensor | int) -> Tensor:
-        """The action of a step, command limits included.
+        """The action ``[*B, act]`` of a step, command limits included.
 
         Args:
             observations (Tensor): ``[*B, history, obs]``, raw units.
             plan (Tensor): of :meth:`plan`.
             age (Tensor or int): steps since it was made ``[*B]``.
-
-        Returns:
-            Tensor: ``[*B, act]``, raw units.
         """
         left = remaining_plan(plan, age)
         if self._decodes:
             left = self.follower(observations, self.state_of(observations), left)
         action = left[..., 0, :]
-        if self.limits is not None:
-            outside = (self.limits.in_range(action) != action).any(-1)
-            self.limited += torch.stack([outside.sum(), torch.ones_like(outside).sum()])
-        return self._limited(observations, action)
+        if self.limits is None:
+            return action
+        held = self.limits.in_range(action)
+        outside = (held != action).any(-1)
+        self.limited += torch.stack([outside.sum(), torch.ones_like(outside).sum()])
+        return self.limits.paced(observations, held)
 
     def decode_ahead(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Plans and decodes the actions of the next steps at once: stateless and without branches on data.
+        """Plans and decodes the actions ``[*B, replan_interval, act]`` of the next steps at once.
 
-        This is what is exported: whoever calls it keeps the last observations and counts steps.
+        This is what is exported, stateless and without branches on data: whoever calls it keeps the last observations
+        and counts steps. Actions are as if the robot moved as it is commanded.
 
         Args:
             observations (Tensor): ``[*B, history, obs]``, raw units.
             noise (Tensor): ``[*B, *planner.noise_shape]``, standard normal.
-
-        Returns:
-            Tensor: ``[*B, replan_interval, act]``, as if the robot moved as it is commanded.
         """
         states, steps = self.state_of(observations), self.execution.replan_interval
         actions = self.planner.sample(states[..., -self.planner.history :, :], noise)
         if self.follower is not None:
             actions = self.follower(observations, states, actions, steps)
-        return self._limited(observations.unsqueeze(-3), actions[..., :steps, :])
+        actions = actions[..., :steps, :]
+        return actions if self.limits is None else self.limits(observations.unsqueeze(-3), actions)
 
     def attach(self, env: EnvBase) -> None:
         """Tells the follower the batch of environments whose episodes are about to begin."""
@@ -238,9 +236,6 @@ class PlanningPolicy(TensorDictModuleBase):
         observed, plan = tensordict.get(self.in_keys[0]), tensordict.get(self.out_keys[1])
         age = tensordict.get(self.receding.counter_key).squeeze(-1).long() - 1
         return tensordict.set(self.out_keys[0], self.act(observed, plan, age))
-
-    def _limited(self, observations: Tensor, action: Tensor) -> Tensor:
-        return action if self.limits is None else self.limits(observations, action)
 
     def _distance_from(self, previous: Tensor) -> Callable[[Tensor], Tensor] | None:
         """How far candidates ``[*B, N, H, w]`` are from the plan of before, every column in units of its spread."""

@@ -81,15 +81,12 @@ class ResponseModel(nn.Module):
         return self.memory + 1
 
     def coordinates(self, positions: Tensor, lead: Tensor, changes: Tensor) -> Tensor:
-        """What the next step is linear in.
+        """What the next step is linear in, ``[*B, J, 2 memory + 1]``.
 
         Args:
             positions (Tensor): measured ``[*B, memory + 1, J]``, the present one last.
             lead (Tensor): distance from the present position to the command ``[*B, J]``.
             changes (Tensor): of the command ``[*B, memory, J]``, the latest last.
-
-        Returns:
-            Tensor: ``[*B, J, 2 memory + 1]``.
         """
         steps = positions.diff(dim=-2).flip(-2).movedim(-2, -1)
         return torch.cat([steps, lead.unsqueeze(-1), changes.flip(-2).movedim(-2, -1)], -1)
@@ -97,7 +94,7 @@ class ResponseModel(nn.Module):
     def predict(
         self, positions: Tensor, command: Tensor, changes: Tensor, future: Tensor, *, weight: Tensor | None = None
     ) -> Tensor:
-        """Positions under given changes of the command.
+        """The next N positions ``[*B, N, J]`` under given changes of the command.
 
         Args:
             positions (Tensor): measured ``[*B, memory + 1, J]``, the present one last.
@@ -107,9 +104,6 @@ class ResponseModel(nn.Module):
 
         Keyword Args:
             weight (Tensor, optional): coefficients ``[J, J, 2 memory + 1]`` to predict with. Default: its own.
-
-        Returns:
-            Tensor: ``[*B, N, J]``, the next N positions.
         """
         weight, predicted = (self.weight if weight is None else weight).to(positions.dtype), []
         for change in future.unbind(-2):
@@ -121,10 +115,7 @@ class ResponseModel(nn.Module):
         return torch.stack(predicted, -2)
 
     def impulse_matrix(self, steps: int) -> Tensor:
-        """Effect of every future change of the command on every future position.
-
-        Args:
-            steps (int): ``N``.
+        """Effect of every future change of the command on the next ``N = steps`` positions.
 
         Returns:
             Tensor: float64 ``[N, J, N - 1, J]``: of the change in step ``k`` of axis ``j`` (last two) on the positions.
