@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The training loop: what one update is, what is logged, and that an interrupted run ends like an uninterrupted one."""
+"""The training loop: what one update is, what is logged, resuming bit for bit, and gradients that are outliers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,15 @@ from torchrl_koap.modules import MLPDenoiser, NoiseSchedule, StatePlanner, make_
 from torchrl_koap.objectives import KOAPLoss, PlannerLoss
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import CheckpointError, load_tensors
-from torchrl_koap.training.loop import DivergedError, phase_finished, train_phase, warmup_cosine
+from torchrl_koap.training import loop as loop_file
+from torchrl_koap.training.loop import (
+    SETTLED,
+    DivergedError,
+    limit_outlier,
+    phase_finished,
+    train_phase,
+    warmup_cosine,
+)
 
 
 class Interrupt(KeyboardInterrupt):
@@ -265,3 +273,81 @@ def test_ctrl_c_within_a_loss_is_ctrl_c(make):
         train_phase("x", loss, lambda: windows, num_steps=1, learning_rate=1e-3)
     for key, value in loss.state_dict().items():
         torch.testing.assert_close(value, before[key], equal_nan=True)
+
+
+# ---- gradients far longer than those before
+
+
+class Regression(nn.Module):
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(0)
+        self.net = nn.Sequential(nn.Linear(4, 32), nn.SiLU(), nn.Linear(32, 2))
+
+    def forward(self, td):
+        return TensorDict({"loss_fit": (self.net(td["x"]) - td["y"]).square().mean()}, [])
+
+
+def batches(poison_at=None, seen=0):
+    """Batches of a smooth function; one of them is a thousand times too large."""
+    number = seen
+
+    def sample():
+        nonlocal number
+        number += 1
+        x = torch.randn(32, 4, generator=torch.Generator().manual_seed(number))
+        y = torch.stack([x.sum(-1).sin(), x[:, 0] * x[:, 1]], -1)
+        return TensorDict({"x": x, "y": y * (1000.0 if number == poison_at else 1.0)}, [32])
+
+    return sample
+
+
+def trained(sample, updates=600, **options):
+    module = Regression()
+    train_phase("planner", module, sample, num_steps=updates, learning_rate=1e-2, **options)
+    return module
+
+
+def error(module):
+    with torch.no_grad():
+        return module(batches()()).get("loss_fit").item()
+
+
+def test_a_single_batch_does_not_undo_a_training(monkeypatch):
+    spoiled, untouched = trained(batches(poison_at=400), 410, decay=False), trained(batches(), 410, decay=False)
+    assert error(spoiled) < 1.5 * error(untouched)
+    monkeypatch.setattr(loop_file, "limit_outlier", lambda optimizer: None)
+    assert error(trained(batches(poison_at=400), 410, decay=False)) > 2 * error(untouched)
+
+
+def test_ordinary_batches_leave_the_same_bits(monkeypatch):
+    weights = trained(batches()).state_dict()
+    monkeypatch.setattr(loop_file, "limit_outlier", lambda optimizer: None)
+    for name, value in trained(batches()).state_dict().items():
+        assert torch.equal(value, weights[name])
+
+
+def test_a_resumed_training_limits_the_same(tmp_path):
+    whole = trained(batches(poison_at=350), 400)
+
+    run = RunDirectory(tmp_path)
+    options = {"run": run, "checkpoint_every": 170}
+    with pytest.raises(Interrupt):
+        trained(batches(poison_at=350), 400, progress=interrupt_at(341), **options)
+    resumed = trained(batches(poison_at=350, seen=340), 400, resume=True, **options)
+    for name, value in resumed.state_dict().items():
+        assert torch.equal(value, whole.state_dict()[name])
+
+
+def test_it_waits_until_there_is_something_to_compare_with():
+    x = nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.AdamW([x], lr=1e-3)
+    for update in range(SETTLED):
+        x.grad = torch.ones(1)
+        assert limit_outlier(optimizer) is None, update
+        optimizer.step()
+    x.grad = torch.zeros(1)
+    assert limit_outlier(optimizer).item() == 1.0
+    x.grad = torch.full((1,), torch.nan)
+    limit_outlier(optimizer)
+    assert x.grad.isnan().all()  # the loop tells of it

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Fitting the response on labelled steps: known systems are found, hidden labels are not read."""
+"""Fitting the response on labelled steps: known systems are found, hidden labels are not read, predictions count."""
 
 import math
 
@@ -10,7 +10,15 @@ from tensordict import TensorDict
 
 from torchrl_koap.modules import ResponseModel
 from torchrl_koap.tasks import Action, Task, get_task
-from torchrl_koap.training.response import fit_response, labelled_steps, tracked_columns
+from torchrl_koap.training import response as response_fit
+from torchrl_koap.training.response import (
+    Stretches,
+    fit_predictions,
+    fit_response,
+    labelled_steps,
+    prediction_errors,
+    tracked_columns,
+)
 
 
 def columns(**options) -> ResponseModel:
@@ -27,7 +35,7 @@ def a_system() -> ResponseModel:
     return system.double()
 
 
-def recordings(episodes: int = 6, length: int = 60) -> TensorDict:
+def recordings(episodes: int = 6, length: int = 60, noise: float = 0.0) -> TensorDict:
     """Fully labelled flat data of the system, each episode at a place of its own: observation is command, position."""
     torch.manual_seed(0)
     parts = []
@@ -37,6 +45,7 @@ def recordings(episodes: int = 6, length: int = 60) -> TensorDict:
         moved = a_system().predict(start.expand(3, 2), start, torch.zeros(2, 2, dtype=torch.float64), action)
         position = torch.cat([start.unsqueeze(0), moved[:-1]])
         command = torch.cat([start.unsqueeze(0), start + action[:-1].cumsum(0)])
+        position = position + noise * torch.randn(length, 2, dtype=torch.float64) if noise else position
         parts.append(
             TensorDict(
                 {
@@ -128,3 +137,80 @@ def test_a_task_without_commands_is_refused_before_any_work():
     )
     with pytest.raises(ValueError, match=r"task 'arm' .* repeats the last command \(Task.command\)"):
         controller_of("mpc", task=task)
+
+
+# ---- the fit of predictions over many steps
+
+
+def stretches(count: int = 40, steps: int = 12, *, offset: float = 0.0, known: bool = True) -> Stretches:
+    """Answers of the system to random commands; the commands that are told are off by a constant per stretch."""
+    torch.manual_seed(0)
+    position = torch.randn(count, 3, 2, dtype=torch.float64).cumsum(1) * 0.01
+    command = position[:, -1] + 0.02 * torch.randn(count, 2, dtype=torch.float64)
+    changes, future = 0.01 * torch.randn(count, 2, 2, dtype=torch.float64), torch.randn(count, steps, 2).double() * 0.01
+    measured = a_system().predict(position, command, changes, future)
+    told = command + offset * torch.randn(count, 2, dtype=torch.float64)
+    return Stretches(position, told, changes, future, measured, torch.full((count,), known))
+
+
+def test_the_system_itself_makes_no_error():
+    assert prediction_errors(a_system(), stretches()).abs().max() < 1e-12
+
+
+def test_a_constant_is_forgiven_where_the_command_is_unknown_and_nowhere_else():
+    unknown, known = stretches(offset=0.1, known=False), stretches(offset=0.1)
+    assert prediction_errors(a_system(), unknown).abs().max() < 1e-12
+    assert prediction_errors(a_system(), known).abs().max() > 1e-2
+    mixed = unknown._replace(known=torch.arange(40) % 2 == 0)
+    error = prediction_errors(a_system(), mixed).abs().amax((1, 2))
+    assert error[1::2].max() < 1e-12 and error[::2].min() > 1e-4
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_coefficients_that_are_off_are_found_from_predictions(known):
+    response, data = columns().double(), stretches(offset=0.0 if known else 0.1, known=known)
+    response.weight.copy_(a_system().weight * 0.8)
+    before = prediction_errors(response, data).square().mean()
+    fit_predictions(response, data, coupled=True)
+    assert prediction_errors(response, data).square().mean() < 0.01 * before
+
+
+def test_axes_that_are_not_coupled_stay_so():
+    response = columns().double()
+    response.weight.copy_(a_system().weight * 0.8)
+    fit_predictions(response, stretches(), coupled=False)
+    assert response.weight[0, 1].abs().max() == 0 and response.weight[1, 0].abs().max() == 0
+    assert not torch.equal(response.weight, a_system().weight * 0.8)
+
+
+def test_without_a_stretch_nothing_changes():
+    response = columns().double()
+    response.weight.copy_(a_system().weight)
+    fit_predictions(response, stretches().take(torch.zeros(0, dtype=torch.long)), coupled=True)
+    assert torch.equal(response.weight, a_system().weight)
+
+
+def test_of_many_stretches_some_are_taken(monkeypatch):
+    seen, errors = [], prediction_errors
+
+    def counted(response, data, weight):
+        seen.append(len(data.known))
+        return errors(response, data, weight)
+
+    monkeypatch.setattr(response_fit, "MOST", 7)
+    monkeypatch.setattr(response_fit, "prediction_errors", counted)
+    fit_predictions(columns().double(), stretches(), coupled=True)
+    assert set(seen) == {7}
+
+
+def test_a_model_that_single_steps_get_wrong_is_put_right(monkeypatch):
+    """A sensor that errs by a little makes a regression of single steps forget momentum; predictions do not."""
+    data, answers = recordings(episodes=8, noise=0.003), []
+    for many in (True, False):
+        response = columns().double()
+        if not many:
+            monkeypatch.setattr(response_fit, "fit_predictions", lambda *_, **__: None)
+        found = fit_response(response, data)
+        assert math.isfinite(found["held_out_error"])
+        answers.append((response.impulse_matrix(12) - a_system().impulse_matrix(12)).square().mean().sqrt())
+    assert answers[0] < 0.5 * answers[1]
