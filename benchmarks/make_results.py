@@ -1,11 +1,12 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Writes docs/results/*.md, the results of the README and their pictures from committed figures.
+"""Writes docs/results, docs/appendix, docs/reference/versions.md, the results of the README and their pictures.
 
     python benchmarks/make_results.py           # write
     python benchmarks/make_results.py --check   # compare with what is committed, exit 1 if it differs
 
-Figures are in ``benchmarks/results/*.csv``; the text of each page is a template beside them and holds no number.
-Intervals are computed from n and successes.
+Figures are in ``benchmarks/results/*.csv``; the text of each page is a template beside them. Pages of docs/results
+extend ``page.jinja``, which says what each one has. A number of a template must be one of the CSV files that its page
+links (tests/docs/test_results_form.py). Intervals are computed from n and successes.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import page_rows
 import paper_rows
 import pictures
+import result_pictures
 import scooping_rows
 import tables
 import tyro
@@ -23,6 +26,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = "<!-- results: made by benchmarks/make_results.py -->", "<!-- end of results -->"
+ORPHAN = "---\norphan: true\n---\n\n"  # pages outside of the navigation
 
 
 def pages() -> dict[Path, str]:
@@ -30,18 +34,19 @@ def pages() -> dict[Path, str]:
     environment = Environment(
         loader=FileSystemLoader(tables.SOURCE), undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
-    for module in (tables, paper_rows, unlabelled_rows, scooping_rows):
+    for module in (tables, paper_rows, unlabelled_rows, scooping_rows, page_rows):
         environment.globals.update(vars(module))
     made = {}
-    for template in sorted(tables.SOURCE.glob("*.md.jinja")):
+    for template in sorted(tables.SOURCE.rglob("*.md.jinja")):
         name = template.name.removesuffix(".jinja")
-        text = environment.get_template(template.name).render()
+        text = environment.get_template(str(template.relative_to(tables.SOURCE))).render()
         if name == "readme.md":
             whole = (ROOT / "README.md").read_text(encoding="utf-8")
             before, rest = whole.split(BEGIN)
             made[Path("README.md")] = f"{before}{BEGIN}\n{text.strip()}\n{END}{rest.split(END)[1]}"
         else:
-            made[Path("docs") / "results" / name] = text
+            folder = "results" if template.parent == tables.SOURCE else template.parent.name
+            made[Path("docs") / folder / name] = ORPHAN * (folder == "appendix") + text
     return made
 
 
@@ -62,7 +67,8 @@ def main(*, check: bool = False) -> int:
     if check:
         print("\n".join(f"{path} is not what the figures give" for path in stale) or "every page is up to date")
         return int(bool(stale))
-    drawn = pictures.draw_all(ROOT / "docs" / "pictures")
+    folder = ROOT / "docs" / "pictures"
+    drawn = [*pictures.draw_all(folder), *result_pictures.draw_result_pictures(folder)]
     print("\n".join(f"wrote {path}" for path in [*stale, *(path.relative_to(ROOT) for path in drawn)]))
     return 0
 

@@ -124,6 +124,9 @@ def measure(options: argparse.Namespace, seed: int, folder: Path) -> dict[str, A
     away = drive(run, seed)
     return {
         "seed": seed,
+        "demonstrations": DEMONSTRATIONS,
+        "labelled": LABELLED,
+        "joints": JOINTS,
         "forecast": "yes" if options.forecast else "no",
         "updates": options.steps,
         "train_seconds": f"{sum(summary['train_seconds'].values()):.0f}",

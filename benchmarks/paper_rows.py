@@ -16,7 +16,6 @@ from torchrl_koap.studies.paper import (
     DEFAULT,
     Entry,
     above_the_paper,
-    average_over_tasks,
     default_entries,
     draw_average,
     layout_rows,
@@ -30,12 +29,12 @@ _PLURAL = {"window": "windows", "trajectory": "trajectories"}
 CELLS = SOURCE / "cells"  # of whole comparisons, as `koap bench` writes them
 
 
-def _done(name: str) -> list[dict[str, Any]]:
+def finished_cells(name: str) -> list[dict[str, Any]]:
     """The finished cells of a comparison."""
     return [row for row in read_cells(CELLS / f"{name}.csv") if row["status"] == "done"]
 
 
-def _entries(name: str) -> list[Entry]:
+def paper_cells_beside(name: str) -> list[Entry]:
     """The cells of a comparison beside the paper's, those that were not run included."""
     return paper_entries(read_cells(CELLS / f"{name}.csv"))
 
@@ -56,7 +55,9 @@ def bench_table(name: str, beside: str = "", methods: Sequence[str] = ()) -> str
     """
     rows = read_cells(CELLS / f"{name}.csv")
     places = {_place(row) for row in rows}
-    others = [row for row in _done(beside) if row["method"] in methods and _place(row) in places] if beside else []
+    others = (
+        [row for row in finished_cells(beside) if row["method"] in methods and _place(row) in places] if beside else []
+    )
     return as_markdown(layout_rows(paper_entries([*others, *rows])))
 
 
@@ -70,7 +71,7 @@ def observation_table(name: str) -> str:
     Args:
         name (str): file of cells without its ending.
     """
-    found = _by_observations(name)
+    found = count_by_observations(name)
     methods = list(dict.fromkeys(method for own in found.values() for method in own))
     body = [
         [share(part), *(percent(own[method]) if method in own else "not run" for method in methods)]
@@ -79,10 +80,10 @@ def observation_table(name: str) -> str:
     return table(["demonstrations", *(f"`{method}`" for method in methods)], body)
 
 
-def _by_observations(name: str) -> dict[float, dict[str, Counter[str]]]:
+def count_by_observations(name: str) -> dict[float, dict[str, Counter[str]]]:
     """Successes and rollouts of all seeds, by share of the trajectories and method."""
     found: dict[float, dict[str, Counter[str]]] = {}
-    for row in _done(name):
+    for row in finished_cells(name):
         counts = found.setdefault(row["demonstrations"], {}).setdefault(row["method"], Counter())
         counts.update(successes=row["successes"], n=row["episodes"])
     return found
@@ -92,7 +93,7 @@ def bench_entropy(name: str, method: str, observations: float) -> str:
     """Mean entropy of the modes over the seeds of a method with a share of the trajectories."""
     found = [
         row["mode_entropy"]
-        for row in _done(name)
+        for row in finished_cells(name)
         if row["method"] == method and row["demonstrations"] == observations and row["mode_entropy"] is not None
     ]
     return f"`{sum(found) / len(found):.2f}`"
@@ -105,7 +106,7 @@ def paper_size() -> str:
 
 def bench_sentence(name: str, method: str = "") -> str:
     """In how many cells of a comparison KOAP is above the paper's, or another method above the paper's KOAP."""
-    entries = _entries(name)
+    entries = paper_cells_beside(name)
     if method:
         entries = [replace(entry, paper=paper_cell(entry.task, "koap", entry.level)) for entry in entries]
     above, both = above_the_paper(entries, method or "koap")
@@ -114,28 +115,13 @@ def bench_sentence(name: str, method: str = "") -> str:
 
 def bench_defaults(name: str) -> str:
     """In how many cells the method that a task is trained with unless told otherwise is above the paper's KOAP."""
-    above, both = above_the_paper(default_entries(_entries(name)), DEFAULT)
+    above, both = above_the_paper(default_entries(paper_cells_beside(name)), DEFAULT)
     return f"{above} of {both}"
-
-
-def bench_default_mean(name: str, level: int) -> str:
-    """Success averaged over the tasks at a level: of the tasks' default methods, of KOAP, of the paper's KOAP."""
-    known = [entry for entry in _entries(name) if entry.level == level]
-    own = [entry for entry in known if entry.method == "koap"]
-    entries = default_entries(known)
-    ((_, mean, low, high),) = average_over_tasks(entries)[DEFAULT]
-    ((_, koap, least, most),) = average_over_tasks(own)["koap"]
-    paper = sum(entry.paper.success for entry in entries) / len(entries)
-    default, own_text = (
-        f"{100 * rate:.1f} % ({100 * ends[0]:.0f}-{100 * ends[1]:.0f})"
-        for rate, *ends in ((mean, low, high), (koap, least, most))
-    )
-    return f"{default}, `koap` {own_text}, the paper's KOAP {100 * paper:.1f} %"
 
 
 def draw_bench_average(name: str, path: Path) -> Path:
     """Draws the success of a comparison averaged over its tasks."""
-    return draw_average(_entries(name), path)
+    return draw_average(paper_cells_beside(name), path)
 
 
 def few_labels_table(name: str) -> str:
@@ -148,7 +134,7 @@ def few_labels_table(name: str) -> str:
     """
     body = []
     for task in PAPER_TASKS:
-        shares = _shares(name, task)
+        shares = label_shares(name, task)
         text = [_pooled(name, task, method, shares[0]) for method in ("koap", "koap_untrained", "linear_steps", "dp")]
         most = f"{_pooled(name, task, 'dp', shares[-1])} with {share(shares[-1])}"
         called = task.replace("po_", "partially observed ").replace("_unobserved_joints", ", joints hidden")
@@ -159,24 +145,24 @@ def few_labels_table(name: str) -> str:
 
 def bench_rollouts(name: str) -> str:
     """Rollouts of all seeds together of KOAP with the fewest labels, the same number for every task."""
-    (number,) = {_counts(name, task, "koap", _shares(name, task)[0])["n"] for task in PAPER_TASKS}
+    (number,) = {count_successes(name, task, "koap", label_shares(name, task)[0])["n"] for task in PAPER_TASKS}
     return str(number)
 
 
 def bench_pooled(name: str, task: str, method: str) -> str:
     """Success of all seeds of a method with the fewest labels of a task."""
-    return _pooled(name, task, method, _shares(name, task)[0]) + " %"
+    return _pooled(name, task, method, label_shares(name, task)[0]) + " %"
 
 
-def _shares(name: str, task: str) -> list[float]:
+def label_shares(name: str, task: str) -> list[float]:
     """The shares of labels of a task, the fewest first."""
-    return sorted({row["labels"] for row in _done(name) if row["task"] == task})
+    return sorted({row["labels"] for row in finished_cells(name) if row["task"] == task})
 
 
-def _counts(name: str, task: str, method: str, labels: float) -> Counter[str]:
+def count_successes(name: str, task: str, method: str, labels: float) -> Counter[str]:
     """Successes and rollouts of all seeds of a method."""
     counts: Counter[str] = Counter()
-    for row in _done(name):
+    for row in finished_cells(name):
         if (row["task"], row["method"], row["labels"]) == (task, method, labels):
             counts.update(successes=row["successes"], n=row["episodes"])
     return counts
@@ -184,14 +170,14 @@ def _counts(name: str, task: str, method: str, labels: float) -> Counter[str]:
 
 def _pooled(name: str, task: str, method: str, labels: float) -> str:
     """Success of all seeds of a method in whole percent with its Wilson interval."""
-    counts = _counts(name, task, method, labels)
+    counts = count_successes(name, task, method, labels)
     low, high = (100 * end for end in wilson_interval(counts["successes"], counts["n"]))
     return f"{100 * counts['successes'] / counts['n']:.0f} ({low:.0f}-{high:.0f})"
 
 
 def bench_size(name: str) -> str:
     """Seeds, rollouts and unit of the labels of a comparison, as its cells have them."""
-    cells = _done(name)
+    cells = finished_cells(name)
     seeds, episodes, units = ({row[part] for row in cells} for part in ("seed", "episodes", "label_unit"))
     rollouts = " or ".join(map(str, sorted(episodes)))
     trained = "1 training seed" if len(seeds) == 1 else f"up to {len(seeds)} training seeds"
@@ -209,7 +195,7 @@ def bench_means(name: str) -> str:
         name (str): file of cells without its ending.
     """
     found: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
-    for row in _done(name):
+    for row in finished_cells(name):
         found.setdefault(row["task"], {}).setdefault(row["method"], []).append(row)
     whole = {
         task: {method: rows for method, rows in own.items() if len({row["labels"] for row in rows}) == 5}

@@ -38,33 +38,6 @@ def scooping_cells(rows: Sequence[Mapping[str, str]] | None = None) -> list[dict
     return cells
 
 
-def scooping_cell(
-    labels: int, method: str, unlabelled: str = "both", rims: bool = False, task: str = "scooping"
-) -> str:
-    """Success of a cell of the study in words, or how often the spoon came over the rim.
-
-    Args:
-        labels (int): labelled demonstrations.
-        method (str): its name.
-        unlabelled (str): videos that there are besides.
-        rims (bool): the rim instead of the success.
-        task (str): ``"scooping"`` or ``"scooping_moving_bowl"``.
-    """
-    cell = _cell(task, labels, unlabelled, method)
-    shown = {"successes": cell["rims" if rims else "successes"], "n": cell["n"]}
-    seeds = len(cell["seeds"])
-    return f"{percent(shown, 0)} of {cell['n']} rollouts, {seeds} seed{'s' if seeds > 1 else ''}"
-
-
-def _cell(task: str, labels: int, unlabelled: str, method: str) -> dict[str, Any]:
-    """A cell whose plans are followed as the study does."""
-    wanted = (str(labels), unlabelled, method)
-    for cell in scooping_cells(read_rows(task)):
-        if tuple(cell[key] for key in _CELL) == wanted:
-            return cell
-    raise KeyError(f"{task}.csv has no row of {wanted}")
-
-
 def scooping_table(task: str = "scooping") -> str:
     """A row per cell of the study.
 

@@ -70,22 +70,6 @@ def success(row: Row) -> str:
     return f"{100 * successes / trials:.1f} ({low:.0f}-{high:.0f}){entropy}"
 
 
-def pooled(rows: Sequence[Row]) -> str:
-    """Formats the success of several rows together: interval, number, range of their entropies."""
-    counts = {key: sum(int(row[key]) for row in rows) for key in ("successes", "n")}
-    entropy = sorted(f"{float(row['entropy']):.2f}" for row in rows if row["entropy"])
-    ends = f" (entropy {entropy[0]}{f' to {entropy[-1]}' if entropy[0] != entropy[-1] else ''})" if entropy else ""
-    return f"{percent(counts)} of {counts['n']} rollouts{ends}"
-
-
-def pooled_boxes(rows: Sequence[Row]) -> str:
-    """Formats how many boxes of Stacking several rows together brought to the zone, with Wilson intervals."""
-    n = sum(int(row["n"]) for row in rows)
-    counts = [sum(int(row["stacked"].split()[boxes]) for row in rows) for boxes in range(3)]
-    first, two, three = (percent({"successes": count, "n": n}) for count in counts)
-    return f"the first box in {first} of {n} rollouts, two in {two}, all three in {three}"
-
-
 def share(fraction: str | float) -> str:
     """Formats a fraction in percent."""
     return f"{100 * float(fraction):.6g} %"
@@ -217,27 +201,6 @@ def planner_rows(task: str, method: str, **wanted: Any) -> list[dict[str, str]]:
     rows = [row for row in read_rows("planner_ablations", **known) if row["note"] in ("", wanted.get("note", ""))]
     best = max((row["denoiser"] for row in rows), key=len, default="")  # with fingers that close on nothing
     return [row for row in rows if row["denoiser"] == best]
-
-
-def planner_table(methods: Mapping[str, Sequence[str]]) -> str:
-    """Formats a row per task and method behind the planner that the task is trained with by default.
-
-    Args:
-        methods (mapping): by task its methods.
-    """
-    body = []
-    for task, names in methods.items():
-        for method in names:
-            presets: dict[str, list[dict[str, str]]] = {}
-            for row in planner_rows(task, method):
-                presets.setdefault(row["preset"], []).append(row)
-            for preset, rows in presets.items():
-                told = f"`{method}`" + (f", `{preset}`" if preset != "default" else "")
-                planner = f"{rows[0]['denoiser'].split()[0]}, {int(rows[0]['updates']):,} x {rows[0]['batch']}"
-                cells = [f"`{task}`", planner, rows[0]["demonstrations"], rows[0]["labels"], told]
-                body.append([*cells, ", ".join(row["training_seed"] for row in rows), pooled(rows)])
-    head = ["task", "planner, updates x batch", "demonstrations", "labels", "method", "training seeds"]
-    return table([*head, "success (95 %), entropy"], body)
 
 
 def commands(rows: Sequence[Row]) -> str:

@@ -9,7 +9,7 @@ import textwrap
 from functools import partial
 from typing import Any
 
-from pages import escape, execution, heading, planner_rows, read_rows, success, table, toctree, write_page
+from pages import benchmark_rows, escape, heading, measured_table, table, toctree, write_page
 
 from torchrl_koap.runs.config import TrainConfig
 from torchrl_koap.tasks import get_task
@@ -132,30 +132,5 @@ def phases(method: Method) -> str:
 
 
 def measured(method: Method) -> str:
-    """Rows of the committed curves, those of a method of the same name before it was changed left out."""
-    rows = []
-    for row in read_rows("label_curves"):
-        if row["method"] != method.name:
-            continue
-        rate = success(row["successes"], row["n"])
-        error = f"{row['action_error']} {row['unit']}" if row["action_error"] else ""
-        data = f"{row['data']}, {row['demonstrations']}"
-        rows.append((row["task"], data, f"{100 * float(row['label_fraction']):g} %", rate, row["entropy"], error))
-    head = ("task", "demonstrations", "labelled", "success (95 %)", "entropy", "action error")
-    return table(head, rows) or planned(method) or "No figure of it is committed."
-
-
-def planned(method: Method) -> str:
-    """Rows of rollouts with several planners, for a method that is in no curve."""
-    rows = [
-        (
-            row["task"],
-            row["demonstrations"],
-            row["labels"],
-            execution(row),
-            success(row["successes"], row["n"]),
-            row["entropy"],
-        )
-        for row in planner_rows(method=method.name)
-    ]
-    return table(("task", "demonstrations", "labels", "planner", "success (95 %)", "entropy"), rows)
+    """Success in the current comparison."""
+    return measured_table(benchmark_rows(method=method.name), "task") or "Not in the current comparison."

@@ -78,17 +78,25 @@ def success(successes: str | int, trials: str | int) -> str:
     return f"{100 * int(successes) / int(trials):.1f} % ({100 * low:.0f}-{100 * high:.0f}) of {trials}"
 
 
-def planner_rows(**wanted: str) -> list[dict[str, str]]:
-    """Rows of ``planner_ablations.csv`` with a learned controller, and with these values."""
-    rows = [row for row in read_rows("planner_ablations") if row["controller"] == "learned"]
-    return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+def benchmark_rows(**wanted: str) -> list[dict[str, str]]:
+    """Cells of the current comparison of methods, all seeds together, with these values of task or method."""
+    found: dict[tuple[str, ...], dict[str, str]] = {}
+    for row in (*read_rows("cells/table_1"), *read_rows("cells/table_2")):
+        if row["status"] != "done" or any(row[name] != value for name, value in wanted.items()):
+            continue
+        cell = found.setdefault((row["task"], row["method"], row["labels"]), row | {"successes": "0", "episodes": "0"})
+        for count in ("successes", "episodes"):
+            cell[count] = str(int(cell[count]) + int(row[count]))
+    return list(found.values())
 
 
-def execution(row: dict[str, str]) -> str:
-    """Denoiser, candidates, training seed and note of a row of ``planner_ablations.csv``."""
-    many = f"{row['candidates']} candidates" if row["candidates"] not in ("", "1") else ""
-    seed = f"training seed {row['training_seed']}"
-    return ", ".join(part for part in (row["denoiser"].split()[0], many, seed, row["note"]) if part)
+def measured_table(rows: Iterable[dict[str, str]], first: str) -> str:
+    """Success of some cells of :func:`benchmark_rows`; the first column is their task or method."""
+    cells = (
+        (f"``{row[first]}``", f"{100 * float(row['labels']):g} %", success(row["successes"], row["episodes"]))
+        for row in rows
+    )
+    return table((first, "labelled", "success (95 %)"), cells)
 
 
 def escape(text: str) -> str:

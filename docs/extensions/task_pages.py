@@ -9,13 +9,11 @@ from typing import Any
 
 from pages import (
     GENERATED,
+    benchmark_rows,
     code,
     escape,
-    execution,
     heading,
-    planner_rows,
-    read_rows,
-    success,
+    measured_table,
     table,
     toctree,
     write_page,
@@ -186,36 +184,10 @@ def expert_blocks(expert: Any) -> list[str]:
 
 
 def measured_blocks(task: Task) -> list[str]:
-    """Success of KOAP and of the ridge, from the committed curves, and of plans followed by prediction."""
-    rows = []
-    for row in read_rows("label_curves"):
-        if row["task"] == task.name and row["method"] in ("koap", "linear") and row.get("n"):
-            rows.append(
-                (
-                    f"``{row['method']}``",
-                    f"{row['data']}, {row['demonstrations']}",
-                    f"{100 * float(row['label_fraction']):g} %",
-                    success(row["successes"], row["n"]),
-                    row["entropy"],
-                )
-            )
-    head = ("method", "demonstrations", "labelled", "success (95 %)", "entropy")
-    followed = [
-        (row["demonstrations"], row["labels"], execution(row), success(row["successes"], row["n"]), row["entropy"])
-        for row in planner_rows(task=task.name, method="mpc")
-    ]
-    if not rows and not followed:
-        return [heading("Measured", 1), "See :doc:`/results/planners`."]
-    tracked = ("demonstrations", "labels", "planner", "success (95 %)", "entropy")
-    return [
-        heading("Measured", 1),
-        table(head, rows),
-        "Plans followed by predicting the robot's answer to its commands, :doc:`/generated/methods/mpc`:"
-        if followed
-        else "",
-        table(tracked, followed),
-        "All methods: :doc:`/results`.",
-    ]
+    """Success of KOAP, of the default method and of the ridge, from the current comparison."""
+    shown = ("koap", task.defaults.method, "mpc", "linear_steps")
+    rows = [row for row in benchmark_rows(task=task.name) if row["method"] in shown]
+    return [heading("Measured", 1), measured_table(rows, "method"), "More: :doc:`/results`."]
 
 
 def draw(task: Task) -> None:
