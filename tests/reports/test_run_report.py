@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import json
-import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from html_pages import Page
 from run_files import make_demonstrations, make_object_rollouts, write_run
 from safetensors.numpy import save_file
 
@@ -22,33 +21,6 @@ from torchrl_koap.reports.run_report import write_report
 from torchrl_koap.tasks import get_task
 
 PICTURES = list(all_pictures().values())
-_VOID = {"meta", "img", "rect", "br"}
-
-
-class Page(HTMLParser):
-    """Text, tags and links of a page; fails on tags that do not close."""
-
-    def __init__(self, path):
-        super().__init__()
-        self.source = path.read_text()
-        self.open, self.tags, self.links, self.words = [], [], [], []
-        self.feed(self.source)
-        assert not self.open, f"not closed: {self.open}"
-        self.text = re.sub(r"\s+", " ", " ".join(self.words))
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append(tag)
-        self.links += [value for name, value in attributes if name in ("src", "href")]
-        if tag not in _VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        if tag not in _VOID:
-            assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] not in ("style", "script"):
-            self.words.append(data)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +88,7 @@ def test_everything_from_files_is_escaped(tmp_path):
     labels = {evil: evil, "labelled_transitions": 1, "total_transitions": 2}
     summary = {"labels": labels, "train_seconds": {evil: 1.0}}
     (tmp_path / "summary.json").write_text(json.dumps(summary))
-    evaluation = {"success_rate": 0.5, "execution": evil, "distinct_modes": evil, "mode_entropy": 0.1}
+    evaluation = {"rates": {evil: {"rate": 0.5}}, "execution": evil, "distinct_modes": evil, "mode_entropy": 0.1}
     evaluation["episode"] = [{"seed": evil, evil: evil}]
     evaluation["action_errors"] = {"outside_budget": {"note": evil}}
     (tmp_path / "eval.json").write_text(json.dumps(evaluation))
@@ -151,7 +123,7 @@ def test_damaged_json_is_named_and_the_rest_is_shown(name, content, tmp_path):
     (tmp_path / name).write_text(content)
     page = Page(write_report(tmp_path, draw=False))
     assert page.source.count('class="warning"') == 1 and str(tmp_path / name) in page.text
-    assert ("success rate" in page.text) == (name != "eval.json")
+    assert ("50.0 % interval" in page.text) == (name != "eval.json")
 
 
 @pytest.mark.parametrize("name", ["rollouts.safetensors", "actions.safetensors", "metrics.csv"])
@@ -172,7 +144,13 @@ def test_damaged_data_are_named_and_old_pictures_not_shown(name, tmp_path, monke
 
 
 def test_odd_values_do_not_stop_the_report(tmp_path):
-    odd = {"success_rate": None, "episodes": "many", "mode_entropy": float("nan"), "control_hz": [], "episode": "none"}
+    odd = {
+        "rates": {"success": {"rate": None}, "half": 3},
+        "episodes": "many",
+        "mode_entropy": float("nan"),
+        "control_hz": [],
+        "episode": "none",
+    }
     (tmp_path / "eval.json").write_text(json.dumps(odd | {"plan_ms": "x"}))
     (tmp_path / "summary.json").write_text(json.dumps({"labels": 3, "train_seconds": 12.0}))
     page = Page(write_report(tmp_path))
@@ -198,7 +176,9 @@ def write_object_run(folder, task="stacking", **evaluation):
 
 
 def test_tiles_of_a_task_with_contexts(tmp_path):
-    rates = {"one box stacked": {"rate": 0.75, "low": 0.3, "high": 0.954}, "three boxes stacked": {"rate": 0.5}}
+    rates = {"success": {"rate": 0.5, "low": 0.15, "high": 0.85}, "one box stacked": {"rate": 0.75, "low": 0.3}}
+    rates["one box stacked"]["high"], rates["three boxes stacked"] = 0.954, {"rate": 0.5}
+    rates = {name: values | {"episodes": 4} for name, values in rates.items()}
     pooled = {"mode_entropy": None, "pooled_mode_entropy": 0.387, "pooled_mode_entropy_low": 0.0}
     write_object_run(tmp_path, rates=rates, **pooled, pooled_mode_entropy_high=0.5)
     text = Page(write_report(tmp_path, draw=False)).text

@@ -171,7 +171,7 @@ def test_jobs_that_cannot_be_ordered_are_refused_before_anything_runs(tmp_path):
 def test_ray_that_is_not_installed_names_the_extra(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None)
     with pytest.raises(ValueError, match=r"pip install 'torchrl_koap\[ray\]'"):
-        Machines(launcher="ray").check()
+        Machines(launcher="ray")
 
 
 def test_no_jobs_end_at_once():

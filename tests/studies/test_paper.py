@@ -69,8 +69,8 @@ def test_what_the_paper_does_not_have_is_none():
 
 
 def test_points_lie_at_the_papers_shares():
-    rows = [row for row in paper_points("avoiding") if row["method"] == "koap"]
-    assert [(row["labels"], row["success"]) for row in rows] == [
+    cells = [cell for cell in paper_points("avoiding") if cell.method == "koap"]
+    assert [(cell.label_share, cell.success) for cell in cells] == [
         (0.02, pytest.approx(0.7803)),
         (0.05, pytest.approx(0.9805)),
         (0.1, pytest.approx(0.9722)),

@@ -6,41 +6,17 @@ from __future__ import annotations
 import csv
 import random
 import re
-from html.parser import HTMLParser
 
 import pytest
+from html_pages import Page
 from PIL import Image
 
+from torchrl_koap.studies.paper_results import PaperCell
 from torchrl_koap.studies.plots import method_styles, plot_measure
 from torchrl_koap.studies.report import write_study_report
 from torchrl_koap.studies.summary import summarise
 
-_VOID = {"meta", "img"}
 _METHODS = {"koap": 0.9, "ridge": 0.6, "vae": 0.4}
-
-
-class Page(HTMLParser):
-    """Text and links of a page; fails on tags that do not close."""
-
-    def __init__(self, path):
-        super().__init__()
-        self.open, self.links, self.words = [], [], []
-        self.feed(path.read_text())
-        assert not self.open, f"not closed: {self.open}"
-        self.text = re.sub(r"\s+", " ", " ".join(self.words))
-
-    def handle_starttag(self, tag, attributes):
-        self.links += [value for name, value in attributes if name in ("src", "href")]
-        if tag not in _VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        if tag not in _VOID:
-            assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] != "style":
-            self.words.append(data)
 
 
 def make_cells(outcomes: dict | None = None, *, methods=_METHODS, labels=(0.01, 0.1), seeds=2, episodes=20, **more):
@@ -88,8 +64,8 @@ def folder(tmp_path_factory):
     spoil(rows[0], "failed", "RuntimeError: <loss> is not\nfinite")
     spoil(rows[5], "missing")
     paper = [
-        {"task": "avoiding", "method": "koap", "labels": 0.1, "success": 0.92},
-        {"task": "avoiding", "method": "ridge", "labels": 0.25, "success": 0.5},
+        PaperCell(1, "avoiding", method, level, share, success, spread=0.03)
+        for method, level, share, success in (("koap", 3, 0.1, 0.92), ("ridge", 4, 0.25, 0.5))
     ]
     options = {"planner.steps": 12345}
     path = write_study_report(folder, rows, outcomes, title="Labels & success", options=options, paper=paper)
@@ -116,8 +92,8 @@ def test_page_says_what_was_run_and_what_was_not(folder):
 
 def test_paper_stands_beside_what_was_measured(folder):
     text = Page(folder / "index.html").text
-    assert re.search(r"koap 10 % 92\.0 \d+\.\d % \(", text)
-    assert "ridge 25 % 50.0 not run" in text
+    assert re.search(r"koap 10 % 92\.0 \+- 3\.0 \d+\.\d % \(", text)
+    assert "ridge 25 % 50.0 +- 3.0 not run" in text
 
 
 def test_pictures_exist_and_nothing_comes_from_elsewhere(folder):

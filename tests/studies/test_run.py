@@ -60,7 +60,7 @@ def rows_of(root):
 
 def episodes_of(root, cell):
     result = json.loads((Path(root) / cell / "eval.json").read_text())
-    return result["episode"], result["success_rate"], result["mean_steps"]
+    return result["episode"], result["rates"]["success"]["rate"], result["mean_steps"]
 
 
 @pytest.fixture(scope="module")

@@ -101,7 +101,7 @@ def test_data_are_needed_where_there_is_no_environment(tmp_path):
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_name_methods_tasks_and_levels_that_exist(name, tmp_path):
     assert check_study(complete(Study(out=tmp_path / "study", preset=name)))
-    assert set(PRESETS[name].methods) <= set(METHODS) and set(PRESETS[name].tasks) <= set(TASKS)
+    assert set(PRESETS[name]["methods"]) <= set(METHODS) and set(PRESETS[name]["tasks"]) <= set(TASKS)
 
 
 @pytest.mark.parametrize(("asked", "at_three"), [({}, [0]), ({"first_seed_only": ()}, [0, 1, 2])])

@@ -59,12 +59,7 @@ class Cell:
 
 
 def prepare_cell(folder: Path, config: TrainConfig, evaluation: EvalConfig | None) -> None:
-    """Writes what is asked of a cell, or of a shared planner, before its work begins.
-
-    Args:
-        folder (Path): where to; made if it is not there.
-        config (TrainConfig): its training.
-        evaluation (EvalConfig, optional): its rollouts; None for a planner alone.
+    """Writes what is asked of a cell, or without an evaluation of a shared planner, before its work begins.
 
     Raises:
         RunDirectoryError: if something else was asked of it before.
@@ -103,20 +98,15 @@ def run_cell(folder: str | Path) -> None:
         results = train(config, planner_only=True).results
         run.write_json(FOUND, {"row": {"train_seconds": time.perf_counter() - began}, "outcomes": [], **results})
         return
-    if not _is_readable(run, "summary.json"):
+    try:
+        summary = run.read_json("summary.json")
+    except RunDirectoryError:
         train(config)
-    trained, summary = time.perf_counter(), run.read_json("summary.json")
+        summary = run.read_json("summary.json")
+    trained = time.perf_counter()
     result = evaluate(folder, evaluation)
     seconds = {"train_seconds": trained - began, "eval_seconds": time.perf_counter() - trained}
     run.write_json(FOUND, {"row": _found_in(summary, result) | seconds, "outcomes": _outcomes_of(result)})
-
-
-def _is_readable(run: RunDirectory, name: str) -> bool:
-    try:
-        run.read_json(name)
-    except RunDirectoryError:
-        return False
-    return True
 
 
 def read_result(folder: str | Path) -> tuple[dict[str, Any], dict[tuple[int, int], float]] | None:
@@ -148,15 +138,9 @@ def read_result(folder: str | Path) -> tuple[dict[str, Any], dict[tuple[int, int
 def cell_row(
     root: Path, cell: Cell, *, label_unit: str, reason: str | None = None
 ) -> tuple[dict[str, Any], dict[tuple[int, int], float]]:
-    """Reads a cell as a row of ``cells.csv``, and its outcomes, which are empty unless it is done.
+    """Reads a cell of a study's folder as a row of ``cells.csv``, and its outcomes, which are empty unless it is done.
 
-    Args:
-        root (Path): folder of the study.
-        cell (Cell): the cell.
-
-    Keyword Args:
-        label_unit (str): what the labels are a share of.
-        reason (str, optional): why it failed.
+    ``reason`` says why it failed, if it did.
     """
     row = asdict(cell) | {"label_unit": label_unit, "run": cell.folder}
     try:
@@ -181,10 +165,10 @@ def _found_in(summary: Mapping[str, Any], result: Mapping[str, Any]) -> dict[str
     if result.get("kind") == KIND:
         names = ("relative_plan_error", "relative_action_error")
         return common | {"kind": KIND} | {name: result[name] for name in names}
-    entropy = result["mode_entropy"]
-    counts = ("episodes", "success_rate", "success_low", "success_high", "collisions", "mean_steps")
-    common |= {name: result[name] for name in counts}
-    common["successes"] = round(result["success_rate"] * result["episodes"])
+    entropy, success = result["mode_entropy"], result["rates"]["success"]
+    common |= {name: result[name] for name in ("episodes", "collisions", "mean_steps")}
+    common |= {f"success_{name}": success[name] for name in ("rate", "low", "high")}
+    common["successes"] = round(success["rate"] * result["episodes"])
     return common | {"mode_entropy": result.get("pooled_mode_entropy") if entropy is None else entropy}
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ from torchrl_koap.studies.study import Study, union
 
 FILE = "study.json"
 # what a later call may add to; all else must be as it was
-_GROWS = ("tasks", "datasets", "planners", "methods", "labels", "levels", "demonstrations", "seeds", "first_seed_only")
+_LISTS = ("tasks", "datasets", "planners", "methods", "labels", "levels", "demonstrations")
+_MAY_CHANGE = (*_LISTS, "seeds", "first_seed_only", "out", "run.plugins")
 
 
 def read_study(folder: Path) -> Study | None:
@@ -34,18 +35,9 @@ def together(study: Study) -> Study:
     earlier = read_study(study.out)
     if earlier is None:
         return study
-    return replace(
-        study,
-        tasks=union(earlier.tasks, study.tasks),
-        datasets=union(earlier.datasets, study.datasets),
-        planners=union(earlier.planners, study.planners),
-        methods=union(earlier.methods, study.methods),
-        labels=union(earlier.labels, study.labels),
-        levels=union(earlier.levels, study.levels),
-        demonstrations=union(earlier.demonstrations, study.demonstrations),
-        seeds=max(study.seeds, earlier.seeds),
-        first_seed_only=tuple(level for level in study.first_seed_only if level in earlier.first_seed_only),
-    )
+    lists: dict[str, Any] = {name: union(vars(earlier)[name], vars(study)[name]) for name in _LISTS}
+    first_seed_only = tuple(level for level in study.first_seed_only if level in earlier.first_seed_only)
+    return replace(study, **lists, seeds=max(study.seeds, earlier.seeds), first_seed_only=first_seed_only)
 
 
 def check_folder(study: Study) -> None:
@@ -63,8 +55,8 @@ def check_folder(study: Study) -> None:
         if path.exists() and not all(entry.name.startswith(own) for entry in path.iterdir()):
             raise RunDirectoryError(f"{path} is not empty and no folder of `koap curve`; choose another --out")
         return
-    was, now = flat_options(earlier), flat_options(study)
-    changed = [name for name in now if name not in (*_GROWS, "out", "run.plugins") and was[name] != now[name]]
+    was, now = (flat_options(to_json(options)) for options in (earlier, study))
+    changed = [name for name in now if name not in _MAY_CHANGE and was[name] != now[name]]
     for name, before, after in (
         ("datasets", earlier.given_dataset, study.given_dataset),
         ("planners", earlier.given_planner, study.given_planner),
@@ -77,14 +69,10 @@ def check_folder(study: Study) -> None:
         raise RunDirectoryError(f"{path} holds a study with another {told}; choose another --out")
 
 
-def flat_options(study: Study) -> dict[str, Any]:
-    """Every option of a study as plain values, by its name with the section."""
-    return dict(_flat(to_json(study)))
-
-
-def _flat(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat_options(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Options of all sections together, each by its name with the section."""
+    flat: dict[str, Any] = {}
     for name, value in options.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
+        inside = isinstance(value, Mapping)
+        flat |= flat_options(value, f"{prefix}{name}.") if inside else {prefix + name: value}
+    return flat

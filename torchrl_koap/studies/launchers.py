@@ -77,7 +77,8 @@ class Machines:
         address: of a Ray cluster (default: one on this machine).
 
     Raises:
-        ValueError: for an unknown launcher, one that is not installed, no workers, or an address that is of no use.
+        ValueError: for an unknown launcher, no workers, or an address that is of no use; for one that is not installed,
+            naming its extra.
 
     Examples:
         >>> from torchrl_koap.studies.launchers import Machines
@@ -95,13 +96,6 @@ class Machines:
             raise ValueError(f"workers must be >= 1, got {self.workers}")
         if self.launcher == "local" and self.address is not None:
             raise ValueError("an address was given, but launcher 'local' works on this machine alone")
-
-    def check(self) -> None:
-        """Refuses a launcher that is not installed.
-
-        Raises:
-            ValueError: naming the extra.
-        """
         if self.launcher == "ray" and importlib.util.find_spec("ray") is None:
             raise ValueError("launcher 'ray' needs an extra: pip install 'torchrl_koap[ray]'")
 
@@ -169,13 +163,7 @@ def _schedule(waiting: list[Job], pool: Any) -> Generator[tuple[Job, str | None]
 
 
 def run_logged(function: Callable[[str], None], folder: str, log: str) -> str | None:
-    """Calls a function of a folder with everything it prints going to a file; returns why it failed, if it did.
-
-    Args:
-        function (callable): what to call.
-        folder (str): what with.
-        log (str): file to append to.
-    """
+    """Calls a function of a folder with everything it prints going to a file; returns why it failed, if it did."""
     try:
         with open_log(log) as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
             try:
@@ -214,13 +202,7 @@ def _without_ctrl_c() -> Iterator[None]:
 
 
 class LocalPool:
-    """Processes that are copies of a server which has imported everything: a job starts in a fraction of a second.
-
-    Examples:
-        >>> from torchrl_koap.studies.launchers import LocalPool
-        >>> LocalPool(print, workers=2).workers
-        2
-    """
+    """Processes that are copies of a server which has imported everything: a job starts in a fraction of a second."""
 
     def __init__(self, function: Callable[[str], None], workers: int):
         self.function, self.workers = function, workers

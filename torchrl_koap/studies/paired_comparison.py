@@ -28,6 +28,7 @@ COMPARISON_COLUMNS = (
 _FLIPS = 10_000
 _RESAMPLES = 4_000
 _CHUNK = 500
+_TAIL = (1 - 0.95) / 2  # share of the resamples outside the interval at either end
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,7 @@ class Comparison:
     pairs: int
 
 
-def compare(
-    first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, level: float = 0.95, errors: bool = False
-) -> Comparison | None:
+def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, errors: bool = False) -> Comparison | None:
     r"""Compares two methods on what both have: equal training seed, context and evaluation seed.
 
     With :math:`d_{sc}` the difference of the successes for training seed s in context c, averaged over rollouts of that
@@ -87,7 +86,6 @@ def compare(
     Args:
         first (mapping): training seed to ``{(context, evaluation seed): success}``.
         second (mapping): the same of the other method.
-        level (float): probability that the interval holds.
         errors (bool): the outcomes are errors, which have no bounds, instead of successes. Where nothing varies there
             is then no interval (NaN).
 
@@ -116,7 +114,7 @@ def compare(
     there = count > 0
     difference = np.where(there, total / np.maximum(count, 1), 0.0)  # [seeds, contexts]
     per_context = difference.sum(0) / there.sum(0)
-    low, high = _interval(difference, there, level)
+    low, high = _interval(difference, there)
     if errors:
         low, high = (low, high) if len(contexts) > 1 else (math.nan, math.nan)
     elif low == high:  # nothing varied: resampling cannot say more, but other contexts could
@@ -133,8 +131,8 @@ def compare(
     )
 
 
-def _interval(difference: np.ndarray, there: np.ndarray, level: float) -> tuple[float, float]:
-    """Percentiles of the mean difference when seeds and contexts are drawn anew."""
+def _interval(difference: np.ndarray, there: np.ndarray) -> tuple[float, float]:
+    """The 95 % interval between percentiles of the mean difference when seeds and contexts are drawn anew."""
     generator = np.random.default_rng(0)
     seeds, contexts = difference.shape
     values = []
@@ -146,19 +144,15 @@ def _interval(difference: np.ndarray, there: np.ndarray, level: float) -> tuple[
         weight = context_weight * (number > 0)
         drawn = weight.sum(1) > 0
         values.append((weight * mean).sum(1)[drawn] / weight.sum(1)[drawn])
-    tail = (1 - level) / 2
-    low, high = np.quantile(np.concatenate(values), [tail, 1 - tail])
+    low, high = np.quantile(np.concatenate(values), [_TAIL, 1 - _TAIL])
     return float(low), float(high)
 
 
 def sign_flip_p(differences: Sequence[float]) -> float:
-    """Two-sided p-value of a mean of 0, from flipping the signs of independent differences.
+    """Two-sided p-value of a mean of 0, from flipping the signs of independent differences, one per context.
 
     Up to 13 of them all flips are counted; beyond, 10,000 drawn ones, the same in every call, and the observed one
     among them, so that the p-value is never below 2 / 10,001.
-
-    Args:
-        differences (sequence of float): one per context; those of 0 change nothing.
 
     Examples:
         >>> from torchrl_koap.studies.paired_comparison import sign_flip_p
@@ -174,10 +168,7 @@ def sign_flip_p(differences: Sequence[float]) -> float:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's correction: adjusted p-values that keep the chance of any false alarm below the level.
-
-    Args:
-        p_values (sequence of float or None): of all comparisons that are looked at together; None stays None.
+    """Holm's correction: p-values adjusted so that the chance of any false alarm stays below the level; None stays.
 
     Examples:
         >>> from torchrl_koap.studies.paired_comparison import holm

@@ -62,8 +62,7 @@ class Entry:
 def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
     """Cells of all tasks, methods and levels that occur among some rows, those that were not run included.
 
-    Args:
-        rows (sequence of mapping): cells; those at shares that are no label level of their task are left out.
+    Cells at shares that are no label level of their task are left out.
 
     Raises:
         ValueError: as :func:`~torchrl_koap.studies.summary.summarise`.
@@ -106,12 +105,7 @@ def layout_rows(entries: Sequence[Entry]) -> list[dict[str, str]]:
 
 
 def above_the_paper(entries: Sequence[Entry], method: str = "koap") -> tuple[int, int]:
-    """In how many cells a method succeeds more often than the paper's, of how many that both have.
-
-    Args:
-        entries (sequence of Entry): of :func:`paper_entries`.
-        method (str): the method.
-    """
+    """In how many cells a method succeeds more often than the paper's, of how many that both have."""
     both = [entry for entry in entries if entry.method == method and entry.paper and entry.success is not None]
     return sum(entry.success > entry.paper.success for entry in both), len(both)
 
@@ -155,10 +149,6 @@ def average_over_tasks(entries: Sequence[Entry]) -> dict[str, list[tuple[int, fl
 def draw_average(entries: Sequence[Entry], path: str | Path) -> Path:
     """Draws success averaged over tasks against the label level; tasks' default methods together have a line too.
 
-    Args:
-        entries (sequence of Entry): of :func:`paper_entries`.
-        path (str or Path): png to write.
-
     Raises:
         ValueError: if there is no level at which a method is done in every task.
     """
@@ -176,10 +166,6 @@ def draw_average(entries: Sequence[Entry], path: str | Path) -> Path:
 
 def write_paper_layout(folder: str | Path, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Writes ``paper_table.md`` and the picture of success averaged over tasks into a folder.
-
-    Args:
-        folder (str or Path): the folder of the study.
-        rows (sequence of mapping): its cells.
 
     Returns:
         dict: ``rows`` of the table, a ``sentence`` on KOAP and the paper's, and ``picture``, the path of the picture

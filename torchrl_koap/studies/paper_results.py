@@ -89,12 +89,7 @@ def paper_cells(table: int) -> list[PaperCell]:
 
 
 def paper_cell(task: str, method: str, level: int) -> PaperCell | None:
-    """A cell of the paper, None if it has no such one; of both tables the first that has it.
-
-    Args:
-        task (str): name of the task, as in :mod:`torchrl_koap.tasks`.
-        method (str): name of the method.
-        level (int): label level, 1 for the fewest labels.
+    """A cell of the paper, None if it has no such one; of both tables the first; level 1 has the fewest labels.
 
     Examples:
         >>> from torchrl_koap.studies.paper_results import paper_cell
@@ -110,16 +105,6 @@ def _by_place() -> dict[tuple[str, str, int], PaperCell]:
     return {(cell.task, cell.method, cell.level): cell for cell in cells}
 
 
-def paper_points(task: str) -> list[dict[str, Any]]:
-    """The paper's figures of a task at its own shares of labels: task, method, labels, success, spread (in 0..1)."""
-    return [
-        {
-            "task": task,
-            "method": cell.method,
-            "labels": cell.label_share,
-            "success": cell.success,
-            "spread": cell.spread,
-        }
-        for (name, _, _), cell in _by_place().items()
-        if name == task
-    ]
+def paper_points(task: str) -> list[PaperCell]:
+    """The cells of a task in both tables, each method and level once."""
+    return [cell for cell in _by_place().values() if cell.task == task]

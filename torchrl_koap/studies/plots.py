@@ -18,6 +18,7 @@ from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocat
 
 from torchrl_koap.reports.style import FAINT, INK, set_title, tidy
 from torchrl_koap.reports.writing import save_figure
+from torchrl_koap.studies.paper_results import PaperCell
 from torchrl_koap.studies.summary import Summary, percent
 
 AXES = {
@@ -39,27 +40,17 @@ _BANDS = 3  # more bands than these hide each other: whiskers instead
 
 
 @dataclass
-class Line:
-    """A named line, the paper's points ``(x, y)`` beside it, and how it is drawn.
-
-    Examples:
-        >>> from torchrl_koap.studies.plots import Line
-        >>> Line("koap", {}, x=[0.1], y=[0.9]).paper
-        []
-    """
+class _Line:
+    """A named line of points ``(x, y, low, high)``, the paper's ``(x, y)`` beside it, and how it is drawn."""
 
     name: str
     style: Mapping[str, Any]
-    x: list[float] = field(default_factory=list)
-    y: list[float] = field(default_factory=list)
-    low: list[float] = field(default_factory=list)
-    high: list[float] = field(default_factory=list)
-    paper: list[tuple[float, float]] = field(default_factory=list)
+    points: list[tuple[float, ...]] = field(default_factory=list)
+    paper: Sequence[tuple[float, float]] = ()
 
-    def add(self, x: float, y: float, low: float, high: float) -> None:
-        """Adds a point with its interval."""
-        for part, value in zip((self.x, self.y, self.low, self.high), (x, y, low, high), strict=True):
-            part.append(value)
+    @property
+    def places(self) -> list[float]:
+        return [x for x, *_ in self.points]
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -87,7 +78,7 @@ def plot_measure(
     measure: str = "success",
     *,
     by: Sequence[str] = ("labels",),
-    paper: Sequence[Mapping[str, Any]] = (),
+    paper: Sequence[PaperCell] = (),
     methods: Sequence[str] | None = None,
     unit: str = "",
     label_unit: str = "",
@@ -102,33 +93,23 @@ def plot_measure(
     Keyword Args:
         by (sequence of str): what the horizontal axes show, of :data:`AXES`. Along ``"demonstrations"`` there is a line
             per method and share of labels that was run with several of them.
-        paper (sequence of mapping): the paper's success, with ``method``, ``labels`` and ``success`` in 0..1: hollow
-            and dashed, in the colour of the method. Drawn only along ``"labels"``.
+        paper (sequence of PaperCell): the paper's success: hollow and dashed, in the colour of the method. Drawn only
+            along ``"labels"``.
         methods (sequence of str, optional): all methods in the order that gives the colours. Default: as they come.
         unit (str): unit of the measure.
         label_unit (str): what the labels are counted in, as in the label of the axis: ``"windows"``.
 
     Raises:
         ValueError: if no cell has the measure, or an error is not above 0.
-
-    Examples:
-        >>> import tempfile
-        >>> from torchrl_koap.studies.plots import plot_measure
-        >>> from torchrl_koap.studies.summary import summarise
-        >>> cell = {"task": "avoiding", "method": "koap", "seed": 0, "status": "done", "episodes": 9, "successes": 5}
-        >>> rows = [cell | {"labels": labels} for labels in (0.01, 0.1)]
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     plot_measure(summarise(rows), f"{folder}/success.png").name
-        'success.png'
     """
     head, title, factor = MEASURES[measure]
     panels = {name: _lines(summaries, name, measure, factor, methods) for name in by}
     panels = {name: lines for name, lines in panels.items() if lines}
     error = measure.endswith("error")
-    if not panels or (error and min(min(line.low) for lines in panels.values() for line in lines) <= 0):
+    if not panels or (error and min(_ends([line for lines in panels.values() for line in lines])) <= 0):
         raise ValueError(f"there is no {measure} to draw: no cell is done" + (" with one above 0" if error else ""))
     for line in panels.get("labels", ()) if measure == "success" else ():
-        line.paper = [(row["labels"], 100 * row["success"]) for row in paper if row["method"] == line.name]
+        line.paper = [(cell.label_share, 100 * cell.success) for cell in paper if cell.method == line.name]
     if paper:
         title += "\nhollow, dashed: the paper, whose demonstrations are others"
     figure = Figure(figsize=(1.9 + 4.1 * len(panels), 4.1), layout="constrained")
@@ -173,14 +154,13 @@ def plot_average(
         raise ValueError("there is nothing to average: no method is done at a level in every task")
     lines, styles = [], method_styles(list(averages))
     for method, points in averages.items():
-        line = Line(method, styles[method], paper=[(level, 100 * mean) for level, mean in paper.get(method, ())])
-        for level, *values in points:
-            line.add(level, *(100 * value for value in values))
-        lines.append(line)
+        shown = [(level, *(100 * value for value in values)) for level, *values in points]
+        beside = [(level, 100 * mean) for level, mean in paper.get(method, ())]
+        lines.append(_Line(method, styles[method], shown, beside))
     figure = Figure(figsize=(7.4, 4.6), layout="constrained")
     axes = figure.add_subplot()
     _draw_lines(axes, lines, beside=lambda x, step: x + 0.028 * step)
-    levels = sorted({level for line in lines for level in line.x})
+    levels = sorted({level for line in lines for level in line.places})
     axes.set(xlim=(levels[0] - 0.25, levels[-1] + 0.25), xticks=levels)
     axes.set(xlabel="label level (1: fewest labels)", ylabel="success (%)")
     _scale_shares(axes, 100)
@@ -193,27 +173,27 @@ def plot_average(
 
 
 def _draw_lines(
-    axes: Axes, lines: Sequence[Line], *, beside: Callable[[float, float], float] = lambda x, step: x * 1.014**step
+    axes: Axes, lines: Sequence[_Line], *, beside: Callable[[float, float], float] = lambda x, step: x * 1.014**step
 ) -> None:
     """Draws bands, or whiskers where there are many lines or each has one point; ``beside`` moves whiskers apart."""
-    whiskers = len(lines) > _BANDS or all(len(line.x) == 1 for line in lines)
+    whiskers = len(lines) > _BANDS or all(len(line.points) == 1 for line in lines)
     for index, line in enumerate(lines):
-        x, order = line.x, 3 + (len(lines) - index) / 100
+        (x, y, low, high), order = zip(*line.points, strict=True), 3 + (len(lines) - index) / 100
         color = line.style["color"]
         if whiskers:  # beside each other
-            x = [beside(value, index - (len(lines) - 1) / 2) for value in x]
-            axes.vlines(x, line.low, line.high, color=color, linewidth=0.9, alpha=0.55, zorder=order - 1)
+            x = tuple(beside(value, index - (len(lines) - 1) / 2) for value in x)
+            axes.vlines(x, low, high, color=color, linewidth=0.9, alpha=0.55, zorder=order - 1)
         else:
-            axes.fill_between(x, line.low, line.high, color=color, alpha=0.13, linewidth=0, zorder=order - 1)
+            axes.fill_between(x, low, high, color=color, alpha=0.13, linewidth=0, zorder=order - 1)
             if len(x) == 1:  # a band needs two places
-                axes.vlines(x, line.low, line.high, color=color, linewidth=2.5, alpha=0.3, zorder=order - 1)
-        axes.plot(x, line.y, **line.style, markersize=5, linewidth=1.6, markeredgewidth=0, zorder=order)
+                axes.vlines(x, low, high, color=color, linewidth=2.5, alpha=0.3, zorder=order - 1)
+        axes.plot(x, y, **line.style, markersize=5, linewidth=1.6, markeredgewidth=0, zorder=order)
         if line.paper:
             style = {**line.style, "linestyle": (0, (2, 2)), "markerfacecolor": "white", "markeredgewidth": 1.3}
             axes.plot(*zip(*sorted(line.paper), strict=True), **style, markersize=6.5, linewidth=1, zorder=order + 0.5)
 
 
-def _name_lines(figure: Figure, lines: Sequence[Line]) -> None:
+def _name_lines(figure: Figure, lines: Sequence[_Line]) -> None:
     """Names every line once, to the right of all panels."""
     named = {line.name: Line2D([], [], **line.style, markersize=5, markeredgewidth=0) for line in lines}
     figure.legend(named.values(), named.keys(), loc="outside right upper", frameon=False, fontsize=8.5)
@@ -221,7 +201,7 @@ def _name_lines(figure: Figure, lines: Sequence[Line]) -> None:
 
 def _lines(
     summaries: Sequence[Summary], by: str, measure: str, factor: float, methods: Sequence[str] | None
-) -> list[Line]:
+) -> list[_Line]:
     """A line per method; along the demonstrations one per method and share of labels."""
     methods = list(methods or dict.fromkeys(item.method for item in summaries))
     shares = sorted({item.labels for item in summaries})
@@ -231,17 +211,21 @@ def _lines(
         for n, labels in enumerate(shares if several else [None]):  # colour tells the method, marker and dash the share
             own = {"marker": _MARKERS[n % 13], "linestyle": _DASHES[n % 3]} if several else {}
             name = f"{method}, {percent(labels)}" if several else method
-            lines[method, labels] = Line(name, styles[method] | own)
+            lines[method, labels] = _Line(name, styles[method] | own)
     for item in sorted(summaries, key=lambda item: item.mean(by) or 0):
         place = item.mean(by)
         if item.method in methods and place is not None and measure in item.measures:
             found = item.measures[measure]
             values = (factor * value for value in (found.mean, found.low, found.high))
-            lines[item.method, item.labels if several else None].add(place, *values)
-    drawn = [line for line in lines.values() if line.x]
-    if by == "demonstrations" and any(len(set(line.x)) > 1 for line in drawn):
-        return [line for line in drawn if len(set(line.x)) > 1]  # the others do not scale anything
+            lines[item.method, item.labels if several else None].points.append((place, *values))
+    drawn = [line for line in lines.values() if line.points]
+    if by == "demonstrations" and any(len(set(line.places)) > 1 for line in drawn):
+        return [line for line in drawn if len(set(line.places)) > 1]  # the others do not scale anything
     return drawn
+
+
+def _ends(lines: Sequence[_Line]) -> list[float]:
+    return [end for line in lines for *_, low, high in line.points for end in (low, high)]
 
 
 def _scale_shares(axes: Axes, top: int) -> None:
@@ -250,9 +234,9 @@ def _scale_shares(axes: Axes, top: int) -> None:
     axes.grid(axis="y", color=FAINT, linewidth=0.5)
 
 
-def _scale_errors(axes: Axes, lines: Sequence[Line]) -> None:
+def _scale_errors(axes: Axes, lines: Sequence[_Line]) -> None:
     axes.set_yscale("log")
-    low, high = min(min(line.low) for line in lines), max(max(line.high) for line in lines)
+    low, high = min(_ends(lines)), max(_ends(lines))
     wide = max(1.15, (2.2 * low / high) ** 0.5)  # at least a factor of two is shown, or chance looks like a trend
     axes.set_ylim(low / wide, high * wide)
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low * wide**2 < 100 else (1,)))
@@ -261,9 +245,9 @@ def _scale_errors(axes: Axes, lines: Sequence[Line]) -> None:
     axes.grid(axis="y", which="both", color=FAINT, linewidth=0.5)
 
 
-def _log_x(axes: Axes, lines: Sequence[Line], *, ticks: bool) -> None:
+def _log_x(axes: Axes, lines: Sequence[_Line], *, ticks: bool) -> None:
     """Logarithmic axis that ends at the data; ``ticks`` at the places themselves, where there is room."""
-    places = sorted({value for line in lines for value in [*line.x, *(place for place, _ in line.paper)]})
+    places = sorted({value for line in lines for value in [*line.places, *(place for place, _ in line.paper)]})
     positive = [place for place in places if place > 0] or [1.0]
     low, high = positive[0], positive[-1]
     margin = max(1.12, (high / low) ** 0.06) if len(positive) > 1 else 2.0

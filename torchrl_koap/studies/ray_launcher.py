@@ -23,10 +23,6 @@ class RayPool:
         function (callable): what jobs do.
         workers (int): jobs at a time, on a cluster of its own.
         address (str, optional): of a cluster that runs, which decides how many by itself.
-
-    Examples:
-        >>> from torchrl_koap.studies.ray_launcher import RayPool
-        >>> RayPool(print, 2, None)  # doctest: +SKIP
     """
 
     def __init__(self, function: Callable[[str], None], workers: int, address: str | None):

@@ -12,6 +12,7 @@ from typing import Any
 from torchrl_koap.files import replacing_file
 from torchrl_koap.reports.html import duration, write_page
 from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, Outcome, compare_cells, p_text
+from torchrl_koap.studies.paper_results import PaperCell
 from torchrl_koap.studies.plots import plot_measure
 from torchrl_koap.studies.summary import Summary, cell_name, percent, plural, summarise
 from torchrl_koap.studies.table import markdown_table, table_rows, why_not_done
@@ -62,7 +63,7 @@ def write_study_report(
     *,
     title: str,
     options: Mapping[str, Any] | None = None,
-    paper: Sequence[Mapping[str, Any]] = (),
+    paper: Sequence[PaperCell] = (),
     reference: str = "koap",
     layout: Mapping[str, Any] | None = None,
 ) -> Path:
@@ -76,7 +77,7 @@ def write_study_report(
     Keyword Args:
         title (str): heading.
         options (mapping, optional): of the study.
-        paper (sequence of mapping): of :func:`~torchrl_koap.studies.paper_results.paper_points`.
+        paper (sequence of PaperCell): of :func:`~torchrl_koap.studies.paper_results.paper_points`.
         reference (str): method that all others are compared with.
         layout (mapping, optional): of :func:`~torchrl_koap.studies.paper.write_paper_layout`, in place of ``paper``.
 
@@ -135,7 +136,7 @@ def _what_was_run(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _draw(
-    folder: Path, summaries: Sequence[Summary], methods: Sequence[str], paper: Sequence[Mapping[str, Any]]
+    folder: Path, summaries: Sequence[Summary], methods: Sequence[str], paper: Sequence[PaperCell]
 ) -> list[dict[str, Any]]:
     """Draws the pictures of every task and unit of the labels; what the page needs to show them."""
     groups = list(dict.fromkeys((item.task, item.label_unit) for item in summaries))
@@ -145,7 +146,7 @@ def _draw(
         shares = sorted({item.demonstrations for item in items})
         main = [item for item in items if item.demonstrations == shares[-1]]
         name = task if sum(task == other for other, _ in groups) == 1 else f"{task}_{label_unit}"
-        points = [row for row in paper if row.get("task", task) == task]
+        points = [cell for cell in paper if cell.task == task]
         error = "relative_action_error"
         if not any(item.mean(error) for item in main):
             error = "action_error"
@@ -184,15 +185,13 @@ def _figure(name: str, kind: str, task: str, more: str = "") -> dict[str, Any]:
     return {"title": f"{head}, {task}", "caption": caption + more, "source": source, "beside": not wide}
 
 
-def _paper_rows(summaries: Sequence[Summary], paper: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def _paper_rows(summaries: Sequence[Summary], paper: Sequence[PaperCell]) -> list[dict[str, str]]:
     ours = {(s.task, s.method, s.labels): s.measures["success"] for s in summaries if "success" in s.measures}
     rows = []
-    for row in paper:
-        item = ours.get((row["task"], row["method"], row["labels"])) if "task" in row else None
-        here = "not run" if item is None else f"{percent(item.mean, 1)} ({100 * item.low:.1f}-{100 * item.high:.1f})"
-        names = {"task": row.get("task", ""), "method": row["method"], "labels": percent(row["labels"])}
-        spread = f" +- {100 * row['spread']:.1f}" if row.get("spread") is not None else ""
-        rows.append(names | {"paper (%)": f"{100 * row['success']:.1f}{spread}", "here (95 %)": here})
+    for cell in paper:
+        item = ours.get((cell.task, cell.method, cell.label_share))
+        names = {"task": cell.task, "method": cell.method, "labels": percent(cell.label_share)}
+        rows.append(names | {"paper (%)": cell.text, "here (95 %)": "not run" if item is None else item.text})
     return rows
 
 

@@ -41,12 +41,6 @@ class StudyResult:
         rows (list of dict): cells as in ``cells.csv``.
         counts (mapping): how many cells are done, failed and missing.
         report (Path): the page.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from torchrl_koap.studies.run import StudyResult
-        >>> StudyResult([], {"done": 0}, Path("index.html")).counts
-        {'done': 0}
     """
 
     rows: list[dict[str, Any]]
@@ -81,7 +75,6 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         ValueError: unknown method 'kaop'; did you mean 'koap'?
     """
     machines = Machines() if machines is None else machines
-    machines.check()
     before = read_study(study.out)
     study = complete(study, () if before is None else before.run.plugins)
     cells, root = check_study(study), RunDirectory(study.out)
@@ -112,7 +105,7 @@ def _report(study: Study, table: _Table) -> Path:
         paper = [point for task in study.tasks for point in paper_points(task)]
         layout = write_paper_layout(study.out, rows) if study.levels else None
     named = study.tasks[0] if len(study.tasks) == 1 else f"{len(study.tasks)} tasks"
-    options = {name: value for name, value in flat_options(study).items() if value not in (None, [])}
+    options = {name: value for name, value in flat_options(to_json(study)).items() if value not in (None, [])}
     title = f"Label efficiency on {named}"
     return write_study_report(study.out, rows, table.outcomes, title=title, options=options, paper=paper, layout=layout)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from torchrl_koap.runs.config import ControllerConfig, LabelConfig, PlannerConfi
 from torchrl_koap.runs.plugins import load_plugins
 from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.studies.cells import NOISE_STEP, Cell
-from torchrl_koap.studies.presets import PRESETS, Preset
+from torchrl_koap.studies.presets import PRESETS, USUAL
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import find_task_of
 from torchrl_koap.training.defaults import resolve
@@ -191,32 +191,16 @@ def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
     """
     plugins = union(plugins, study.run.plugins)
     load_plugins(plugins)
-    usual = Preset() if study.preset is None else lookup(PRESETS, study.preset, "preset")
-    run, evaluation = study.run, study.evaluation
-    if run.precision == RunConfig.precision:
-        run = replace(run, precision=usual.precision)
-    if evaluation.episodes == EvalConfig.episodes:
-        evaluation = replace(evaluation, episodes=usual.episodes)
-    labels, levels = study.labels, study.levels
-    if not labels and not levels:
-        labels, levels = usual.labels, usual.levels
+    usual = USUAL | ({} if study.preset is None else lookup(PRESETS, study.preset, "preset"))
+    if study.labels or study.levels:  # neither comes on top of the other
+        usual |= {"labels": (), "levels": ()}
+    study = _filled_in(study, usual)
     study = replace(
         study,
         out=study.out.absolute(),
         preset=None,
-        tasks=study.tasks or usual.tasks or _tasks_of(study.datasets),
-        record=usual.record if study.record is None else study.record,
-        methods=study.methods or usual.methods,
-        labels=labels,
-        levels=levels,
-        first_seed_only=usual.first_seed_only if study.first_seed_only is None else study.first_seed_only,
-        label_unit=study.label_unit or usual.label_unit,
-        demonstrations=study.demonstrations or usual.demonstrations,
-        seeds=usual.seeds if study.seeds is None else study.seeds,
-        planner=replace(usual.planner, **_asked(study.planner)),
-        controller=replace(usual.controller, **_asked(study.controller)),
-        evaluation=evaluation,
-        run=replace(run, plugins=plugins),
+        tasks=study.tasks or _tasks_of(study.datasets),
+        run=replace(study.run, plugins=plugins),
     )
     for name in study.tasks:
         study.task(name)
@@ -229,8 +213,16 @@ def _named(paths: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(f"{task}={path}" for task, path in paths.items())
 
 
-def _asked(section: PlannerConfig | ControllerConfig) -> dict[str, Any]:
-    return {name: value for name, value in vars(section).items() if value is not None}
+def _filled_in(given: Any, usual: Mapping[str, Any]) -> Any:
+    """Options with the usual ones in place of those that are at their defaults; likewise in every section."""
+    found = {}
+    for option in fields(given):
+        value = vars(given)[option.name]
+        if isinstance(usual.get(option.name), Mapping):
+            found[option.name] = _filled_in(value, usual[option.name])
+        elif option.name in usual and value == option.default:
+            found[option.name] = usual[option.name]
+    return replace(given, **found)
 
 
 def _tasks_of(datasets: Sequence[str]) -> tuple[str, ...]:

@@ -28,30 +28,25 @@ MEASURES = (
 
 @dataclass(frozen=True)
 class Measure:
-    """A mean with its ends: of ``"success"`` the Wilson 95 % interval, of all others the least and greatest seed.
-
-    Examples:
-        >>> from torchrl_koap.studies.summary import Measure
-        >>> Measure(0.5, low=0.2, high=0.8).high
-        0.8
-    """
+    """A mean with its ends: of ``"success"`` the Wilson 95 % interval, of all others the least and greatest seed."""
 
     mean: float
     low: float
     high: float
+
+    @property
+    def text(self) -> str:
+        """A share with its ends in percent: ``50.0 % (20.0-80.0)``."""
+        return f"{percent(self.mean, 1)} ({100 * self.low:.1f}-{100 * self.high:.1f})"
 
 
 @dataclass(frozen=True)
 class Summary:
     """All seeds of a method at one share of labels.
 
-    Args:
-        labels (float): share of the labels.
-        demonstrations (float): share of the demonstrations that is known at all.
-        done, failed, missing (tuple of int): seeds whose cell is that.
-        successes, episodes (int): over all done cells.
-        measures (mapping): :class:`Measure` by name: ``"success"``, ``"seed_success"`` (worst and best seed) and
-            :data:`MEASURES`, those that some cell has.
+    ``labels`` and ``demonstrations`` are shares; ``done``, ``failed`` and ``missing`` the seeds whose cell is that.
+    ``measures`` are ``"success"``, ``"seed_success"`` (worst and best seed) and those :data:`MEASURES` that some cell
+    has.
 
     Examples:
         >>> from torchrl_koap.studies.summary import summarise
@@ -91,8 +86,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
     The Wilson interval takes every episode for independent. The same contexts recur for every seed, so it is too narrow
     where seeds differ more than chance: look at the range of the seeds beside it.
 
-    Args:
-        rows (sequence of mapping): cells, with at least task, method, labels, seed and status.
+    Cells have at least task, method, labels, seed and status.
 
     Raises:
         ValueError: if a cell occurs twice, or is done without its number of episodes and successes.
@@ -165,10 +159,6 @@ def cell_name(row: Mapping[str, Any]) -> str:
 
 def percent(share: float | None, digits: int | None = None) -> str:
     """A share in percent, with as few digits as it has if ``digits`` is not given; None gives a dash.
-
-    Args:
-        share (float, optional): 0 to 1.
-        digits (int, optional): behind the point.
 
     Examples:
         >>> from torchrl_koap.studies.summary import percent

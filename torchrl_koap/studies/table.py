@@ -50,12 +50,8 @@ _WORDS = {int: "a whole number", float: "a finite number"}
 def write_cells(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Writes cells as csv, aside first; what a row lacks, and what is not a finite number, stays empty.
 
-    Args:
-        path (str or Path): the file.
-        rows (sequence of mapping): columns of :data:`CELL_COLUMNS`.
-
     Raises:
-        ValueError: for another column, or an unknown status.
+        ValueError: for another column than :data:`CELL_COLUMNS`, or an unknown status.
     """
     path = Path(path)
     for row in rows:
@@ -76,10 +72,7 @@ def _written(value: Any) -> Any:
 
 
 def read_cells(path: str | Path) -> list[dict[str, Any]]:
-    """Reads cells with their types; empty numbers are None, empty texts are empty.
-
-    Args:
-        path (str or Path): a file of :func:`write_cells`. Columns may be in another order.
+    """Reads a file of :func:`write_cells` with its types; empty numbers are None, columns may be in another order.
 
     Raises:
         ValueError: if the file is damaged; the message names it, the line and the column.
@@ -166,10 +159,7 @@ def table_rows(summaries: Sequence[Summary]) -> list[dict[str, str]]:
 
 
 def _interval(item: Summary) -> str:
-    if "success" not in item.measures:
-        return "no cell done"
-    success = item.measures["success"]
-    return f"{percent(success.mean, 1)} ({100 * success.low:.1f}-{100 * success.high:.1f})"
+    return item.measures["success"].text if "success" in item.measures else "no cell done"
 
 
 def _range(item: Summary) -> str:
