@@ -34,7 +34,6 @@ COVERED_BY = {
     "envs/scooping/simulation.py": "envs/scooping/test_env.py",
     "evaluation/closed_loop.py": "commands/test_eval.py",
     "evaluation/config.py": "commands/test_eval.py",
-    "evaluation/environments.py": "evaluation/test_gymnasium.py",
     "evaluation/inspection.py": "evaluation/test_diagnosis.py",
     "evaluation/latency.py": "commands/test_eval.py",
     "evaluation/policies.py": "evaluation/test_oracle.py",

@@ -36,7 +36,7 @@ from torchrl_koap.tasks import get_task
 assert "site-packages" in torchrl_koap.__file__, torchrl_koap.__file__
 assert len(evaluation_contexts(get_task("aligning"))) >= 60
 with tempfile.TemporaryDirectory() as folder:
-    Path(folder, "eval.json").write_text('{"success_rate": 0.5, "episodes": 2}')
+    Path(folder, "eval.json").write_text('{"rates": {"success": {"rate": 0.5, "episodes": 2}}}')
     assert "50.0 %" in write_report(folder).read_text()
 print(torchrl_koap.__version__)
 """

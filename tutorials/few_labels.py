@@ -112,8 +112,8 @@ result = score(episodes, seeds, num_modes=task.num_modes, mode_index=mode_index)
 rollouts = rollouts_to_tensors(episodes, position=task.observation[task.position], mode_index=mode_index, interval=4)
 rollouts = {name: tensor.numpy() for name, tensor in rollouts.items()}
 draw_rollouts(rollouts, RunFacts(Path(), task)).savefig("few_labels.png", dpi=150)
-low, high = (100 * result[f"success_{end}"] for end in ("low", "high"))
-print(f"success {100 * result['success_rate']:.1f} % ({low:.0f}-{high:.0f}) of {len(seeds)} rollouts")
+rate, low, high = (100 * result["rates"]["success"][name] for name in ("rate", "low", "high"))
+print(f"success {rate:.1f} % ({low:.0f}-{high:.0f}) of {len(seeds)} rollouts")
 print(f"{result['distinct_modes']} of {task.num_modes} ways taken, entropy {result['mode_entropy']:.2f}")
 
 # %%

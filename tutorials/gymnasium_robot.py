@@ -128,9 +128,9 @@ for method in ("linear", "koap_untrained", "koap"):
 
 print("\nrollouts from the upper end to the lower one, 20 each")
 for method, result in results.items():
-    low, high = (100 * result[f"success_{end}"] for end in ("low", "high"))
+    rate, low, high = (100 * result["rates"]["success"][name] for name in ("rate", "low", "high"))
     print(
-        f"{method:16} {100 * result['success_rate']:5.1f} % ({low:.0f}-{high:.0f}),"
+        f"{method:16} {rate:5.1f} % ({low:.0f}-{high:.0f}),"
         f" {np.mean([row['steps'] for row in result['episode']]):.0f} steps"
     )
 

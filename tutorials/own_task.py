@@ -193,8 +193,8 @@ trained = train(TrainConfig(dataset=str(folder / "demos"), out=run, labels=Label
 labels = trained.results["labels"]
 print(f"labels: {labels['labelled_transitions']} of {labels['total_transitions']} transitions")
 result = evaluate(run, EvalConfig(episodes=40, rollouts_per_context=2, seed=100))
-low, high = (100 * result[f"success_{end}"] for end in ("low", "high"))
-print(f"success {100 * result['success_rate']:.1f} % ({low:.0f}-{high:.0f}) of 40 rollouts")
+rate, low, high = (100 * result["rates"]["success"][name] for name in ("rate", "low", "high"))
+print(f"success {rate:.1f} % ({low:.0f}-{high:.0f}) of 40 rollouts")
 errors = result["action_errors"]["outside_budget"]["unit"][0]  # all actions are known: they serve evaluation alone
 print("action error, mm:", {name: round(1e3 * errors[name], 2) for name in ("controller", "ridge", "mean_action")})
 print(f"entropy of the sides {result['pooled_mode_entropy']:.2f}, 1 is an even choice")

@@ -87,9 +87,9 @@ for name, options in {
 }.items():
     results[name], episodes = closed_loop(*options)
     result = results[name]
+    rate, low, high = (100 * result["rates"]["success"][part] for part in ("rate", "low", "high"))
     print(
-        f"{name:24} success {100 * result['success_rate']:5.1f} %"
-        f" ({100 * result['success_low']:.0f}-{100 * result['success_high']:.0f}),"
+        f"{name:24} success {rate:5.1f} % ({low:.0f}-{high:.0f}),"
         f" entropy {result['mode_entropy'] or 0:.2f}, {result['distinct_modes']} modes"
     )
 

@@ -10,6 +10,7 @@ import torch
 from tiny_runs import koap
 
 from torchrl_koap.evaluation.action_errors import AFTER
+from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.runs.weights import load_tensors
 
 
@@ -20,9 +21,7 @@ def test_what_an_evaluation_writes(copied_run, capsys):
     rows = result["episode"]
     assert [row["seed"] for row in rows] == [100, 101, 102]
     assert {row["outcome"] for row in rows} <= {"success", "collision", "timeout"}
-    won = sum(row["outcome"] == "success" for row in rows)
-    assert result["success_rate"] == won / 3 and result["episodes"] == 3
-    assert 0 <= result["success_low"] <= result["success_rate"] <= result["success_high"] <= 1
+    assert result["rates"]["success"] == rate([row["outcome"] == "success" for row in rows]) and result["episodes"] == 3
     assert result["collisions"] == sum(row["outcome"] == "collision" for row in rows)
     assert result["mean_steps"] == pytest.approx(sum(row["steps"] for row in rows) / 3)
     assert all(-1 <= row["mode"] < 24 for row in rows) and 0 <= result["mode_entropy"] <= 1
@@ -32,7 +31,7 @@ def test_what_an_evaluation_writes(copied_run, capsys):
     assert tensors["length"].tolist() == [row["steps"] for row in rows] and about["task"] == "avoiding"
     assert (copied_run / "index.html").stat().st_size > 1000
     out = capsys.readouterr().out
-    assert "success_rate" in out and "labels_read_outside_budget" in out and "mean_action" not in out
+    assert "rates success" in out and "labels_read_outside_budget" in out and "mean_action" not in out
 
 
 def test_labels_outside_the_budget_are_read_here_alone(copied_run, demonstrations, no_report, tmp_path):

@@ -22,7 +22,7 @@ from torchrl_koap import (
     save_demonstrations,
     train,
 )
-from torchrl_koap.evaluation.statistics import wilson_interval
+from torchrl_koap.evaluation.statistics import rate
 from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
 
@@ -43,8 +43,7 @@ def test_the_command(arm_run):
     asked = ("--env", "toy_gym:ToyReachOwnKey-v0", "--success-key", "arrived", "--no-animate")
     assert koap("eval", arm_run, "--episodes", 3, "--threads", 1, *asked) == 0
     result = json.loads((arm_run / "eval.json").read_text())
-    assert (result["episodes"], result["success_rate"]) == (3, 1.0)
-    assert (result["success_low"], result["success_high"]) == wilson_interval(3, 3)
+    assert result["episodes"] == 3 and result["rates"]["success"] == rate([True] * 3)
     assert result["mode_entropy"] is None and result["env"] == "toy_gym:ToyReachOwnKey-v0"
     assert [row["seed"] for row in result["episode"]] == [100, 101, 102]
     assert {row["steps"] for row in result["episode"]} == {6}

@@ -44,7 +44,7 @@ def run(tmp_path_factory):
 def test_a_run_of_seven_joints(run):
     result = evaluate(run, FEW)
     assert result == json.loads((run / "eval.json").read_text())
-    assert result["kind"] == "offline" and "success_rate" not in result
+    assert result["kind"] == "offline" and "rates" not in result
     (group,) = result["plan_errors"]["unit"]
     assert group["unit"] == "rad" and len(group["columns"]) == 14 and len(group["planner"]["best_of"]["per_step"]) == 14
     assert result["action_errors"]["outside_budget"]["note"] == "no trajectory outside the budget has labels"

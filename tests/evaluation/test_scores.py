@@ -38,10 +38,7 @@ def test_scores_by_hand():
     assert 0 <= result.pop("mode_entropy_low") < 0.75 < result.pop("mode_entropy_high") <= 1
     assert result == {
         "episodes": 8,
-        "rates": {"success": {"rate": 0.625, "low": low, "high": high}},
-        "success_rate": 0.625,
-        "success_low": low,
-        "success_high": high,
+        "rates": {"success": {"rate": 0.625, "low": low, "high": high, "episodes": 8}},
         "mode_entropy": pytest.approx(0.75),
         "distinct_modes": 3,
         "collisions": 2,
@@ -61,7 +58,7 @@ def test_entropy_per_context_by_hand():
     # entropies 1, 0, 0 (one of the two modes was not complete) of the contexts with success
     result = score(episodes, range(8), **options)
     assert result["mode_entropy"] == pytest.approx(1 / 3) and result["contexts"] == 4
-    assert result["success_rate"] == 6 / 8 and result["episode"][3]["context"] == 1
+    assert result["rates"]["success"]["rate"] == 6 / 8 and result["episode"][3]["context"] == 1
     assert result["pooled_mode_entropy"] == pytest.approx(0.9709505944546686)  # 2 of 0, 3 of 1
     assert 0 <= result["mode_entropy_low"] <= 1 / 3 <= result["mode_entropy_high"] <= 1
     assert score(episodes, range(8), unsolved="zero", **options)["mode_entropy"] == pytest.approx(1 / 4)
@@ -114,7 +111,7 @@ def test_stacked_boxes_by_hand():
     ],
 )
 def test_the_figure_that_d3il_ranks_by(task, success, entropy, wanted):
-    found = task_scores(get_task(task), {"success_rate": success, "mode_entropy": entropy}, [], [])
+    found = task_scores(get_task(task), {"rates": {"success": {"rate": success}}, "mode_entropy": entropy}, [], [])
     assert found.get("d3il_score") == (None if wanted is None else pytest.approx(wanted))
 
 
@@ -132,7 +129,7 @@ def test_the_figure_of_stacking_is_the_sum_of_its_rates():
 
 def test_without_modes_there_is_no_entropy():
     result = score([episode_of(4, success=True)], [0], num_modes=1, mode_index=number)
-    assert result["success_rate"] == 1.0 and result["mode_entropy"] is None
+    assert result["rates"]["success"]["rate"] == 1.0 and result["mode_entropy"] is None
 
 
 @pytest.mark.parametrize("unsolved", ["Zero", ""])

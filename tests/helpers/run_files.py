@@ -31,10 +31,7 @@ ERRORS = {
     "column": [{"name": name, "unit": "m", **_MODELS} for name in "xy"],
 }
 EVALUATION = {
-    "rates": {"success": {"rate": 0.5, "low": 0.15, "high": 0.85}},
-    "success_rate": 0.5,
-    "success_low": 0.15,
-    "success_high": 0.85,
+    "rates": {"success": {"rate": 0.5, "low": 0.15, "high": 0.85, "episodes": 4}},
     "mode_entropy": 0.218,
     "distinct_modes": 2,
     "collisions": 1,
@@ -101,7 +98,7 @@ def make_demonstrations() -> dict[str, np.ndarray]:
 def write_run(folder: Path) -> Path:
     """Every file that training and evaluation leave."""
     config = {"task": "avoiding", "method": "koap", "preset": "default", "seed": 0, "sizes": {"planner": [32, 64]}}
-    config |= {"command": ["koap", "train", "--out", "a folder"], "versions": {"torch": "2.13.0"}}
+    config |= {"command": "koap train --out 'a folder'", "versions": {"torch": "2.13.0"}}
     summary = {"labels": LABELS, "planner_parameters": 812345, "train_seconds": {"planner": 65.0, "controller": 20.0}}
     for name, content in (("config", config), ("summary", summary), ("eval", EVALUATION)):
         (folder / f"{name}.json").write_text(json.dumps(content))

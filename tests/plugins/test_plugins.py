@@ -91,7 +91,7 @@ def test_modes_scores_and_goal():
     env = make_env(task, 4, max_steps=5)
     episodes = list(env.rollout(5, break_when_any_done=False))
     result = score(episodes, range(4), num_modes=2, mode_index=mode_index_of(task), contexts=[0, 0, 1, 1])
-    assert result["success_rate"] == 0.0 and result["episodes"] == 4
+    assert result["rates"]["success"]["rate"] == 0.0 and result["episodes"] == 4
     assert task_scores(task, result, episodes, [0, 0, 1, 1])["rates"]["passed on the left"]["rate"] == 0.0
     assert task.goal_reached(torch.tensor([[0.0, 0.0, 0.5, 0.4], [0.5, 0.4, 0.0, 0.0]])).tolist() == [True, False]
 

@@ -24,6 +24,10 @@ def found(**numbers):
     return advice(RunFacts(Path("run"), **numbers))
 
 
+def rates(success, **more):
+    return {"rates": {"success": {"rate": success, "episodes": 60} | more}}
+
+
 def actions(own, ridge):
     errors = {"left_out": {"relative": own, "relative_of_ridge": ridge}}
     return {"action_errors_on": "left_out", "action_errors": errors}
@@ -38,7 +42,7 @@ def test_nothing_is_known_and_nothing_is_said():
 
 
 def test_a_run_that_succeeds_in_many_ways_needs_nothing():
-    evaluation = {"success_rate": 0.95, "success_low": 0.86, "success_high": 0.98, "episodes": 60, "mode_entropy": 0.9}
+    evaluation = rates(0.95, low=0.86, high=0.98) | {"mode_entropy": 0.9}
     summary = {"labels": {"labelled_transitions": 80}}
     evaluation |= actions(0.1, 0.3)
     run = {"task": get_task("avoiding"), "config": {"method": "koap"}}
@@ -46,23 +50,23 @@ def test_a_run_that_succeeds_in_many_ways_needs_nothing():
 
 
 def test_failure_without_inspection_asks_for_one():
-    assert commands(evaluation={"success_rate": 0.5, "episodes": 60}) == ["koap inspect {run}"]
+    assert commands(evaluation=rates(0.5)) == ["koap inspect {run}"]
 
 
 def test_a_policy_of_its_own_cannot_be_inspected():
-    assert commands(summary={"planner_parameters": 0}, evaluation={"success_rate": 0.5, "episodes": 60}) == []
+    assert commands(summary={"planner_parameters": 0}, evaluation=rates(0.5)) == []
 
 
 @pytest.mark.parametrize(
-    ("rates", "words"),
+    ("shares", "words"),
     [
         ((0.6, 0.95, 0.5), "the planner is what fails"),
         ((0.95, 0.5, 0.4), "the controller is what fails"),
         ((0.95, 0.95, 0.4), "leave what the planner was trained on"),
     ],
 )
-def test_the_part_that_fails_is_named(rates, words):
-    (item,) = found(evaluation={"success_rate": rates[2], "episodes": 60}, inspection=inspected(*rates))
+def test_the_part_that_fails_is_named(shares, words):
+    (item,) = found(evaluation=rates(shares[2]), inspection=inspected(*shares))
     assert words in item.finding
 
 
@@ -70,7 +74,7 @@ def test_more_labels_are_not_proposed_where_the_planner_fails():
     numbers = {
         "config": {"method": "koap"},
         "summary": {"labels": {"labelled_transitions": 80}},
-        "evaluation": {"success_rate": 0.5, "episodes": 60},
+        "evaluation": rates(0.5),
     }
     assert "koap suggest {run} --count 5" in commands(**numbers)
     assert "koap suggest {run} --count 5" not in commands(**numbers, inspection=inspected(0.6, 0.9, 0.5))
@@ -78,8 +82,7 @@ def test_more_labels_are_not_proposed_where_the_planner_fails():
 
 @pytest.mark.parametrize(("candidates", "command"), [(8, "koap eval {run} --candidates 1"), (1, "koap inspect {run}")])
 def test_low_entropy(candidates, command):
-    evaluation = {"success_rate": 0.95, "episodes": 60, "mode_entropy": 0.3}
-    evaluation["execution"] = {"candidates": candidates}
+    evaluation = rates(0.95) | {"mode_entropy": 0.3, "execution": {"candidates": candidates}}
     task = get_task("avoiding")  # in which 57 episodes without preferences have an entropy of 0.93
     assert commands(task=task, evaluation=evaluation) == [command]
     assert commands(task=task, evaluation=evaluation | {"mode_entropy": 0.8}) == []
@@ -105,6 +108,6 @@ def test_slow_plans():
 
 
 def test_wide_intervals_come_last():
-    evaluation = {"success_rate": 0.5, "success_low": 0.2, "success_high": 0.8, "episodes": 8}
+    evaluation = rates(0.5, low=0.2, high=0.8, episodes=8)
     assert commands(evaluation=evaluation)[-1] == "koap eval {run} --episodes 60 --seed 100"
     assert RULES[-1].__name__ == "few_rollouts"

@@ -203,10 +203,10 @@ def test_a_policy_is_evaluated_without_a_planner(policy_run, tmp_path, capsys):
     result = json.loads((out / "eval.json").read_text())
     assert result["execution"]["strategy"] == "open_loop"
     assert [row["seed"] for row in result["episode"]] == [100, 101]
-    assert result["success_rate"] == sum(row["outcome"] == "success" for row in result["episode"]) / 2
+    assert result["rates"]["success"]["rate"] == sum(row["outcome"] == "success" for row in result["episode"]) / 2
     rollouts = load_tensors(out / "rollouts.safetensors")[0]
     assert rollouts["length"].tolist() == [row["steps"] for row in result["episode"]]
-    assert "success_rate" in capsys.readouterr().out
+    assert "rates success" in capsys.readouterr().out
 
 
 def test_a_policy_spends_the_labels_it_was_given(policy_run):

@@ -79,7 +79,8 @@ class Eval(Command):
             write_report(folder, animation=self.animate)
         with open_logger(self.logger, folder) as logger:
             if logger is not None:
-                log_scores(logger, result)
+                rates = {f"{name}_rate": values["rate"] for name, values in result.get("rates", {}).items()}
+                log_scores(logger, result | rates)
         return describe_offline(result) if result.get("kind") == KIND else result
 
 

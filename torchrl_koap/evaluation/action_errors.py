@@ -16,7 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from torchrl_koap.data import cut_windows
-from torchrl_koap.evaluation.plan_errors import SAMPLES, score_sequences
+from torchrl_koap.evaluation.plan_errors import SAMPLES, score_sequences, spread_evenly
 from torchrl_koap.modules import DiffusionPolicy, LinearInverseDynamics
 from torchrl_koap.modules.planning.energy_score import sample_sequences
 from torchrl_koap.modules.ridge import DEFAULT_PENALTY, ridge
@@ -111,11 +111,8 @@ def errors_left_out(
     What lies before the decoder stays as it was trained; it has seen the states of the trajectory left out, and none of
     its labels where it is trained without any.
 
-    Args:
-        controller (nn.Module): the trained controller, whose decoder is fitted in closed form; not changed.
-        labelled (TensorDictBase): flat data after the budget was applied, as the controller sees it.
-        task (Task): names and units of the actions.
-        columns (sequence of int): state columns that the controller reads.
+    Args: as :func:`errors_outside_budget`; the controller, whose decoder is fitted in closed form, is not changed, and
+    ``columns`` are the state columns that it reads.
 
     Returns:
         dict: as of :func:`errors_outside_budget`.
@@ -155,17 +152,13 @@ def errors_of_chunks(
     task: Task,
     *,
     samples: int = SAMPLES,
-    chunks: int = 500,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Errors of sampled actions on the trajectories that have labels of which none was in the budget.
 
-    Args:
-        policy (DiffusionPolicy): the trained policy, of which ``samples`` chunks are drawn in each situation.
-        data (TensorDictBase): flat data ``[N]`` with ``state`` and all labels that there are; at most ``chunks``
-            situations are looked at, spread evenly over all labelled steps.
-        labelled (TensorDictBase): the same after the budget was applied.
-        task (Task): names and units of the actions.
+    Of the policy ``samples`` chunks are drawn in each situation, of which there are as many as for
+    :func:`~torchrl_koap.evaluation.plan_errors.plan_errors`. Args: as :func:`errors_outside_budget`, all columns of the
+    state included.
 
     Returns:
         dict: of :func:`summarise_errors` for the mean of the sampled first actions, where ``"ridge"`` is a linear
@@ -184,8 +177,7 @@ def errors_of_chunks(
     windows = windows[torch.isin(windows["episode"][:, -1], episodes.cpu())]
     if not len(windows):
         return {"note": "no trajectory outside the budget has labels"}
-    if len(windows) > chunks:
-        windows = windows[torch.linspace(0, len(windows) - 1, chunks).round().long()]
+    windows = spread_evenly(windows)
 
     def moved(part: TensorDictBase) -> Tensor:
         """Absolute actions as distances from where their columns are in the present frame."""

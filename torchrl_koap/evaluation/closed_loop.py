@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from torchrl_koap.evaluation.config import EvalConfig, check_options
-from torchrl_koap.evaluation.environments import choose_contexts, environment_of
 from torchrl_koap.evaluation.latency import measure_latency
 from torchrl_koap.evaluation.loop_on_labels import limited_commands
 from torchrl_koap.evaluation.offline import evaluate_actions, evaluate_offline
@@ -24,6 +26,7 @@ from torchrl_koap.runs.pretrained import writable_folder
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory
 from torchrl_koap.runs.weights import save_tensors
+from torchrl_koap.tasks import Task
 from torchrl_koap.training.trained import Trained
 
 
@@ -49,18 +52,12 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
     Examples:
         >>> import tempfile
         >>> from pathlib import Path
-        >>> import numpy as np
-        >>> from torchrl_koap import ControllerConfig, EvalConfig, PlannerConfig, TrainConfig, evaluate, train
-        >>> from torchrl_koap.data import save_demonstrations
-        >>> states = [np.random.default_rng(i).normal(size=(30, 4)).cumsum(0) for i in range(6)]
-        >>> actions = [np.diff(frames[:, :2], axis=0) if i < 2 else None for i, frames in enumerate(states)]
-        >>> with tempfile.TemporaryDirectory() as root:
-        ...     arm = save_demonstrations(root + "/arm", states, actions, control_hz=30, robot=[0, 1])
-        ...     few = {"planner": PlannerConfig(steps=2), "controller": ControllerConfig(steps=2)}
-        ...     _ = train(TrainConfig(dataset=str(arm), out=Path(root) / "run", **few))
-        ...     scores = evaluate(root + "/run", EvalConfig(samples=2, threads=1))
-        >>> scores["kind"], scores["relative_plan_error"] > 0  # without an environment: on recorded data
-        ('offline', True)
+        >>> from torchrl_koap import EvalConfig, evaluate
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     config = EvalConfig(episodes=2, threads=1, out=Path(folder, "run"))
+        ...     result = evaluate("pretrained:avoiding", config)
+        >>> result["rates"]["success"]["episodes"]
+        2
     """
     config = EvalConfig() if config is None else config
     check_options(config)
@@ -74,7 +71,7 @@ def evaluate(run: str | Path, config: EvalConfig | None = None) -> dict[str, Any
         raise ValueError("the strategy 'oracle' reads the task's own simulation; it cannot be combined with env")
     policy = trained_policy(trained, config.execution)
     seeds = list(range(config.seed, config.seed + config.episodes))
-    where = environment_of(task, config)
+    where = _place_of(task, config)
     errors, actions = evaluate_actions(trained, config.dataset)
     policy = policy.to(config.device)
     with progress_bar(config.episodes, "rollouts", unit="episode") as bar:
@@ -125,11 +122,70 @@ def _judge_offline(trained: Trained, config: EvalConfig) -> dict[str, Any]:
     """Evaluation without an environment; an earlier one in closed loop cannot have been this task's."""
     choose_contexts(trained.task, 1, config.rollouts_per_context, config.contexts_file)  # refuses what has no meaning
     policy = trained_policy(trained, config.execution)
-    asked: dict[str, Any] = {"dataset": config.dataset, "samples": config.samples, "seed": config.seed}
-    result, actions = evaluate_offline(trained, **asked, execution=config.execution)
+    result, actions = evaluate_offline(trained, config)
     result |= measure_latency(policy.to(config.device), trained.task.observation_dim)
     result["seed"] = config.seed
     if actions:
         save_tensors(trained.folder / "actions.safetensors", actions)
     RunDirectory(trained.folder).write_json("eval.json", result)
     return result
+
+
+def choose_contexts(
+    task: Task, episodes: int, rollouts_per_context: int = 1, contexts_file: Path | None = None
+) -> tuple[list[int] | None, np.ndarray | None]:
+    """Returns number and pose of the context of every rollout; None for a task in which all episodes start alike.
+
+    Raises:
+        ValueError: if there are too few contexts, or they were asked for where the task has none.
+    """
+    if not task.objects:
+        _refuse_contexts(rollouts_per_context, contexts_file, f"task {task.name!r}")
+        return None, None
+    from torchrl_koap.envs.contexts import evaluation_contexts, load_contexts  # takes seconds
+
+    table = evaluation_contexts(task) if contexts_file is None else load_contexts(contexts_file, task)
+    needed = (episodes - 1) // rollouts_per_context + 1
+    if needed > len(table):
+        raise ValueError(
+            f"{episodes} episodes with {rollouts_per_context} per context need {needed} contexts,"
+            f" there are {len(table)}"
+        )
+    numbers = [episode // rollouts_per_context for episode in range(episodes)]
+    return numbers, table[numbers]
+
+
+def _refuse_contexts(rollouts_per_context: int, contexts_file: Path | None, where: str) -> None:
+    given = {"contexts_file": contexts_file is not None, "rollouts_per_context": rollouts_per_context != 1}
+    for name, unfit in given.items():
+        if unfit:
+            raise ValueError(f"{name} was given, but {where} has no contexts")
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a run is rolled out."""
+
+    make_env: Callable[[int], Any]  # of a number of parallel episodes
+    max_steps: int
+    mode_index: Callable[[torch.Tensor], torch.Tensor]  # from the environment's leaf ``mode``
+    num_modes: int
+    numbers: list[int] | None = None  # of the context of every rollout
+    contexts: np.ndarray | None = None
+
+
+def _place_of(task: Task, config: EvalConfig) -> _Place:
+    """The task's own environment, or the one of Gymnasium that was asked for."""
+    if config.env is None:
+        numbers, contexts = choose_contexts(task, config.episodes, config.rollouts_per_context, config.contexts_file)
+        from torchrl_koap.envs.registry import make_env_of, mode_index_of  # takes seconds
+
+        make_env = make_env_of(task, num_threads=config.threads or torch.get_num_threads())
+        return _Place(make_env, task.max_steps, mode_index_of(task), task.num_modes, numbers, contexts)
+    _refuse_contexts(config.rollouts_per_context, config.contexts_file, "an environment of Gymnasium")
+    from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch
+
+    make_env = partial(GymnasiumBatch, config.env, task, success_key=config.success_key)
+    probe = make_env(1)
+    probe.close()
+    return _Place(make_env, probe.max_steps, lambda mode: mode[..., 0], 1)

@@ -38,7 +38,7 @@ class EvalConfig:
 
     Examples:
         >>> from torchrl_koap.evaluation import EvalConfig, evaluate
-        >>> evaluate("runs/koap", EvalConfig(episodes=20))["success_rate"]  # doctest: +SKIP
+        >>> evaluate("runs/koap", EvalConfig(episodes=20))["rates"]["success"]  # doctest: +SKIP
     """
 
     episodes: int = 60

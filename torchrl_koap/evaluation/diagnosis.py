@@ -23,6 +23,7 @@ from torchrl_koap.keys import HAS_ACTION, OBSERVATION, PLAN
 from torchrl_koap.modules import PlanningPolicy, StatePlanner
 from torchrl_koap.tasks import Task
 
+_MOST_STATES = 4000  # visited, and demonstrated, whose distances are measured
 RECORDED_FUTURE = "recorded_future"
 RECORDED = "recorded"  # steps whose next state the recording that is followed has, not the standing at its end
 
@@ -173,11 +174,10 @@ def left_recordings(task: Task, episodes: Sequence[TensorDict], interval: int, *
     return sum(error[task.position][-1] > beyond for error in errors if task.position in error)
 
 
-def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase, *, most: int = 4000) -> dict[str, float]:
+def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase) -> dict[str, float]:
     """Measures how far visited states are from the nearest demonstrated one, and demonstrated ones, in spreads.
 
-    Every second demonstration is compared with the others, so that both figures are distances to strangers. About
-    ``most`` states of each kind are looked at.
+    Every second demonstration is compared with the others, so that both figures are distances to strangers.
 
     Returns:
         dict: median and 95 % quantile of the distances; empty if there is a single demonstration.
@@ -189,7 +189,7 @@ def coverage(task: Task, episodes: Sequence[TensorDict], data: TensorDictBase, *
     scale = known.std(0).clamp_min(1e-6) * task.state_dim**0.5
     visited = torch.cat([task.state_of(episode[OBSERVATION]) for episode in episodes])
     known = known[:: max(1, len(known) // 20000)]
-    sample = [states[:: max(1, len(states) // most)] for states in (visited, held_out)]
+    sample = [states[:: max(1, len(states) // _MOST_STATES)] for states in (visited, held_out)]
     figures = [
         torch.cat([torch.cdist(part / scale, known / scale).amin(1) for part in states.split(2048)])
         for states in sample

@@ -19,7 +19,7 @@ _LEFT = 0.1  # share of recorded paths that a controller may leave
 _WORSE = 2.0  # from here on a latent model's error is no longer that of a comparable model
 
 
-def unit_circle_sides(magnitudes: Sequence[float], *, tolerance: float = ON_THE_CIRCLE) -> list[str]:
+def unit_circle_sides(magnitudes: Sequence[float]) -> list[str]:
     """Tells whether eigenvalues of these magnitudes lie ``"inside"``, ``"on"`` or ``"outside"`` the unit circle.
 
     Examples:
@@ -27,7 +27,8 @@ def unit_circle_sides(magnitudes: Sequence[float], *, tolerance: float = ON_THE_
         >>> unit_circle_sides([0.9, 0.9995, 1.2])
         ['inside', 'on', 'outside']
     """
-    return ["outside" if size > 1 + tolerance else "inside" if size < 1 - tolerance else "on" for size in magnitudes]
+    low, high = 1 - ON_THE_CIRCLE, 1 + ON_THE_CIRCLE
+    return ["outside" if size > high else "inside" if size < low else "on" for size in magnitudes]
 
 
 def error_unit(part: str, task: Task) -> tuple[str, float]:

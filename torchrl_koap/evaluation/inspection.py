@@ -12,6 +12,7 @@ import tyro
 from tensordict import TensorDictBase
 
 from torchrl_koap.data import controller_view, trajectory_lengths
+from torchrl_koap.evaluation.closed_loop import choose_contexts
 from torchrl_koap.evaluation.diagnosis import (
     coverage,
     follow_recordings,
@@ -19,7 +20,6 @@ from torchrl_koap.evaluation.diagnosis import (
     planner_rollout,
     tracking_errors,
 )
-from torchrl_koap.evaluation.environments import choose_contexts
 from torchrl_koap.evaluation.findings import NEAR, describe_inspection
 from torchrl_koap.evaluation.latent_space import analyse_latent
 from torchrl_koap.evaluation.policies import trained_policy

@@ -205,7 +205,6 @@ def analyse_latent(
     parts: Mapping[str, Sequence[int]],
     *,
     horizon: int = 10,
-    seed: int = 0,
 ) -> dict[str, Any]:
     """Measures spectrum, multi-step errors and what a linear probe explains.
 
@@ -217,7 +216,6 @@ def analyse_latent(
 
     Keyword Args:
         horizon (int): steps to predict; fewer where trajectories are shorter.
-        seed (int): seed of the half of the trajectories that is fitted on.
 
     Returns:
         dict: ``eigenvalues``, ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET`
@@ -226,7 +224,7 @@ def analyse_latent(
         labelled trajectories.
     """
     result: dict[str, Any] = {"eigenvalues": spectrum(controller.operator.eigenvalues())}
-    fit_on = split_trajectories(data[EPISODE], labelled, seed=seed)
+    fit_on = split_trajectories(data[EPISODE], labelled)
     reach = controller.num_window_frames - 1 - controller.num_past
     horizon = min(horizon, max(1, int(trajectory_lengths(data).min()) - reach))
     held_out = int(len(data[EPISODE].unique()) - len(fit_on))
@@ -240,7 +238,7 @@ def analyse_latent(
         if len(steps[EPISODE].unique()) < 2:
             note = "fewer than two trajectories have labels to probe latent actions with"
             return result | {OUTSIDE_THE_BUDGET: {"note": note}}
-        fit_on = split_trajectories(steps[EPISODE], torch.zeros(len(steps), dtype=torch.bool), seed=seed)
+        fit_on = split_trajectories(steps[EPISODE], torch.zeros(len(steps), dtype=torch.bool))
     latent, action, fit = steps["latent_action"], steps[ACTION], torch.isin(steps[EPISODE], fit_on)
     budget = data[EPISODE][labelled].unique()
     with torch.no_grad():

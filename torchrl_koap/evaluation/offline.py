@@ -19,7 +19,7 @@ from torchrl_koap.runs.run_directory import RunDirectoryError
 from torchrl_koap.tasks.units import thousandths
 
 if TYPE_CHECKING:
-    from torchrl_koap.modules import ExecutionConfig
+    from torchrl_koap.evaluation.config import EvalConfig
     from torchrl_koap.training.trained import Trained
 
 KIND = "offline"
@@ -30,15 +30,7 @@ _CHUNKS = ("policy", "mean_action")
 _COMMANDS = "the controller decodes no recorded states: it follows plans by the command that it gave"
 
 
-def evaluate_offline(
-    trained: Trained,
-    *,
-    dataset: str | None = None,
-    samples: int = 16,
-    plans: int = 500,
-    seed: int = 0,
-    execution: ExecutionConfig | None = None,
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def evaluate_offline(trained: Trained, config: EvalConfig) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Judges a run on recorded data.
 
     Plans are scored on the validation trajectories, which the planner has not seen
@@ -47,9 +39,6 @@ def evaluate_offline(
     (:mod:`~torchrl_koap.evaluation.action_errors`). A policy of its own samples chunks of actions outside the budget.
     The whole policy acts in a linear model of how states follow actions
     (:func:`~torchrl_koap.evaluation.loop_on_labels.check_loop`).
-
-    There are ``samples`` plans or chunks in each of at most ``plans`` situations. The data set is where it was, unless
-    ``dataset`` says where it is now.
 
     Returns:
         tuple: ``kind`` ``"offline"``, ``plan_errors``, ``action_errors`` and ``loop``, ``relative_plan_error`` (1: no
@@ -60,16 +49,16 @@ def evaluate_offline(
     Raises:
         RunDirectoryError: if the data set has moved, or is another one.
     """
-    data = trained.data(dataset)
+    data = trained.data(config.dataset)
     labelled, _ = trained.hide_labels(data)
-    plan = _plans(trained, data, samples=samples, plans=plans, seed=seed)
+    asked = {"samples": config.samples, "seed": config.seed}
+    plan = _plans(trained, data, **asked)
     if trained.planner is not None:
         outside, tensors = _outside_budget(trained, data, labelled)
     else:
-        asked = {"samples": samples, "chunks": plans, "seed": seed}
         outside, tensors = errors_of_chunks(trained.controller, data, labelled, trained.task, **asked), {}
     action = {"outside_budget": outside, "left_out": _left_out(trained, labelled, outside)}
-    loop = check_loop(trained, data, labelled, execution=execution, seed=seed)
+    loop = check_loop(trained, data, labelled, execution=config.execution, seed=config.seed)
     return {
         "kind": KIND,
         "relative_plan_error": plan.get("relative"),

@@ -20,7 +20,8 @@ from torchrl_koap.modules.planning.energy_score import energy_score, sample_sequ
 from torchrl_koap.tasks import Task
 from torchrl_koap.tasks.units import unit_groups
 
-SAMPLES = 16
+SAMPLES = 16  # plans in each situation
+SITUATIONS = 500  # that are looked at, at most
 
 
 def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
@@ -41,11 +42,11 @@ def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
 
 
 def plan_errors(
-    planner: StatePlanner, data: TensorDictBase, task: Task, *, samples: int = SAMPLES, plans: int = 500, seed: int = 0
+    planner: StatePlanner, data: TensorDictBase, task: Task, *, samples: int = SAMPLES, seed: int = 0
 ) -> dict[str, Any]:
     """Scores a planner on trajectories that it has not seen, beside standing still and constant velocity.
 
-    There are ``samples`` plans in each of at most ``plans`` situations, spread evenly over all steps that have a whole
+    There are ``samples`` plans in each of at most :data:`SITUATIONS`, spread evenly over all steps that have a whole
     recorded future.
 
     Returns:
@@ -57,8 +58,7 @@ def plan_errors(
     """
     horizon, history = planner.horizon, max(planner.history, 2)  # constant velocity needs two frames
     windows = cut_windows(data, history + horizon, select=["state", "episode"], pad_before=history - 1)
-    if len(windows) > plans:
-        windows = windows[torch.linspace(0, len(windows) - 1, plans).round().long()]
+    windows = spread_evenly(windows)
     states = windows["state"].float().cpu()
     past, future = planner.split_window(states[:, history - planner.history :])
     episode = windows["episode"][:, -1].cpu()
@@ -78,6 +78,13 @@ def plan_errors(
             for number in episode.unique().tolist()
         ],
     }
+
+
+def spread_evenly(windows: TensorDictBase) -> TensorDictBase:
+    """At most :data:`SITUATIONS` of some windows, spread evenly."""
+    if len(windows) <= SITUATIONS:
+        return windows
+    return windows[torch.linspace(0, len(windows) - 1, SITUATIONS).round().long()]
 
 
 def score_sequences(

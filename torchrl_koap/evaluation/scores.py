@@ -38,7 +38,7 @@ def score(
     contexts: Sequence[int] | None = None,
     unsolved: str = "skip",
 ) -> dict[str, Any]:
-    """Success with its 95 % Wilson interval, entropy of the modes of successful episodes, and a row per episode.
+    """Success (in ``rates``) with its 95 % interval, entropy of the modes of successful episodes, a row per episode.
 
     Args:
         episodes (sequence of TensorDict): from :func:`~torchrl_koap.evaluation.rollouts.roll_out`.
@@ -58,8 +58,7 @@ def score(
     won = [row for row in rows if row["outcome"] == "success"]
     modes = [row["mode"] for row in won if row["mode"] >= 0]
     success = rate([row["outcome"] == "success" for row in rows])
-    result: dict[str, Any] = {"episodes": success.pop("episodes"), "rates": {"success": success}}
-    result |= {f"success_{name}": value for name, value in success.items()}
+    result: dict[str, Any] = {"episodes": len(rows), "rates": {"success": success}}
 
     def pooled(sample: Sequence[int]) -> float | None:
         return mode_entropy(sample, num_modes) if num_modes > 1 else None
@@ -109,13 +108,14 @@ def task_scores(
     Examples:
         >>> from torchrl_koap.evaluation.scores import task_scores
         >>> from torchrl_koap.tasks import get_task
-        >>> task_scores(get_task("aligning"), {"success_rate": 0.5, "mode_entropy": 1.0}, [], [])["d3il_score"]
+        >>> result = {"rates": {"success": {"rate": 0.5}}, "mode_entropy": 1.0}
+        >>> task_scores(get_task("aligning"), result, [], [])["d3il_score"]
         0.75
     """
     rule = resolve(task.score, f"score of task {task.name!r}")
     found = {} if rule is None else dict(rule(result, episodes, contexts))
     rates = {name: rate(good) for name, good in found.pop("rates", {}).items()}
-    return result | found | {"rates": result.get("rates", {}) | rates}
+    return result | found | {"rates": result["rates"] | rates}
 
 
 def stacking_scores(result: dict[str, Any], episodes: Sequence[TensorDict], contexts: Sequence[int]) -> dict[str, Any]:

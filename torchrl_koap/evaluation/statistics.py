@@ -12,10 +12,11 @@ from scipy.special import entr
 from scipy.stats import binomtest
 
 OUTCOMES = ("timeout", "success", "collision")  # of an episode, by number
+_RESAMPLES, _TAIL = 500, (1 - 0.95) / 2  # of a bootstrap; share outside its interval at either end
 
 
-def wilson_interval(successes: int, trials: int, *, level: float = 0.95) -> tuple[float, float]:
-    """Returns both ends, in 0..1, of the Wilson score interval of a success rate.
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Returns both ends, in 0..1, of the Wilson score interval (95 %) of a success rate.
 
     Raises:
         ValueError: if there are no trials, or more successes than trials.
@@ -27,7 +28,7 @@ def wilson_interval(successes: int, trials: int, *, level: float = 0.95) -> tupl
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(f"expected 0 <= successes <= trials and trials >= 1, got {successes} of {trials}")
-    interval = binomtest(successes, trials).proportion_ci(level, method="wilson")
+    interval = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
     return float(interval.low), float(interval.high)
 
 
@@ -46,9 +47,7 @@ def rate(good: Sequence[bool]) -> dict[str, float]:
 def mode_entropy(modes: Sequence[int], num_modes: int) -> float:
     """Entropy of the modes seen, logarithm base ``num_modes``: 1 if all are equally frequent, 0 for a single one.
 
-    Args:
-        modes (sequence of int): one mode ``0 .. num_modes - 1`` per successful episode (D3IL counts no others).
-        num_modes (int): number of possible modes.
+    There is a mode ``0 .. num_modes - 1`` per successful episode; D3IL counts no others.
 
     Raises:
         ValueError: for a mode out of range.
@@ -92,14 +91,8 @@ def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsol
 
     A single rollout per context always gives 0: the figure says something from two on.
 
-    Args:
-        modes (sequence): for each context the modes of its successful rollouts.
-        num_modes (int): number of possible modes.
-        unsolved (str): ``"skip"`` leaves contexts without success out (Sorting, Stacking), ``"zero"`` counts them as 0
-            (Aligning).
-
-    Returns:
-        float or None: None if there is nothing to average.
+    ``unsolved`` says what contexts without success count: ``"skip"`` leaves them out (Sorting, Stacking), ``"zero"``
+    counts them as 0 (Aligning). None if there is nothing to average.
 
     Raises:
         ValueError: for a mode out of range, or another ``unsolved``.
@@ -115,18 +108,15 @@ def conditional_entropy(modes: Sequence[Sequence[int]], num_modes: int, *, unsol
     return sum(values) / len(values) if values else None
 
 
-def bootstrap_interval(
-    units: Sequence, statistic: Callable[[Sequence], float | None], *, draws: int = 500, level: float = 0.95
-) -> tuple[float, float] | None:
-    """Percentile interval of a statistic under resampling of independent units, shifted by the bias.
+def bootstrap_interval(units: Sequence, statistic: Callable[[Sequence], float | None]) -> tuple[float, float] | None:
+    """Percentile interval (95 %) of a statistic under resampling of independent units, shifted by the bias.
 
     Resamples hold fewer distinct units than the sample; an entropy is lower on them. The interval is moved by as much
-    as their mean lies beside the statistic of the sample.
+    as their mean lies beside the statistic of the sample. Every call draws the same resamples.
 
     Args:
         units (sequence): what was sampled independently: episodes, or contexts with all their episodes.
         statistic (callable): from a list of units to a number, or None where it is not defined.
-        draws (int): number of resamples; the same ones in every call.
 
     Returns:
         tuple or None: low and high end; None if the statistic is never defined.
@@ -137,10 +127,10 @@ def bootstrap_interval(
         (1.0, 1.0)
     """
     generator = random.Random(0)
-    values = [statistic(generator.choices(units, k=len(units))) for _ in range(draws)]
+    values = [statistic(generator.choices(units, k=len(units))) for _ in range(_RESAMPLES)]
     values = sorted(value for value in values if value is not None)
     if not values:
         return None
-    tail, estimate = (1 - level) / 2, statistic(units)
+    estimate = statistic(units)
     shift = 0.0 if estimate is None else estimate - sum(values) / len(values)
-    return values[int(tail * (len(values) - 1))] + shift, values[round((1 - tail) * (len(values) - 1))] + shift
+    return values[int(_TAIL * (len(values) - 1))] + shift, values[round((1 - _TAIL) * (len(values) - 1))] + shift

@@ -47,7 +47,7 @@ def advice(run: RunFacts) -> list[Advice]:
 
 def which_part(run: RunFacts) -> Advice | None:
     """The closed loop fails and nobody has looked where."""
-    success = run.evaluated("success_rate")
+    success = run.success()
     if success is None or success >= GOOD or run.experiment("both") is not None or _is_policy(run):
         return None
     finding = f"success is {_percent(success)}; whether planner or controller fails is not known"
@@ -87,7 +87,7 @@ def one_way_only(run: RunFacts) -> Advice | None:
     """Low entropy of the modes."""
     entropy = run.evaluated("mode_entropy")
     entropy = run.evaluated("pooled_mode_entropy") if entropy is None else entropy
-    success, even = run.evaluated("success_rate"), run.expected_entropy
+    success, even = run.success(), run.expected_entropy
     if entropy is None or not even or not success or entropy >= FEW_MODES * even:
         return None
     seen = f"the entropy of the modes is {entropy:.2f}, a uniform choice would average {even:.2f}"
@@ -126,7 +126,7 @@ def control_is_as_good(run: RunFacts) -> Advice | None:
 
 def few_labels(run: RunFacts) -> Advice | None:
     """Little is labelled, and it does not succeed yet."""
-    labels, success = run.labels, run.evaluated("success_rate")
+    labels, success = run.labels, run.success()
     planner = run.experiment("planner_alone")
     if labels is None or labels >= FEW_LABELS or success is None or success >= GOOD:
         return None
@@ -172,7 +172,7 @@ def too_slow(run: RunFacts) -> Advice | None:
 
 def few_rollouts(run: RunFacts) -> Advice | None:
     """The interval is too wide to tell anything from anything."""
-    low, high, episodes = (run.evaluated(name) for name in ("success_low", "success_high", "episodes"))
+    low, high, episodes = (run.success(entry) for entry in ("low", "high", "episodes"))
     if low is None or high is None or episodes is None or high - low <= WIDE or episodes >= 60:
         return None
     return Advice(

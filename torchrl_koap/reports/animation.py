@@ -46,7 +46,6 @@ def animate_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     Args:
         rollouts (mapping): the entries of :func:`~torchrl_koap.reports.rollout_plots.draw_rollouts`, ``plan`` and
             ``plan_step`` if there are any.
-        run (RunFacts): the run.
     """
     paths, mode, outcome = read_episodes(rollouts)
     longest = max(map(len, paths), default=0)

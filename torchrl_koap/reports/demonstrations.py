@@ -44,7 +44,6 @@ def draw_demonstrations(demonstrations: Mapping[str, Any], run: RunFacts) -> Fig
         demonstrations (mapping): ``episode`` ``[N]``, ``labelled`` ``[N]``; ``state`` ``[N, d]`` for tasks without an
             environment, which are drawn over time, ``position`` ``[N, 2]`` (m) for others; optionally ``objects``
             ``[N, bodies, 2]`` (m), which get a panel of their own.
-        run (RunFacts): the run.
     """
     episode = entry(demonstrations, "episode", [None])
     labelled = entry(demonstrations, "labelled", [len(episode)]).astype(bool)

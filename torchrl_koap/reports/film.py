@@ -35,7 +35,6 @@ def film_rollout(rollouts: Mapping[str, Any], run: RunFacts) -> Film:
     Args:
         rollouts (mapping): ``action`` ``[E, T, act]`` (NaN after the end), ``outcome`` ``[E]``, ``context``
             ``[E, bodies, 3]`` of tasks with bodies: x, y (m), yaw (rad).
-        run (RunFacts): the run.
 
     Raises:
         NothingToDraw: if actions were not kept, or the task is not known.

@@ -17,13 +17,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from torchrl_koap.files import replacing_file
 
 _UNITS = {"_ms": "ms", "_mm": "mm", "_mrad": "mrad", "_hz": "Hz", "_seconds": "s"}
-_SHARES = ("success_rate", "success_low", "success_high")
 _PLAIN = ("seed", "mode")
-_WORDS = {
-    "success_low": "success, 95 % from",
-    "success_high": "success, 95 % to",
-    "labels_read_outside_budget": "labels read outside the budget, for evaluation only",
-}
+_WORDS = {"labels_read_outside_budget": "labels read outside the budget, for evaluation only"}
 
 
 def duration(seconds: float) -> str:
@@ -41,16 +36,12 @@ def duration(seconds: float) -> str:
 
 
 def show(value: Any, key: str = "") -> str:
-    """Returns a single value as text; the template escapes it.
-
-    Args:
-        value: a value of a JSON file that is no container.
-        key (str): its key, which may say that it is a share or a seed.
+    """Returns a single value of a JSON file as text, by its key, which may be a seed's; the template escapes it.
 
     Examples:
         >>> from torchrl_koap.reports.html import show
-        >>> show(12345), show(0.123456), show("<b>"), show(None), show(0.95, "success_rate")
-        ('12,345', '0.1235', '<b>', '–', '95.0 %')
+        >>> show(12345), show(0.123456), show("<b>"), show(None), show(12345, "seed")
+        ('12,345', '0.1235', '<b>', '–', '12345')
     """
     if value is None:
         return "–"
@@ -61,7 +52,7 @@ def show(value: Any, key: str = "") -> str:
     if isinstance(value, float):
         if not math.isfinite(value):
             return "not a number" if math.isnan(value) else "infinite"
-        return f"{100 * value:.1f} %" if key in _SHARES else f"{value:.4g}"
+        return f"{value:.4g}"
     return str(value)
 
 

@@ -125,7 +125,6 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
 
     Args:
         result (mapping): ``inspect.json``.
-        run (RunFacts): the run.
     """
     if "both" not in result:
         raise NothingToDraw("the experiments in the simulator were left out")

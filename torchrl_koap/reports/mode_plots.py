@@ -89,9 +89,7 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 def recorded_modes(demonstrations: Path, modes: Modes) -> np.ndarray:
     """Returns the modes of the demonstrations that are decided; none where paths do not tell them.
 
-    Args:
-        demonstrations (Path): file with ``mode`` ``[episodes]``, or ``position`` ``[N, 2]`` (m), ``episode`` ``[N]``.
-        modes (Modes): those of the task.
+    The file holds ``mode`` ``[episodes]``, or ``position`` ``[N, 2]`` (m) and ``episode`` ``[N]``.
     """
     data = load_file(demonstrations) if demonstrations.exists() else {}
     found = entry(data, "mode", [None]).astype(int) if "mode" in data else np.zeros(0, int)
@@ -125,10 +123,7 @@ def draw_mode_table(axes: Axes, mode: np.ndarray, modes: Modes) -> None:
     Columns are the last of several choices. A single choice becomes a list with the names beside the cells (initials
     from 11 on).
 
-    Args:
-        axes (Axes): panel to fill.
-        mode (np.ndarray): modes to count ``[n]``; those out of range are left out.
-        modes (Modes): those of the task.
+    Of the modes to count ``[n]`` those out of range are left out.
     """
     *heads, (last, names) = modes.choices
     number, listed = modes.number, not heads
@@ -169,12 +164,7 @@ def draw_mode_table(axes: Axes, mode: np.ndarray, modes: Modes) -> None:
 
 
 def color_of_mode(mode: int, colors: np.ndarray) -> Any:
-    """Returns the colour of a mode, grey where it has none.
-
-    Args:
-        mode (int): number of the mode, -1 if it is not decided.
-        colors (np.ndarray): a colour per mode.
-    """
+    """Returns the colour of a mode, grey for -1: it is not decided."""
     return colors[mode] if 0 <= mode < len(colors) else GREY
 
 

@@ -52,7 +52,6 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
     Args:
         result (mapping): ``eval.json`` with ``plan_errors``, as of
             :func:`~torchrl_koap.evaluation.plan_errors.plan_errors`.
-        run (RunFacts): the run.
     """
     plan = _part(result, "plan_errors")
     if "unit" not in plan:
@@ -96,7 +95,6 @@ def draw_action_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
 
     Args:
         result (mapping): ``eval.json`` with ``action_errors`` by split; notes are skipped.
-        run (RunFacts): the run.
     """
     parts = [(name, part) for name, part in _part(result, "action_errors").items() if "column" in part]
     if not parts:

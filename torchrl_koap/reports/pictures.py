@@ -112,14 +112,10 @@ _PICTURES: dict[str, Picture] = {}
 
 
 def picture(name: str, **facts: Any) -> Callable[[Draw], Draw]:
-    """Registers the decorated function as the one that draws a picture of a run; the function stays as it is.
+    """Registers the decorated function as the one that draws a picture; ``facts`` are the other entries of `Picture`.
 
     Of the source, ``.safetensors`` comes as a dictionary of arrays, ``.json`` as what it holds, ``.csv`` as a list of
-    rows.
-
-    Args:
-        name (str): file of the picture.
-        **facts: the other arguments of :class:`Picture`.
+    rows. The function stays as it is.
 
     Raises:
         ValueError: if there is a picture of that name already.
@@ -144,11 +140,7 @@ def all_pictures() -> dict[str, Picture]:
 
 
 def draw_pictures(
-    folder: str | Path,
-    *,
-    names: Collection[str] | None = None,
-    animation: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    folder: str | Path, *, names: Collection[str] | None = None, animation: bool = True
 ) -> dict[str, str]:
     """Draws every picture whose source is there into ``plots/``; one that fails does not stop the others.
 
@@ -158,7 +150,6 @@ def draw_pictures(
     Keyword Args:
         names (collection of str, optional): the pictures to draw. Default: all.
         animation (bool): draw the moving pictures too (a second from above, some more for the film).
-        progress (callable, optional): called with (pictures looked at, pictures in all).
 
     Returns:
         dict: what went wrong, a message per picture that could not be drawn although its source is there. A picture
@@ -168,9 +159,10 @@ def draw_pictures(
         FileNotFoundError: if there is no such directory.
     """
     run = RunFacts.read(folder)
-    wanted = [item for name, item in all_pictures().items() if names is None or name in names]
     problems = {}
-    for done, item in enumerate(wanted, 1):
+    for item in all_pictures().values():
+        if names is not None and item.name not in names:
+            continue
         source, path = run.folder / item.source, run.folder / FOLDER / item.name
         if source.exists() and (animation or not item.name.endswith(".gif")):
             try:
@@ -183,8 +175,6 @@ def draw_pictures(
                 problems[item.name] = f"{item.source}: {error}"
         elif source.exists() and path.exists() and path.stat().st_mtime < source.stat().st_mtime:
             path.unlink()  # a film of an earlier evaluation beside the figures of this one
-        if progress is not None:
-            progress(done, len(wanted))
     return problems
 
 

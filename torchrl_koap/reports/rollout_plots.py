@@ -54,7 +54,6 @@ def draw_rollouts(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
         rollouts (mapping): ``position`` ``[E, T, 2]`` (m, NaN after the end), ``length`` ``[E]``, ``mode`` ``[E]`` (-1
             none), ``outcome`` ``[E]`` (0 out of time, 1 success, 2 collision); optionally ``object_position``
             ``[E, T, bodies, 2]`` (m) and ``context`` ``[E, bodies, 3]`` (x, y in m, yaw in rad).
-        run (RunFacts): the run.
     """
     paths, mode, outcome = read_episodes(rollouts)
     bodies, colors = body_paths(rollouts), mode_colors(run.modes)
@@ -130,7 +129,6 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     Args:
         rollouts (mapping): the entries of :func:`draw_rollouts`, ``plan`` ``[E, P, H, 2]`` (m, NaN padded) and
             ``plan_step`` ``[E, P]``, the control step at which each plan was made (-1 padding).
-        run (RunFacts): the run.
     """
     paths, mode, outcome = read_episodes(rollouts)
     plan = entry(rollouts, "plan", [len(paths), None, None, 2])
@@ -175,13 +173,7 @@ def draw_plans(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
 def choose_episodes(mode: np.ndarray, outcome: np.ndarray, count: int) -> list[int]:
     """Chooses the episodes worth showing: two failures, then a success of a new mode each, then what is left.
 
-    Args:
-        mode (array): mode of every episode, int ``[E]``; -1 where it has none.
-        outcome (array): outcome of every episode, int ``[E]``; 1 is success.
-        count (int): how many to choose at most.
-
-    Returns:
-        list of int: rows of the arrays.
+    Modes (-1: none) and outcomes are those of every episode, int ``[E]``; at most ``count`` rows of them are returned.
     """
     bad = np.flatnonzero(outcome != SUCCESS).tolist()
     chosen, spare = bad[: min(2, count)], bad[2:]
@@ -195,16 +187,9 @@ def choose_episodes(mode: np.ndarray, outcome: np.ndarray, count: int) -> list[i
 
 
 def plan_deviation(path: np.ndarray, plans: Sequence[np.ndarray]) -> np.ndarray:
-    """Returns the distance of planned points from the nearest point of the executed path, whatever the time (m).
+    """Returns the distances of planned points ``[H, 2]`` from the executed path ``[L, 2]``, whatever the time (m).
 
     Points planned beyond the path's end are left out: nothing was executed there.
-
-    Args:
-        path (np.ndarray): executed positions ``[L, 2]``.
-        plans (sequence): planned positions ``[H, 2]`` each.
-
-    Returns:
-        np.ndarray: distances, one per planned point that was reached.
     """
     points = np.concatenate([np.zeros((0, 2)), *plans])
     if len(path) < 2 or not len(points):

@@ -45,7 +45,8 @@ class RunFacts:
         >>> from pathlib import Path
         >>> from torchrl_koap.reports.run_facts import RunFacts
         >>> from torchrl_koap.tasks import get_task
-        >>> run = RunFacts(Path("runs/koap"), get_task("avoiding"), evaluation={"success_rate": 0.5, "episodes": 8})
+        >>> evaluation = {"rates": {"success": {"rate": 0.5, "episodes": 8}}}
+        >>> run = RunFacts(Path("runs/koap"), get_task("avoiding"), evaluation=evaluation)
         >>> run.modes.number, run.successes
         (24, 4)
     """
@@ -96,9 +97,20 @@ class RunFacts:
         return Modes() if self.task is None or self.evaluation.get("env") else self.task.modes
 
     @property
+    def rates(self) -> Mapping[str, Mapping[str, Any]]:
+        """Shares of the rollouts by name, success first: ``rate``, ``low``, ``high`` and ``episodes`` of each."""
+        found = self.evaluation.get("rates")
+        known = found.items() if isinstance(found, Mapping) else ()
+        return {name: values for name, values in known if isinstance(values, Mapping)}
+
+    def success(self, entry: str = "rate") -> float | None:
+        """Returns the success rate, an end of its interval or the number of rollouts; None if it is not there."""
+        return number(self.rates.get("success", {}).get(entry))
+
+    @property
     def successes(self) -> int:
         """Number of successful rollouts, 0 where there are none."""
-        rate, episodes = self.evaluated("success_rate"), self.evaluated("episodes")
+        rate, episodes = self.success(), self.success("episodes")
         return round(rate * episodes) if rate and episodes else 0
 
     @property

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,11 @@ from torchrl_koap.reports.tiles import tiles
 
 _SIMULATED = ("rollouts.safetensors", "inspect.json", "eigenvalues.safetensors")
 _BESIDE_LABELS = "demonstrations.png"
-_EVAL_ELSEWHERE = ("episode", "command", "trajectory", "faults", "rates", "action_errors")
+_EVAL_ELSEWHERE = ("episode", "trajectory", "faults", "rates", "action_errors")
 _CONFIG_ELSEWHERE = ("versions", "command")
 
 
-def write_report(
-    folder: str | Path,
-    *,
-    draw: bool = True,
-    animation: bool = True,
-    progress: Callable[[int, int], None] | None = None,
-) -> Path:
+def write_report(folder: str | Path, *, draw: bool = True, animation: bool = True) -> Path:
     """Writes ``index.html`` into a run directory; sections whose files are absent say which command makes them.
 
     Args:
@@ -36,7 +30,6 @@ def write_report(
     Keyword Args:
         draw (bool): draw the pictures first. Otherwise those already there are shown.
         animation (bool): draw the moving pictures too.
-        progress (callable, optional): see :func:`~torchrl_koap.reports.pictures.draw_pictures`.
 
     Returns:
         Path: the page.
@@ -45,7 +38,7 @@ def write_report(
         FileNotFoundError: if there is no such directory.
     """
     run = RunFacts.read(folder)
-    problems = draw_pictures(run.folder, animation=animation, progress=progress) if draw else {}
+    problems = draw_pictures(run.folder, animation=animation) if draw else {}
     config, summary, evaluation = run.config, run.summary, run.evaluation
     figures, missing = _figures(run, problems)
     commands = {"train": TRAIN, "eval": "koap eval {run}" if run.offline else EVAL}
@@ -120,14 +113,8 @@ def _figures(run: RunFacts, problems: Mapping[str, str]) -> tuple[list[dict[str,
 
 def _again(run: RunFacts) -> list[str]:
     """Command lines that train and evaluate the run again."""
-    commands = [_command(source["command"]) for source in (run.config, run.evaluation) if _given(source, "command")]
-    if run.evaluation and not _given(run.evaluation, "command"):
-        commands.append(_eval_command(run))
-    return commands
-
-
-def _command(command: Any) -> str:
-    return shlex.join(map(str, command)) if isinstance(command, (list, tuple)) else str(command)
+    trained = [str(run.config["command"])] if _given(run.config, "command") else []
+    return trained + ([_eval_command(run)] if run.evaluation else [])
 
 
 def _eval_command(run: RunFacts) -> str:

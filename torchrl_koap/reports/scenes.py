@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
 from torchrl_koap.lookup import lookup
-from torchrl_koap.reports.style import BLUE, FAILURE_MARKS, FAINT, GREEN, INK, MUTED, RED, as_array, entry, tidy
+from torchrl_koap.reports.style import BLUE, FAILURE_MARKS, FAINT, GREEN, INK, MUTED, RED, entry, tidy
 from torchrl_koap.tasks import Body, Shape, Task
 
 # how a role is drawn; a shape's own colour goes before the role's
@@ -41,12 +41,7 @@ def color_of(name: str) -> str:
 
 
 def draw_scene(axes: Axes, task: Task | None) -> Axes:
-    """Draws the still shapes of a task to scale, with axes in metres, and returns the axes.
-
-    Args:
-        axes (Axes): where to draw.
-        task (Task, optional): the task. None draws the axes only.
-    """
+    """Draws the still shapes of a task, if there is one, to scale, with axes in metres, and returns the axes."""
     if task is not None:
         for shape in task.scene.shapes:
             _draw_shape(axes, shape)
@@ -81,11 +76,9 @@ def _draw_shape(axes: Axes, shape: Shape) -> None:
 
 
 def keep_inside(axes: Axes, paths: Sequence[np.ndarray]) -> None:
-    """Widens a panel until paths lie inside it, on every side by at most half of what it showed before.
+    """Widens a panel until paths ``[n, 2]`` (m) lie inside it, on every side by at most half of what it showed before.
 
-    Args:
-        axes (Axes): the panel; one that shows no scene yet is fitted to the paths.
-        paths (sequence): positions ``[n, 2]`` (m) each.
+    A panel that shows no scene yet is fitted to the paths.
     """
     points = np.concatenate([np.zeros((0, 2)), *paths])
     points = points[np.isfinite(points).all(1)]
@@ -134,12 +127,7 @@ def _paths(rollouts: Mapping[str, Any], key: str, shape: Sequence[int | None], l
 
 
 def bodies_of(task: Task | None, number: int) -> tuple[Body, ...]:
-    """Returns a body to draw for each of ``number``; grey ones where the task is not known or has another number.
-
-    Args:
-        task (Task, optional): the task.
-        number (int): number of bodies.
-    """
+    """Returns a body to draw for each of ``number``; grey ones where the task is not known or has another number."""
     bodies = task.bodies if task is not None and len(task.bodies) == number else (_UNKNOWN,) * number
     return tuple(replace(body, color=color_of(body.color)) for body in bodies)
 
@@ -150,7 +138,6 @@ def draw_bodies(
     """Draws the bodies of a task: start outlines (if there are contexts), paths in their colours, ends.
 
     Args:
-        axes (Axes): where to draw.
         paths (sequence): positions ``[frames, bodies, 2]`` (m) of each episode.
         task (Task, optional): the task.
         good (sequence of bool): whether each episode succeeded: its bodies end in a dot, otherwise in a cross.
@@ -174,17 +161,13 @@ def draw_bodies(
 
 
 def draw_starts(axes: Axes, contexts: Any, bodies: Sequence[Body]) -> None:
-    """Draws outlines of the bodies as the contexts place them, paler the more there are.
+    """Draws outlines of bodies as contexts ``[E, bodies, 3]`` (x, y in m, yaw in rad) place them, paler the more.
 
     The far side of a body whose orientation matters is thick; of more than 20 only the centres are drawn, each with a
     line to its far side.
 
-    Args:
-        axes (Axes): where to draw.
-        contexts (array): ``[E, bodies, 3]``: x, y (m), yaw (rad).
-        bodies (sequence of Body): what to draw.
     """
-    contexts = as_array("context", contexts, [None, len(bodies), 3]).astype(float)
+    contexts = entry({"context": contexts}, "context", [None, len(bodies), 3]).astype(float)
     many = len(contexts) > MANY
     opacity = float(np.clip(4 / max(len(contexts), 1), 0.13, 0.8))
     for index, body in enumerate(bodies):
@@ -202,11 +185,9 @@ def draw_starts(axes: Axes, contexts: Any, bodies: Sequence[Body]) -> None:
 
 
 def outlines(poses: np.ndarray, half: tuple[float, float]) -> np.ndarray:
-    """Returns closed outlines ``[..., 5, 2]`` of rectangles (m); the side from point 2 to point 3 is the far one.
+    """Returns closed outlines ``[..., 5, 2]`` (m) of rectangles at poses ``[..., 3]`` (x, y in m, yaw in rad).
 
-    Args:
-        poses (np.ndarray): ``[..., 3]``: x, y (m), yaw (rad).
-        half (tuple of float): half width and half depth (m).
+    ``half`` is their half width and half depth (m); the side from point 2 to point 3 is the far one.
     """
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half
     cosine, sine = np.cos(poses[..., 2]), np.sin(poses[..., 2])
@@ -217,9 +198,7 @@ def outlines(poses: np.ndarray, half: tuple[float, float]) -> np.ndarray:
 def body_handles(bodies: Sequence[Body], good: Sequence[bool] = ()) -> list[Line2D]:
     """Returns handles of a legend: every kind of body once, and the marks of :func:`draw_bodies` that occur.
 
-    Args:
-        bodies (sequence of Body): bodies that are drawn.
-        good (sequence of bool): whether each drawn episode succeeded.
+    ``good`` says whether each drawn episode succeeded.
     """
     handles: dict[str, Line2D] = {}
     for body in bodies:
@@ -232,13 +211,7 @@ def body_handles(bodies: Sequence[Body], good: Sequence[bool] = ()) -> list[Line
 
 
 def draw_failure_end(axes: Axes, path: np.ndarray, outcome: int) -> None:
-    """Marks where an episode that failed has ended.
-
-    Args:
-        axes (Axes): where to draw.
-        path (np.ndarray): positions ``[n, 2]`` (m).
-        outcome (int): number of the outcome.
-    """
+    """Marks where an episode with the path ``[n, 2]`` (m) has ended that failed, by the number of its outcome."""
     if len(path):
         mark = FAILURE_MARKS.get(int(outcome), "D")
         axes.scatter(*path[-1], s=75, marker=mark, color=INK, edgecolors="white", linewidths=0.9, zorder=6)

@@ -20,38 +20,19 @@ OUTCOMES = {TIMEOUT: "out of time", SUCCESS: "success", COLLISION: "collision"}
 FAILURE_MARKS = {TIMEOUT: "s", COLLISION: "X"}
 
 
-def as_array(name: str, value: Any, shape: Sequence[int | None]) -> np.ndarray:
-    """Turns a tensor or array into a numpy array and checks its shape.
-
-    Args:
-        name (str): name used in the message.
-        value (torch.Tensor or array): the values.
-        shape (sequence of int or None): size of every axis; None allows any.
-
-    Raises:
-        ValueError: if the shape is another one.
-    """
-    value = np.asarray(value)
-    if value.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, value.shape, strict=False)):
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name!r} must have shape [{wanted}], got {list(value.shape)}")
-    return value
-
-
 def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.ndarray:
-    """Returns an entry that has to be there as an array of a shape.
-
-    Args:
-        data (mapping): the entries.
-        key (str): its name.
-        shape (sequence of int or None): see :func:`as_array`.
+    """Returns an entry that has to be there as an array of a shape, of which None allows any size.
 
     Raises:
         ValueError: if it is missing (the message lists those that are there) or has another shape.
     """
     if key not in data:
         raise ValueError(f"missing entry {key!r}; got {', '.join(sorted(map(str, data))) or 'nothing'}")
-    return as_array(key, data[key], shape)
+    value = np.asarray(data[key])
+    if value.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, value.shape, strict=False)):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{key!r} must have shape [{wanted}], got {list(value.shape)}")
+    return value
 
 
 def tidy(axes: Axes) -> Axes:
@@ -68,12 +49,7 @@ def tidy(axes: Axes) -> Axes:
 
 
 def set_title(axes: Axes, text: str) -> None:
-    """Sets the title of a panel, flush left.
-
-    Args:
-        axes (Axes): the panel.
-        text (str): one line or several.
-    """
+    """Sets the title of a panel, one line or several, flush left."""
     axes.set_title(text, loc="left", fontsize=9.5, color=INK, linespacing=1.35)
 
 
@@ -84,12 +60,6 @@ def legend_beside(axes: Axes, **options: Any) -> None:
 
 
 def legend_below(axes: Axes, offset: float, **options: Any) -> None:
-    """Puts the legend below a panel, in two columns.
-
-    Args:
-        axes (Axes): the panel.
-        offset (float): how far below, as a share of its height.
-        **options: further ones of ``Axes.legend``.
-    """
+    """Puts the legend below a panel by a share of its height, in two columns, with further options as above."""
     place = {"loc": "upper center", "bbox_to_anchor": (0.5, -offset), "ncols": 2}
     axes.legend(**({"frameon": False, "fontsize": 8} | place | options))

@@ -46,20 +46,15 @@ def _offline_errors(run: RunFacts) -> list[dict[str, Any]]:
 
 def _rates(run: RunFacts) -> list[dict[str, Any]]:
     """Shares of the rollouts: success, and those that the task's own score adds."""
-    evaluation = run.evaluation
-    contexts, episodes = run.evaluated("contexts"), run.evaluated("episodes")
-    success = {name: evaluation.get(f"success_{name}") for name in ("rate", "low", "high")}
-    rates = {"success": success} | dict(evaluation.get("rates") or {})
-    found = []
-    for name, values in rates.items():
-        rate, low, high = (number(values.get(key)) for key in ("rate", "low", "high"))
+    contexts, found = run.evaluated("contexts"), []
+    for name, values in run.rates.items():
+        rate, low, high, total = (number(values.get(key)) for key in ("rate", "low", "high", "episodes"))
         if rate is None:
             continue
         notes, interval = [], None
         if low is not None and high is not None:
             notes = [f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"]
             interval = tuple(100 * min(max(part, 0.0), 1.0) for part in (rate, low, high))
-        total = number(values.get("episodes", episodes))
         if total:
             among = f" in {contexts:g} contexts" if contexts and name == "success" else ""
             notes.append(f"{round(rate * total)} of {total:g} rollouts{among}")

@@ -42,7 +42,6 @@ def draw_losses(rows: Sequence[Mapping[str, str]], run: RunFacts) -> Figure:
     Args:
         rows (sequence): rows of ``metrics.csv`` with ``step`` and any number of ``loss_*``, empty where a term does not
             belong to the row.
-        run (RunFacts): the run.
     """
     if not rows:
         raise ValueError("no row has been logged yet")
@@ -95,12 +94,7 @@ def _column(rows: Sequence[Mapping[str, str]], name: str) -> np.ndarray:
 
 
 def running_mean(values: np.ndarray, reach: int) -> np.ndarray:
-    """Returns the mean of the values at most ``reach`` places away, leaving out NaN; NaN where there is none.
-
-    Args:
-        values (np.ndarray): numbers ``[N]``.
-        reach (int): places to either side.
-    """
+    """Returns the mean of the values ``[N]`` at most ``reach`` places away without NaN; NaN where there is none."""
     there = np.isfinite(values)
     sums = [np.convolve(part, np.ones(2 * reach + 1)) for part in (np.where(there, values, 0.0), there)]
     total, count = (part[reach : reach + len(values)] for part in sums)

@@ -35,29 +35,16 @@ class Film:
     seconds: float
 
 
-def save_figure(figure: Figure, path: str | Path, *, dpi: int = 150) -> Path:
-    """Writes a figure as png and returns the file.
-
-    Args:
-        figure (Figure): what was drawn.
-        path (str or Path): the file.
-
-    Keyword Args:
-        dpi (int): dots per inch.
-    """
+def save_figure(figure: Figure, path: str | Path) -> Path:
+    """Writes a figure as png and returns the file."""
     path = Path(path)
     with replacing_file(path) as aside:
-        figure.savefig(aside, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
+        figure.savefig(aside, format="png", dpi=150, facecolor="white", metadata={"Software": None})
     return path
 
 
 def save_film(film: Film, path: str | Path) -> Path:
-    """Writes a film as gif and returns the file.
-
-    Args:
-        film (Film): what is shown.
-        path (str or Path): the file.
-    """
+    """Writes a film as gif and returns the file."""
     path, frames = Path(path), list(film.frames)
     with replacing_file(path) as aside:
         # one palette for all, without dithering: what stands still does not flicker and costs nothing

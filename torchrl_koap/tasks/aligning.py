@@ -46,7 +46,7 @@ def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
     """Computes D3IL's figure ``d3il_score``, mean of success and entropy; none where no context had two rollouts."""
     if result["mode_entropy"] is None:
         return {}
-    return {"d3il_score": 0.5 * (result["success_rate"] + result["mode_entropy"])}
+    return {"d3il_score": 0.5 * (result["rates"]["success"]["rate"] + result["mode_entropy"])}
 
 
 register_task(

@@ -63,7 +63,7 @@ def mode_of_path(path: np.ndarray) -> int:
 
 def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
     """Computes D3IL's figure ``d3il_score``: 0.8 success + 0.2 entropy."""
-    return {"d3il_score": 0.8 * result["success_rate"] + 0.2 * result["mode_entropy"]}
+    return {"d3il_score": 0.8 * result["rates"]["success"]["rate"] + 0.2 * result["mode_entropy"]}
 
 
 def _cylinders() -> tuple[Shape, ...]:

@@ -70,7 +70,7 @@ def score(result: dict[str, Any], *_: Any) -> dict[str, float]:
     """
     if result["mode_entropy"] is None:
         return {}
-    return {"d3il_score": result["success_rate"] - (1 - result["mode_entropy"])}
+    return {"d3il_score": result["rates"]["success"]["rate"] - (1 - result["mode_entropy"])}
 
 
 @functools.cache
