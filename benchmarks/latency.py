@@ -12,7 +12,6 @@ compiler, ONNX the extra ``onnx``; what is missing is named and left out.
 
 from __future__ import annotations
 
-import csv
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
+from tables import write_table
 from torch import Tensor
 
 from torchrl_koap import load_policy
@@ -131,10 +131,7 @@ def main(
     for row in rows:
         print(", ".join(f"{name} {value}" for name, value in row.items()))
     if write:
-        with RESULTS.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        write_table(RESULTS, rows)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ these (``--no-forecast`` shows it). ``--write`` writes ``benchmarks/results/own_
 from __future__ import annotations
 
 import argparse
-import csv
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tables import write_table
 
 from torchrl_koap import (
     Agent,
@@ -154,10 +154,7 @@ def main() -> None:
             rows.append(measure(options, seed, Path(folder)))
         print(", ".join(f"{name} {value}" for name, value in rows[-1].items()), flush=True)
     if options.write:
-        with RESULTS.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+        write_table(RESULTS, rows)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import numpy as np
 import pusht
 import torch
 import tyro
-from resumable_table import open_table
+from tables import open_table
 
 from torchrl_koap import LabelConfig, PlannerConfig, RunConfig, TrainConfig, load_policy, train
 from torchrl_koap.envs.gymnasium_batch import GymnasiumBatch

@@ -28,6 +28,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 
 import torch  # noqa: E402
+from tables import write_table  # noqa: E402
 from tiny_runs import TINY, write_demonstrations  # noqa: E402
 
 import torchrl_koap.envs.registry  # noqa: E402, F401
@@ -36,17 +37,8 @@ from torchrl_koap.commands.cli import main as koap  # noqa: E402
 
 SIGNALS = ("SIGKILL", "SIGKILL", "SIGTERM", "SIGINT", "SIGHUP")
 COLUMNS = ("command", "signals", "seconds", "calls", "equal", "leftovers")
-CLOCK = (
-    "train_seconds",
-    "eval_seconds",
-    "iterations_per_second",
-    "plan_ms",
-    "control_ms",
-    "control_hz",
-    "out",
-    "command",
-    "resume",
-)
+CLOCK = ("train_seconds", "eval_seconds", "iterations_per_second", "plan_ms", "control_ms", "control_hz")
+OUTSIDE = (*CLOCK, "out", "command", "resume")  # entries that are not compared
 
 
 @dataclass(frozen=True)
@@ -81,7 +73,7 @@ def cases(data: Path, run: Path) -> list[Case]:
                 + (() if (out / "config.json").exists() else ("--method", method))
                 + ("--quiet",)
             ),
-            ("*.safetensors", "metrics.csv", "summary.json", "digests.json"),
+            ("*.safetensors", "metrics.csv", "summary.json"),
         )
 
     def evaluated(out: Path) -> tuple[object, ...]:
@@ -151,9 +143,7 @@ def content(folder: Path, patterns: Sequence[str]) -> dict[str, object]:
 
 def _timeless(value):
     if isinstance(value, dict):
-        return {
-            key: _timeless(entry) for key, entry in value.items() if key not in (*CLOCK, "out", "command", "resume")
-        }
+        return {key: _timeless(entry) for key, entry in value.items() if key not in OUTSIDE}
     return [_timeless(entry) for entry in value] if isinstance(value, list) else value
 
 
@@ -222,10 +212,7 @@ def main() -> int:
             print(" ".join(f"{rows[-1][name]}" for name in COLUMNS), flush=True)
             shutil.rmtree(out, ignore_errors=True)
             if options.table is not None:
-                with options.table.open("w", newline="") as file:
-                    writer = csv.DictWriter(file, COLUMNS)
-                    writer.writeheader()
-                    writer.writerows(rows)
+                write_table(options.table, rows)
     equal = sum(row["equal"] == "yes" for row in rows)
     kills = sum(len(row["signals"].split()) for row in rows)
     print(f"{len(rows)} runs ended {kills} times: {equal} equal to a run that was left alone")

@@ -45,26 +45,6 @@ class Regime:
     hidden: tuple[int, ...] = ()
 
 
-def apply_regime(data: TensorDictBase, regime: str | Regime, *, seed: int = 0) -> TensorDictBase:
-    """The data as they are observed in a regime.
-
-    Args:
-        data (TensorDictBase): flat data ``[N]`` with ``state`` and ``episode``.
-        regime (str or Regime): a name in :data:`REGIMES`, or a regime.
-
-    Keyword Args:
-        seed (int): of noise and distractors.
-
-    Returns:
-        TensorDictBase: the data with another ``state``; the rest is shared.
-
-    Raises:
-        ValueError: for an unknown regime, or a state that has no such columns to hide.
-    """
-    sensor = RegimeSensor(data, regime, seed=seed)
-    return data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
-
-
 class RegimeSensor:
     """What a regime shows of a state: fitted to recorded data, it can be asked for the states of a rollout too.
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
-from resumable_table import open_table
+from tables import open_table
 
 from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig, TrainConfig, train
 from torchrl_koap.envs.scooping.recording import record_videos
@@ -97,7 +97,7 @@ def run_cell(
         train(config)
     result, n = evaluate(out, evaluation), evaluation.episodes
     rates = result["rates"]
-    counts = (round(result["success_rate"] * n), round(rates["spoon over the bowl"]["rate"] * n))
+    counts = (round(rates[name]["rate"] * n) for name in ("success", "spoon over the bowl"))
     starts = (f"{rates[f'success from {start}']['rate']:.3f}" for start in ("left", "near", "right"))
     split = result["action_errors_on"]
     error = f"{1e3 * result['action_errors'][split]['unit'][0]['controller']:.1f}" if split else ""

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import torch
 import tyro
-from resumable_table import open_table
+from tables import open_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "helpers"))
 from tiny_runs import TINY, koap, write_demonstrations  # noqa: E402

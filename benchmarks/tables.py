@@ -1,10 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Figures of the committed CSV files as cells and tables of the pages in docs/results."""
+"""Figures of the committed CSV files as cells and tables of the pages in docs/results, and how studies write them."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -207,3 +207,39 @@ def commands(rows: Sequence[Row]) -> str:
     """Formats the commands that made some rows as a block of code."""
     lines = dict.fromkeys(row["command"] for row in rows if row["command"])
     return "```bash\n" + "\n".join(lines) + "\n```"
+
+
+def open_table(
+    table: Path, columns: Sequence[str], keys: Sequence[str]
+) -> tuple[set[tuple[str, ...]], Callable[[Sequence[object]], None]]:
+    """What a table holds already, and a function that adds a row; a new table gets its header.
+
+    Args:
+        table (Path): the file; its folder is made if it is not there.
+        columns (sequence of str): of the table.
+        keys (sequence of str): columns that tell cells of the study apart.
+
+    Returns:
+        tuple: the keys of the rows that are there, and the function.
+    """
+    done: set[tuple[str, ...]] = set()
+    if table.exists():
+        with table.open(newline="", encoding="utf-8") as file:
+            done = {tuple(row[key] for key in keys) for row in csv.DictReader(file)}
+    else:
+        table.parent.mkdir(parents=True, exist_ok=True)
+        table.write_text(",".join(columns) + "\n", encoding="utf-8")
+
+    def write(row: Sequence[object]) -> None:
+        with table.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerow(row)
+
+    return done, write
+
+
+def write_table(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes the rows of a study as a CSV file, in place of what is there."""
+    with file.open("w", newline="", encoding="utf-8") as out:
+        writer = csv.DictWriter(out, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)

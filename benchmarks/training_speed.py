@@ -18,7 +18,7 @@ from typing import Literal
 
 import torch
 import tyro
-from resumable_table import open_table
+from tables import open_table
 from tensordict import TensorDict
 from torchrl.objectives import LossModule
 

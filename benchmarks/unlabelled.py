@@ -27,7 +27,7 @@ from pathlib import Path
 import torch
 import tyro
 from regimes import REGIMES, Regime, RegimeSensor
-from resumable_table import open_table
+from tables import open_table
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import step_mdp
 

@@ -11,7 +11,13 @@ import torch
 from tensordict import TensorDict
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-from regimes import REGIMES, Regime, RegimeSensor, apply_regime  # noqa: E402
+from regimes import REGIMES, Regime, RegimeSensor  # noqa: E402
+
+
+def apply_regime(data, regime, seed=0):
+    """The data as they are observed in a regime."""
+    sensor = RegimeSensor(data, regime, seed=seed)
+    return data.copy().set("state", sensor.noisy(sensor.recorded).to(data["state"].dtype))
 
 
 def make_data(length=600, columns=2):

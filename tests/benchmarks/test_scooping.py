@@ -41,7 +41,7 @@ def study(benchmark_script, monkeypatch, tmp_path):
         starts = {f"success from {start}": {"rate": rate} for start, rate in (("left", 1), ("near", 0.5), ("right", 0))}
         errors = {"outside_budget": {"unit": [{"controller": 0.01234}]}}
         found = {"action_errors_on": "outside_budget", "action_errors": errors}
-        return found | {"success_rate": 6 / 15, "rates": {"spoon over the bowl": {"rate": 9 / 15}} | starts}
+        return found | {"rates": {"success": {"rate": 6 / 15}, "spoon over the bowl": {"rate": 9 / 15}} | starts}
 
     monkeypatch.setattr(module, "train", train)
     monkeypatch.setattr(module, "evaluate", evaluate)
