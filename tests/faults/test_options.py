@@ -52,14 +52,16 @@ RIGHT = {
     "suggest": ("--seed 0",),
     "train": (
         *("--run.seed 0", "--controller.steps 0", "--labels.episodes -1", "--labels.episodes 0"),
-        *("--planner.held-out 0", "--execution.blend 0", "--execution.lead 0"),
+        *("--planner.held-out 0", "--planner.octaves 0", "--execution.blend 0", "--execution.lead 0"),
     ),
 }
-RIGHT["curve"] = RIGHT["bench"] = RIGHT["train"]
+RIGHT["curve"] = RIGHT["bench"] = (*RIGHT["train"], "--evaluation.seed 0")
 EMPTY = ("--action-units", "--state-units")  # of a number without a unit
 # where the message has another word for the option
 SAYS = {
     "--labels.unit": "unit",
+    "--label-unit": "unit",
+    "--planner.source": "/dev/null/below|source",
     "--action-kind": "kind of action|action-kind",
     "--to": "unknown format|--to",
     "--tasks": "task",
@@ -102,9 +104,7 @@ def faults() -> Iterator[Fault]:
                 if call in RIGHT.get(name, ()) or option in RIGHT.get(name, ()) or option in EMPTY:
                     continue
                 words = (name, *BASE[name], option, value)
-                word = option.removeprefix("--")
-                if name != "train":  # a study says the name of an option without its section
-                    word = word.rpartition(".")[2]
+                word = option.removeprefix("--").rpartition(".")[2]  # a message may leave the section out
                 says = SAYS.get(option, re.escape(word).replace("\\-", "[-_ ]"))
                 if kind is bool:
                     says = value

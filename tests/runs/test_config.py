@@ -23,6 +23,7 @@ from torchrl_koap import ControllerConfig, LabelConfig, PlannerConfig, RunConfig
         (PlannerConfig, {"source": "pretrained:avoidin"}, "did you mean 'avoiding'"),
         (ControllerConfig, {"steps": -1}, "controller.steps must be >= 0, got -1"),
         (RunConfig, {"seed": -1}, "run.seed must be >= 0, got -1"),
+        (RunConfig, {"device": "gpu"}, "device must be 'cpu' or 'cuda', got 'gpu'"),
         (RunConfig, {"precision": "float8"}, "unknown precision 'float8'"),
     ],
 )

@@ -23,7 +23,7 @@ def test_auto_is_what_the_processor_has_units_for(units):
 
 
 def test_float32_is_the_default_on_every_processor(units):
-    assert training_dtype(None) is None and training_dtype("float32") is None
+    assert training_dtype("float32") is None
 
 
 def test_bfloat16_by_name_is_obeyed_and_warns_where_it_is_emulated(units):

@@ -94,12 +94,9 @@ def make_demonstrations(
     Keyword Args:
         control_hz (float): frames per second; recordings may know it.
         name (str): name of the task.
-        state_names (sequence of str, optional): names of the state columns. Default: ``state_0``, ...
-        state_units (sequence of str, or str): their units, or one for all.
-        action_names (sequence of str, optional): names of the action columns. Default: ``action_0``, ...
-        action_units (sequence of str, or str): their units, or one for all. Errors are averaged over columns of one
-            unit.
-        action_dim (int, optional): number of action columns, where no trajectory has actions.
+        state_names, action_names, action_dim: as for :func:`~torchrl_koap.data.make_recordings`.
+        state_units, action_units (sequence of str, or str): unit of every column, or one for all. Errors of actions are
+            averaged over columns of one unit.
         robot (sequence of str or int, optional): state columns of the robot itself, by name or number: the controller
             reads these. Default: all that are no command.
         command (sequence of str or int): neighbouring columns that repeat the last command. Their differences are the

@@ -155,8 +155,7 @@ class GripperRecovery(TensorDictModuleBase):
         open_above (float): narrowest fingers that count as open (m). Defaults to ``0.075``.
         steps (int): control steps that opening takes. Defaults to ``5``.
         decay (float): ``rho``, share of the way that remains after a control step. Defaults to ``0.5``.
-        history (int): observed frames of the window. Defaults to ``2``.
-        key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
+        history, key: as of :class:`RecoveryAugmentation`.
 
     Raises:
         ValueError: for a share or decay outside [0, 1], or an empty hand as wide as an open one.
@@ -226,9 +225,7 @@ class NeighborRecovery(TensorDictModuleBase):
         share (float): ``s``, farthest share of the way to the neighbour; 0 changes nothing.
 
     Keyword Args:
-        history (int): observed frames of the window. Defaults to ``2``.
-        decay (float): ``rho``, how slowly it comes back. Defaults to ``0.85``.
-        key (NestedKey): window of states ``[B, T, d]``, replaced. Defaults to ``"state"``.
+        history, decay, key: as of :class:`RecoveryAugmentation`, but for the default of ``decay``, ``0.85``.
 
     Raises:
         ValueError: for a negative ``share`` or a ``decay`` outside [0, 1); at a call, for windows that are not a batch

@@ -26,11 +26,8 @@ class RandomPlanarTransform(TensorDictModuleBase):
         shift (float): standard deviation of the displacement (m). Defaults to ``0.05``.
         turn (float): standard deviation of the angle (rad); the scene turns about the first point of the last frame
             observed. Defaults to ``0.3``.
-        history (int): observed frames of the window. Defaults to ``2``.
         turned_actions (sequence of int, optional): action columns ``(x, y)`` of a displacement, turned with the scene.
-        key (NestedKey): window of states ``[*B, T, d]``, replaced. Defaults to ``"state"``.
-        action_key (NestedKey): actions ``[*B, T, act]``, replaced with ``turned_actions``; NaN stays. Defaults to
-            ``"action"``.
+        history, key, action_key: as of :class:`~torchrl_koap.data.RecoveryAugmentation`.
 
     Raises:
         ValueError: for a negative shift or turn.

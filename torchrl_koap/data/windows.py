@@ -170,8 +170,7 @@ def make_window_buffer(
         batch_size (int): windows per batch.
         select (sequence of keys, optional): the entries to return; the fewer the faster. Default: all.
         labelled_share (float, optional): see :class:`WindowSampler`.
-        pad_before (int): see :meth:`WindowTable.build`.
-        pad_after (int): likewise.
+        pad_before, pad_after (int): see :meth:`WindowTable.build`.
         transform (callable, optional): what every batch undergoes, such as an augmentation.
 
     Returns:

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from torchrl_koap.modules import ExecutionConfig
+from torchrl_koap.runs.device import check_machine
 from torchrl_koap.runs.plugins import Plugins
 
 MOST_EPISODES = 100_000  # kept in memory
@@ -74,6 +75,7 @@ def check_options(config: EvalConfig) -> None:
         raise ValueError(
             f"episodes must be at most {MOST_EPISODES:,}, which are kept in memory, got {config.episodes:,}"
         )
+    check_machine(config.threads, config.device)
     if config.seed < 0:
         raise ValueError(f"seed must be >= 0, got {config.seed}")
     if config.success_key is not None and config.env is None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.execution.execution import ExecutionConfig
-from torchrl_koap.runs.device import PRECISIONS
+from torchrl_koap.runs.device import PRECISIONS, check_machine
 from torchrl_koap.runs.plugins import Plugins
 from torchrl_koap.runs.pretrained import find_run
 from torchrl_koap.runs.progress import LOGGERS
@@ -152,7 +152,7 @@ class RunConfig:
             reads the run.
 
     Raises:
-        ValueError: for a number out of range, or an unknown precision or logger.
+        ValueError: for a number out of range, or an unknown device, precision or logger.
 
     Examples:
         >>> from torchrl_koap import RunConfig
@@ -170,6 +170,7 @@ class RunConfig:
 
     def __post_init__(self):
         _check("run", self, seed=(0, None), threads=(1, None))
+        check_machine(self.threads, self.device)
         lookup(PRECISIONS, self.precision, "precision")
         lookup(LOGGERS, self.logger, "logger")
 

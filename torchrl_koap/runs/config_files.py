@@ -6,6 +6,7 @@ from __future__ import annotations
 import difflib
 import functools
 import importlib.metadata
+import json
 import platform
 import types
 from collections.abc import Iterator, Mapping
@@ -25,9 +26,6 @@ _LARGEST = 2**63 - 1
 def read_config(run: RunDirectory) -> TrainConfig:
     """Reads the options of a run.
 
-    Args:
-        run (RunDirectory): the run.
-
     Raises:
         RunDirectoryError: if ``config.json`` is not there or damaged; the message names file and entry.
     """
@@ -39,8 +37,8 @@ def read_config(run: RunDirectory) -> TrainConfig:
 
 
 def to_json(config: Any) -> dict[str, Any]:
-    """Returns options as plain values, section by section."""
-    return _plain(asdict(config))
+    """Returns options as ``json`` reads them, section by section."""
+    return json.loads(json.dumps(asdict(config), default=str))  # paths
 
 
 def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
@@ -79,27 +77,14 @@ def _read(kind: Any, content: Any, path: str, prefix: str, known: tuple[str, ...
         if is_dataclass(kinds[name]):
             values[name] = _read(kinds[name], value, path, f"{prefix}{name}.", known)
         else:
-            check_type(value, kinds[name], f"{path}: {prefix}{name}")
+            if not _fits(value, kinds[name]):
+                wanted = f"{prefix}{name} must be {_words(kinds[name])}"
+                raise RunDirectoryError(f"{path}: {wanted}, got {_short(value)}")
             values[name] = tuple(value) if isinstance(value, list) else value
     try:
         return kind(**values)
     except (TypeError, ValueError) as error:
         raise RunDirectoryError(f"{path}: {error}") from error
-
-
-def check_type(value: Any, kind: Any, what: str) -> None:
-    """Refuses a value of JSON that does not fit a type hint.
-
-    Args:
-        value (Any): the value.
-        kind (Any): the hint, as :func:`typing.get_type_hints` returns it.
-        what (str): file and entry, for the message.
-
-    Raises:
-        RunDirectoryError: naming what was wanted and what is there.
-    """
-    if not _fits(value, kind):
-        raise RunDirectoryError(f"{what} must be {_words(kind)}, got {_short(value)}")
 
 
 def _names(kind: Any, prefix: str = "") -> Iterator[str]:
@@ -130,13 +115,7 @@ _version = functools.cache(importlib.metadata.version)
 
 
 def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
-    """Returns the names of the options, with their sections, in which two configurations differ.
-
-    Args:
-        one (dataclass): a configuration.
-        other (dataclass): another of the same kind.
-        prefix (str): begins every name.
-    """
+    """Returns the names of the options, with their sections, in which two configurations of one kind differ."""
     changed = []
     for field in fields(one):
         a, b = getattr(one, field.name), getattr(other, field.name)
@@ -145,14 +124,6 @@ def changed_options(one: Any, other: Any, prefix: str = "") -> list[str]:
         elif a != b:
             changed.append(prefix + field.name)
     return changed
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    return str(value) if isinstance(value, Path) else value
 
 
 def _fits(value: Any, kind: Any) -> bool:

@@ -14,54 +14,36 @@ _MOST_THREADS = 1024
 _BFLOAT16 = ("amx_bf16", "avx512_bf16")  # what processors that multiply bfloat16 matrices say of themselves
 
 
-def training_dtype(precision: str | None, device: str | torch.device = "cpu") -> torch.dtype | None:
+def training_dtype(precision: str, device: str | torch.device = "cpu") -> torch.dtype | None:
     """Type of the denoiser's matrix products in training; None leaves them as they are.
 
     With units for bfloat16 a processor is several times quicker than with float32; without them it emulates it and is
     many times slower (``benchmarks/training_speed.py`` measures both).
 
     Args:
-        precision (str, optional): "float32", "bfloat16", or "auto": bfloat16 where the device has units for it.
-            Default: float32.
-        device (str or torch.device, optional): where the training runs. Default: "cpu".
+        precision (str): "float32", "bfloat16", or "auto": bfloat16 where the device has units for it.
+        device (str or torch.device): where the training runs.
 
     Raises:
         ValueError: for another precision.
 
     Warns:
         UserWarning: if bfloat16 was asked for by name where it is emulated.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.runs.device import training_dtype
-        >>> training_dtype("float32") is None, training_dtype("auto") in (None, torch.bfloat16)
-        (True, True)
     """
-    lookup(PRECISIONS, precision or "float32", "precision")
-    if precision in (None, "float32"):
+    if lookup(PRECISIONS, precision, "precision") == "float32":
         return None
     quick = has_bfloat16_units(device)
-    if precision == "auto":
-        return torch.bfloat16 if quick else None
-    if not quick:
-        told = (
+    if precision == "bfloat16" and not quick:
+        warnings.warn(
             f"precision 'bfloat16': {torch.device(device).type} has no units for it and emulates it, many times slower"
+            " than 'float32'; 'auto' takes what is quick on the machine",
+            stacklevel=2,
         )
-        warnings.warn(f"{told} than 'float32'; 'auto' takes what is quick on the machine", stacklevel=2)
-    return torch.bfloat16
+    return torch.bfloat16 if quick or precision == "bfloat16" else None
 
 
 def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
-    """Whether a device multiplies bfloat16 matrices itself.
-
-    Args:
-        device (str or torch.device, optional): ``"cpu"`` or ``"cuda"``. Default: "cpu".
-
-    Examples:
-        >>> from torchrl_koap.runs.device import has_bfloat16_units
-        >>> isinstance(has_bfloat16_units(), bool)
-        True
-    """
+    """Whether a device, ``"cpu"`` or ``"cuda"``, multiplies bfloat16 matrices itself."""
     if torch.device(device).type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     features = torch.cpu.get_capabilities()
@@ -69,17 +51,35 @@ def has_bfloat16_units(device: str | torch.device = "cpu") -> bool:
 
 
 def set_up_torch(threads: int | None, device: str) -> None:
-    """Sets the number of threads and checks that the device is there.
+    """Sets the number of threads, None leaves it as it is, and checks that the device is there.
 
     Args:
-        threads (int, optional): number of torch threads, at least 1. None leaves it as it is.
+        threads (int, optional): number of torch threads.
         device (str): ``"cpu"`` or ``"cuda"``, with an index or not.
 
     Raises:
-        ValueError: if the number is below 1, or this machine has no such device.
+        ValueError: if the number is out of range, or this machine has no such device.
+    """
+    check_machine(threads, device)
+    kind, _, index = device.partition(":")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device {device!r} was asked for, but torch finds no CUDA here (see `koap doctor`)")
+    if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
+        raise ValueError(f"device {device!r} was asked for, but there are {torch.cuda.device_count()}, counted from 0")
+    if threads is not None:
+        torch.set_num_threads(threads)
+
+
+def check_machine(threads: int | None, device: str) -> None:
+    """Refuses a number of threads and a name of a device that no machine has.
+
+    Raises:
+        ValueError: naming which of them.
     """
     if threads is not None and threads < 1:
         raise ValueError(f"threads must be >= 1, got {threads}")
+    if threads is not None and threads > _MOST_THREADS:
+        raise ValueError(f"threads must be at most {_MOST_THREADS}, got {threads}")
     kind, colon, index = device.partition(":")
     if kind not in ("cpu", "cuda") or (colon and not index.isdecimal()):
         raise ValueError(f"device must be 'cpu' or 'cuda', got {device!r}")
@@ -87,12 +87,3 @@ def set_up_torch(threads: int | None, device: str) -> None:
         raise ValueError(
             f"device must be 'cpu' or 'cuda', got {device!r}: there is one processor, as far as torch knows"
         )
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device {device!r} was asked for, but torch finds no CUDA here (see `koap doctor`)")
-    if kind == "cuda" and int(index or 0) >= torch.cuda.device_count():
-        raise ValueError(f"device {device!r} was asked for, but there are {torch.cuda.device_count()}, counted from 0")
-    if threads is None:
-        return
-    if threads > _MOST_THREADS:
-        raise ValueError(f"threads must be at most {_MOST_THREADS}, got {threads}")
-    torch.set_num_threads(threads)

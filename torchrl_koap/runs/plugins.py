@@ -64,11 +64,9 @@ def _load(name: str) -> None:
 
 
 def load_entry_points(group: str) -> None:
-    """Imports what installed packages announce in an entry-point group, as ``[project.entry-points."GROUP"]`` does.
+    """Imports what installed packages announce in an entry-point group, such as ``"torchrl_koap.methods"``.
 
-    Args:
-        group (str): ``"torchrl_koap.methods"`` for instance. The value of an entry is a module, or an object in one;
-            importing it registers what it holds.
+    The value of an entry is a module, or an object in one; importing it registers what it holds.
 
     Raises:
         PluginError: if an entry cannot be imported; the message names the entry and the group.

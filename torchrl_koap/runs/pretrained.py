@@ -49,13 +49,6 @@ def find_run(name: str | Path) -> Path:
 def copy_run(source: str | Path, target: str | Path) -> Path:
     """Copies what a run is made of, and nothing that an evaluation wrote, to a folder that is new or holds that run.
 
-    Args:
-        source (str or Path): run directory.
-        target (str or Path): the other folder.
-
-    Returns:
-        Path: the other folder.
-
     Raises:
         RunDirectoryError: if the source is no run, or the target holds another one.
     """
@@ -71,15 +64,11 @@ def copy_run(source: str | Path, target: str | Path) -> Path:
 
 
 def writable_folder(run: str | Path, out: str | Path | None = None) -> Path:
-    """The folder that results about a run are written to: its own, or one to which what it is made of is copied.
-
-    Args:
-        run (str or Path): run directory, or ``"pretrained:NAME"``.
-        out (str or Path, optional): the other folder.
+    """The folder that results about a run are written to: its own, or ``out``, to which what it is made of is copied.
 
     Raises:
         ValueError: if a pretrained run comes without another folder.
-        RunDirectoryError: as :func:`copy_run` and :func:`~torchrl_koap.runs.pretrained.find_run`.
+        RunDirectoryError: as :func:`copy_run` and :func:`find_run`.
     """
     source = find_run(run)
     if out is not None:

@@ -103,20 +103,12 @@ def without_progress_bars() -> Iterator[None]:
 
 
 def count_up_to(bar: tqdm) -> Callable[..., None]:
-    """A function that moves a bar to the number it is called with first, whatever else it is told.
-
-    Args:
-        bar (tqdm): the bar.
-    """
+    """A function that moves a bar to the number it is called with first, whatever else it is told."""
     return lambda done, *rest: bar.update(done - bar.n) and None
 
 
 def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
-    """What :func:`~torchrl_koap.training.loop.train_phase` calls after every update: moves the bar, shows the losses.
-
-    Args:
-        bar (tqdm): the bar.
-    """
+    """What a training calls after every update: moves the bar, shows the losses."""
 
     def update(step: int, values: dict[str, float]) -> None:
         bar.update(step - bar.n)
@@ -131,19 +123,8 @@ def show_losses(bar: tqdm) -> Callable[[int, dict[str, float]], None]:
 def check_logger(name: str) -> None:
     """Refuses a logger that is unknown or whose package is not installed, before any work is done.
 
-    Args:
-        name (str): a name in ``LOGGERS``.
-
     Raises:
-        ValueError: naming the nearest logger, or the extra to install.
-
-    Examples:
-        >>> from torchrl_koap.runs.progress import check_logger
-        >>> check_logger("csv")
-        >>> check_logger("wandbb")
-        Traceback (most recent call last):
-        ...
-        ValueError: unknown logger 'wandbb'; did you mean 'wandb'?
+        ValueError: naming the nearest of ``LOGGERS``, or the extra to install.
     """
     lookup(LOGGERS, name, "logger")
     if name != "csv" and importlib.util.find_spec(name) is None:
@@ -175,12 +156,7 @@ def open_logger(name: str, out: Path) -> Iterator[Any | None]:
 
 
 def log_scores(logger: Any, scores: Mapping[str, Any]) -> None:
-    """Logs the scores of an evaluation that are finite numbers, as ``eval/NAME``.
-
-    Args:
-        logger: what :func:`open_logger` yielded.
-        scores (mapping): name to value.
-    """
+    """Logs the scores of an evaluation that are finite numbers, as ``eval/NAME``."""
     numbers = {
         name: value for name, value in scores.items() if isinstance(value, (int, float)) and math.isfinite(value)
     }

@@ -20,12 +20,7 @@ _ONE_OF = ("fraction", "count", "episodes")
 
 
 def begun_with(run: RunDirectory, asked: TrainConfig) -> TrainConfig:
-    """Returns the options of a resumed run: what is not asked for otherwise is as it was.
-
-    Args:
-        run (RunDirectory): the run, which may be new.
-        asked (TrainConfig): what is asked for now.
-    """
+    """Returns the options of a run, which may be new: of a resumed one what is not asked for otherwise is as it was."""
     if not (asked.run.resume and (run.path / "config.json").exists()):
         return asked
     return _merged(asked, read_config(run))
@@ -45,11 +40,7 @@ def _merged(asked: Any, saved: Any) -> Any:
 
 
 def check_resume(run: RunDirectory, config: TrainConfig) -> None:
-    """Refuses a folder that holds another run, or one that was not asked to be resumed.
-
-    Args:
-        run (RunDirectory): the folder.
-        config (TrainConfig): what is to be trained, nothing left open.
+    """Refuses a folder that holds another run than what is to be trained, or was not asked to be resumed.
 
     Raises:
         RunDirectoryError: naming what differs.

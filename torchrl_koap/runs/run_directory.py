@@ -42,12 +42,7 @@ class RunDirectory:
         self.path = Path(path)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Writes a JSON file in one go; numbers that are not finite, which JSON does not know, become null.
-
-        Args:
-            name (str): the file.
-            content (mapping): what it is to hold.
-        """
+        """Writes a JSON file in one go; numbers that are not finite, which JSON does not know, become null."""
         with replacing_file(self.path / name) as aside:
             aside.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
@@ -73,10 +68,6 @@ class RunDirectory:
     def read_entry(self, name: str, key: str) -> Any:
         """Reads one entry of a JSON file.
 
-        Args:
-            name (str): the file.
-            key (str): the entry.
-
         Raises:
             RunDirectoryError: if the file or the entry is not there; the message names both.
         """
@@ -86,12 +77,9 @@ class RunDirectory:
         return content[key]
 
     def log(self, phase: str, step: int, values: Mapping[str, float]) -> None:
-        """Appends a row to ``metrics.csv``; a value that no row had before gets a column of its own.
+        """Appends a row to ``metrics.csv``: the values (losses, learning rate, speed) after a step of a phase.
 
-        Args:
-            phase (str): part of the training.
-            step (int): updates done in it.
-            values (mapping): name to value: losses, learning rate, speed.
+        A value that no row had before gets a column of its own.
         """
         path = self.path / "metrics.csv"
         row = {"phase": phase, "step": step, **values}
@@ -146,12 +134,7 @@ class RunDirectory:
         return {key: float(value) for key, value in rows[-1].items() if value and key not in ("phase", "step")}
 
     def rewind_metrics(self, phase: str, step: int) -> None:
-        """Drops the rows of ``phase`` behind ``step``, and those of later phases, before a run goes on from there.
-
-        Args:
-            phase (str): part of the training.
-            step (int): its updates that are kept.
-        """
+        """Drops the rows of ``phase`` behind ``step``, and those of later phases, before a run goes on from there."""
         if not (self.path / "metrics.csv").exists():
             return
         kept = []

@@ -28,13 +28,7 @@ class CheckpointError(ValueError):
 
 
 def save_weights(path: str | Path, module: nn.Module, about: Mapping[str, Any]) -> None:
-    """Writes the state dict of a module, normaliser statistics included, in one go.
-
-    Args:
-        path (str or Path): file to write.
-        module (nn.Module): the module.
-        about (mapping): JSON-serialisable facts kept in the header; :func:`load_weights` compares those it expects.
-    """
+    """Writes the state dict of a module, normaliser statistics included, and facts for :func:`load_weights`."""
     save_tensors(path, module.state_dict(), about)
 
 
@@ -62,12 +56,12 @@ def load_weights(path: str | Path, module: nn.Module, expected: Mapping[str, Any
 
 
 def load_parts(path: str | Path, tensors: Mapping[str, Tensor], parts: Mapping[str, nn.Module | None]) -> None:
-    """Hands several modules their weights, of names ``"PART.ENTRY"``.
+    """Hands several modules, those that are not None, their weights, of names ``"PART.ENTRY"``.
 
     Args:
         path (str or Path): the file they are from, for the message.
         tensors (mapping): all weights.
-        parts (mapping): modules by name; None is passed over.
+        parts (mapping): modules by name.
 
     Raises:
         CheckpointError: as :func:`load_weights`.
@@ -84,19 +78,6 @@ def _load(path: str | Path, module: nn.Module, tensors: Mapping[str, Tensor]) ->
     except RuntimeError as error:
         problems = " ".join(str(error).split("\n", 1)[-1].split())
         raise CheckpointError(f"{path} does not fit the model: {problems}") from error
-    check_weights(path, module)
-
-
-def check_weights(path: str | Path, module: nn.Module) -> None:
-    """Refuses weights with which nothing can be computed.
-
-    Args:
-        path (str or Path): the file they are from, for the message.
-        module (nn.Module): the module that has received them.
-
-    Raises:
-        CheckpointError: naming an entry that is NaN or infinite, or a normaliser whose scale is not positive.
-    """
     for name, value in module.named_parameters():  # of a buffer that nobody has fitted NaN says just that
         if not value.isfinite().all():
             raise CheckpointError(f"{path} is damaged: {name} is NaN or infinite")
@@ -111,13 +92,7 @@ def check_weights(path: str | Path, module: nn.Module) -> None:
 
 
 def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
-    """Writes tensors and facts to one safetensors file, aside and renamed.
-
-    Args:
-        path (str or Path): the file; it is complete or not there.
-        tensors (mapping): tensors by name, on any device.
-        about (mapping, optional): facts for the header, plain JSON types.
-    """
+    """Writes tensors by name, and facts of plain JSON types, to one safetensors file, aside and renamed."""
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     with replacing_file(path) as aside:
         try:

@@ -274,6 +274,7 @@ def check_study(study: Study) -> list[Cell]:
         (study.run.resume, "run.resume", "it goes on by itself"),
         (study.planner.source is not None, "planner.source", "name runs with --planners"),
         (study.evaluation.out is not None, "evaluation.out", "a cell is evaluated in its own folder"),
+        (study.evaluation.dataset is not None, "evaluation.dataset", "a cell is evaluated on what it was trained on"),
     ):
         if given:
             raise ValueError(f"{name} is not for a study: {why}")

@@ -72,21 +72,25 @@ def test_faults(file, tmp_path):
 @pytest.mark.parametrize(
     ("entry", "values", "message"),
     [
-        ("obs/eef", np.zeros((5, 4)), r"data/demo_10/obs/eef is \[5, 4\], data/demo_2/obs/eef is \[4, 3\]"),
         (
             "obs/eef",
-            np.zeros((4, 3)),
-            r"data/demo_10/obs: entries have different numbers of frames: eef \[4, 3\], width",
+            np.zeros((5, 4)),
+            "demo_10: state columns are eef_0, .*eef_3, width; those of demo_2 are .*eef_2, w",
         ),
-        ("actions", np.zeros((5, 6)), r"data/demo_10/actions is \[5, 6\], data/demo_2/actions is \[4, 7\]"),
+        ("obs/eef", np.zeros((4, 3)), "demo_10: its columns have different numbers of rows: eef_0 4, .*, width 5"),
+        ("next_obs/eef", np.zeros((4, 2)), r"demo_10/next_obs/eef is \[4, 2\], obs/eef is \[5, 3\]"),
+        ("actions", np.zeros((5, 6)), "demo_10: action columns are .*action_5; those of demo_2 are .*action_6"),
         ("actions", np.zeros((2, 7)), "trajectory demo_10: 2 actions for 5 frames"),
     ],
 )
 def test_other_shapes_are_named(entry, values, message, file):
     with h5py.File(file, "a") as stream:
-        if entry in stream["data/demo_10"]:
-            del stream[f"data/demo_10/{entry}"]
-        stream[f"data/demo_10/{entry}"] = values
+        demo = stream["data/demo_10"]
+        if entry.startswith("next_obs"):
+            demo["next_obs/width"] = demo["obs/width"][:]
+        elif entry in demo:
+            del demo[entry]
+        demo[entry] = values
     with pytest.raises(DataError, match=message):
         read_robomimic(file)
 

@@ -69,7 +69,7 @@ def read_robomimic(
         if not chosen:
             problems.append(f"no entry of obs is a table of numbers; there are {', '.join(first['obs'])}")
         declared = _control_frequency(stream["data"].attrs.get("env_args"))
-        pieces = [_piece(name, stream["data"], chosen, first, problems) for name in demos]
+        pieces = [_piece(stream[f"data/{name}"], name, chosen, problems) for name in demos]
         skipped = [f"obs/{name}" for name in sorted(first["obs"]) if name not in chosen]
         skipped += [name for name in sorted(first) if name not in ("obs", "next_obs", "actions")]
     if problems:
@@ -84,48 +84,36 @@ def read_robomimic(
     )
 
 
-def _piece(name: str, data: Any, chosen: Sequence[str], first: Any, problems: list[str]) -> Piece:
-    """One demonstration of a group; its entries must have a row per frame, as wide as those of the first one."""
-    group, states, lengths = data[name], dict[str, np.ndarray](), dict[str, list[int]]()
+def _piece(group: Any, name: str, chosen: Sequence[str], problems: list[str]) -> Piece:
+    """One demonstration."""
+    states: dict[str, np.ndarray] = {}
+    following = group.get("next_obs", {})
+    behind = all(entry in following for entry in chosen)
     for entry in chosen:
-        if entry not in group["obs"]:
-            have = ", ".join(sorted(group["obs"]))
-            problems.append(f"data/{name}/obs has no entry {entry!r}; it has {have}")
-            continue
-        place, part = f"obs/{entry}", group["obs"][entry]
-        if not _is_table(part):
-            shape = list(getattr(part, "shape", ()))
-            problems.append(f"data/{name}/{place} is {shape}, no table of numbers: it cannot be part of the state")
-            continue
-        _check_width(name, place, part, first, problems)
-        part = np.asarray(part)
-        if "next_obs" in group and all(other in group["next_obs"] for other in chosen):
-            behind = np.asarray(group["next_obs"][entry])
-            if behind.shape[1:] != part.shape[1:] or not len(behind):
-                problems.append(f"data/{name}/next_{place} is {list(behind.shape)}, {place} is {list(part.shape)}")
+        part = group["obs"].get(entry)
+        if part is None:
+            problems.append(f"data/{name}/obs has no entry {entry!r}; it has {', '.join(sorted(group['obs']))}")
+        elif not _is_table(part):
+            said = "no table of numbers: it cannot be part of the state"
+            problems.append(f"data/{name}/obs/{entry} is {_shape(part)}, {said}")
+        else:
+            last = following[entry] if behind else part[:0]
+            if _shape(last)[1:] != _shape(part)[1:] or behind and not len(last):
+                problems.append(f"data/{name}/next_obs/{entry} is {_shape(last)}, obs/{entry} is {_shape(part)}")
                 continue
-            part = np.concatenate([part, behind[-1:]])
-        states |= spread(entry, part)
-        lengths[entry] = list(part.shape)
-    if len({shape[0] for shape in lengths.values()}) > 1:
-        shapes = ", ".join(f"{entry} {shape}" for entry, shape in lengths.items())
-        problems.append(f"data/{name}/obs: entries have different numbers of frames: {shapes}")
+            states |= spread(entry, np.concatenate([part, last[-1:]]))
     if "actions" not in group:
         return Piece(name, states)
-    if not _is_table(group["actions"]):
-        shape = list(getattr(group["actions"], "shape", ()))
-        problems.append(f"data/{name}/actions must be numbers [T, a], got {shape}")
+    actions = group["actions"]
+    if not _is_table(actions):
+        problems.append(f"data/{name}/actions must be numbers [T, a], got {_shape(actions)}")
         return Piece(name, states)
-    _check_width(name, "actions", group["actions"], first, problems)
-    actions = np.asarray(group["actions"])
-    columns = actions.reshape(len(actions), -1).T
+    columns = np.asarray(actions).reshape(len(actions), -1).T
     return Piece(name, states, {f"action_{index}": values for index, values in enumerate(columns)})
 
 
-def _check_width(name: str, place: str, part: Any, first: Any, problems: list[str]) -> None:
-    if place in first and _is_table(first[place]) and part.shape[1:] != first[place].shape[1:]:
-        wanted = f"{first[place].name.removeprefix('/')} is {list(first[place].shape)}"
-        problems.append(f"data/{name}/{place} is {list(part.shape)}, {wanted}")
+def _shape(entry: Any) -> list[int]:
+    return list(getattr(entry, "shape", ()))
 
 
 def _number(name: str) -> tuple[int, str]:
