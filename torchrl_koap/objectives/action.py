@@ -22,7 +22,7 @@ class ActionLoss(WindowLoss):
         freeze_latents (bool): fit the action decoder of a controller with a latent to latents that stay as they are.
             Defaults to ``False``.
         sample (bool): decode samples of the latents instead of what is inferred. Defaults to ``False``.
-        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+        reduction (str): as for :class:`~torchrl_koap.objectives.base.WindowLoss`.
 
     Raises:
         ValueError: for latents to freeze, or samples, of a network that has none.

@@ -16,15 +16,7 @@ from torchrl_koap.modules.inverse_dynamics import InverseDynamics
 
 
 def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Reads an entry that must be there.
-
-    Args:
-        tensordict (TensorDictBase): a batch.
-        key (NestedKey): the entry.
-
-    Raises:
-        KeyError: if it is not there.
-    """
+    """Reads an entry; a KeyError names those that are there if it is not."""
     value = tensordict.get(key, None)
     if value is None:
         raise KeyError(f"the loss needs the entry {key!r}; there are {sorted(map(str, tensordict.keys(True)))}")
@@ -32,20 +24,7 @@ def read_entry(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def read_mask(tensordict: TensorDictBase, key: NestedKey, state: Tensor) -> Tensor:
-    """Reads a mask of the frames of windows, stored with a trailing 1 or not.
-
-    Args:
-        tensordict (TensorDictBase): a batch.
-        key (NestedKey): the entry, bool ``[*B, T, 1]`` or ``[*B, T]``.
-        state (Tensor): windows ``[*B, T, d]``, for the shape.
-
-    Returns:
-        Tensor: bool ``[*B, T]``.
-
-    Raises:
-        KeyError: if it is not there.
-        ValueError: if it has another shape or type.
-    """
+    """Reads a mask ``[*B, T]`` of the frames of windows ``[*B, T, d]``, stored with a trailing 1 or not."""
     mask = read_entry(tensordict, key)
     if mask.shape == (*state.shape[:-1], 1):
         mask = mask.squeeze(-1)
@@ -68,12 +47,6 @@ class NetworkLoss(LossModule):
 
     Raises:
         ValueError: for an unknown reduction.
-
-    Examples:
-        >>> from torchrl_koap.modules import make_koopman_inverse_dynamics
-        >>> from torchrl_koap.objectives import KOAPLoss  # a loss of this base
-        >>> KOAPLoss(make_koopman_inverse_dynamics(2, 2, latent_dim=8)).in_keys[:2]
-        ['state', 'action']
     """
 
     network: nn.Module
@@ -113,6 +86,15 @@ class NetworkLoss(LossModule):
         padded = read_mask(tensordict, self.tensor_keys.padded, state)
         return ~(padded[..., 1:] | padded[..., :-1])
 
+    def _reduce(self, error: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Reduces errors; those outside of a mask, of their shape or with a trailing 1, are 0 and do not count."""
+        if mask is None:
+            return self._reduce_loss(error)
+        error = torch.where(mask, error, 0.0)
+        if self.reduction == "none":
+            return error
+        return error.sum() / (mask.expand_as(error).sum().clamp_min(1) if self.reduction == "mean" else 1)
+
 
 class WindowLoss(NetworkLoss):
     """Base class of the losses on windows of states of which some frames have an action label.
@@ -121,10 +103,7 @@ class WindowLoss(NetworkLoss):
         network (InverseDynamics): the controller; its entries of states and actions are those of the loss.
 
     Keyword Args:
-        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"``.
-
-    Raises:
-        ValueError: for an unknown reduction.
+        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
 
     Examples:
         >>> import torch
@@ -193,11 +172,3 @@ class WindowLoss(NetworkLoss):
             columns = f"{target.shape[-1]} columns, the network decodes {predicted.shape[-1]}"
             raise ValueError(f"{self.tensor_keys.action!r} has {columns}")
         return (predicted - target).square().mean(-1)
-
-    def _reduce(self, error: Tensor, mask: Tensor) -> Tensor:
-        error = torch.where(mask, error, 0.0)
-        if self.reduction == "none":
-            return error
-        if self.reduction == "sum":
-            return error.sum()
-        return error.sum() / mask.sum().clamp_min(1)

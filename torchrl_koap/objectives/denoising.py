@@ -16,7 +16,7 @@ from torchrl_koap import keys
 from torchrl_koap.modules.planning.diffusion_policy import DiffusionPolicy
 from torchrl_koap.modules.planning.planner import StatePlanner
 from torchrl_koap.modules.planning.sampler import ConditionalSampler
-from torchrl_koap.objectives.base import NetworkLoss, read_entry, read_mask
+from torchrl_koap.objectives.base import NetworkLoss, WindowLoss, read_entry, read_mask
 
 
 class DenoisingLoss(NetworkLoss):
@@ -43,7 +43,8 @@ class DenoisingLoss(NetworkLoss):
             its weights.
 
     Raises:
-        ValueError: if ``reduction`` is unknown.
+        ValueError: if ``reduction`` is unknown; at the call if an entry has another shape than the network needs.
+        KeyError: at the call if an entry is missing.
 
     Examples:
         >>> import torch
@@ -73,9 +74,6 @@ class DenoisingLoss(NetworkLoss):
     def read(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Reads raw histories and sequences of a batch, and which of their steps count.
 
-        Args:
-            tensordict (TensorDictBase): the batch.
-
         Returns:
             tuple: histories ``[*B, h, d]``, sequences ``[*B, H, width]`` (finite also where steps do not count) and
             the steps that count, bool ``[*B, H, 1]``, or None where all do.
@@ -102,27 +100,9 @@ class DenoisingLoss(NetworkLoss):
         self._clear_weakrefs(tensordict, result, "network_params", "target_network_params")
         return result
 
-    def _reduce(self, error: Tensor, counts: Tensor | None) -> Tensor:
-        if counts is None:
-            return self._reduce_loss(error)
-        loss = torch.where(counts, error, 0.0)
-        if self.reduction == "none":
-            return loss
-        return loss.sum() / ((counts.sum() * error.shape[-1]).clamp_min(1) if self.reduction == "mean" else 1)
-
 
 class PlannerLoss(DenoisingLoss):
-    r"""Trains a planner on windows of states (:class:`DenoisingLoss`).
-
-    Args:
-        planner (StatePlanner): planner to train, its normalisers already fitted.
-
-    Keyword Args:
-        **options: as for :class:`DenoisingLoss`.
-
-    Raises:
-        KeyError: if an entry is missing.
-        ValueError: if an entry has another shape than the planner needs, or ``reduction`` is unknown.
+    """Trains a planner on windows of states; Args as for :class:`DenoisingLoss`.
 
     Examples:
         >>> import torch
@@ -144,9 +124,9 @@ class PlannerLoss(DenoisingLoss):
         """Entries of the input; the last two are read if they are there.
 
         Attributes:
-            state (NestedKey): windows of raw states ``[*B, history + horizon, d]``. Defaults to ``"state"``.
-            noise (NestedKey): noise ``[*B, horizon, d]`` instead of random. Defaults to ``"planner_noise"``.
-            time (NestedKey): time ``[*B]`` in training steps instead of random. Defaults to ``"planner_time"``.
+            state (NestedKey): windows of raw states ``[*B, history + horizon, d]``.
+            noise (NestedKey): noise ``[*B, horizon, d]`` instead of random.
+            time (NestedKey): time ``[*B]`` in training steps instead of random.
         """
 
         state: NestedKey = keys.STATE
@@ -164,23 +144,13 @@ class PlannerLoss(DenoisingLoss):
 
 
 class DiffusionPolicyLoss(DenoisingLoss):
-    r"""Trains a Diffusion Policy on labelled steps of windows (:class:`DenoisingLoss`).
+    """Trains a Diffusion Policy on labelled steps of windows; Args as for :class:`DenoisingLoss`.
 
     The sequence are the actions of frames ``history - 1 .. T - 2``. A step counts if it has a label and neither its
     frame nor the next one is padded. The denoiser sees steps that do not count as the middle of the range of actions,
     noise added; what was stored there (NaN) reaches neither value nor gradient. A batch without labels gives exactly 0.
     Labels are what this method lives on: draw windows with ``labelled_share=1``
     (:class:`~torchrl_koap.data.WindowSampler`).
-
-    Args:
-        policy (DiffusionPolicy): policy to train, its normalisers already fitted.
-
-    Keyword Args:
-        **options: as for :class:`DenoisingLoss`.
-
-    Raises:
-        KeyError: if an entry is missing.
-        ValueError: if an entry has another shape than the policy needs, or ``reduction`` is unknown.
 
     Examples:
         >>> import torch
@@ -194,24 +164,14 @@ class DiffusionPolicyLoss(DenoisingLoss):
     """
 
     @dataclass
-    class _AcceptedKeys:
-        """Entries of the input; the last three are read if they are there. Masks may have a trailing 1 or not.
+    class _AcceptedKeys(WindowLoss._AcceptedKeys):
+        """Entries of the input, as in :class:`WindowLoss` with ``T = history + horizon``; the others are optional.
 
         Attributes:
-            state (NestedKey): windows of raw states ``[*B, history + horizon, d]``. Defaults to ``"state"``.
-            action (NestedKey): raw actions ``[*B, history + horizon, act]``, NaN where unlabelled. Defaults to
-                ``"action"``.
-            has_action (NestedKey): labelled frames, bool ``[*B, history + horizon, 1]``. Defaults to ``"has_action"``.
-            padded (NestedKey): frames that repeat an edge of the trajectory, bool ``[*B, history + horizon]``. Defaults
-                to ``"padded"``.
-            noise (NestedKey): noise ``[*B, horizon, act]`` instead of random. Defaults to ``"policy_noise"``.
-            time (NestedKey): time ``[*B]`` in training steps instead of random. Defaults to ``"policy_time"``.
+            noise (NestedKey): noise ``[*B, horizon, act]`` instead of random.
+            time (NestedKey): time ``[*B]`` in training steps instead of random.
         """
 
-        state: NestedKey = keys.STATE
-        action: NestedKey = keys.ACTION
-        has_action: NestedKey = keys.HAS_ACTION
-        padded: NestedKey = keys.PADDED
         noise: NestedKey = "policy_noise"
         time: NestedKey = "policy_time"
 

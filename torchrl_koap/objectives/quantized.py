@@ -1,9 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-r"""The loss of latent action policies (LAPO) with a quantised latent.
-
-.. math::
-    L = \overline{|h_\psi(x_{t-n}, \dots, x_t, u_t) - (x_{t+1} - x_t)|^2}
-"""
+"""The loss of latent action policies (LAPO) with a quantised latent."""
 
 from __future__ import annotations
 
@@ -15,15 +11,13 @@ from torchrl_koap.objectives.base import WindowLoss
 
 
 class QuantizedDynamicsLoss(WindowLoss):
-    """Computes the error of the next step, predicted from the past and the code of the transition, ``loss_dynamics``.
+    r"""Computes the error of the next step, predicted from the past and the code of the transition, ``loss_dynamics``.
 
-    No label is read: actions are decoded by :class:`~torchrl_koap.objectives.ActionLoss`, afterwards.
+    .. math::
+        L = \overline{|h_\psi(x_{t-n}, \dots, x_t, u_t) - (x_{t+1} - x_t)|^2}
 
-    Args:
-        network (QuantizedInverseDynamics): the model.
-
-    Keyword Args:
-        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+    No label is read: actions are decoded by :class:`~torchrl_koap.objectives.ActionLoss`, afterwards. Args as for
+    :class:`~torchrl_koap.objectives.base.WindowLoss`.
 
     Examples:
         >>> import torch

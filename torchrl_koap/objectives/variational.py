@@ -31,7 +31,7 @@ class VariationalLoss(WindowLoss):
     Keyword Args:
         kl_coeff (float): ``beta``, already applied to ``loss_kl``. Defaults to ``0.01``. Assigning to it later is an
             in-place buffer write.
-        reduction (str): ``"mean"`` (default), ``"sum"`` or ``"none"`` (``[*B, frames]``, 0 where masked).
+        reduction (str): as for :class:`~torchrl_koap.objectives.base.WindowLoss`.
 
     Raises:
         ValueError: if the noise handed in has another shape than the latents.

@@ -1,9 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Networks that predict the clean sequence (or the noise) in a noisy sequence of states.
-
-All take a sequence ``[*B, H, d]``, a time ``[*B]`` in training steps and a condition ``[*B, c]``, and return
-``[*B, H, d]``.
-"""
+"""Networks that predict the clean sequence (or the noise) in a noisy sequence of states."""
 
 from __future__ import annotations
 
@@ -13,36 +9,11 @@ import torch
 from torch import Tensor, nn
 
 
-def check_input(sequence: Tensor, condition: Tensor, state_dim: int, condition_dim: int) -> None:
-    """Checks that sequence and condition fit a denoiser.
-
-    Args:
-        sequence (Tensor): ``[*B, H, state_dim]``.
-        condition (Tensor): ``[*B, condition_dim]``.
-        state_dim (int): columns of a sequence.
-        condition_dim (int): columns of a condition.
-
-    Raises:
-        ValueError: if they do not; the message names the axis.
-    """
-    if sequence.ndim < 2 or sequence.shape[-1] != state_dim:
-        raise ValueError(f"sequence must be [*B, H, {state_dim}] (state_dim), got {list(sequence.shape)}")
-    if condition.shape != (*sequence.shape[:-2], condition_dim):
-        wanted = [*sequence.shape[:-2], condition_dim]
-        raise ValueError(f"condition must be {wanted} ([*B, condition_dim]), got {list(condition.shape)}")
-
-
 class StepEmbedding(nn.Module):
     """Embeds times as sines and cosines of geometrically spaced frequencies, then a two-layer network.
 
     Args:
         embedding_dim (int): width of the embedding, even and at least 4.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.planning.denoisers import StepEmbedding
-        >>> StepEmbedding(32)(torch.arange(5.0)).shape
-        torch.Size([5, 32])
     """
 
     def __init__(self, embedding_dim: int):
@@ -73,12 +44,6 @@ class ConditionEncoder(nn.Module):
         condition_dim (int): number ``c`` of condition columns.
         frequencies (int): octaves of sines and cosines per column; 0 leaves the plain columns.
         width (int): width of the embedding.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.planning.denoisers import ConditionEncoder
-        >>> ConditionEncoder(4, frequencies=3, width=64)(torch.randn(5, 4)).shape
-        torch.Size([5, 64])
     """
 
     def __init__(self, condition_dim: int, *, frequencies: int, width: int):
@@ -94,7 +59,55 @@ class ConditionEncoder(nn.Module):
         return self.network(torch.cat([condition, angles.sin(), angles.cos()], -1))
 
 
-class MLPDenoiser(nn.Module):
+class Denoiser(nn.Module):
+    """Base class of denoisers: input checks, one batch dimension, embedded time and condition.
+
+    A subclass writes :meth:`denoise`.
+
+    Args:
+        state_dim (int): number ``d`` of state columns.
+        condition_dim (int): number ``c`` of condition columns.
+
+    Keyword Args:
+        frequencies (int): octaves of the condition's Fourier features.
+        condition_width (int): width ``w`` of the :class:`ConditionEncoder`.
+        embedding_dim (int): width ``e`` of the step embedding, even and at least 4. Defaults to 32.
+
+    Raises:
+        ValueError: for sizes that are not possible; at the call for a sequence or condition of another shape.
+    """
+
+    def __init__(
+        self, state_dim: int, condition_dim: int, *, frequencies: int, condition_width: int, embedding_dim: int = 32
+    ):
+        super().__init__()
+        self.state_dim, self.condition_dim = state_dim, condition_dim
+        self.step_embedding = StepEmbedding(embedding_dim)
+        self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=condition_width)
+        self.context_dim = embedding_dim + condition_width
+
+    def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
+        """Predicts ``[N, H, d]`` from sequences ``[N, H, d]``, embedded steps ``[N, e]`` and conditions ``[N, w]``."""
+        raise NotImplementedError
+
+    def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
+        """Predicts what the schedule asks for, ``[*B, H, d]``, from noisy sequences.
+
+        Args:
+            sequence (Tensor): noisy sequences ``[*B, H, d]``.
+            time (Tensor): ``[*B]`` in training steps.
+            condition (Tensor): ``[*B, c]``.
+        """
+        if sequence.ndim < 2 or sequence.shape[-1] != self.state_dim:
+            raise ValueError(f"sequence must be [*B, H, {self.state_dim}] (state_dim), got {list(sequence.shape)}")
+        wanted = (*sequence.shape[:-2], self.condition_dim)
+        if condition.shape != wanted:
+            raise ValueError(f"condition must be {list(wanted)} ([*B, condition_dim]), got {list(condition.shape)}")
+        x, condition = sequence.reshape(-1, *sequence.shape[-2:]), condition.reshape(-1, self.condition_dim)
+        return self.denoise(x, self.step_embedding(time.reshape(-1)), self.encoder(condition)).reshape(sequence.shape)
+
+
+class MLPDenoiser(Denoiser):
     """Residual network on the flattened sequence, for one fixed horizon: what planners of tasks with objects have.
 
     On Avoiding its plans touch obstacles more often than those of
@@ -103,14 +116,13 @@ class MLPDenoiser(nn.Module):
     Args:
         state_dim (int): number ``d`` of state columns.
         condition_dim (int): number ``c`` of condition columns.
+
+    Keyword Args:
         horizon (int): number ``H`` of planned steps.
         width (int): hidden width. Defaults to 512.
         depth (int): number of residual layers. Defaults to 4.
-        embedding_dim (int): width of the step embedding. Defaults to 32.
         frequencies (int): octaves of the condition's Fourier features. Defaults to 1.
-
-    Raises:
-        ValueError: for an ``embedding_dim`` that is odd or below 4.
+        **options: ``embedding_dim``, width of the step embedding.
 
     Examples:
         >>> import torch
@@ -128,41 +140,23 @@ class MLPDenoiser(nn.Module):
         horizon: int,
         width: int = 512,
         depth: int = 4,
-        embedding_dim: int = 32,
         frequencies: int = 1,
+        **options: int,
     ):
-        super().__init__()
-        self.state_dim, self.condition_dim, self.horizon = state_dim, condition_dim, horizon
-        self.step_embedding = StepEmbedding(embedding_dim)
-        self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=width)
-        self.first = nn.Linear(horizon * state_dim + width + embedding_dim, width)
+        super().__init__(state_dim, condition_dim, frequencies=frequencies, condition_width=width, **options)
+        self.horizon = horizon
+        self.first = nn.Linear(horizon * state_dim + self.context_dim, width)
         self.layers = nn.ModuleList(
             nn.Sequential(nn.LayerNorm(width), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
             for _ in range(depth)
         )
         self.last = nn.Linear(width, horizon * state_dim)
 
-    def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Predicts what the schedule asks for, from noisy sequences.
-
-        Args:
-            sequence (Tensor): noisy sequences ``[*B, H, d]``.
-            time (Tensor): ``[*B]`` in training steps.
-            condition (Tensor): ``[*B, c]``.
-
-        Returns:
-            Tensor: the prediction ``[*B, H, d]``.
-
-        Raises:
-            ValueError: for a sequence or condition of another shape.
-        """
-        check_input(sequence, condition, self.state_dim, self.condition_dim)
-        if sequence.shape[-2] != self.horizon:
-            raise ValueError(f"sequence must have {self.horizon} steps (horizon) on axis -2, got {sequence.shape[-2]}")
-        x = sequence.reshape(-1, self.horizon * self.state_dim)
-        condition = self.encoder(condition.reshape(-1, self.condition_dim))
-        context = torch.cat([condition, self.step_embedding(time.reshape(-1))], -1)
-        x = self.first(torch.cat([x, context], -1))
+    def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
+        """Predicts ``[N, H d]`` from sequences ``[N, H, d]`` (:meth:`Denoiser.denoise`)."""
+        if x.shape[1] != self.horizon:
+            raise ValueError(f"sequence must have {self.horizon} steps (horizon) on axis -2, got {x.shape[1]}")
+        x = self.first(torch.cat([x.flatten(1), condition, step], -1))
         for layer in self.layers:
             x = x + layer(x)
-        return self.last(x).reshape(sequence.shape)
+        return self.last(x)

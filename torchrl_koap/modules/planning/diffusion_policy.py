@@ -27,12 +27,9 @@ class DiffusionPolicy(ConditionalSampler):
         entry               0      1      2      ...  13
 
     KOAP's first public code diffuses ``a_2, a_3, ...`` here and begins to execute them in frame 1, one step too early.
-    Keywords that are not listed are those of :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`.
 
-    Args:
-        denoiser (nn.Module): ``denoiser(sequence [*B, H, act], time [*B], condition [*B, h * d + f]) -> [*B, H, act]``.
-        schedule (NoiseSchedule, optional): noise levels and what the denoiser predicts. Defaults to
-            ``NoiseSchedule()``.
+    Args as for :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`, like keywords that are not listed; a
+    sequence is a chunk, of ``act`` columns.
 
     Keyword Args:
         state_dim (int): number ``d`` of state columns.
@@ -42,7 +39,7 @@ class DiffusionPolicy(ConditionalSampler):
         out_keys (list of NestedKey): the entry of the actions ``[*B, H, act]``. Defaults to ``["action_chunk"]``.
 
     Raises:
-        ValueError: for a history of another length or width, noise of another shape, an unknown solver.
+        ValueError: for an ``action_dim`` below 1.
 
     Examples:
         >>> import torch
@@ -88,14 +85,13 @@ class DiffusionPolicy(ConditionalSampler):
         if actions.ndim < 2 or actions.shape[-1] != self.action_dim:
             raise ValueError(f"actions must be [*M, {self.action_dim}] (action_dim), got {list(actions.shape)}")
         history, _ = self.split_window(windows.reshape(-1, *windows.shape[-2:]))
-        example = self.action_normalizer.scale
-        condition = Normalizer.fit(self.condition(history), mode=mode)
+        example, condition = self.action_normalizer.scale, Normalizer.fit(self.condition(history), mode=mode)
         self.action_normalizer = Normalizer.fit(actions, mode=mode).to(example)
         self.condition_normalizer = condition.to(example)
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Maps raw actions ``[*B, H, act]`` to normalised ones, wherever the state is."""
-        self._check_sequence(sequence)
+        self.check_sequence(sequence)
         return self.action_normalizer(sequence)
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:

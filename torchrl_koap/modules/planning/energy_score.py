@@ -50,18 +50,9 @@ def energy_score(samples: Tensor, true: Tensor) -> Tensor:
 
 @torch.no_grad()
 def sample_sequences(sampler: ConditionalSampler, history: Tensor, *, samples: int, seed: int = 0) -> Tensor:
-    """Samples several sequences for each history.
+    """Samples ``S`` sequences ``[S, N, H, width]`` of planner or Diffusion Policy for each history ``[N, h, d]``.
 
-    Args:
-        sampler (ConditionalSampler): a planner, or a Diffusion Policy.
-        history (Tensor): ``[N, h, d]``.
-
-    Keyword Args:
-        samples (int): sequences ``S`` per history.
-        seed (int): seed of their noise; torch's global generator is not used.
-
-    Returns:
-        Tensor: ``[S, N, H, width]``.
+    Their noise is drawn with the seed; torch's global generator is not used.
     """
     generator = torch.Generator().manual_seed(seed)
     drawn = []
@@ -73,13 +64,14 @@ def sample_sequences(sampler: ConditionalSampler, history: Tensor, *, samples: i
 
 
 def relative_score(samples: Tensor, true: Tensor, reference: Tensor, groups: Sequence[Sequence[int]]) -> float:
-    """Computes the energy score as a share of that of a reference, the mean over groups of columns.
+    """Computes the energy score of ``[S, N, H, d]`` as a share of that of a reference, such as standing still.
 
     Args:
         samples (Tensor): ``[S, N, H, d]``.
-        true (Tensor): ``[N, H, d]``.
-        reference (Tensor): what is compared with, such as standing still, ``[N, H, d]``.
-        groups (sequence): columns of one unit each; those in which the reference makes no error are left out.
+        true (Tensor): ``[N, H, d]``, like the reference.
+        reference (Tensor): what is compared with.
+        groups (sequence): columns of one unit each, over which shares are averaged; those in which the reference makes
+            no error are left out.
 
     Returns:
         float: 1 for samples as good as the reference, NaN if nothing moves.

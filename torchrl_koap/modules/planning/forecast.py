@@ -45,7 +45,7 @@ class LinearForecast(nn.Module):
         self.residual = Normalizer(width)
 
     def fit(self, condition: Tensor, sequence: Tensor, groups: Tensor | None = None, *, mode: str = "minmax") -> float:
-        """Fits the ridge and the statistics of what it leaves over.
+        """Fits the ridge and the statistics of what it leaves over, and returns the penalty chosen.
 
         Args:
             condition (Tensor): normalised conditions ``[N, c]``.
@@ -55,9 +55,6 @@ class LinearForecast(nn.Module):
 
         Keyword Args:
             mode (str): of the statistics (:class:`~torchrl_koap.modules.normalizer.Normalizer`).
-
-        Returns:
-            float: the penalty chosen.
         """
         groups = torch.arange(len(condition), device=condition.device) if groups is None else groups
         rows = slice(None, None, -(-len(condition) // _MOST_ROWS))
@@ -78,27 +75,11 @@ class LinearForecast(nn.Module):
         return fit.penalty
 
     def encode(self, condition: Tensor, sequence: Tensor) -> Tensor:
-        """Maps sequences to their normalised deviation from the forecast.
-
-        Args:
-            condition (Tensor): normalised conditions ``[*B, c]``.
-            sequence (Tensor): normalised sequences ``[*B, w]``.
-
-        Returns:
-            Tensor: ``[*B, w]``.
-        """
+        """Maps normalised sequences ``[*B, w]`` to their deviation from the forecast of conditions ``[*B, c]``."""
         return self.residual(sequence - self._forecast(condition))
 
     def decode(self, condition: Tensor, deviation: Tensor) -> Tensor:
-        """Maps deviations to sequences; the inverse of :meth:`encode`.
-
-        Args:
-            condition (Tensor): normalised conditions ``[*B, c]``.
-            deviation (Tensor): normalised deviations ``[*B, w]``.
-
-        Returns:
-            Tensor: ``[*B, w]``.
-        """
+        """Maps deviations ``[*B, w]`` to sequences; the inverse of :meth:`encode`."""
         return self.residual.inverse(deviation) + self._forecast(condition)
 
     def _forecast(self, condition: Tensor) -> Tensor:

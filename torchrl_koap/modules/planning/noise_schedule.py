@@ -35,16 +35,13 @@ Denoise = Callable[[Tensor, NoiseLevel], tuple[Tensor, Tensor]]
 
 
 def ddim(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
-    """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0).
+    """Deterministic implicit sampling (Song et al. 2021, eq. 12 with eta = 0): clean sequences ``[*B, H, d]``.
 
     Args:
         denoise (callable): ``denoise(x, level)`` gives the clean sequence and the noise that the network sees in ``x``,
             both ``[*B, H, d]``.
         x (Tensor): start noise ``[*B, H, d]``.
         levels (sequence of NoiseLevel): stops from much noise to none, one more than steps.
-
-    Returns:
-        Tensor: clean sequences ``[*B, H, d]``.
     """
     for level, after in zip(levels[:-1], levels[1:], strict=True):
         sample, epsilon = denoise(x, level)
@@ -55,13 +52,7 @@ def ddim(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
 def dpm_solver_2m(denoise: Denoise, x: Tensor, levels: Sequence[NoiseLevel]) -> Tensor:
     """Second-order multistep solver in the log signal-to-noise ratio (Lu et al. 2022, algorithm 2).
 
-    Args:
-        denoise (callable): as for :func:`ddim`.
-        x (Tensor): start noise ``[*B, H, d]``.
-        levels (sequence of NoiseLevel): as for :func:`ddim`.
-
-    Returns:
-        Tensor: clean sequences ``[*B, H, d]``.
+    Args as for :func:`ddim`.
     """
     previous, previous_step = None, 0.0
     for level, after in zip(levels[:-1], levels[1:], strict=True):
@@ -81,14 +72,7 @@ SOLVERS = {"dpm++2m": dpm_solver_2m, "ddim": ddim}
 
 
 def squared_cosine(num_train_steps: int) -> Tensor:
-    """Computes the signal variance after each step, nearly a squared cosine (Nichol and Dhariwal 2021).
-
-    Args:
-        num_train_steps (int): number ``N`` of steps.
-
-    Returns:
-        Tensor: float64 ``[N]``.
-    """
+    """Computes the signal variance after each step, nearly a squared cosine (Nichol and Dhariwal 2021), float64."""
     edges = torch.arange(num_train_steps + 1, dtype=torch.float64) / num_train_steps
     kept = torch.cos((edges + 0.008) / 1.008 * math.pi / 2).square()
     return (kept[1:] / kept[:-1]).clamp_min(1e-3).cumprod(0)
@@ -135,29 +119,12 @@ class NoiseSchedule(nn.Module):
         return f"prediction={self.prediction!r}, num_train_steps={self.num_train_steps}"
 
     def sample_time(self, like: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Draws training times.
-
-        Args:
-            like (Tensor): sequences ``[*B, H, d]``, for shape, type and device.
-            generator (torch.Generator, optional): source of the numbers.
-
-        Returns:
-            Tensor: ``[*B]`` in training steps.
-        """
+        """Draws training times ``[*B]``, in training steps, of the type and device of sequences ``[*B, H, d]``."""
         time = torch.randint(self.num_train_steps, like.shape[:-2], device=like.device, generator=generator)
         return time.to(like.dtype)
 
     def add_noise(self, sample: Tensor, noise: Tensor, time: Tensor) -> Tensor:
-        """Mixes the noisy sequence ``signal(t) x_0 + noise(t) eps``.
-
-        Args:
-            sample (Tensor): clean sequences ``x_0``, ``[*B, H, d]``.
-            noise (Tensor): noise ``eps``, ``[*B, H, d]``.
-            time (Tensor): ``[*B]`` in training steps.
-
-        Returns:
-            Tensor: ``[*B, H, d]``.
-        """
+        """Mixes the noisy sequence ``signal(t) x_0 + noise(t) eps``, ``[*B, H, d]``, at times ``[*B]``."""
         index = time.long()
         signal, amplitude = self.signal[index].to(time.dtype), self.noise[index].to(time.dtype)
         return signal[..., None, None] * sample + amplitude[..., None, None] * noise
@@ -167,13 +134,7 @@ class NoiseSchedule(nn.Module):
         return noise if self.prediction == "epsilon" else sample
 
     def noise_levels(self, num_steps: int) -> list[NoiseLevel]:
-        """Lists the stops of a solver, evenly spaced in time from the noisiest level to the clean sequence.
-
-        Args:
-            num_steps (int): number of solver steps, at most ``num_train_steps``.
-
-        Returns:
-            list of NoiseLevel: one more than steps.
+        """Lists the stops of a solver, one more than steps, evenly spaced from the noisiest level to no noise.
 
         Raises:
             ValueError: if the number of steps is out of range.
@@ -186,17 +147,9 @@ class NoiseSchedule(nn.Module):
     def split(
         self, output: Tensor, x: Tensor, level: NoiseLevel, clip: float | None = None, prefix: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Splits a noisy sequence into the clean one and the noise that a network output stands for.
+        """Splits noisy sequences ``x`` of a level into the clean ones and the noise that a network output stands for.
 
-        Args:
-            output (Tensor): of the network, ``[*B, H, d]``.
-            x (Tensor): the noisy sequence it was asked about, ``[*B, H, d]``.
-            level (NoiseLevel): level of its noise.
-            clip (float, optional): the clean sequence is clipped to ``[-clip, clip]``.
-            prefix (Tensor, optional): first frames ``[*B, k, d]`` of the clean sequence.
-
-        Returns:
-            tuple of Tensor: clean sequence and noise, ``[*B, H, d]`` each.
+        All are ``[*B, H, d]``; ``clip`` and ``prefix`` as for :meth:`solve`.
         """
         sample = output if self.prediction == "sample" else (x - output * level.noise) / level.signal
         if clip is not None:
@@ -217,7 +170,7 @@ class NoiseSchedule(nn.Module):
         clip: float | None = None,
         prefix: Tensor | None = None,
     ) -> Tensor:
-        """Turns noise into sequences.
+        """Turns noise into sequences ``[*B, H, d]``.
 
         Args:
             network (callable): ``network(x [*B, H, d], time [*B]) -> [*B, H, d]``, its output read as ``prediction``.
@@ -229,9 +182,6 @@ class NoiseSchedule(nn.Module):
             clip (float, optional): bound of the clean sequence at every step. Defaults to no bound.
             prefix (Tensor, optional): first frames ``[*B, k, d]`` that the clean sequence has to have: they replace
                 what the network says at every step, so that the rest is made to fit them.
-
-        Returns:
-            Tensor: ``[*B, H, d]``.
 
         Raises:
             ValueError: for an unknown solver or a number of steps out of range.

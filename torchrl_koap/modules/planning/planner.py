@@ -29,12 +29,10 @@ class StatePlanner(ConditionalSampler):
     (:class:`~torchrl_koap.modules.planning.forecast.LinearForecast`), which carries over to goals never seen.
 
     Every entry of condition and plan has its own offset and scale (:meth:`fit_normalizers`); they travel in the state
-    dict. Keywords that are not listed are those of :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`.
+    dict.
 
-    Args:
-        denoiser (nn.Module): ``denoiser(sequence [*B, H, d], time [*B], condition [*B, h * d + f]) -> [*B, H, d]``.
-        schedule (NoiseSchedule, optional): noise levels and what the denoiser predicts. Defaults to
-            ``NoiseSchedule()``.
+    Args as for :class:`~torchrl_koap.modules.planning.sampler.ConditionalSampler`, like keywords that are not listed; a
+    sequence is a plan, of ``d`` columns.
 
     Keyword Args:
         state_dim (int): number ``d`` of state columns.
@@ -42,9 +40,6 @@ class StatePlanner(ConditionalSampler):
         forecast (bool): model deviations from a linear forecast. Defaults to False.
         in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``. Defaults to ``["history"]``.
         out_keys (list of NestedKey): the entry of the plan ``[*B, H, d]``. Defaults to ``["plan"]``.
-
-    Raises:
-        ValueError: for a history of another length or width, noise of another shape, an unknown solver.
 
     Examples:
         >>> import torch
@@ -100,7 +95,7 @@ class StatePlanner(ConditionalSampler):
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
         """Maps raw plans ``[*B, H, d]`` to normalised sequences (:meth:`ConditionalSampler.encode`)."""
-        self._check_sequence(sequence)
+        self.check_sequence(sequence)
         sequence = self.plan_normalizer(self._displaced(history, sequence))
         if self.forecast is not None:
             sequence = self.forecast.encode(self.encode_history(history), sequence)

@@ -26,12 +26,6 @@ class RelativePosition:
         origin (slice): state columns of the position it is seen from; where it has 2, the height is taken as it is.
         yaw (slice, optional): state columns ``cos, sin`` of the yaw of the frame it is seen in.
         other_yaw (slice, optional): ``cos, sin`` of a yaw to be told relative to that frame, too.
-
-    Examples:
-        >>> from torchrl_koap.modules.planning.relative_positions import RelativePosition
-        >>> tool_from_box = RelativePosition(place=slice(0, 2), origin=slice(2, 4), yaw=slice(4, 6))
-        >>> tool_from_box.other_yaw is None
-        True
     """
 
     place: slice
@@ -70,8 +64,8 @@ class RelativePositionFeatures(nn.Module):
     @property
     def num_features(self) -> int:
         """Number of features."""
-        sizes = (_size(pair.place) for pair in self.pairs)
-        return sum((1 + len(NEAR)) * size for size in sizes) + sum(2 for r in self.pairs if r.other_yaw)
+        sizes = (pair.place.stop - pair.place.start for pair in self.pairs)
+        return sum((1 + len(NEAR)) * size for size in sizes) + sum(2 for pair in self.pairs if pair.other_yaw)
 
     def forward(self, history: Tensor) -> Tensor:
         """Features of the last frame."""
@@ -91,16 +85,8 @@ class RelativePositionFeatures(nn.Module):
 
 
 def relative_features(pairs: Sequence[Sequence[slice]]) -> RelativePositionFeatures | None:
-    """Makes the features of a task from its columns, ``Task.relative_columns()``; None where it has no pair of them.
-
-    Args:
-        pairs (sequence of sequence of slice): ``(place, origin)`` each, with ``yaw`` and ``other_yaw`` where there are.
-    """
+    """Makes the features of a task from its columns, ``Task.relative_columns()``; None where it has no pair of them."""
     return RelativePositionFeatures([RelativePosition(*pair) for pair in pairs]) if pairs else None
-
-
-def _size(part: slice) -> int:
-    return part.stop - part.start
 
 
 def _turn_back(vector: Tensor, yaw: Tensor) -> Tensor:

@@ -44,14 +44,8 @@ class ConditionalSampler(TensorDictModuleBase):
             ``"noise"``.
 
     Raises:
-        ValueError: for sizes below 1, several in- or out-keys, an unknown solver.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules import StatePlanner, TemporalUnet  # a subclass, of states
-        >>> planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, horizon=14)
-        >>> planner.noise_shape, planner.sample(torch.zeros(3, 2, 2)).shape
-        ((14, 2), torch.Size([3, 14, 2]))
+        ValueError: for sizes below 1, several in- or out-keys, an unknown solver; at the call for a history or noise of
+            another shape.
     """
 
     def __init__(
@@ -97,14 +91,7 @@ class ConditionalSampler(TensorDictModuleBase):
         return self.horizon, self._width
 
     def encode(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """Maps raw sequences to the normalised ones that noise is added to.
-
-        Args:
-            history (Tensor): raw histories ``[*B, h, d]``.
-            sequence (Tensor): raw sequences ``[*B, H, width]``.
-
-        Returns:
-            Tensor: ``[*B, H, width]``.
+        """Maps raw sequences ``[*B, H, width]``, after raw histories ``[*B, h, d]``, to the normalised ones.
 
         Raises:
             ValueError: for sequences of another shape.
@@ -112,16 +99,16 @@ class ConditionalSampler(TensorDictModuleBase):
         raise NotImplementedError
 
     def decode(self, history: Tensor, sequence: Tensor) -> Tensor:
-        """Maps normalised sequences ``[*B, H, width]`` to raw ones; the inverse of :meth:`encode`.
-
-        Args:
-            history (Tensor): raw histories ``[*B, h, d]``.
-            sequence (Tensor): normalised sequences ``[*B, H, width]``.
-
-        Returns:
-            Tensor: ``[*B, H, width]``.
-        """
+        """Maps normalised sequences ``[*B, H, width]`` to raw ones; the inverse of :meth:`encode`."""
         raise NotImplementedError
+
+    def check_sequence(self, sequence: Tensor) -> None:
+        """Refuses sequences that are not ``[*B, H, width]``."""
+        if sequence.shape[-2:] != self.noise_shape:
+            raise ValueError(
+                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self._width}] (horizon, columns),"
+                f" got {list(sequence.shape)}"
+            )
 
     def split_window(self, window: Tensor) -> tuple[Tensor, Tensor]:
         """Cuts windows of states ``[*B, history + horizon, d]`` into history and future."""
@@ -238,10 +225,3 @@ class ConditionalSampler(TensorDictModuleBase):
             )
         rest = prefix[..., -1:, :].expand(*prefix.shape[:-2], self.horizon - frames, -1)
         return self.encode(history, torch.cat([prefix, rest], -2))[..., :frames, :]
-
-    def _check_sequence(self, sequence: Tensor) -> None:
-        if sequence.shape[-2:] != self.noise_shape:
-            raise ValueError(
-                f"{self.out_keys[0]!r} must be [*B, {self.horizon}, {self._width}] (horizon, columns),"
-                f" got {list(sequence.shape)}"
-            )

@@ -9,10 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from torchrl_koap.modules.planning.denoisers import ConditionEncoder, StepEmbedding, check_input
+from torchrl_koap.modules.planning.denoisers import Denoiser
 
 
-class TemporalUnet(nn.Module):
+class TemporalUnet(Denoiser):
     """One-dimensional U-Net over the steps of a plan, conditioned by FiLM (Janner et al. 2022; Chi et al. 2023).
 
     Each block is convolution, group norm, activation, twice, with a residual path; between them the features are
@@ -27,13 +27,15 @@ class TemporalUnet(nn.Module):
     Args:
         state_dim (int): number ``d`` of state columns.
         condition_dim (int): number ``c`` of condition columns.
+
+    Keyword Args:
         channels (sequence of int): channels per level. Defaults to ``(32, 64)``.
         kernel_size (int): odd width of the convolutions in steps. Defaults to 5.
         blocks_per_level (int): residual blocks per level on either side. Defaults to 1.
-        embedding_dim (int): width of the step embedding. Defaults to 32.
-        condition_width (int): width of the :class:`ConditionEncoder`. Defaults to 128.
-        frequencies (int): octaves of its Fourier features. Defaults to 4.
         groups (int): groups of the group norm; must divide every entry of ``channels``. Defaults to 8.
+        frequencies (int): octaves of the condition's Fourier features. Defaults to 4.
+        condition_width (int): width of their encoder. Defaults to 128.
+        **options: ``embedding_dim``, width of the step embedding.
 
     Raises:
         ValueError: if a size is not possible; the message names the argument.
@@ -54,12 +56,13 @@ class TemporalUnet(nn.Module):
         channels: Sequence[int] = (32, 64),
         kernel_size: int = 5,
         blocks_per_level: int = 1,
-        embedding_dim: int = 32,
-        condition_width: int = 128,
-        frequencies: int = 4,
         groups: int = 8,
+        frequencies: int = 4,
+        condition_width: int = 128,
+        **options: int,
     ):
-        super().__init__()
+        options |= {"frequencies": frequencies, "condition_width": condition_width}
+        super().__init__(state_dim, condition_dim, **options)
         channels = tuple(channels)
         if not channels or any(width < 1 or width % groups for width in channels):
             raise ValueError(f"channels must be multiples of groups ({groups}), got {channels}")
@@ -67,10 +70,7 @@ class TemporalUnet(nn.Module):
             raise ValueError(f"kernel_size must be odd, got {kernel_size}")
         if blocks_per_level < 1:
             raise ValueError(f"blocks_per_level must be at least 1, got {blocks_per_level}")
-        self.state_dim, self.condition_dim = state_dim, condition_dim
         self.multiple = max(8, 2 ** (len(channels) - 1))  # steps that plans are padded to a multiple of
-        self.step_embedding = StepEmbedding(embedding_dim)
-        self.encoder = ConditionEncoder(condition_dim, frequencies=frequencies, width=condition_width)
 
         def blocks(width_in: int, width_out: int) -> nn.ModuleList:
             widths = [width_in] + [width_out] * blocks_per_level
@@ -93,31 +93,18 @@ class TemporalUnet(nn.Module):
             nn.Conv1d(channels[0], state_dim, 1),
         )
         # One matrix product serves the FiLM of all blocks: at batch 1 the number of calls is what costs.
-        self._film_sizes = [2 * block.width for block in self._all_blocks()]
-        self.film = nn.Sequential(nn.SiLU(), nn.Linear(embedding_dim + condition_width, sum(self._film_sizes)))
+        stages = (*self.down, self.middle, *self.up)
+        self._film_sizes = [2 * block.width for blocks in stages for block in blocks]
+        self.film = nn.Sequential(nn.SiLU(), nn.Linear(self.context_dim, sum(self._film_sizes)))
 
-    def forward(self, sequence: Tensor, time: Tensor, condition: Tensor) -> Tensor:
-        """Predicts what the schedule asks for, from noisy sequences.
-
-        Args:
-            sequence (Tensor): noisy sequences ``[*B, H, d]``.
-            time (Tensor): ``[*B]`` in training steps.
-            condition (Tensor): ``[*B, c]``.
-
-        Returns:
-            Tensor: the prediction ``[*B, H, d]``.
-
-        Raises:
-            ValueError: for a sequence or condition of another shape.
-        """
-        check_input(sequence, condition, self.state_dim, self.condition_dim)
-        horizon, batch = sequence.shape[-2], sequence.shape[:-2]
-        x = sequence.reshape(-1, horizon, self.state_dim).transpose(1, 2).contiguous()  # [N, d, H]
-        condition = self.encoder(condition.reshape(-1, self.condition_dim))
+    def denoise(self, x: Tensor, step: Tensor, condition: Tensor) -> Tensor:
+        """Predicts ``[N, H, d]`` from sequences ``[N, H, d]`` (:meth:`Denoiser.denoise`)."""
+        horizon = x.shape[1]
+        x = x.transpose(1, 2).contiguous()  # [N, d, H]
         surplus = -horizon % self.multiple
         if surplus:
             x = F.pad(x, (0, surplus), mode="replicate")
-        film = self.film(torch.cat([self.step_embedding(time.reshape(-1)), condition], -1))
+        film = self.film(torch.cat([step, condition], -1))
         films = iter(film.unsqueeze(-1).split(self._film_sizes, 1))
 
         kept = []
@@ -134,13 +121,7 @@ class TemporalUnet(nn.Module):
             for block in blocks:
                 x = block(x, next(films))
             x = grow(x)
-        x = self.head(x)
-        return x[..., :horizon].transpose(1, 2).reshape(*batch, horizon, self.state_dim)
-
-    def _all_blocks(self):
-        for stage in (self.down, [self.middle], self.up):
-            for blocks in stage:
-                yield from blocks
+        return self.head(x)[..., :horizon].transpose(1, 2)
 
 
 class _Block(nn.Module):
