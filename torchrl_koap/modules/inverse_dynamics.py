@@ -132,14 +132,11 @@ class InverseDynamics(TensorDictModuleBase):
             self.reader.fit(self.normalize_state(windows))
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Predicts actions in normalised units; a subclass says how.
+        """Predicts actions ``[*B, len(frames), act]`` in normalised units; a subclass says how.
 
         Args:
             state (Tensor): window of raw states ``[*B, T, d]``.
             frames (range, optional): frames to predict for. Default: all ``T``; offsets beyond the window are clamped.
-
-        Returns:
-            Tensor: ``[*B, len(frames), act]``.
         """
         raise NotImplementedError
 

@@ -150,7 +150,7 @@ def ridge(
 
 
 def shared_filter(steps: Tensor, action: Tensor, *, penalty: float = 0.02) -> Tensor:
-    r"""Fits one filter that all axes share: the prior mean of a decoder that has few labels.
+    r"""Fits one filter ``w [S]`` that all axes share: the prior mean of a decoder that has few labels.
 
     .. math::
         a_{t,i} \approx \sum_s w_s v_{t,s,i} \qquad \text{for every axis } i
@@ -164,9 +164,6 @@ def shared_filter(steps: Tensor, action: Tensor, *, penalty: float = 0.02) -> Te
 
     Keyword Args:
         penalty (float): assumed ratio of noise to signal variance. Defaults to ``0.02``.
-
-    Returns:
-        Tensor: the filter ``w`` ``[S]``.
     """
     rows, target = steps.mT.flatten(0, 1), action.flatten()  # [N * act, S]
     unit = rows.square().sum(-1).mean()

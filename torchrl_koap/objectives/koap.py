@@ -17,8 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 
-from torchrl_koap.modules.baselines.nonlinear import NonlinearInverseDynamics
-from torchrl_koap.modules.koopman.inverse_dynamics import KoopmanInverseDynamics
+from torchrl_koap.modules.koopman.inverse_dynamics import LiftedInverseDynamics
 from torchrl_koap.objectives.base import WindowLoss
 
 RECONSTRUCTION, KOOPMAN, ACTION = "loss_reconstruction", "loss_koopman", "loss_action"
@@ -28,8 +27,7 @@ class _KoopmanLoss(WindowLoss):
     """Computes those of the three terms that :attr:`terms` names, from one pass through the networks."""
 
     terms: tuple[str, ...]
-
-    network: KoopmanInverseDynamics | NonlinearInverseDynamics
+    network: LiftedInverseDynamics
 
     def _terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         network, wanted = self.network, self.terms
@@ -85,8 +83,7 @@ class KoopmanReconstructionLoss(_KoopmanLoss):
 class KoopmanDynamicsLoss(_KoopmanLoss):
     """Computes the one-step error of the latent dynamics, ``loss_koopman``, over the frames that count.
 
-    Args and keywords as of :class:`KoopmanReconstructionLoss`; with ``"none"`` the loss is ``[*B, frames]``, 0 where
-    masked.
+    Args as of :class:`KoopmanReconstructionLoss`; with ``"none"`` the loss is ``[*B, frames]``, 0 where masked.
 
     Examples:
         >>> import torch
@@ -105,7 +102,7 @@ class KoopmanDynamicsLoss(_KoopmanLoss):
 class LatentActionLoss(_KoopmanLoss):
     """Computes the error of the decoded actions, ``loss_action``, over the labelled frames that count.
 
-    Args and keywords as of :class:`KoopmanDynamicsLoss`.
+    Args as of :class:`KoopmanDynamicsLoss`.
 
     Examples:
         >>> import torch
@@ -157,7 +154,7 @@ class KOAPLoss(_KoopmanLoss):
 
     def __init__(
         self,
-        network: KoopmanInverseDynamics | NonlinearInverseDynamics,
+        network: LiftedInverseDynamics,
         *,
         koopman_coeff: float = 1.0,
         action_coeff: float = 1.0,

@@ -58,7 +58,7 @@ class LinearInverseDynamics(InverseDynamics):
     def fit_labels(
         self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None, **_: Any
     ) -> dict[str, Any]:
-        """Fits the regression on the labelled frames; see :meth:`InverseDynamics.fit_labels`."""
+        """Fits the regression on the labelled frames."""
 
         def read(state: Tensor, frames: range) -> Tensor:
             return self.reader(self.normalize_state(state), frames)

@@ -10,13 +10,12 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from torchrl_koap.modules.inverse_dynamics import LatentInverseDynamics
+from torchrl_koap.modules.koopman.inverse_dynamics import LiftedInverseDynamics
 from torchrl_koap.modules.koopman.latent_action import LatentActionMLP
 from torchrl_koap.modules.koopman.lifting import KoopmanLifting
-from torchrl_koap.modules.windows import WindowReader
 
 
-class NonlinearInverseDynamics(LatentInverseDynamics):
+class NonlinearInverseDynamics(LiftedInverseDynamics):
     r"""Works as KOAP does, but with nonlinear latent dynamics and a nonlinear action decoder.
 
     .. math::
@@ -61,26 +60,15 @@ class NonlinearInverseDynamics(LatentInverseDynamics):
         **kwargs,
     ):
         frames: dict[str, Any] = {"num_past": num_past, "look_ahead": look_ahead, "relative": True}
-        latent_action = LatentActionMLP(state_dim, latent_dim, hidden_dims=hidden_dims, **frames)
-        layers = {"num_cells": hidden_dims, "activation_class": nn.ReLU}
-        super().__init__(None, MLP(latent_dim, action_dim, **layers), **kwargs)
-        self.latent_dim, self.latent_action = latent_dim, latent_action
-        self.lifting = KoopmanLifting(state_dim, latent_dim, hidden_dims=lifting_dims)
-        self.dynamics = MLP(2 * latent_dim, latent_dim, **layers)
-
-    @property
-    def reader(self) -> WindowReader:  # type: ignore[override]
-        """The reader of the network ``f``."""
-        return self.latent_action.reader
-
-    def lift(self, state: Tensor) -> Tensor:
-        """Lifts raw states ``[*B, T, d]`` to ``[*B, T, m]``."""
-        return self.lifting.encode(self.normalize_state(state))
+        layers: dict[str, Any] = {"num_cells": hidden_dims, "activation_class": nn.ReLU}
+        super().__init__(
+            LatentActionMLP(state_dim, latent_dim, hidden_dims=hidden_dims, **frames),
+            MLP(latent_dim, action_dim, **layers),
+            KoopmanLifting(state_dim, latent_dim, hidden_dims=lifting_dims),
+            **kwargs,
+        )
+        self.latent_dim, self.dynamics = latent_dim, MLP(2 * latent_dim, latent_dim, **layers)
 
     def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """Predicts ``z_{t+1}`` of lifted states and latent actions, all ``[*B, T, m]``."""
+        """Predicts ``z_{t+1}`` by the network ``h``."""
         return self.dynamics(torch.cat([lifted, latent_action], -1))
-
-    def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Infers the latent actions ``[*B, len(frames), m]`` of a window of raw states ``[*B, T, d]``."""
-        return self.latent_action.infer(self.latent_action.gather(self.normalize_state(state), frames))

@@ -97,18 +97,12 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
     def fit_labels(
         self, windows: TensorDictBase, mask: Tensor, *, groups: Tensor | None = None, **_: Any
     ) -> dict[str, Any]:
-        """Fits the ridge for every number of components and keeps the one with the smallest held-out error.
-
-        Args and result as of :meth:`InverseDynamics.fit_labels`.
-        """
+        """Fits the ridge for every number of components and keeps the one with the smallest held-out error."""
         self.gate.fill_(1.0)
         latent, action, groups = self.labelled_frames(self.infer, windows, mask, groups)
         numbers = torch.arange(len(self.gate), device=self.gate.device)
-        options: dict[str, Any] = {"groups": groups, "default_penalty": self.penalty, "bias": False}
-        fits = {
-            count: ridge(latent * (numbers < count), action, input_noise=INPUT_NOISE, **options)
-            for count in self._counts
-        }
+        options = {"groups": groups, "default_penalty": self.penalty, "input_noise": INPUT_NOISE, "bias": False}
+        fits = {count: ridge(latent * (numbers < count), action, **options) for count in self._counts}
         best = min(fits, key=lambda count: fits[count].error)
         self.gate.copy_(numbers < best)
         self.action_decoder.assign(fits[best])

@@ -42,18 +42,6 @@ class NoiseAdjustedComponents(nn.Module):
 
     Raises:
         ValueError: for more components than columns.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.koopman.compact_lifting import NoiseAdjustedComponents
-        >>> _ = torch.manual_seed(0)
-        >>> time = 0.2 * torch.arange(12) + 6.28 * torch.rand(500, 1)
-        >>> windows = torch.stack([time.sin(), torch.zeros_like(time)], -1)  # the second column is noise alone
-        >>> windows = windows + torch.tensor([0.02, 5.0]) * torch.randn_like(windows)
-        >>> components = NoiseAdjustedComponents(2, 2)
-        >>> components.fit(windows)
-        >>> (components.weights > 0).tolist()
-        [True, False]
     """
 
     analysis: Tensor
@@ -197,12 +185,8 @@ class CompactLifting(TensorDictModuleBase):
         components, size = self.components(windows), self.components.weights.sqrt()
         for network in (self.small, self.large):
             network.prepare(components * size)
-            for linear, factor in (
-                (network.encoder_skip, size),
-                (network.decoder_skip, torch.where(size > 0, 1 / size.clamp_min(1e-6), 0.0)[:, None]),
-            ):
-                assert linear is not None
-                linear.weight.mul_(factor)
+            network.encoder_skip.weight.mul_(size)
+            network.decoder_skip.weight.mul_(torch.where(size > 0, 1 / size.clamp_min(1e-6), 0.0)[:, None])
 
     @torch.enable_grad()
     def pretrain(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
@@ -210,12 +194,8 @@ class CompactLifting(TensorDictModuleBase):
 
         An encoder that starts at linear components leaves states of a folded surface together that are far apart, and
         no gradient of the losses unfolds it. These start at :func:`~torchrl_koap.modules.koopman.isomap.isomap` of
-        means of a few successive frames, which have less noise.
-
-        Args:
-            windows (Tensor): ``[*B, T >= 5, d]`` in the networks' units; no label is read.
-            updates (int): of each network, at most; more than 1000 are not made.
-            progress (callable, optional): called with the number of updates done and wanted, of both networks.
+        means of a few successive frames, which have less noise. Windows have 5 frames or more; of each network more
+        than 1000 updates are not made.
         """
         updates = min(updates, PRETRAINING_UPDATES)
         weights, components = self.components.weights, self.components(windows.flatten(0, -3)).detach()

@@ -25,7 +25,49 @@ from torchrl_koap.modules.windows import WindowReader
 RAW_SHARE = 0.85
 
 
-class KoopmanInverseDynamics(LatentInverseDynamics):
+class LiftedInverseDynamics(LatentInverseDynamics):
+    """Base class of models of lifted states ``z = g(x)`` that latent actions move on: what ``KOAPLoss`` trains.
+
+    A subclass says how (:meth:`predict_next`).
+
+    Args:
+        latent_action (LatentActionModule): the network ``f``.
+        action_decoder (nn.Module): maps latent actions to actions in normalised units.
+        lifting (KoopmanLifting or CompactLifting): the networks ``g``.
+
+    Keyword Args:
+        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
+    """
+
+    def __init__(
+        self,
+        latent_action: LatentActionModule,
+        action_decoder: nn.Module,
+        lifting: KoopmanLifting | CompactLifting,
+        **kwargs,
+    ):
+        super().__init__(None, action_decoder, **kwargs)
+        self.latent_action, self.lifting = latent_action, lifting
+
+    @property
+    def reader(self) -> WindowReader:  # type: ignore[override]
+        """The reader of the network ``f``."""
+        return self.latent_action.reader
+
+    def lift(self, state: Tensor) -> Tensor:
+        """Lifts raw states ``[*B, T, d]`` to ``[*B, T, m]``."""
+        return self.lifting.encode(self.normalize_state(state))
+
+    def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
+        """Infers the latent actions ``[*B, len(frames), p]`` of a window of raw states ``[*B, T, d]``."""
+        return self.latent_action.infer(self.latent_action.gather(self.normalize_state(state), frames))
+
+    def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
+        """Predicts ``z_{t+1}`` of lifted states ``[*B, T, m]`` and latent actions ``[*B, T, p]``."""
+        raise NotImplementedError
+
+
+class KoopmanInverseDynamics(LiftedInverseDynamics):
     r"""Infers latent actions from a window of states and decodes them linearly to robot actions.
 
     Normalises, infers :math:`u_t = f_\theta(\cdot)`, decodes :math:`a_t = D u_t + b` and de-normalises. Lifting and
@@ -83,30 +125,16 @@ class KoopmanInverseDynamics(LatentInverseDynamics):
         if latent_action.out_keys != action_decoder.in_keys:
             written, read = latent_action.out_keys[0], action_decoder.in_keys[0]
             raise ValueError(f"latent_action writes {written!r}, but action_decoder reads {read!r}")
-        super().__init__(None, action_decoder, **kwargs)
+        super().__init__(latent_action, action_decoder, lifting, **kwargs)
         self.out_keys = [*latent_action.out_keys, self.out_key]
-        self.latent_action, self.lifting, self.operator = latent_action, lifting, operator
-        self.penalty = penalty
-
-    @property
-    def reader(self) -> WindowReader:  # type: ignore[override]
-        """The reader of the network ``f``."""
-        return self.latent_action.reader
-
-    def lift(self, state: Tensor) -> Tensor:
-        """Lifts raw states ``[*B, T, d]`` to ``[*B, T, m]``."""
-        return self.lifting.encode(self.normalize_state(state))
-
-    def infer(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Infers the latent actions ``[*B, len(frames), m]`` of a window of raw states ``[*B, T, d]``."""
-        return self.latent_action.infer(self.latent_action.gather(self.normalize_state(state), frames))
+        self.operator, self.penalty = operator, penalty
 
     def decode(self, latent: Tensor) -> Tensor:
         """Decodes latent actions ``[*B, T, m]`` to actions ``[*B, T, act]`` in normalised units."""
         return self.action_decoder.linear(latent)
 
     def predict_next(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """Predicts ``z_{t+1} = K z_t + u_t`` of lifted states ``[*B, T, m]`` and latent actions ``[*B, T, p]``."""
+        """Predicts ``z_{t+1} = K z_t + u_t``, or with ``B u_t``."""
         return self.operator.step(lifted, latent_action)
 
     def rollout_latent(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
@@ -120,7 +148,7 @@ class KoopmanInverseDynamics(LatentInverseDynamics):
     def prepare(self, windows: Tensor, *, updates: int = 0, progress: Callable[[int, int], None] | None = None) -> None:
         """Sets what is known of the inputs before training, and trains a lifting that starts from Isomap coordinates.
 
-        Args and keywords as of :meth:`InverseDynamics.prepare`. Without updates a lifting starts at linear components.
+        Without updates a lifting starts at linear components.
         """
         windows = self.normalize_state(windows)
         with torch.no_grad():
@@ -150,10 +178,7 @@ class KoopmanInverseDynamics(LatentInverseDynamics):
 
         With ``axes``, where a latent action holds the steps along them, the decoder is shrunk towards one filter of the
         steps that all axes share, instead of towards 0. Guessed axes are used only if labels left out are then
-        predicted better. Args and keywords as of :meth:`InverseDynamics.fit_labels`.
-
-        Returns:
-            dict: penalty, number of labels, held-out error in normalised units, and ``block`` if there were several.
+        predicted better. The summary names the ``block`` if there were several.
         """
         normalizer = self.action_normalizer
         options = {

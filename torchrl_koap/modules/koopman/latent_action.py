@@ -80,9 +80,6 @@ class LatentActionModule(TensorDictModuleBase):
     def axis_features(self, axes: Sequence[int]) -> tuple[Tensor, Tensor] | None:
         """Says where a latent action holds the steps along some state columns, and their size per unit of it.
 
-        Args:
-            axes (sequence of int): state columns.
-
         Returns:
             tuple of Tensor or None: entries of the latent action, int64 ``[S, len(axes)]``, and factors of that shape
                 that turn them into steps in the networks' units; ``S = num_past + len(look_ahead)``. None if it does
@@ -108,7 +105,7 @@ class LatentActionModule(TensorDictModuleBase):
 class LatentActionLSTM(LatentActionModule):
     """Infers latent actions by an LSTM over ``x_{t-n}, ..., x_t, x_{t+k}`` (the paper's ``f``).
 
-    Args and keys as in :class:`LatentActionModule`.
+    Args as for :class:`LatentActionModule`, and:
 
     Keyword Args:
         hidden_dim (int): width of the LSTM. Defaults to ``128``.
@@ -138,7 +135,7 @@ class LatentActionLSTM(LatentActionModule):
 class LatentActionMLP(LatentActionModule):
     """Infers latent actions by a perceptron on the concatenated frames.
 
-    Args and keys as in :class:`LatentActionModule`.
+    Args as for :class:`LatentActionModule`, and:
 
     Keyword Args:
         hidden_dims (sequence of int): widths. Defaults to ``(128, 128)``.
@@ -172,7 +169,7 @@ class LatentActionFourier(LatentActionModule):
     features). The Koopman loss trains frequencies and phases, so the operator needs an input matrix
     (``KoopmanOperator(input_dim=...)``).
 
-    Args and keys as in :class:`LatentActionModule`, with ``relative`` always on.
+    Keywords as for :class:`LatentActionModule`, ``relative`` always on, and those below.
 
     Args:
         state_dim (int): size ``d`` of a state.

@@ -81,11 +81,7 @@ class KoopmanLifting(TensorDictModuleBase):
 
     @torch.no_grad()
     def prepare(self, windows: Tensor) -> None:
-        """Sets the linear maps, if there are any, to the principal components at unit spread; before training.
-
-        Args:
-            windows (Tensor): states ``[*B, d]`` in the networks' units; no label is read.
-        """
+        """Sets the linear maps, if there are any, to the principal components of states ``[*B, d]`` at unit spread."""
         if self.encoder_skip is None:
             return
         states = windows.flatten(0, -2).double()
@@ -98,7 +94,13 @@ class KoopmanLifting(TensorDictModuleBase):
         self.decoder_skip.weight.zero_()[:, :count] = (components * spread).to(self.decoder_skip.weight)
 
     def pretrain(self, windows: Tensor, updates: int, progress: Callable[[int, int], None] | None = None) -> None:
-        """Trains what is trained before the losses are, on windows ``[*B, T, d]`` without labels: here nothing."""
+        """Trains what is trained before the losses are, on windows ``[*B, T, d]`` without labels: here nothing.
+
+        Args:
+            windows (Tensor): in the networks' units.
+            updates (int): at most so many.
+            progress (callable, optional): called with the number of updates done, and of all.
+        """
 
     def finish(self, windows: Tensor) -> None:
         """Chooses after training, on windows ``[*B, T, d]`` without labels, what is kept: here everything."""

@@ -68,15 +68,7 @@ class KoopmanOperator(TensorDictModuleBase):
         return values[values.abs().argsort(descending=True)]
 
     def step(self, lifted: Tensor, latent_action: Tensor) -> Tensor:
-        """Computes ``K z + u``, or ``K z + B u`` with an input matrix.
-
-        Args:
-            lifted (Tensor): lifted states ``z``, ``[*B, T, m]``.
-            latent_action (Tensor): latent actions ``u``, ``[*B, T, input_dim]``.
-
-        Returns:
-            Tensor: lifted states one step later, ``[*B, T, m]``.
-        """
+        """Computes lifted states ``[*B, T, m]`` one step later, ``K z + u``, or ``K z + B u`` with an input matrix."""
         following = lifted @ self.weight.mT
         return following + (latent_action if self.input is None else latent_action @ self.input.mT)
 

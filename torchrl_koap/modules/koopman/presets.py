@@ -106,10 +106,7 @@ def make_koopman_inverse_dynamics(
 
     Keyword Args:
         preset (str): ``"default"``, ``"absolute"``, ``"semi_supervised"`` or ``"paper"``.
-        state_normalizer (nn.Module, optional): see :class:`~torchrl_koap.modules.InverseDynamics`, as the next three.
-        action_normalizer (nn.Module, optional): of actions.
-        columns (tuple of int, optional): state columns that are read.
-        targets (tuple of int): columns that absolute actions are learned as distances to.
+        state_normalizer, action_normalizer, columns, targets: see :class:`~torchrl_koap.modules.InverseDynamics`.
         **overrides: any entry of ``PRESETS[preset]``, and of ``NETWORK_OPTIONS`` for the network chosen.
 
     Returns:

@@ -21,19 +21,6 @@ class WienerSmoother(nn.Module):
     Args:
         num_frames (int): frames ``F`` of a window.
         dim (int): columns of a frame.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.modules.koopman.smoothing import WienerSmoother
-        >>> _ = torch.manual_seed(0)
-        >>> turn = torch.rand(2000, 1) * 6.28 + torch.arange(12) * 0.2
-        >>> clean = turn.sin()[..., None]  # [N, T, 1]
-        >>> noisy = clean + 0.2 * torch.randn_like(clean)
-        >>> smoother = WienerSmoother(12, 1)
-        >>> smoother.fit(noisy, noisy)
-        >>> error = (smoother(noisy) - clean).square().mean().sqrt()
-        >>> bool(error < 0.6 * 0.2)
-        True
     """
 
     gain: Tensor
@@ -84,9 +71,6 @@ def noise_covariance(windows: Tensor) -> Tensor:
 
     Returns:
         Tensor: symmetric and positive semidefinite ``[d, d]``, float64.
-
-    Raises:
-        ValueError: for shorter windows.
 
     Examples:
         >>> import torch
