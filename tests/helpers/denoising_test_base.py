@@ -67,8 +67,6 @@ class DenoisingLossTestBase(LossTestBase):
         loss = self.make_loss()
         assert not loss.eval().network.training and loss.train().network.training
 
-    def test_an_unknown_reduction_and_entries_set_by_hand_are_refused(self):
-        with pytest.raises(ValueError, match="reduction must be 'none', 'mean' or 'sum', got 'median'"):
-            self.make_loss(reduction="median")
+    def test_entries_set_by_hand_are_refused(self):
         with pytest.raises(RuntimeError, match="use set_keys"):
             self.make_loss().in_keys = ["x"]

@@ -188,7 +188,7 @@ class LossTestBase:
                 torch.testing.assert_close(total[key], elements[key].sum())
                 torch.testing.assert_close(mean[key], elements[key].sum() / self.counted(batch, key, elements[key]))
         self.assert_same(self.make_loss()(batch), mean)  # the default
-        with pytest.raises(ValueError, match="reduction must be"):
+        with pytest.raises(ValueError, match="reduction must be 'none', 'mean' or 'sum', got 'median'"):
             self.make_loss(reduction="median")
 
     def test_extra_and_absent_batch_dimensions(self):

@@ -44,6 +44,7 @@ def batch_of(*batch, dtype=torch.float32):
 class TestPlannerLoss(DenoisingLossTestBase):
     default_keys = {"state": "state", "noise": "planner_noise", "time": "planner_time"}
     in_names, out_keys = ("state",), ("loss_planner",)
+    decrease = 0.5
 
     def make_loss(self, seed=0, **options):
         return make_loss(seed=seed, **options)
@@ -72,30 +73,6 @@ def test_value_in_closed_form(prediction, dtype):
     assert value.dtype == dtype
 
 
-def test_reductions_and_batches_agree():
-    data = batch_of(3, 4)
-    elements = make_loss(reduction="none")(data)["loss_planner"]
-    assert elements.shape == (3, 4, 6, 2)
-    torch.testing.assert_close(make_loss(reduction="mean")(data)["loss_planner"], elements.mean())
-    torch.testing.assert_close(make_loss(reduction="sum")(data)["loss_planner"], elements.sum())
-    flat = make_loss(reduction="none")(data.reshape(-1))["loss_planner"]
-    torch.testing.assert_close(elements.flatten(0, 1), flat)
-
-
-@pytest.mark.parametrize("prediction", PREDICTIONS)
-def test_loss_decreases_on_a_fixed_batch(prediction):
-    loss, data = make_loss(prediction), batch_of(32)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
-    values = []
-    for _ in range(60):
-        value = loss(data)["loss_planner"]
-        optimizer.zero_grad()
-        value.backward()
-        optimizer.step()
-        values.append(float(value))
-    assert values[-1] < 0.5 * values[0]
-
-
 def test_training_recovers_the_mean_and_spread_of_the_data():
     torch.manual_seed(0)
     planner = StatePlanner(
@@ -121,45 +98,6 @@ def test_training_recovers_the_mean_and_spread_of_the_data():
         plans = planner.sample(history)
     assert plans.mean() == pytest.approx(2.5, abs=0.12)
     assert plans.std() == pytest.approx(0.5, abs=0.12)
-
-
-def test_set_keys_reaches_everything():
-    loss = make_loss()
-    expected = loss(batch_of(4))["loss_planner"]
-    loss.set_keys(state=("window", "x"), noise="e", time="t")
-    assert loss.in_keys == [("window", "x")]
-    data = batch_of(4)
-    renamed = TensorDict({"window": {"x": data["state"]}, "e": data["planner_noise"], "t": data["planner_time"]}, [4])
-    before = renamed.clone()
-    torch.testing.assert_close(loss(renamed)["loss_planner"], expected)
-    assert (renamed == before).all() and set(renamed.keys(True)) == set(before.keys(True))
-    with pytest.raises(ValueError, match="not an accepted tensordict key"):
-        loss.set_keys(future="x")
-
-
-def test_dispatch_by_name():
-    loss = make_loss()
-    torch.manual_seed(1)
-    by_name = loss(state=windows(4))
-    torch.manual_seed(1)
-    torch.testing.assert_close(by_name, loss(TensorDict({"state": windows(4)}, [4]))["loss_planner"])
-
-
-def test_reset_and_state_dict():
-    loss, other = make_loss(), make_loss()
-    other.reset_parameters_recursive()
-    data = batch_of(8)
-    assert not torch.allclose(loss(data)["loss_planner"], other(data)["loss_planner"])
-    other.load_state_dict(loss.state_dict())
-    torch.testing.assert_close(other(data)["loss_planner"], loss(data)["loss_planner"])
-
-
-def test_bad_input_is_explained():
-    loss = make_loss()
-    with pytest.raises(KeyError, match="needs the entry 'state'; there are"):
-        loss(TensorDict({"states": windows(4)}, [4]))
-    with pytest.raises(ValueError, match=r"windows must be \[\*B, 8, 2\]"):
-        loss(TensorDict({"state": windows(4)[:, 1:]}, [4]))
 
 
 @pytest.mark.parametrize("network", ["mlp", "unet"])

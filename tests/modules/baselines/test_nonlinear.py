@@ -19,7 +19,7 @@ from inverse_dynamics_test_base import (
 from loss_test_base import LossTestBase
 from tensordict import TensorDict
 
-from torchrl_koap.modules import LatentActionMLP, NonlinearInverseDynamics
+from torchrl_koap.modules import NonlinearInverseDynamics
 from torchrl_koap.objectives import KOAPLoss
 
 SPAN = range(2, 6)
@@ -102,14 +102,6 @@ def test_one_term_trains_only_what_it_should():
         "loss_koopman": {"lifting", "latent_action", "dynamics"},
         "loss_action": {"latent_action", "action_decoder"},
     }
-
-
-def test_its_latent_actions_are_those_of_the_koopman_models_network():
-    network, state = make_network(), torch.randn(4, T, 3)
-    plain = LatentActionMLP(3, 6, hidden_dims=(16,), num_past=2, look_ahead=(2, 3), relative=True)
-    plain.load_state_dict(network.latent_action.state_dict())
-    expected = plain(TensorDict({"state": network.normalize_state(state)}, [4]))["latent_action"]
-    assert torch.equal(network(TensorDict({"state": state}, [4]))["latent_action"], expected)
 
 
 def test_the_successor_may_not_be_read():

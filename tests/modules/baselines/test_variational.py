@@ -18,7 +18,6 @@ from inverse_dynamics_test_base import (
     train,
 )
 from loss_test_base import LossTestBase
-from tensordict import TensorDict
 
 from torchrl_koap.modules import SupervisedInverseDynamics, VariationalInverseDynamics
 from torchrl_koap.objectives import ActionLoss, VariationalLoss
@@ -153,9 +152,3 @@ def test_two_stages_learn_actions_from_few_labels():
     unseen = data[1024:]
     error = (network(unseen.select("state"))["action"] - unseen["action"])[:, 1:10].square().mean()
     assert error < 0.2, error  # the mean action has error 1
-
-
-def test_no_window_at_all_is_read_as_none():
-    """Where every trajectory has a label there is nothing to measure hidden actions on."""
-    network = make_network()
-    assert network(TensorDict({"state": torch.zeros(0, T, 3)}, [0]))["action"].shape == (0, T, 2)

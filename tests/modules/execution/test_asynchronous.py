@@ -92,24 +92,6 @@ def test_the_first_plan_is_made_before_the_clock_runs():
     agent.close()
 
 
-@pytest.mark.parametrize("prediction", ["epsilon", "sample"])
-def test_a_plan_has_the_states_that_are_known(prediction):
-    from torchrl_koap.modules import NoiseSchedule
-
-    torch.manual_seed(0)
-    planner = StatePlanner(
-        TemporalUnet(2, 4, channels=(8, 16)), NoiseSchedule(prediction=prediction), state_dim=2, num_steps=4
-    )
-    planner.fit_normalizers(torch.randn(50, 16, 2).cumsum(1))
-    history, known, noise = torch.randn(3, 2, 2), torch.randn(3, 2, 2), torch.randn(3, 14, 2)
-    with torch.no_grad():
-        free, bound = planner.sample(history, noise), planner.sample(history, noise, prefix=known)
-    torch.testing.assert_close(bound[:, :2], known)
-    assert not torch.allclose(free[:, 2:], bound[:, 2:])
-    with pytest.raises(ValueError, match=r"a prefix must be \[\*B, 1..13, 2\]"):
-        planner.sample(history, noise, prefix=torch.zeros(3, 14, 2))
-
-
 def test_the_command_is_held_back_as_in_the_policy_itself():
     agent = make_agent(lead=0.1)
     agent.reset()

@@ -15,9 +15,7 @@ from toy_policies import (
     CountingSampler,
     EchoController,
     EpisodesOfRandomLength,
-    PlannedStep,
     state_number,
-    wandering_planner,
 )
 
 from torchrl_koap.envs.avoiding import AvoidingEnv, mode_index
@@ -103,17 +101,6 @@ def test_every_action_in_a_collector_with_auto_reset(kind, interval, num_envs):
                 episode, step = episode + 1, 0
         made = sum(int(number // 100) == index for call in policy.planner.calls for number in call)
         assert made == plans  # the planner runs for rows that need a plan, and for no others
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_collectors_of_any_exploration_and_a_plain_rollout_agree(kind):
-    env = TransformedEnv(EpisodesOfRandomLength(3, LENGTHS), policy_transforms(2))
-    rollout = env.rollout(12, policy_of(kind), break_when_any_done=False)
-    for row in range(12):
-        if not rollout["is_init"][1, : row + 1].sum() == 1:
-            break
-        assert rollout["action"][1, row].tolist() == expected_action(1, 0, row, 4, kind)
-    assert row == 9
 
 
 def test_the_plan_is_kept_once_and_its_last_state_is_repeated_when_it_runs_out():
@@ -342,20 +329,3 @@ def test_pictures_and_latency_need_no_plans():
     result = measure_latency(policy, 4, repeats=5)
     assert result["plan_ms"] > result["control_ms"] > 0
     assert result["control_hz"] == pytest.approx(1e3 / (result["control_ms"] + result["plan_ms"] / 4))
-
-
-@pytest.mark.parametrize("kind", ["plans", "chunks"])
-def test_a_stochastic_start_stays_stochastic_under_deterministic_exploration(kind):
-    """Equal observations get different plans: with one fixed start noise all episodes would take the same way."""
-    env = TransformedEnv(AvoidingEnv(20), policy_transforms(2))
-    if kind == "chunks":
-        policy = make_policy(diffusion_policy(), state_of=(1, 2, 3))
-    else:
-        policy = make_policy(wandering_planner(), PlannedStep(), state_of=(2, 3))
-    collector = Collector(
-        env, policy, frames_per_batch=20 * 5, total_frames=20 * 5, exploration_type=ExplorationType.DETERMINISTIC
-    )
-    (data,) = collector
-    collector.shutdown()
-    assert data.shape == (20, 5) and data["action"].isfinite().all()
-    assert data["action"][:, 0].unique(dim=0).shape[0] == 20  # all begin at the same place

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import numpy as np
 import pytest
 import torch
 import toy_gym  # noqa: F401 - registers
@@ -14,7 +13,6 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.envs import DoubleToFloat, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
 
 from torchrl_koap.modules import (
-    Agent,
     DiffusionPolicy,
     Execution,
     InverseDynamicsFollower,
@@ -155,18 +153,6 @@ def test_in_a_collector(make_policy, layout):
     collector.shutdown()
     assert batch.shape[-1] == 8
     alone(make_policy, batch)
-
-
-@POLICIES
-def test_an_agent_with_the_same_seed_acts_alike(make_policy):
-    env, policy = make_env(make_policy), make_policy()
-    env.set_seed(3)
-    with torch.no_grad():
-        rollout = env.rollout(6, policy)
-    agent = Agent(make_policy(), seed=3)
-    agent.reset()
-    for observation, action in zip(rollout["observation"], rollout["action"], strict=True):
-        np.testing.assert_array_equal(agent.act(observation.numpy()), action.numpy())
 
 
 @POLICIES

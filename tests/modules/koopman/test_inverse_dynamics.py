@@ -194,17 +194,6 @@ def test_fitting_takes_any_batch_and_leaves_the_mode_alone():
     assert not nested.latent_action.training
 
 
-@pytest.mark.parametrize("poison", [float("nan"), float("inf"), 1e38, 0.0])
-def test_actions_outside_the_mask_are_not_read(poison):
-    data, mask = labelled(20)
-    models = make_model(), make_model()
-    models[0].fit_labels(data, mask)
-    data["action"] = torch.where(mask.unsqueeze(-1), data["action"], poison)
-    models[1].fit_labels(data, mask)
-    for name, value in models[0].state_dict().items():
-        assert torch.equal(value, models[1].state_dict()[name]), name
-
-
 class RefusesNaN(Normalizer):
     """A normaliser that checks what it gets."""
 
