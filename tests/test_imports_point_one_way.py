@@ -74,6 +74,6 @@ def test_training_loads_no_simulator_and_no_pictures():
     )
     loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
     assert "torchrl_koap.training.on_disk" in loaded
-    assert not {"mujoco", "numba", "matplotlib", "PIL"} & set(loaded)
+    assert not {"mujoco", "numba", "matplotlib", "dm_control", "PIL"} & set(loaded)
     rooms = {name.split(".")[1] for name in loaded if name.startswith("torchrl_koap.")}
     assert rooms == TRAINING

@@ -24,6 +24,7 @@ COVERED_BY = {
     "envs/mujoco/inverse_kinematics.py": "envs/experts/test_stacking.py",
     "envs/mujoco/kinematics.py": "envs/mujoco/test_controller.py",
     "envs/mujoco/linear_algebra.py": "envs/mujoco/test_controller.py",
+    "envs/mujoco/mjcf.py": "envs/mujoco/test_panda.py",
     "envs/mujoco/scene.py": "envs/mujoco/test_panda.py",
     "envs/mujoco/simulation.py": "envs/mujoco/test_controller.py",
     "envs/registry.py": "plugins/test_plugins.py",

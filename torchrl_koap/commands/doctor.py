@@ -47,7 +47,16 @@ class Doctor(Command):
 def machine_facts() -> dict[str, str]:
     """Facts about this machine, name to value."""
     facts = {"python": platform.python_version(), "platform": platform.platform()}
-    for name in ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco", "gymnasium-robotics", "numba"):
+    for name in (
+        "torchrl_koap",
+        "torch",
+        "torchrl",
+        "tensordict",
+        "mujoco",
+        "dm-control",
+        "gymnasium-robotics",
+        "numba",
+    ):
         try:
             facts[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

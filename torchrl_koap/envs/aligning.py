@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-import mujoco
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -15,10 +16,10 @@ from torchrl_koap.tasks.aligning import BASE_HALF, DISTANCE_TOLERANCE, ROTATION_
 INSIDE_REACH = 0.051  # m; the rod is inside the tray if nearer to its centre than this
 # name, direction from the centre, colour
 WALLS = (
-    ("wall_right", (1, 0), "0 0 1"),
-    ("wall_far", (0, 1), "0 1 0"),
-    ("wall_left", (-1, 0), "1 0 0"),
-    ("wall_near", (0, -1), "0 1 1"),
+    ("wall_right", (1, 0), (0, 0, 1, 1)),
+    ("wall_far", (0, 1), (0, 1, 0, 1)),
+    ("wall_left", (-1, 0), (1, 0, 0, 1)),
+    ("wall_near", (0, -1), (0, 1, 1, 1)),
 )
 
 
@@ -113,14 +114,19 @@ class AligningEnv(ManipulationEnv):
         """Poses of tray and target as D3IL's recorder logs them."""
         return super().raw_objects() | {"target": self.targets}
 
-    def _scene(self) -> mujoco.MjModel:
-        base = f'type="box" size="{BASE_HALF} {BASE_HALF} 0.01"'
-        tray = f'<geom name="base" {base} mass="1" friction="0.3 0.001 0.0001" priority="1" rgba="0.8 0.655 0.45 1"/>'
-        target = f'<site name="target_base" {base} rgba="0.8 0.655 0.45 0.5"/>'
-        for name, (x, y), colour in WALLS:
-            size = f"0.005 {BASE_HALF}" if x else f"{BASE_HALF} 0.005"
-            wall = f'type="box" size="{size} 0.045" pos="{x * BASE_HALF} {y * BASE_HALF} 0.0485"'
-            tray += f'<geom name="{name}" {wall} mass="0.001" rgba="{colour} 1"/>'
-            target += f'<site name="target_{name}" {wall} rgba="{colour} 0.4"/>'
-        box = f'<body name="box"><freejoint name="box"/>{tray}</body>'
-        return scene(f'{box}<body name="target" mocap="true">{target}</body>')
+    def _scene(self) -> Any:
+        return scene(add_objects=_add_tray_and_target)
+
+
+def _add_tray_and_target(root) -> None:
+    tray = root.worldbody.add("body", name="box")
+    tray.add("freejoint", name="box")
+    base = {"size": (BASE_HALF, BASE_HALF, 0.01), "type": "box", "rgba": (0.8, 0.655, 0.45, 1)}
+    tray.add("geom", name="base", mass=1.0, friction=(0.3, 0.001, 0.0001), priority=1, **base)
+    target = root.worldbody.add("body", name="target", mocap=True)
+    target.add("site", name="target_base", **base | {"rgba": (0.8, 0.655, 0.45, 0.5)})
+    for name, (x, y), colour in WALLS:
+        size = (0.005, BASE_HALF, 0.045) if x else (BASE_HALF, 0.005, 0.045)
+        wall = {"type": "box", "size": size, "pos": (x * BASE_HALF, y * BASE_HALF, 0.0485)}
+        tray.add("geom", name=name, mass=0.001, rgba=colour, **wall)
+        target.add("site", name=f"target_{name}", rgba=(*colour[:3], 0.4), **wall)

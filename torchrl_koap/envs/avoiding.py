@@ -5,12 +5,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
-from torchrl_koap.envs.mujoco.scene import scene
+from torchrl_koap.envs.mujoco.scene import PANDA, scene
 from torchrl_koap.tasks.avoiding import FINISH_Y, OBSTACLES, ROW_Y
 
 ROW_REACH = 0.03
@@ -95,7 +94,7 @@ class AvoidingEnv(ManipulationEnv):
     def __init__(self, *args: Any, **options: Any):
         super().__init__(*args, **options)
         model = self.sims.model
-        self._rod = model.geom("rod").id
+        self._rod = model.geom(f"{PANDA}rod").id
         self._obstacles = np.array([model.geom(name).id for name, *_ in OBSTACLES])
 
     def _command(self, rows: np.ndarray, action: np.ndarray) -> None:
@@ -131,11 +130,11 @@ class AvoidingEnv(ManipulationEnv):
         mode[:, 8] |= at & (x > 0.35) & ~mode[:, 5:8].any(1)
         self._mode[rows] = mode
 
-    def _scene(self) -> mujoco.MjModel:
-        cylinders = [
-            f"""<body name="{name}" pos="{x} {y} 0">
-                <geom name="{name}" type="cylinder" size="{radius} {half_height}" rgba="1 0 0 1"/></body>"""
-            for name, x, y, radius, half_height in OBSTACLES
-        ]
-        line = f'class="drawn" type="box" size="0.5 0.01 0.005" pos="0.4 {FINISH_Y} 0" rgba="0 1 0 1"'
-        return scene(still="".join(cylinders) + f'<geom name="finish_line" {line}/>')
+    def _scene(self) -> Any:
+        root = scene()
+        for name, x, y, radius, half_height in OBSTACLES:
+            body = root.worldbody.add("body", name=name, pos=(x, y, 0))
+            body.add("geom", name=name, type="cylinder", size=(radius, half_height), rgba=(1, 0, 0, 1))
+        line = {"type": "box", "size": (0.5, 0.01, 0.005), "pos": (0.4, FINISH_Y, 0), "rgba": (0, 1, 0, 1)}
+        root.worldbody.add("geom", name="finish_line", contype=0, conaffinity=0, **line)
+        return root

@@ -16,7 +16,6 @@ from __future__ import annotations
 import abc
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -28,6 +27,7 @@ from torchrl_koap.envs.contexts import check_contexts, draw_contexts
 from torchrl_koap.envs.episode_state import EpisodeState
 from torchrl_koap.envs.mujoco import controller
 from torchrl_koap.envs.mujoco.rendering import Renderer
+from torchrl_koap.envs.mujoco.scene import compile_scene
 from torchrl_koap.envs.mujoco.simulation import SimulationBatch
 from torchrl_koap.tasks import Task, get_task
 
@@ -113,7 +113,7 @@ class ManipulationEnv(EpisodeState, EnvBase):
 
     def _simulations(self, num_envs: int, num_threads: int) -> Any:
         """What is simulated; differs where another arm than D3IL's moves."""
-        return SimulationBatch(self._scene(), num_envs, num_threads)
+        return SimulationBatch(compile_scene(self._scene()), num_envs, num_threads)
 
     def _episode_arrays(self, num_envs: int) -> dict[str, np.ndarray]:
         """What an episode in progress consists of beside the simulation, a row per environment."""
@@ -161,8 +161,8 @@ class ManipulationEnv(EpisodeState, EnvBase):
         self._commands[rows, :3] = self.sims.tcp_position[rows]
         self._commands[rows, 3:] = (0.0, 1.0, 0.0, 0.0)
 
-    def _scene(self) -> mujoco.MjModel:
-        """Scene of the task."""
+    def _scene(self) -> Any:
+        """Scene of the task, an ``mjcf.RootElement``."""
         raise NotImplementedError
 
     @abc.abstractmethod

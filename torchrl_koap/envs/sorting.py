@@ -5,13 +5,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
-from torchrl_koap.envs.mujoco.scene import free_box, scene
+from torchrl_koap.envs.mujoco.scene import scene
 from torchrl_koap.tasks.features import tan_yaw
 from torchrl_koap.tasks.sorting import (
     BIN_HALF,
@@ -20,15 +19,15 @@ from torchrl_koap.tasks.sorting import (
     BIN_X,
     BIN_Y,
     BOX_HALF,
-    COLOURS,
     PLATFORM_X,
     arrival_orders,
     sorting_task,
 )
 
+RED, BLUE = 0, 1
 PLATFORM_TOP = 0.1  # (m)
 START_HEIGHT = 0.05  # m; inside the platform, as in the original: the first steps push the boxes up
-_RGB = ("1 0 0", "0 0 1")  # of red and blue
+_COLOURS = {RED: (1, 0, 0, 1), BLUE: (0, 0, 1, 1)}
 
 
 def box_colours(num_boxes: int) -> np.ndarray:
@@ -38,7 +37,7 @@ def box_colours(num_boxes: int) -> np.ndarray:
         ValueError: if there is no such task.
     """
     sorting_task(num_boxes)  # refuses other numbers
-    return np.repeat((0, 1), num_boxes // 2)
+    return np.repeat((RED, BLUE), num_boxes // 2)
 
 
 def mode_colours(mode: int, num_boxes: int = 4) -> tuple[int, ...]:
@@ -176,17 +175,21 @@ class SortingEnv(ManipulationEnv):
                 noted[count] = nearest
                 self._mode[rows[index], count] = self._colours[nearest]
 
-    def _scene(self) -> mujoco.MjModel:
-        named = zip(self.task.objects, self._colours.tolist(), strict=True)
-        boxes = "".join(free_box(name, (BOX_HALF,) * 3, _RGB[colour]) for name, colour in named)
+    def _scene(self) -> Any:
+        def add_boxes(root) -> None:
+            for name, colour in zip(self.task.objects, self._colours.tolist(), strict=True):
+                box = root.worldbody.add("body", name=name)
+                box.add("freejoint", name=name)
+                box.add("geom", name=name, type="box", size=(BOX_HALF,) * 3, mass=0.05, rgba=_COLOURS[colour])
+
+        root = scene(link_collisions=True, add_objects=add_boxes)
         # bodies of their own, after the boxes: contacts are listed in the order of bodies, as in the original
-        friction = 'friction="0.3 0.001 0.0001" priority="1"'
-        platform = f'<geom type="box" size="0.3 0.3 {PLATFORM_TOP}" {friction} rgba="0.5 0.5 0.5 0.5"/>'
-        still = f'<body name="platform" pos="{sum(PLATFORM_X) / 2} -0.1 0">{platform}</body>'
-        for colour, name in enumerate(COLOURS):
-            walls = "".join(
-                f'<geom type="box" pos="{x} {y} 0" size="{width} {depth} 0.1" rgba="{_RGB[colour]} 0.5"/>'
-                for x, y, width, depth in BIN_WALLS  # far, left, right, near
-            )
-            still += f'<body name="{name}_bin" pos="{BIN_X[colour]} {BIN_Y} 0">{walls}</body>'
-        return scene(boxes, still, link_collisions=True)
+        platform = root.worldbody.add("body", name="platform", pos=((PLATFORM_X[0] + PLATFORM_X[1]) / 2, -0.1, 0))
+        size, friction = (0.3, 0.3, PLATFORM_TOP), (0.3, 0.001, 0.0001)
+        platform.add("geom", type="box", size=size, friction=friction, priority=1, rgba=(0.5, 0.5, 0.5, 0.5))
+        for colour, name in ((RED, "red"), (BLUE, "blue")):
+            bin_ = root.worldbody.add("body", name=f"{name}_bin", pos=(BIN_X[colour], BIN_Y, 0))
+            for across, along, width, depth in BIN_WALLS:  # far, left, right, near
+                wall = {"pos": (across, along, 0), "size": (width, depth, 0.1), "rgba": (*_COLOURS[colour][:3], 0.5)}
+                bin_.add("geom", type="box", **wall)
+        return root

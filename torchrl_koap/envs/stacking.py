@@ -5,21 +5,19 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.contexts import poses_of
 from torchrl_koap.envs.mujoco import controller
-from torchrl_koap.envs.mujoco.panda import numbers
-from torchrl_koap.envs.mujoco.scene import free_box, scene
+from torchrl_koap.envs.mujoco.scene import scene
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.features import tan_yaw
 from torchrl_koap.tasks.stacking import BOXES, HEIGHT_GAP, TARGET, TARGET_HALF, ZONE_RADIUS
 
 OPEN_ABOVE = 0.075  # a greater gripper command opens the fingers, any other closes them
-_RGB = {"red": "1 0 0", "green": "0 1 0", "blue": "0 0 1"}
+COLOURS = {"red": (1, 0, 0, 1), "green": (0, 1, 0, 1), "blue": (0, 0, 1, 1)}
 JOINT_BOUND = 0.03  # rad per control step
 GRIPPER_BOUND = 0.08  # m
 
@@ -164,7 +162,14 @@ class StackingEnv(ManipulationEnv):
         """Nothing: joints are commanded."""
         return {}  # the log holds them already
 
-    def _scene(self) -> mujoco.MjModel:
-        boxes = "".join(free_box(name, half, _RGB[name]) for name, half in BOXES)
-        zone = f'type="box" pos="{numbers(TARGET)} 0" size="{TARGET_HALF} {TARGET_HALF} 0.04" rgba="1 0.5 0 0.3"'
-        return scene(f'{boxes}<site name="target" {zone}/>', rod=False, arm_alpha=1.0, link_collisions=True)
+    def _scene(self) -> Any:
+        return scene(rod=False, arm_alpha=1.0, link_collisions=True, add_objects=_add_boxes_and_target)
+
+
+def _add_boxes_and_target(root) -> None:
+    for name, size in BOXES:
+        box = root.worldbody.add("body", name=name)
+        box.add("freejoint", name=name)
+        box.add("geom", name=name, type="box", size=size, mass=0.05, rgba=COLOURS[name])
+    size = (TARGET_HALF, TARGET_HALF, 0.04)
+    root.worldbody.add("site", name="target", type="box", pos=(*TARGET, 0), size=size, rgba=(1, 0.5, 0, 0.3))

@@ -11,7 +11,7 @@ from shared_data import SHARED
 from torchrl_koap.envs.avoiding import AvoidingEnv
 from torchrl_koap.envs.mujoco import controller, kinematics
 from torchrl_koap.envs.mujoco.linear_algebra import solve_clipped
-from torchrl_koap.envs.mujoco.scene import scene
+from torchrl_koap.envs.mujoco.scene import compile_scene, scene
 from torchrl_koap.envs.mujoco.simulation import SimulationBatch
 
 RECORDINGS = SHARED / "d3il_reference" / "avoiding.npz"
@@ -19,7 +19,7 @@ RECORDINGS = SHARED / "d3il_reference" / "avoiding.npz"
 
 @pytest.fixture(scope="module")
 def model():
-    return scene(rod=True)
+    return compile_scene(scene(rod=True))
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def compiled_inverse_kinematics(target, q):
 
 
 def test_forward_kinematics_agree_with_mujoco(model, generator):
-    data, tcp_body = mujoco.MjData(model), model.body("tcp").id
+    data, tcp_body = mujoco.MjData(model), model.body("panda/tcp").id
     for _ in range(50):
         q = generator.uniform(kinematics.Q_MIN, kinematics.Q_MAX)
         data.qpos[:7] = q
@@ -168,7 +168,7 @@ def test_logged_velocity_is_jacobian_times_joint_velocity(model):
     sims.track_pose(np.array([0]), command, 10)
     sims.track_pose(np.array([0]), command, 1)
     data, jacobian = sims.data[0], np.zeros((3, model.nv))
-    mujoco.mj_jacBody(model, data, jacobian, None, model.body("tcp").id)
+    mujoco.mj_jacBody(model, data, jacobian, None, model.body("panda/tcp").id)
     np.testing.assert_allclose(sims.log[0, controller.LOG_COLUMNS["c_vel"]], jacobian @ data.qvel, atol=1e-13)
     np.testing.assert_array_equal(sims.log[0, controller.LOG_COLUMNS["j_pos"]], data.qpos[:7])
 

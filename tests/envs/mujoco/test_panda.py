@@ -10,12 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from torchrl_koap.envs.mujoco import panda as panda_module
 from torchrl_koap.envs.mujoco.panda import panda
-from torchrl_koap.envs.mujoco.scene import scene
+from torchrl_koap.envs.mujoco.scene import TABLE_TOP, compile_scene, scene
 
 
 def compiled(**arguments) -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(f"<mujoco>{panda(**arguments)}</mujoco>")
+    return compile_scene(panda(**arguments))
 
 
 def test_masses_and_inertias_are_those_of_the_table():
@@ -52,19 +53,19 @@ def test_what_collides(link_collisions):
 def test_consecutive_links_never_collide_although_their_hulls_overlap():
     model = compiled(rod=True, link_collisions=True)
     data = mujoco.MjData(model)
-    data.qpos[:7] = 0.0, 0.17453, 0.0, -0.87266, 0.0, 1.22173, 0.78540
+    data.qpos[:7] = panda_module.REST_POSTURE
     data.qpos[7:] = 0.02
     mujoco.mj_forward(model, data)
     assert data.ncon == 0
 
 
 def test_scene_settings():
-    model = scene()
+    model = compile_scene(scene(rod=True))
     option = model.opt
     assert (option.timestep, option.impratio, option.tolerance, option.iterations) == (0.001, 3.0, 1e-10, 100)
     assert option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and option.integrator == mujoco.mjtIntegrator.mjINT_EULER
     table = model.geom("table_top")
-    assert table.pos[2] + table.size[2] == pytest.approx(-0.019)
+    assert table.pos[2] + table.size[2] == pytest.approx(TABLE_TOP)
 
 
 def test_the_rod_ends_12_cm_below_the_tcp():

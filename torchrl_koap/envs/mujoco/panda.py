@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The Franka Panda arm of the D3IL benchmark in MJCF, MuJoCo's XML (docs/d3il.md, Robot).
+"""The Franka Panda arm of the D3IL benchmark as a `dm_control.mjcf` model (docs/d3il.md, Robot).
 
 The numbers are D3IL's, not those of the Panda that ships with ``gymnasium-robotics``: only the ten meshes are taken
 from that package. Lengths in m, masses in kg, inertias in kg m^2, angles in rad, quaternions (w, x, y, z).
@@ -9,8 +9,14 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Iterable
 from pathlib import Path
+
+from torchrl_koap.envs.mujoco.mjcf import mjcf
+
+TCP_OFFSET = 0.105  # tool centre point along the hand's z axis
+FLANGE_OFFSET = 0.107  # link8 along the z axis of link7
+HAND_QUAT = (0.92388, 0.0, 0.0, -0.382683)  # D3IL's rounded -45 deg about z
+REST_POSTURE = (0.0, 0.17453, 0.0, -0.87266, 0.0, 1.22173, 0.78540)
 
 _TURN = 0.5**0.5
 _TO_X = (_TURN, _TURN, 0.0, 0.0)  # +90 deg about x
@@ -41,17 +47,8 @@ _INERTIA = (
 )
 _LOW = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)  # of the joints
 _HIGH = (2.9671, 1.8326, 2.9671, 0.0873, 2.9671, 3.8223, 2.9671)
-_MOTORS = dict(zip((f"joint{index}" for index in range(1, 8)), (87, 87, 87, 87, 12, 12, 12), strict=True))  # N m
-_MOTORS |= {"finger_left": 70, "finger_right": 70}  # N
-_WRIST = 'solimp="1.998 1.999 0"'
-_MESHES = (*(f"link{index}" for index in range(8)), "hand", "finger")
-_CHAIN = (*(f"link{index}" for index in range(9)), "hand")
-_ROD_RADIUS, _ROD_LENGTH, _ROD_DENSITY = 0.01, 0.3, 1000.0  # D3IL leaves the inertia of rod and tip to their shapes
-
-
-def numbers(values: Iterable[float]) -> str:
-    """Writes numbers as MJCF has them."""
-    return " ".join(map(str, values))
+_MOTOR_LIMITS = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+_FINGER_LIMIT = 70.0
 
 
 def mesh_folder() -> Path:
@@ -68,7 +65,7 @@ def mesh_folder() -> Path:
             " pip install 'gymnasium-robotics>=1.4'"
         )
     folder = Path(spec.origin).parent / "envs" / "assets" / "kitchen_franka" / "franka_assets" / "meshes" / "visual"
-    missing = [name for name in _MESHES if not (folder / f"{name}.stl").exists()]
+    missing = [name for name in (*(f"link{i}" for i in range(8)), "hand", "finger") if not _mesh(folder, name).exists()]
     if missing:
         raise FileNotFoundError(
             f"the installed 'gymnasium-robotics' has no Panda mesh {missing[0]}.stl in {folder} (version 1.4.2 does)"
@@ -76,8 +73,8 @@ def mesh_folder() -> Path:
     return folder
 
 
-def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0) -> str:
-    """Writes the arm: 7 hinge joints, 2 finger slides, 9 motors, TCP body, wrist camera, optionally a rod in the hand.
+def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0) -> mjcf.RootElement:
+    """Builds the arm: 7 hinge joints, 2 finger slides, 9 motors, TCP body, wrist camera, optionally a rod in the hand.
 
     What can touch something always collides: rod, fingers, finger pads and hand. Names: joints ``joint1`` ...
     ``joint7``, ``finger_left``, ``finger_right`` (motors alike), bodies ``link0`` ... ``link8``, ``hand``, ``tcp``,
@@ -89,82 +86,90 @@ def panda(*, rod: bool = True, link_collisions: bool = False, alpha: float = 1.0
             them collide with each other as well, which joint limits and tasks keep them from; testing takes time.
         alpha (float): opacity of the arm when drawn.
 
-    Returns:
-        str: sections of MJCF, to stand in a ``<mujoco>``.
-
     Raises:
         ImportError: if ``gymnasium-robotics``, which holds the meshes, is not installed.
     """
-    folder, links = mesh_folder(), ""
-    # a conaffinity would let links meet each other
-    hull = f'class="mesh" contype="{int(link_collisions)}" conaffinity="0"'
+    folder = mesh_folder()
+    root = mjcf.RootElement(model="panda")
+    root.compiler.angle = "radian"
+    for name in (*(f"link{i}" for i in range(8)), "hand", "finger"):
+        root.asset.add("mesh", name=name, file=str(_mesh(folder, name)))
+    colour, dark = (0.95, 0.95, 0.95, alpha), (0.25, 0.25, 0.28, alpha)
+    hull = {"contype": int(link_collisions), "conaffinity": 0}  # a conaffinity would let links meet each other
+
+    body = root.worldbody
     for index, ((offset, quat, mass, com), (inertia, frame)) in enumerate(zip(_LINKS, _INERTIA, strict=True)):
-        reach = f"{_LOW[index - 1]} {_HIGH[index - 1]}"
-        links += f"""
-<body name="link{index}" pos="{numbers(offset)}" quat="{numbers(quat)}">
-  <inertial mass="{mass}" pos="{numbers(com)}" diaginertia="{numbers(inertia)}" quat="{numbers(frame)}"/>
-  {f'<joint name="joint{index}" axis="0 0 1" limited="true" range="{reach}"/>' if index else ""}
-  <geom name="link{index}" {hull} mesh="link{index}" {_WRIST if index == 7 else ""}/>"""
-    motors = "".join(
-        f'<motor name="{joint}" joint="{joint}" forcelimited="true" forcerange="-{most} {most}"/>'
-        for joint, most in _MOTORS.items()
+        body = body.add("body", name=f"link{index}", pos=offset, quat=quat)
+        body.add("inertial", mass=mass, pos=com, diaginertia=inertia, quat=frame)
+        if index:
+            joint = {"type": "hinge", "axis": (0, 0, 1), "limited": True, "range": (_LOW[index - 1], _HIGH[index - 1])}
+            body.add("joint", name=f"joint{index}", **joint)
+        wrist = {"solimp": (1.998, 1.999, 0.0)} if index == 7 else {}
+        body.add("geom", name=f"link{index}", type="mesh", mesh=f"link{index}", rgba=colour, **hull, **wrist)
+
+    flange = body.add("body", name="link8", pos=(0, 0, FLANGE_OFFSET))
+    flange.add("inertial", mass=0.1, pos=(0, 0, 0), diaginertia=(0.1, 0.1, 0.1))
+    hand = flange.add("body", name="hand", quat=HAND_QUAT)
+    hand.add(
+        "inertial",
+        mass=0.670782,
+        pos=(-2.76618e-6, -0.00061547, 0.0239295),
+        diaginertia=(0.00227632, 0.00206087, 0.000456542),
+        quat=(0.697945, 0.716151, -0.000242485, 8.47563e-5),
     )
-    return f"""
-<compiler angle="radian"/>
-<default>
-  <default class="mesh"><geom type="mesh" rgba="0.95 0.95 0.95 {alpha}"/></default>
-  <default class="finger">
-    <geom condim="4" margin="0.001" solimp="0.998 0.999 0.001" rgba="0.25 0.25 0.28 {alpha}"/>
-  </default>
-</default>
-<asset>{"".join(f'<mesh name="{name}" file="{folder / name}.stl"/>' for name in _MESHES)}</asset>
-<worldbody>{links}
-  <body name="link8" pos="0 0 0.107">
-    <inertial mass="0.1" pos="0 0 0" diaginertia="0.1 0.1 0.1"/>
-    <body name="hand" quat="0.92388 0 0 -0.382683">
-      <inertial mass="0.670782" pos="-2.76618e-6 -0.00061547 0.0239295" diaginertia="0.00227632 0.00206087 0.000456542"
-        quat="0.697945 0.716151 -0.000242485 8.47563e-5"/>
-      <geom name="hand" class="mesh" mesh="hand" {_WRIST}/>
-      <camera name="wrist" pos="0.1 0 0" euler="0 3.14 1.57" fovy="60"/>
-      <body name="tcp" pos="0 0 0.105"/>
-      {_rod() if rod else ""}{_finger(1, "left", "")}{_finger(-1, "right", 'quat="0 0 0 1"')}
-    </body>
-  </body>
-  {"</body>" * len(_LINKS)}
-</worldbody>
-<contact>
-  {"".join(f'<exclude body1="{a}" body2="{b}"/>' for a, b in zip(_CHAIN, _CHAIN[1:], strict=False))}
-</contact>
-<actuator>{motors}</actuator>"""
+    hand.add("geom", name="hand", type="mesh", mesh="hand", rgba=colour, solimp=(1.998, 1.999, 0.0))
+    hand.add("camera", name="wrist", pos=(0.1, 0, 0), euler=(0, 3.14, 1.57), fovy=60)
+    hand.add("body", name="tcp", pos=(0, 0, TCP_OFFSET))
+    if rod:
+        _add_rod(hand)
+    for side, name in ((1.0, "left"), (-1.0, "right")):
+        _add_finger(hand, side, name, dark)
+
+    chain = [f"link{i}" for i in range(9)] + ["hand"]
+    for first, second in zip(chain, chain[1:], strict=False):
+        root.contact.add("exclude", body1=first, body2=second)
+    motors = [(f"joint{i + 1}", limit) for i, limit in enumerate(_MOTOR_LIMITS)]
+    motors += [("finger_left", _FINGER_LIMIT), ("finger_right", _FINGER_LIMIT)]
+    for motor, limit in motors:
+        root.actuator.add("motor", name=motor, joint=motor, gear=(1,), forcelimited=True, forcerange=(-limit, limit))
+    return root
 
 
-def _rod() -> str:
-    mass = _ROD_DENSITY * math.pi * _ROD_RADIUS**2 * _ROD_LENGTH
-    across, along = mass * (3 * _ROD_RADIUS**2 + _ROD_LENGTH**2) / 12, mass * _ROD_RADIUS**2 / 2
-    tip = _ROD_DENSITY * 4 / 3 * math.pi * _ROD_RADIUS**3
-    return f"""
-<body name="rod">
-  <inertial mass="{mass}" pos="0 0 0.075" diaginertia="{across} {across} {along}"/>
-  <geom name="rod" type="cylinder" size="0.01 0.15" pos="0 0 0.075" rgba="0.2 0.4 0.8 1"/>
-  <body name="rod_tip">
-    <inertial mass="{tip}" pos="0 0 0.225" diaginertia="{numbers((0.4 * tip * _ROD_RADIUS**2,) * 3)}"/>
-    <geom name="rod_tip" type="sphere" contype="0" conaffinity="0" size="0.01" pos="0 0 0.225" rgba="0.2 0.4 0.8 1"/>
-  </body>
-</body>"""
+def _mesh(folder: Path, name: str) -> Path:
+    return folder / f"{name}.stl"
 
 
-def _finger(side: int, name: str, turned: str) -> str:
-    com, frame = (-2.42335e-5 * side, 0.0119585 * side, 0.0237816), (0.996177, 0.0868631 * side, -2.77937e-5 * side)
-    return f"""
-<body name="finger_{name}" pos="0 0 0.0584">
-  <inertial mass="0.0218754" pos="{numbers(com)}" diaginertia="5.69661e-6 5.56035e-6 1.55183e-6"
-    quat="{numbers(frame)} -0.00926642"/>
-  <joint name="finger_{name}" type="slide" axis="0 {side} 0" limited="true" range="0 0.04" damping="10"/>
-  <geom name="finger_{name}" class="finger" type="mesh" mesh="finger" friction="1 0.005 0.0001" solref="0.02 1"
-    {turned}/>
-  <body name="finger_tip_{name}" pos="0 {0.0085 * side} 0.056">
-    <inertial mass="0.01" pos="0 0 0" diaginertia="0.01 0.01 0.01" quat="0 0 0 1"/>
-    <geom name="pad_{name}" class="finger" type="box" size="0.008 0.004 0.008" pos="0 {-0.005 * side} -0.012"
-      friction="2 0.05 0.0001" solref="0.01 0.5"/>
-  </body>
-</body>"""
+def _add_rod(hand: mjcf.Element) -> None:
+    # D3IL leaves the inertia of rod and tip to their shapes, at the density of water
+    radius, length, density = 0.01, 0.3, 1000.0
+    mass = density * math.pi * radius**2 * length
+    across, along = mass * (3 * radius**2 + length**2) / 12, mass * radius**2 / 2
+    rod = hand.add("body", name="rod")
+    rod.add("inertial", mass=mass, pos=(0, 0, 0.075), diaginertia=(across, across, along))
+    rod.add("geom", name="rod", type="cylinder", size=(0.01, 0.15), pos=(0, 0, 0.075), rgba=(0.2, 0.4, 0.8, 1))
+    tip = rod.add("body", name="rod_tip")
+    mass = density * 4 / 3 * math.pi * radius**3
+    tip.add("inertial", mass=mass, pos=(0, 0, 0.225), diaginertia=(0.4 * mass * radius**2,) * 3)
+    drawn = {"contype": 0, "conaffinity": 0, "rgba": (0.2, 0.4, 0.8, 1)}
+    tip.add("geom", name="rod_tip", type="sphere", size=(0.01,), pos=(0, 0, 0.225), **drawn)
+
+
+def _add_finger(hand: mjcf.Element, side: float, name: str, colour: tuple) -> None:
+    finger = hand.add("body", name=f"finger_{name}", pos=(0, 0, 0.0584))
+    finger.add(
+        "inertial",
+        mass=0.0218754,
+        pos=(-2.42335e-5 * side, 0.0119585 * side, 0.0237816),
+        diaginertia=(5.69661e-6, 5.56035e-6, 1.55183e-6),
+        quat=(0.996177, 0.0868631 * side, -2.77937e-5 * side, -0.00926642),
+    )
+    slide = {"type": "slide", "axis": (0, side, 0), "limited": True, "range": (0, 0.04), "damping": 10}
+    finger.add("joint", name=f"finger_{name}", **slide)
+    firm = {"condim": 4, "margin": 0.001, "solimp": (0.998, 0.999, 0.001)}
+    turned = {} if side > 0 else {"quat": (0, 0, 0, 1)}
+    shape = {"type": "mesh", "mesh": "finger", "friction": (1, 0.005, 0.0001), "solref": (0.02, 1), "rgba": colour}
+    finger.add("geom", name=f"finger_{name}", **shape, **firm, **turned)
+    tip = finger.add("body", name=f"finger_tip_{name}", pos=(0, 0.0085 * side, 0.056))
+    tip.add("inertial", mass=0.01, pos=(0, 0, 0), diaginertia=(0.01, 0.01, 0.01), quat=(0, 0, 0, 1))
+    pad = {"type": "box", "size": (0.008, 0.004, 0.008), "pos": (0, -0.005 * side, -0.012), "rgba": colour}
+    tip.add("geom", name=f"pad_{name}", **pad, friction=(2, 0.05, 0.0001), solref=(0.01, 0.5), **firm)

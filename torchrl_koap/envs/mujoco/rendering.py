@@ -95,14 +95,13 @@ class Renderer:
 
         Args:
             data (mujoco.MjData): its state.
-            camera (str): name of a camera of the scene.
+            camera (str): name of a camera of the scene; the prefix of the arm may be left out.
 
         Raises:
             ValueError: if the scene has no such camera.
         """
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
-        cameras = {self._model.camera(index).name: index for index in range(self._model.ncam)}
-        self._camera.fixedcamid = lookup(cameras, camera, "camera")
+        self._camera.fixedcamid = self._camera_id(camera)
         self._context.make_current()
         perturbation, everything = mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self._model, data, self._option, perturbation, self._camera, everything, self._scene)
@@ -112,6 +111,13 @@ class Renderer:
         mujoco.mjr_render(viewport, self._scene, self._gpu)
         mujoco.mjr_readPixels(picture, None, viewport, self._gpu)
         return np.ascontiguousarray(picture[::-1])  # OpenGL counts rows from below
+
+    def _camera_id(self, name: str) -> int:
+        names = [self._model.camera(index).name for index in range(self._model.ncam)]
+        for candidate in (name, f"panda/{name}"):
+            if candidate in names:
+                return names.index(candidate)
+        return lookup({known.removeprefix("panda/"): names.index(known) for known in names}, name, "camera")
 
     def close(self) -> None:
         """Frees the graphics memory; the renderer cannot be used afterwards."""
