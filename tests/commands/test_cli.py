@@ -145,7 +145,3 @@ def test_two_trainings_that_begin_together(demonstrations, tmp_path, capsys, mon
     monkeypatch.setattr(on_disk, "load_demonstrations", meanwhile)
     assert "holds a run already" in fails(capsys, *command)
     assert (out / "summary.json").exists()
-
-
-def test_every_error_line_says_how_to_see_more(capsys, tmp_path):
-    assert fails(capsys, "eval", tmp_path).endswith("(KOAP_TRACEBACK=1 shows where)")

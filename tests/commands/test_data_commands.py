@@ -13,25 +13,6 @@ from tiny_runs import koap, write_demonstrations
 from torchrl_koap.data import load_ted, save_demonstrations
 
 
-@pytest.fixture(scope="module")
-def arrays(tmp_path_factory):
-    """Six trajectories of a robot; two have actions."""
-    folder, generator = tmp_path_factory.mktemp("arrays"), np.random.default_rng(0)
-    for index in range(6):
-        content = {"states": generator.normal(size=(30, 4)).cumsum(0), "state_names": ["q1", "q2", "goal1", "goal2"]}
-        if index < 2:
-            content |= {"actions": generator.normal(size=(30, 2)), "action_names": ["dq1", "dq2"]}
-        np.savez(folder / f"run_{index}.npz", control_hz=20.0, **content)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def arm(arrays, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("own") / "arm"
-    assert koap("convert", arrays, "--out", folder, "--robot", "q1", "q2", "--action-units", "rad") == 0
-    return folder
-
-
 def test_data_of_an_own_task_are_validated_without_naming_it(arm, capsys):
     assert koap("validate", arm) == 0
     assert "no problem found" in capsys.readouterr().out

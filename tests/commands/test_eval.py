@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 
 import pytest
-import torch
 from tiny_runs import koap
 
 from torchrl_koap.evaluation.action_errors import AFTER
@@ -53,16 +52,6 @@ def test_labels_outside_the_budget_are_read_here_alone(copied_run, demonstration
     result = json.loads((copied_run / "eval.json").read_text())
     assert result["labels_read_outside_budget"] == 0 and result["relative_action_error"] is None
     assert "is not there" in result["action_errors"]["outside_budget"]["note"]
-
-
-def test_an_evaluation_does_not_depend_on_the_batch_size(copied_run, no_report):
-    found = []
-    for size in (5, 3):
-        assert koap("eval", copied_run, "--episodes", 5, "--seed", 7, "--threads", 1, "--batch-size", size) == 0
-        result = json.loads((copied_run / "eval.json").read_text())
-        found.append((result["episode"], load_tensors(copied_run / "rollouts.safetensors")[0]["position"]))
-    assert found[0][0] == found[1][0]
-    torch.testing.assert_close(found[0][1], found[1][1], atol=1e-4, rtol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize(

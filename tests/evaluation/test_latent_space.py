@@ -134,10 +134,10 @@ def test_every_preset_can_be_analysed(preset):
 
 def test_spectrum_by_hand():
     values = torch.tensor([0.5, 0.9j, -1.0, 1.0005, 1.2], dtype=torch.complex128)
-    found = spectrum(values, slowest=1)
+    found = spectrum(values)
     assert (found["inside"], found["on"], found["outside"]) == (2, 2, 1)
     assert found["spectral_radius"] == pytest.approx(1.2)
-    assert found["slowest_decay_steps"] == pytest.approx([-1 / math.log(0.9)])
+    assert found["slowest_decay_steps"] == pytest.approx([-1 / math.log(0.9), -1 / math.log(0.5)])
 
 
 def test_steps_are_inferred_once_each_whatever_the_labels():

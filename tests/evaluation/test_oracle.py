@@ -110,8 +110,3 @@ def test_where_there_is_nothing_to_follow(demonstrations, copied_run, tmp_path, 
         assert koap("eval", run, "--strategy", "oracle", *option) == 1
         assert message in capsys.readouterr().err
         assert not (run / "eval.json").exists()
-
-
-def test_an_unknown_strategy(trained_run, capsys):
-    assert koap("eval", trained_run, "--strategy", "oracel") == 1
-    assert "unknown strategy 'oracel'; did you mean 'oracle'" in capsys.readouterr().err

@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Files that another process writes a little later than it says."""
+"""What another process does a little later than it says."""
 
 from __future__ import annotations
 
@@ -14,3 +14,11 @@ def wait_for(text, folder, seconds=30):
             return True
         time.sleep(0.2)
     return False
+
+
+def wait_until(condition, seconds=120.0):
+    """Waits for something that another process does."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)

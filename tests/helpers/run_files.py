@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from safetensors.numpy import save_file
 
+from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 
 LABELS = {
@@ -46,6 +47,11 @@ EVALUATION = {
     "execution": {"strategy": "feedback", "replan_interval": 4},
     "episode": [{"seed": 100 + e, "outcome": "success", "mode": e, "steps": 20} for e in range(4)],
 }
+
+
+def run_of(task: str | None, folder: Path = Path("run"), **numbers) -> RunFacts:
+    """What is known about a run of a task."""
+    return RunFacts(folder, None if task is None else get_task(task), **numbers)
 
 
 def make_rollouts(episodes: int = 4, steps: int = 20) -> dict[str, np.ndarray]:

@@ -3,20 +3,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from PIL import Image
-from run_files import make_object_rollouts, make_rollouts
+from run_files import make_object_rollouts, make_rollouts, run_of
 
 from torchrl_koap.reports.animation import animate_rollouts
-from torchrl_koap.reports.pictures import NothingToDraw
-from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.writing import save_film
-from torchrl_koap.tasks import get_task
+from torchrl_koap.reports.pictures import NothingToDraw, save_film
 
-RUN = RunFacts(Path("run"), get_task("avoiding"))
+RUN = run_of("avoiding")
 
 
 def test_animation_shows_every_step_and_holds_the_end(tmp_path):
@@ -32,7 +27,7 @@ def test_animation_shows_every_step_and_holds_the_end(tmp_path):
 
 def test_objects_move_in_the_animation():
     """A box that nothing else covers is drawn where it is: red pixels at its last place, none at its first."""
-    run = RunFacts(Path("run"), get_task("stacking"))
+    run = run_of("stacking")
     first, *_, last = animate_rollouts(make_object_rollouts("stacking", episodes=1), run).frames
     red = [(frame[..., 0] > 180) & (frame[..., 1:] < 70).all(-1) for frame in (first.astype(int), last.astype(int))]
     assert red[0].sum() > 10 and red[1].sum() > 10 and not (red[0] & red[1]).any()

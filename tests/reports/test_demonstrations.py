@@ -7,15 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_files import drawn_lines, make_demonstrations, titles
+from run_files import drawn_lines, make_demonstrations, run_of, titles
 
 from torchrl_koap.reports.demonstrations import draw_demonstrations
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.tasks import Action, Task, get_task
-
-
-def run_of(task):
-    return RunFacts(Path("run"), get_task(task))
+from torchrl_koap.tasks import Action, Task
 
 
 def test_demonstrations_emphasise_exactly_the_labelled_transitions():

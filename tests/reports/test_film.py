@@ -3,20 +3,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from run_files import make_object_rollouts, make_rollouts
+from run_files import make_object_rollouts, make_rollouts, run_of
 
 from torchrl_koap.reports import film
 from torchrl_koap.reports.pictures import NotFilmed
-from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 
 
 def film_of(rollouts, task):
-    return film.film_rollout(rollouts, RunFacts(Path("run"), get_task(task)))
+    return film.film_rollout(rollouts, run_of(task))
 
 
 def frames_of(actions, task, monkeypatch, size, **more):

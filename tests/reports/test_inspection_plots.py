@@ -4,22 +4,19 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from run_files import titles
+from run_files import run_of, titles
 from safetensors.numpy import save_file
 
 from torchrl_koap.evaluation.findings import MODELS, OUTSIDE_THE_BUDGET
 from torchrl_koap.evaluation.latent_space import spectrum
 from torchrl_koap.reports.inspection_plots import EXPERIMENTS, draw_eigenvalues, draw_experiments, draw_latent
 from torchrl_koap.reports.pictures import NothingToDraw
-from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.tasks import get_task
 
-RUN = RunFacts(Path("run"), get_task("avoiding"))
+RUN = run_of("avoiding")
 
 
 def test_eigenvalues_outside_the_circle_are_counted():
@@ -66,11 +63,11 @@ def test_latent_space(outside, panels, said, tmp_path):
     errors = {name: {"measured_xy": [0.001, 0.002]} for name in MODELS} | {"steps": 2, "held_out_trajectories": 3}
     outside = outside if "note" in outside else {"probe_r2": [0.9, 0.8], "decoder_r2": [0.7, 0.6]} | outside
     result = {"latent": {"multi_step": errors, OUTSIDE_THE_BUDGET: outside, "eigenvalues": {}}}
-    figure = draw_latent(result, RunFacts(tmp_path, get_task("avoiding")))
+    figure = draw_latent(result, run_of("avoiding", tmp_path))
     assert len(figure.axes) == panels and figure.get_suptitle().endswith(said)
     assert titles(figure)[0] == "Error of the predicted measured xy\non 3 demonstrations"
     save_file({"real": np.ones(3), "imag": np.zeros(3)}, tmp_path / "eigenvalues.safetensors")
-    figure = draw_latent(result, RunFacts(tmp_path, get_task("avoiding")))
+    figure = draw_latent(result, run_of("avoiding", tmp_path))
     assert titles(figure)[0].startswith("3 eigenvalues") and len(figure.axes) == panels + 1
 
 

@@ -9,18 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.colors import rgb_to_hsv
-from run_files import drawn_lines, titles
+from run_files import drawn_lines, run_of, titles
 from safetensors.numpy import save_file
 
 from torchrl_koap.reports.mode_plots import draw_modes, mode_colors, recorded_modes
 from torchrl_koap.reports.pictures import NothingToDraw
-from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import TASKS, Modes, get_task
 
 
 def drawn(task, mode, folder=Path("run")):
     mode = np.array(mode)
-    return draw_modes({"mode": mode, "outcome": np.ones(len(mode))}, RunFacts(folder, get_task(task)))
+    return draw_modes({"mode": mode, "outcome": np.ones(len(mode))}, run_of(task, folder))
 
 
 def test_modes_histogram(tmp_path):

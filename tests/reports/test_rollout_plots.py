@@ -3,23 +3,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from run_files import drawn_lines, make_object_rollouts, make_rollouts, titles
+from run_files import drawn_lines, make_object_rollouts, make_rollouts, run_of, titles
 
 from torchrl_koap.reports import scenes
 from torchrl_koap.reports.mode_plots import mode_colors
 from torchrl_koap.reports.rollout_plots import choose_episodes, draw_plans, draw_rollouts, plan_deviation
-from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.tasks import get_task
 
 ROLLOUTS = make_rollouts()
-
-
-def run_of(task):
-    return RunFacts(Path("run"), None if task is None else get_task(task))
 
 
 def test_rollouts_are_cut_coloured_and_counted():

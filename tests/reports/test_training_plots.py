@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_files import titles
+from run_files import run_of, titles
 
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.training_plots import draw_actions, draw_losses, running_mean
-from torchrl_koap.tasks import Action, Task, get_task
+from torchrl_koap.tasks import Action, Task
 
-NOTHING = RunFacts(Path("run"))
+NOTHING = run_of(None)
 
 
 def test_losses_get_a_panel_each_and_zero_is_said():
@@ -60,7 +60,7 @@ def test_actions_tell_the_error_and_what_they_are_read_for():
     true = np.zeros((50, 2))
     predicted = np.tile([0.003, 0.004], (50, 1))
     predicted[0] = np.nan  # left out
-    figure = draw_actions({"predicted": predicted, "true": true}, RunFacts(Path("run"), get_task("avoiding")))
+    figure = draw_actions({"predicted": predicted, "true": true}, run_of("avoiding"))
     assert titles(figure) == ["x: RMSE 3 mm", "y: RMSE 4 mm", "all: RMSE 3.54 mm, median 3.5"]
     assert figure.get_suptitle() == "49 steps of demonstrations outside the label budget, for evaluation only"
 
@@ -68,9 +68,7 @@ def test_actions_tell_the_error_and_what_they_are_read_for():
 def test_actions_in_two_units():
     """Stacking: seven joints in mrad per step, and a width in mm that the error of all leaves out."""
     predicted = np.tile([0.002] * 7 + [0.08], (50, 1))
-    figure = draw_actions(
-        {"predicted": predicted, "true": np.zeros((50, 8))}, RunFacts(Path("run"), get_task("stacking"))
-    )
+    figure = draw_actions({"predicted": predicted, "true": np.zeros((50, 8))}, run_of("stacking"))
     said, panels = titles(figure), figure.axes
     assert said[0] == "joint 1: RMSE 2 mrad" and said[7] == "gripper: RMSE 80 mm"
     assert said[8] == "all but gripper: RMSE 2 mrad, median 2"

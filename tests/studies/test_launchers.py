@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 import pytest
+from late_files import wait_until
 
 from torchrl_koap.studies.launchers import Job, Machines, launch, run_logged
 
@@ -71,13 +72,6 @@ def act(folder):
         sleep(folder)
     else:
         say(folder)
-
-
-def wait_for(condition, seconds=30.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 def is_alive(pid):
@@ -182,11 +176,11 @@ def test_closing_the_iterator_stops_what_is_running(tmp_path):
     file = tmp_path / "sleeps" / "pid"
     ended = launch(act, jobs_of(tmp_path, sleeps=None, quick=None), Machines(workers=2))
     assert next(ended)[0].folder.name == "quick"
-    wait_for(lambda: file.exists() and file.read_text())
+    wait_until(lambda: file.exists() and file.read_text())
     pid = int(file.read_text())
     assert is_alive(pid)
     ended.close()
-    wait_for(lambda: not is_alive(pid))
+    wait_until(lambda: not is_alive(pid))
 
 
 def test_jobs_do_not_outlive_a_parent_that_is_killed(tmp_path):
@@ -204,7 +198,7 @@ def test_jobs_do_not_outlive_a_parent_that_is_killed(tmp_path):
     files = [tmp_path / name / "pid" for name in "ab"]
     parent = subprocess.Popen([sys.executable, str(script)])
     try:
-        wait_for(lambda: all(file.exists() and file.read_text() for file in files), 60)
+        wait_until(lambda: all(file.exists() and file.read_text() for file in files), 60)
         pids = [int(file.read_text()) for file in files]
         server = int(stat(pids[0])[1])
         assert all(map(is_alive, [*pids, server])) and server != parent.pid
@@ -212,7 +206,7 @@ def test_jobs_do_not_outlive_a_parent_that_is_killed(tmp_path):
         parent.kill()
         parent.wait()
     try:
-        wait_for(lambda: not any(map(is_alive, [*pids, server])))
+        wait_until(lambda: not any(map(is_alive, [*pids, server])))
     finally:
         for pid in filter(is_alive, pids):
             os.kill(pid, signal.SIGKILL)

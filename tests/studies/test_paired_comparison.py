@@ -51,7 +51,7 @@ def test_identical_outcomes_differ_by_nothing():
     # without any spread the rule of three says what contexts not seen could hide
     reach = 3 / result.contexts
     assert (result.low, result.high) == (pytest.approx(-reach), pytest.approx(reach))
-    assert (result.contexts, result.seeds, result.pairs) == (60, 3, 180)
+    assert (result.contexts, result.seeds, result.n) == (60, 3, 180)
 
 
 def test_swapping_the_methods_swaps_the_signs():
@@ -83,7 +83,7 @@ def test_rollouts_of_one_context_are_one_unit():
     first = {0: {(context, 10 * context + k): True for context in range(4) for k in range(5)}}
     second = {0: {(context, 10 * context + k): k == 0 for context in range(4) for k in range(5)}}
     result = compare(first, second)
-    assert (result.contexts, result.pairs) == (4, 20)
+    assert (result.contexts, result.n) == (4, 20)
     assert result.difference == pytest.approx(0.8)
     assert result.p == 2 / 2**4  # four units, not twenty
 
@@ -92,7 +92,7 @@ def test_only_shared_pairs_count():
     first = {0: {(0, 0): True, (1, 1): True}, 1: {(0, 0): True}, 5: {(0, 0): True}}
     second = {0: {(1, 1): False, (2, 2): True}, 1: {(0, 0): True}, 6: {(0, 0): False}}
     result = compare(first, second)
-    assert (result.contexts, result.seeds, result.pairs) == (2, 2, 2)
+    assert (result.contexts, result.seeds, result.n) == (2, 2, 2)
     assert result.difference == 0.5
     assert compare({0: {(0, 0): True}}, {1: {(0, 0): True}}) is None
     assert compare({0: {(0, 0): True}}, {0: {(1, 1): True}}) is None

@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 import pytest
+from late_files import wait_until
 from tiny_runs import write_demonstrations
 
 from torchrl_koap.studies.table import read_cells
@@ -129,7 +130,8 @@ def test_a_curve_goes_on_where_it_was_when_the_head_is_started_again(tmp_path, s
     words, disturbed = curve_of(tmp_path), out / "cells" / "avoiding" / "koap-0.25-1-seed0"
     with cluster(short / "first", settings) as address:
         process = subprocess.Popen([*words, "--address", address], env=settings, stderr=subprocess.PIPE, text=True)
-        wait_for(disturbed / "metrics.csv", process)
+        wait_until(lambda: (disturbed / "metrics.csv").exists() or process.poll() is not None, LONGEST)
+        assert process.poll() is None
     _, said = process.communicate(timeout=LONGEST)
     assert process.returncode == 1 and "Traceback" not in said
     assert "127.0.0.1" in said.splitlines()[-1] or "Ray" in said.splitlines()[-1], said
@@ -140,11 +142,3 @@ def test_a_curve_goes_on_where_it_was_when_the_head_is_started_again(tmp_path, s
     assert [row["status"] for row in read_cells(out / "cells.csv")] == 2 * ["done"]
     assert finished == {path: path.stat().st_mtime_ns for path in finished}
     assert not (tmp_path / "home" / ".ray").exists()
-
-
-def wait_for(file: Path, process: subprocess.Popen) -> None:
-    """Until a file is there."""
-    ends = time.monotonic() + LONGEST
-    while not file.exists():
-        assert time.monotonic() < ends and process.poll() is None, f"no {file}; status {process.poll()}"
-        time.sleep(0.05)

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from late_files import wait_until
 from tiny_runs import koap
 
 from torchrl_koap import ControllerConfig, EvalConfig, ExecutionConfig, PlannerConfig
@@ -283,13 +284,6 @@ def test_a_damaged_study_json_is_named(curve, demonstrations, capsys):
     assert f"{curve / 'study.json'} is damaged" in fails(capsys, *command_of(curve, demonstrations))
 
 
-def wait_for(condition, seconds=120.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.01)
-
-
 def living(session):
     """Processes of a session that still do something."""
     found = []
@@ -309,11 +303,11 @@ def test_a_curve_that_was_killed_goes_on_and_ends_like_one_that_was_not(whole_cu
     command = [sys.executable, "-m", "torchrl_koap.commands.cli", *command_of(out, demonstrations, workers=1)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        wait_for(lambda: (out / DP / "config.json").exists() or process.poll() is not None)
+        wait_until(lambda: (out / DP / "config.json").exists() or process.poll() is not None)
     finally:
         process.kill()
         process.wait()
-    wait_for(lambda: not living(process.pid))
+    wait_until(lambda: not living(process.pid))
     before = marks(out)
     assert f"{PLANNER}/result.json" in before and not (out / "index.html").exists()
     assert not (out / LINEAR / "result.json").exists()

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any
 
 from torchrl_koap import __version__
-from torchrl_koap.commands.printing import HINT, complain, one_line, show
 from torchrl_koap.commands.shell import (
     ReadEnough,
     describe_interrupt,
@@ -32,6 +32,8 @@ from torchrl_koap.commands.shell import (
 # errors that speak for themselves; anything else is a fault of ours and keeps its traceback
 EXPECTED = (ValueError, RuntimeError, KeyError, OSError, MemoryError)
 DESCRIPTION = "Imitation learning with few action labels. `koap --version` prints the version."
+HINT = "KOAP_TRACEBACK=1 shows where"
+_LONG = ("episode", "action_errors")  # entries of a result that are not printed
 _MAY_BE_EMPTY = ("--action-units", "--state-units")  # the unit of a number without one
 
 
@@ -55,12 +57,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 141
     except KeyboardInterrupt as error:
         message, status = describe_interrupt(error)
-        complain(message)
+        _complain(message)
         return status
     except Exception as error:
         if os.environ.get("KOAP_TRACEBACK") or not _is_expected(error):
             raise
-        complain(f"{one_line(error)} ({HINT})")
+        _complain(f"{_one_line(error)} ({HINT})")
         return 1
 
 
@@ -78,7 +80,7 @@ def _run(arguments: Sequence[str]) -> int:
         result = command()
     if not command.quiet:
         with written_output():
-            show(result)
+            _show(result)
     return 1 if isinstance(result, Mapping) and result.get("failed") else 0
 
 
@@ -149,6 +151,52 @@ def _commands() -> tuple[Any, ...]:
 def _is_expected(error: Exception) -> bool:
     # the simulator's own error for a machine that has too little memory or no graphics derives from nothing else
     return isinstance(error, EXPECTED) or type(error).__module__.partition(".")[0] == "mujoco"
+
+
+def _one_line(error: BaseException) -> str:
+    """The message of an error, the problems it lists one after the other."""
+    message = str(error.args[0] if isinstance(error, KeyError) and error.args else error)
+    said = "; ".join(line.strip().removeprefix("- ") for line in message.splitlines() if line.strip()).replace(
+        ":;", ":"
+    )
+    if isinstance(error, MemoryError):
+        return f"out of memory{f': {said}' if said else ''}; try fewer episodes, or smaller batches"
+    return said or type(error).__name__
+
+
+def _complain(message: str) -> None:
+    """Writes one line to stderr, if that can be written to."""
+    with contextlib.suppress(OSError, ValueError):  # a full device, a closed one
+        sys.stderr.write(f"koap: {message}\n")
+        sys.stderr.flush()
+
+
+def _show(result: Any) -> None:
+    """Prints a result: a table of names and values, without the rows of single episodes or action columns."""
+    if not isinstance(result, Mapping):
+        print(result)
+        return
+    lines = [line for key, value in result.items() if key not in _LONG for line in _lines(key, value)]
+    width = min(max((len(name) for name, _ in lines), default=0), 45)
+    for name, text in lines:
+        print(f"{name:<{width}}  {text}")
+
+
+def _lines(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """A line per value; a mapping of plain values is one line, a nested one a line for each of its entries."""
+    if isinstance(value, Mapping) and any(isinstance(entry, Mapping) for entry in value.values()):
+        for key, entry in value.items():
+            yield from _lines(f"{name} {key}", entry)
+    elif isinstance(value, Mapping):
+        yield name, json.dumps({key: _short(entry) for key, entry in value.items()})
+    else:
+        yield name, _short(value)
+
+
+def _short(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_short(entry) for entry in value]
+    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 if __name__ == "__main__":

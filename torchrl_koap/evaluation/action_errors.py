@@ -82,25 +82,27 @@ def errors_outside_budget(
     predicted, true, episode = first_actions(controller, data, outside)
     if not len(true):
         return {"note": "no trajectory outside the budget has labels"}, {}
-    known = labelled["action"][labelled["has_action"].squeeze(-1)]
-    models = {
-        "controller": _commanded(predicted, true, task),
-        "ridge": first_actions(_ridge_on(labelled, task), data, outside)[0],
-        "mean_action": known.mean(0).expand_as(true),
-    }
+    models = _beside(predicted, true, labelled, data, outside, task)
     return summarise_errors(models, true, episode, task), {"predicted": predicted, "true": true}
 
 
-def _ridge_on(labelled: TensorDictBase, task: Task) -> LinearInverseDynamics:
-    """A ridge regression on raw frames, fitted to the labels that are left."""
-    ridge = LinearInverseDynamics(labelled["state"].shape[-1], task.action_dim).to(labelled["state"].dtype)
-    fit_closed_form(ridge, labelled)
-    return ridge
-
-
-def _commanded(decoded: Tensor, true: Tensor, task: Task) -> Tensor:
-    """Actions ``[N, act]`` as a policy commands them: those that never change are what they were."""
-    return torch.where(torch.tensor([action.constant is not None for action in task.actions.values()]), true, decoded)
+def _beside(
+    predicted: Tensor,
+    true: Tensor,
+    known: TensorDictBase,
+    data: TensorDictBase,
+    episodes: Tensor | Sequence[int],
+    task: Task,
+) -> dict[str, Tensor]:
+    """Actions ``[N, act]`` on some trajectories: a controller's, a ridge's on raw frames, the mean of those known."""
+    ridge = LinearInverseDynamics(known["state"].shape[-1], task.action_dim).to(known["state"].dtype)
+    fit_closed_form(ridge, known)
+    fixed = torch.tensor([action.constant is not None for action in task.actions.values()])
+    return {
+        "controller": torch.where(fixed, true, predicted),  # as a policy commands: what never changes is what it was
+        "ridge": first_actions(ridge, data, episodes)[0],
+        "mean_action": known["action"][known["has_action"].squeeze(-1)].mean(0).expand_as(true),
+    }
 
 
 def errors_left_out(
@@ -122,8 +124,7 @@ def errors_left_out(
     if len(episodes) < 2:
         return {"note": "only one trajectory has labels: none can be left out"}
     left_out = episodes[torch.linspace(0, len(episodes) - 1, min(len(episodes), _MOST_FOLDS)).round().long()]
-    models: dict[str, list[Tensor]] = {"controller": [], "ridge": [], "mean_action": []}
-    truths, numbers = [], []
+    folds = []
     for number in left_out:
         fold = labelled.copy()
         hidden = labelled["episode"] == number
@@ -132,16 +133,12 @@ def errors_left_out(
         again = copy.deepcopy(controller)
         fit_closed_form(again, fold, **axes_of(task, columns))
         predicted, true, episode = first_actions(again, labelled, [int(number)])
-        if not len(true):  # its labels lie too near its end
-            continue
-        models["controller"].append(_commanded(predicted, true, task))
-        models["ridge"].append(first_actions(_ridge_on(fold, task), labelled, [int(number)])[0])
-        models["mean_action"].append(fold["action"][fold["has_action"].squeeze(-1)].mean(0).expand_as(true))
-        truths.append(true)
-        numbers.append(episode)
-    if not truths:
+        if len(true):  # else its labels lie too near its end
+            folds.append((_beside(predicted, true, fold, labelled, [int(number)], task), true, episode))
+    if not folds:
         return {"note": "no labelled step has enough recorded future to decode its action"}
-    joined = {name: torch.cat(parts) for name, parts in models.items()}
+    models, truths, numbers = zip(*folds, strict=True)
+    joined = {name: torch.cat([part[name] for part in models]) for name in models[0]}
     return summarise_errors(joined, torch.cat(truths), torch.cat(numbers), task)
 
 

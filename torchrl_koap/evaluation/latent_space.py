@@ -23,10 +23,10 @@ from torchrl_koap.modules.ridge import ridge
 _MOST_WINDOWS = 20000  # errors of more of them differ by less than they are read to
 
 
-def spectrum(eigenvalues: Tensor, *, slowest: int = 5) -> dict[str, Any]:
+def spectrum(eigenvalues: Tensor) -> dict[str, Any]:
     r"""Tells where the eigenvalues of an operator lie, and in how many steps its slowest parts fade to 1/e.
 
-    The decay times are :math:`-1 / \ln |\lambda|` of the ``slowest`` of those inside the unit circle.
+    The decay times are :math:`-1 / \ln |\lambda|` of the five slowest of those inside the unit circle.
 
     Examples:
         >>> import math
@@ -41,7 +41,7 @@ def spectrum(eigenvalues: Tensor, *, slowest: int = 5) -> dict[str, Any]:
     return {
         "spectral_radius": size[0].item(),
         **{side: sides.count(side) for side in ("inside", "on", "outside")},
-        "slowest_decay_steps": (-1 / inside[:slowest].log()).tolist(),
+        "slowest_decay_steps": (-1 / inside[:5].log()).tolist(),
     }
 
 

@@ -28,11 +28,6 @@ class Advice:
         finding (str): what the numbers say.
         proposal (str): what may help, or tell more.
         command (str): the command line, with ``{run}`` for the run directory; empty if there is none.
-
-    Examples:
-        >>> from torchrl_koap.reports.advice import Advice
-        >>> Advice("12 rollouts", "roll out more often", "koap eval {run} --episodes 60").command
-        'koap eval {run} --episodes 60'
     """
 
     finding: str

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_koap.reports.pictures import NotFilmed, NothingToDraw, picture
+from torchrl_koap.reports.pictures import Film, NotFilmed, NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
 from torchrl_koap.reports.style import SUCCESS, entry
-from torchrl_koap.reports.writing import Film
 from torchrl_koap.tasks import Task
 
 MOST_FRAMES = 24  # software rendering takes 0.1 s each

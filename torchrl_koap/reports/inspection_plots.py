@@ -27,7 +27,6 @@ from torchrl_koap.reports.style import (
     WARNING,
     entry,
     legend_below,
-    set_title,
     tidy,
 )
 from torchrl_koap.tasks import Task
@@ -139,8 +138,7 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     left.set_xticks(range(len(made)), numbers, fontsize=8)
     left.set_ylim(0, 105)
     left.set_ylabel("success (%)")
-    set_title(left, "Who reaches the goal (95 % intervals)")
-    tidy(left)
+    tidy(left, "Who reaches the goal (95 % intervals)")
     for key, color, label in (
         ("plan_to_execution", ORANGE, "from the plan"),
         ("recording_to_execution", MUTED, "from the recording, when that is the plan"),
@@ -153,10 +151,9 @@ def draw_experiments(result: Mapping[str, Any], run: RunFacts) -> Figure:
     right.set_yticks(range(len(names)), [name.replace("_", " ") for name in names], fontsize=8)
     right.invert_yaxis()
     right.set_xlabel("root mean square distance after the last step of a plan\n(m, rad, or on the unit circle)")
-    set_title(right, "How far execution is")
     if names:
         legend_below(right, 0.24)
-    tidy(right)
+    tidy(right, "How far execution is")
     return figure
 
 
@@ -198,8 +195,7 @@ def _draw_plane(axes: Axes, values: np.ndarray) -> None:
             panel.scatter(here.real, here.imag, **style)
     counts = [f"{int((side == name).sum())} {name}" for name in SIDES]
     radius = f"{len(values)} eigenvalues, radius {np.abs(values).max():.5g}"
-    set_title(axes, f"{radius}\n{', '.join(counts)} the unit circle")
-    tidy(axes)
+    tidy(axes, f"{radius}\n{', '.join(counts)} the unit circle")
 
 
 def _draw_distances(axes: Axes, values: np.ndarray, control_hz: float | None) -> None:
@@ -224,9 +220,8 @@ def _draw_distances(axes: Axes, values: np.ndarray, control_hz: float | None) ->
     axes.yaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("rank")
     axes.set_ylabel("magnitude - 1")
-    set_title(axes, "distance from the unit circle\n(shaded: counted as on it)")
     axes.legend(frameon=False, fontsize=8, loc="upper right")
-    tidy(axes)
+    tidy(axes, "distance from the unit circle\n(shaded: counted as on it)")
     if control_hz is not None:
         places = {math.exp(-1 / (time * control_hz)) - 1: f"{time:g} s" for time in _TIMES}
         places = {place: text for place, text in places.items() if bottom < place < -ON_THE_CIRCLE}
@@ -251,11 +246,9 @@ def _draw_errors(axes: Axes, errors: Mapping[str, Any], task: Task) -> None:
     axes.set_xlabel(f"control steps ahead, {1e3 / task.control_hz:.0f} ms each\n(latent actions given)")
     axes.set_ylabel("root mean square distance" + (f" ({shown})" if shown else ""))
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-    axes.grid(axis="y", which="major", color=FAINT, linewidth=0.5)
     judged = f"on {errors['held_out_trajectories']} demonstrations"
-    set_title(axes, f"Error of the predicted {part.replace('_', ' ')}\n{judged}")
     legend_below(axes, 0.22)
-    tidy(axes)
+    tidy(axes, f"Error of the predicted {part.replace('_', ' ')}\n{judged}", grid=True)
 
 
 def _draw_probe(axes: Axes, outside: Mapping[str, Any], names: list[str]) -> None:
@@ -274,6 +267,5 @@ def _draw_probe(axes: Axes, outside: Mapping[str, Any], names: list[str]) -> Non
     axes.set_xticks(places, names, fontsize=8, rotation=45 if len(names) > 4 else 0)
     axes.set_yticks((0, 0.25, 0.5, 0.75, 1))
     axes.set_ylabel("share of variance explained (R²)")
-    set_title(axes, "True actions from latent actions\non the same held-out demonstrations")
     legend_below(axes, 0.22, columnspacing=1)
-    tidy(axes)
+    tidy(axes, "True actions from latent actions\non the same held-out demonstrations")

@@ -80,8 +80,7 @@ def draw_modes(rollouts: Mapping[str, Any], run: RunFacts) -> Figure:
     occurred = f"{int((counts > 0).sum())} of {number} modes, entropy {mode_entropy(mode.tolist(), number):.2f}"
     uniform = f"a uniform choice gives {expected_entropy(len(mode), number):.2f} on average at n = {len(mode)}"
     parts = [occurred] + [uniform] * bool(len(mode)) + [f"{lost} without a mode"] * bool(lost)
-    set_title(axes, ";\n".join((parts[0], "; ".join(parts[1:]))) if few and parts[1:] else "; ".join(parts))
-    tidy(axes)
+    tidy(axes, ";\n".join((parts[0], "; ".join(parts[1:]))) if few and parts[1:] else "; ".join(parts))
     axes.tick_params(axis="x", length=0)
     return figure
 

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from torchrl_koap.reports.pictures import NothingToDraw, picture
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.style import BLUE, FAINT, MUTED, ORANGE, PALE_BLUE, RED, legend_beside, set_title, tidy
+from torchrl_koap.reports.style import BLUE, MUTED, ORANGE, PALE_BLUE, RED, legend_beside, set_title, tidy
 from torchrl_koap.tasks.units import thousandths
 
 _PLANS = {
@@ -68,8 +68,7 @@ def draw_plan_errors(result: Mapping[str, Any], run: RunFacts) -> Figure:
                 axes.plot(steps, values, color=color, linestyle=dash, linewidth=1.6, label=label)
             axes.set_ylim(bottom=0)
             axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
-            axes.grid(axis="y", color=FAINT, linewidth=0.5)
-            tidy(axes)
+            tidy(axes, grid=True)
         pair[0].set_ylabel(f"distance ({shown or 'units of the data'})")
         set_title(pair[0], f"energy score: {_list_names(row['columns'])}")
         set_title(pair[1], f"best of {plan['samples']} plans")
@@ -126,9 +125,8 @@ def _draw_bars(axes: Axes, rows: Sequence[Mapping[str, Any]], unit: str) -> None
     axes.set_xticks(places, [row["name"] for row in rows], rotation=45 if len(rows) > _MANY else 0)
     axes.set_xlim(-0.6, len(rows) - 0.4)
     axes.set_ylabel(f"RMSE ({shown or 'units of the data'})")
-    axes.grid(axis="y", color=FAINT, linewidth=0.5)
     axes.set_axisbelow(True)
-    tidy(axes)
+    tidy(axes, grid=True)
 
 
 def _part(result: Any, name: str) -> Mapping[str, Any]:

@@ -10,27 +10,30 @@ A picture is one decorated function, here or in any other package::
         return figure
 
 The function is called with the content of its source file and the :class:`~torchrl_koap.reports.run_facts.RunFacts`. It
-returns a figure (or a :class:`~torchrl_koap.reports.writing.Film`), which the register writes.
+returns a figure (or a :class:`Film`), which the register writes aside first: an earlier picture is replaced whole.
 """
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
+from torchrl_koap.files import replacing_file
 from torchrl_koap.reports.run_facts import RunFacts
-from torchrl_koap.reports.writing import Film, save_figure, save_film
 
 FOLDER = "plots"
+HOLD_SECONDS = 1.5  # of the last frame of a film
 _BUILT_IN = (
     "rollout_plots",
     "demonstrations",
@@ -50,7 +53,19 @@ _COMMANDS = {
     "inspect.json": "koap inspect {run}",
     "eigenvalues.safetensors": "koap inspect {run}",
 }
-Draw = Callable[[Any, RunFacts], "Figure | Film"]
+
+
+@dataclass(frozen=True)
+class Film:
+    """A moving picture.
+
+    Args:
+        frames (iterable): images ``[height, width, 3]``, uint8, of equal size.
+        seconds (float): how long each is shown; the last one is held for longer.
+    """
+
+    frames: Iterable[np.ndarray]
+    seconds: float
 
 
 class NothingToDraw(ValueError):
@@ -59,6 +74,9 @@ class NothingToDraw(ValueError):
 
 class NotFilmed(RuntimeError):
     """No OpenGL library can be used here; everything else can be drawn."""
+
+
+Draw = Callable[[Any, RunFacts], Figure | Film]
 
 
 @dataclass(frozen=True)
@@ -176,6 +194,27 @@ def draw_pictures(
         elif source.exists() and path.exists() and path.stat().st_mtime < source.stat().st_mtime:
             path.unlink()  # a film of an earlier evaluation beside the figures of this one
     return problems
+
+
+def save_figure(figure: Figure, path: str | Path) -> Path:
+    """Writes a figure as png and returns the file."""
+    path = Path(path)
+    with replacing_file(path) as aside:
+        figure.savefig(aside, format="png", dpi=150, facecolor="white", metadata={"Software": None})
+    return path
+
+
+def save_film(film: Film, path: str | Path) -> Path:
+    """Writes a film as gif and returns the file."""
+    path, frames = Path(path), list(film.frames)
+    with replacing_file(path) as aside:
+        # one palette for all, without dithering: what stands still does not flicker and costs nothing
+        some = Image.fromarray(np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]]))
+        palette = some.quantize(224, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)  # keeps rare colours
+        images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+        times = [round(1000 * film.seconds)] * (len(images) - 1) + [round(1000 * HOLD_SECONDS)]
+        images[0].save(aside, "GIF", save_all=True, append_images=images[1:], duration=times, loop=0)
+    return path
 
 
 def _load(source: Path) -> Any:

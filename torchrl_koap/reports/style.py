@@ -35,8 +35,12 @@ def entry(data: Mapping[str, Any], key: str, shape: Sequence[int | None]) -> np.
     return value
 
 
-def tidy(axes: Axes) -> Axes:
-    """Gives a panel a light frame, small ticks and labels."""
+def tidy(axes: Axes, title: str | None = None, *, grid: bool = False) -> Axes:
+    """Gives a panel a light frame, small ticks and labels; a title flush left and lines across if asked for."""
+    if title is not None:
+        set_title(axes, title)
+    if grid:
+        axes.grid(axis="y", color=FAINT, linewidth=0.5)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):

@@ -173,12 +173,11 @@ def _histogram(axes: Axes, error: np.ndarray, names: Sequence[str], unit: str, l
         axes.hist(np.clip(error[:, column], -reach, reach), bins=41, range=(-reach, reach), **style)
     which = f"all but {', '.join(left_out)}" if left_out else "all"
     size = f"RMSE {_rms(error):.3g} {unit}".rstrip()
-    set_title(axes, f"{which}: {size}, median {np.median(abs(error)):.2g}")
     axes.set_box_aspect(1)
     axes.set_xlabel(f"predicted - recorded ({unit})" if unit else "predicted - recorded")
     axes.set_ylabel("steps")
     legend_beside(axes)
-    tidy(axes)
+    tidy(axes, f"{which}: {size}, median {np.median(abs(error)):.2g}")
 
 
 def _rms(values: np.ndarray) -> float:

@@ -48,14 +48,7 @@ if sys.argv[:1] == ["-c"] and "multiprocessing.forkserver" in sys.modules:  # ho
 class Job:
     """A folder that says what is to be done; what is printed is appended to its ``log.txt``.
 
-    Args:
-        needs (Path, optional): folder of the job that must have succeeded before.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from torchrl_koap.studies.launchers import Job
-        >>> Job(Path("cell"), needs=Path("planner")).log.name
-        'log.txt'
+    ``needs`` is the folder of the job that must have succeeded before.
     """
 
     folder: Path

@@ -36,20 +36,12 @@ class Comparison:
     """How much more often the first of two methods succeeds.
 
     Args:
-        difference (float): mean over contexts of the difference of the success rates, in -1..1.
-        low (float): lower end of its 95 % interval.
-        high (float): upper end.
+        difference (float): mean over contexts of the difference of the success rates, in -1..1, with the ends ``low``
+            and ``high`` of its 95 % interval.
         p (float): two-sided p-value of the hypothesis of no difference.
         contexts (int): number of contexts compared.
         seeds (int): number of training seeds that both methods have.
-        pairs (int): number of pairs of rollouts behind it.
-
-    Examples:
-        >>> from torchrl_koap.studies.paired_comparison import compare
-        >>> same = {0: {(context, 7): True for context in range(6)}}
-        >>> result = compare(same, same)
-        >>> result.difference, result.p, result.seeds, result.pairs
-        (0.0, 1.0, 1, 6)
+        n (int): number of pairs of rollouts behind it.
     """
 
     difference: float
@@ -58,7 +50,7 @@ class Comparison:
     p: float
     contexts: int
     seeds: int
-    pairs: int
+    n: int
 
 
 def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, errors: bool = False) -> Comparison | None:
@@ -127,7 +119,7 @@ def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, erro
         p=sign_flip_p(per_context),
         contexts=len(contexts),
         seeds=len(seeds),
-        pairs=int(count.sum()),
+        n=int(count.sum()),
     )
 
 
@@ -214,17 +206,19 @@ def compare_cells(
         for method in methods:
             if reference in methods and method != reference:
                 result = compare(methods[reference], methods[method], errors=key in offline)
-                named = dict(zip(COMPARISON_COLUMNS, (*key, reference, method), strict=False))
-                known = {} if result is None else asdict(result) | {"n": result.pairs}
-                numbers = {name: known.get(name) for name in COMPARISON_COLUMNS if name not in named}
-                numbers = {name: None if value != value else value for name, value in numbers.items()}  # NaN
-                compared.append(named | numbers | {"n": known.get("n", 0)})
+                known = dict(zip(COMPARISON_COLUMNS, (*key, reference, method), strict=False))
+                known |= {"n": 0} if result is None else asdict(result)
+                compared.append({name: _unless_nan(known.get(name)) for name in COMPARISON_COLUMNS})
     for row, adjusted in zip(compared, holm([row["p"] for row in compared]), strict=True):
         row["p_holm"] = adjusted
     order = list(dict.fromkeys(row["method"] for row in rows))
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     compared.sort(key=lambda row: (tasks.index(row["task"]), *list(row.values())[1:4], order.index(row["method"])))
     return compared
+
+
+def _unless_nan(value: Any) -> Any:
+    return None if value != value else value
 
 
 def p_text(p: float | None) -> str:

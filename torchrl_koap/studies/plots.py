@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, NullLocator
 
+from torchrl_koap.reports.pictures import save_figure
 from torchrl_koap.reports.style import FAINT, INK, set_title, tidy
-from torchrl_koap.reports.writing import save_figure
 from torchrl_koap.studies.paper_results import PaperCell
 from torchrl_koap.studies.summary import Summary, percent
 
@@ -166,8 +166,7 @@ def plot_average(
     _scale_shares(axes, 100)
     title = f"success, 95 % interval: {tasks[0]}" if len(tasks) == 1 else f"mean over {len(tasks)} tasks, 95 % interval"
     hollow = "\nhollow, dashed: the paper, whose demonstrations are others" if any(line.paper for line in lines) else ""
-    set_title(axes, title + hollow)
-    tidy(axes)
+    tidy(axes, title + hollow)
     _name_lines(figure, lines)
     return save_figure(figure, path)
 

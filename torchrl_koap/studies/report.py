@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import csv
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from torchrl_koap.studies.paired_comparison import COMPARISON_COLUMNS, Outcome, 
 from torchrl_koap.studies.paper_results import PaperCell
 from torchrl_koap.studies.plots import plot_measure
 from torchrl_koap.studies.summary import Summary, cell_name, percent, plural, summarise
-from torchrl_koap.studies.table import markdown_table, table_rows, why_not_done
+from torchrl_koap.studies.table import markdown_table, table_rows, why_not_done, write_csv
 from torchrl_koap.tasks import get_task
 from torchrl_koap.tasks.units import thousandths
 from torchrl_koap.training.methods import METHODS
@@ -89,10 +88,7 @@ def write_study_report(
     compared = compare_cells(rows, outcomes or {}, reference=reference)
     with replacing_file(folder / "table.md") as aside:
         aside.write_text(markdown_table(rows), encoding="utf-8")
-    with replacing_file(folder / "comparisons.csv") as aside, aside.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COMPARISON_COLUMNS)
-        writer.writeheader()
-        writer.writerows(compared)
+    write_csv(folder / "comparisons.csv", COMPARISON_COLUMNS, compared)
     times, total = _times(rows)
     offline = any(item.offline for item in summaries)
     return write_page(

@@ -16,20 +16,23 @@ from tensordict import TensorDictBase
 from torchrl_koap.data import flatten_trajectories, save_ted, subsample_trajectories
 from torchrl_koap.evaluation import EvalConfig
 from torchrl_koap.runs.config import TrainConfig
-from torchrl_koap.runs.config_files import to_json
+from torchrl_koap.runs.config_files import from_json, to_json
 from torchrl_koap.runs.progress import count_up_to, progress_bar
 from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.studies.cells import Cell, cell_row, prepare_cell, read_result, run_cell
-from torchrl_koap.studies.folder import FILE, check_folder, flat_options, read_study, together
 from torchrl_koap.studies.launchers import Job, Machines, launch
 from torchrl_koap.studies.paper import write_paper_layout
 from torchrl_koap.studies.paper_results import paper_points
 from torchrl_koap.studies.report import write_study_report
-from torchrl_koap.studies.study import Study, check_study, complete
+from torchrl_koap.studies.study import Study, check_study, complete, union
 from torchrl_koap.studies.table import write_cells
 from torchrl_koap.tasks import Task, get_task
 from torchrl_koap.training.datasets import label_budget, load_demonstrations
 
+_FILE = "study.json"
+# what a later call may add to; all else must be as it was
+_LISTS = ("tasks", "datasets", "planners", "methods", "labels", "levels", "demonstrations")
+_MAY_CHANGE = (*_LISTS, "seeds", "first_seed_only", "out", "run.plugins")
 _EVERY = 1.0  # least time (s) between two writes of the table
 
 
@@ -75,18 +78,18 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
         ValueError: unknown method 'kaop'; did you mean 'koap'?
     """
     machines = Machines() if machines is None else machines
-    before = read_study(study.out)
+    before = _read_study(study.out)
     study = complete(study, () if before is None else before.run.plugins)
     cells, root = check_study(study), RunDirectory(study.out)
-    check_folder(study)
+    _check_folder(study)
     for name in study.tasks:
         _check_labels(study, cells, name, _first_look(study, study.task(name)))
     with root.locked("koap curve", "lock"):
-        check_folder(study)  # another one may have finished here in the meantime
+        _check_folder(study)  # another one may have finished here in the meantime
         for name in study.tasks:
             _record(study, cells, name)
-        whole = together(study)
-        root.write_json(FILE, to_json(replace(whole, out=Path())))
+        whole = _together(study)
+        root.write_json(_FILE, to_json(replace(whole, out=Path())))
         asked = set(cells)
         earlier = [cell for cell in whole.cells() if cell not in asked and _began(study.out / cell.folder)]
         table = _Table(study, [*cells, *earlier])
@@ -98,6 +101,66 @@ def run_study(study: Study, machines: Machines | None = None) -> StudyResult:
     return StudyResult(rows, counts, report)
 
 
+def _read_study(folder: Path) -> Study | None:
+    """Reads what an earlier call in a folder asked for, None if there was none.
+
+    Raises:
+        RunDirectoryError: if ``study.json`` is damaged.
+    """
+    run = RunDirectory(folder)
+    if not (run.path / _FILE).exists():
+        return None
+    return from_json(Study, run.read_json(_FILE), run.path / _FILE)
+
+
+def _together(study: Study) -> Study:
+    """A complete study and what earlier calls in its folder asked for besides."""
+    earlier = _read_study(study.out)
+    if earlier is None:
+        return study
+    lists: dict[str, Any] = {name: union(vars(earlier)[name], vars(study)[name]) for name in _LISTS}
+    first_seed_only = tuple(level for level in study.first_seed_only if level in earlier.first_seed_only)
+    return replace(study, **lists, seeds=max(study.seeds, earlier.seeds), first_seed_only=first_seed_only)
+
+
+def _check_folder(study: Study) -> None:
+    """Refuses a folder that holds something else, or a study with other settings.
+
+    Raises:
+        RunDirectoryError: naming what differs.
+    """
+    path, earlier = study.out, _read_study(study.out)
+    if earlier is None:
+        if path.exists() and not path.is_dir():
+            raise RunDirectoryError(f"{path} is a file; choose another --out")
+        # what a study leaves that was killed before it came to write its options
+        own = ("lock", "demonstrations", f".{_FILE}.")
+        if path.exists() and not all(entry.name.startswith(own) for entry in path.iterdir()):
+            raise RunDirectoryError(f"{path} is not empty and no folder of `koap curve`; choose another --out")
+        return
+    was, now = (_flat_options(to_json(options)) for options in (earlier, study))
+    changed = [name for name in now if name not in _MAY_CHANGE and was[name] != now[name]]
+    for name, before, after in (
+        ("datasets", earlier.given_dataset, study.given_dataset),
+        ("planners", earlier.given_planner, study.given_planner),
+    ):
+        if any(before(task) != after(task) for task in {*earlier.tasks} & {*study.tasks}):
+            changed.append(name)
+    if changed:
+        values = [", ".join(map(str, was[name])) if isinstance(was[name], list) else was[name] for name in changed]
+        told = ", ".join(f"{name} ({value})" for name, value in zip(changed, values, strict=True))
+        raise RunDirectoryError(f"{path} holds a study with another {told}; choose another --out")
+
+
+def _flat_options(options: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Options of all sections together, each by its name with the section."""
+    flat: dict[str, Any] = {}
+    for name, value in options.items():
+        inside = isinstance(value, Mapping)
+        flat |= _flat_options(value, f"{prefix}{name}.") if inside else {prefix + name: value}
+    return flat
+
+
 def _report(study: Study, table: _Table) -> Path:
     """Writes the page; label levels of windows stand beside the paper's figures."""
     rows, paper, layout = list(table.rows.values()), [], None
@@ -105,7 +168,7 @@ def _report(study: Study, table: _Table) -> Path:
         paper = [point for task in study.tasks for point in paper_points(task)]
         layout = write_paper_layout(study.out, rows) if study.levels else None
     named = study.tasks[0] if len(study.tasks) == 1 else f"{len(study.tasks)} tasks"
-    options = {name: value for name, value in flat_options(to_json(study)).items() if value not in (None, [])}
+    options = {name: value for name, value in _flat_options(to_json(study)).items() if value not in (None, [])}
     title = f"Label efficiency on {named}"
     return write_study_report(study.out, rows, table.outcomes, title=title, options=options, paper=paper, layout=layout)
 

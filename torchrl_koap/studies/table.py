@@ -53,15 +53,21 @@ def write_cells(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     Raises:
         ValueError: for another column than :data:`CELL_COLUMNS`, or an unknown status.
     """
-    path = Path(path)
     for row in rows:
         for name in row:
             lookup(CELL_COLUMNS, name, "column of a cell")
         lookup(STATUSES, row.get("status"), "status of a cell")
+    return write_csv(
+        Path(path), CELL_COLUMNS, [{name: _written(row.get(name)) for name in CELL_COLUMNS} for row in rows]
+    )
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Path:
+    """Writes rows as csv, aside first."""
     with replacing_file(path) as aside, aside.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, CELL_COLUMNS)
+        writer = csv.DictWriter(file, columns)
         writer.writeheader()
-        writer.writerows({name: _written(row.get(name)) for name in CELL_COLUMNS} for row in rows)
+        writer.writerows(rows)
     return path
 
 
