@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import math
 import sys
@@ -64,19 +65,6 @@ def check_options(options: Any) -> None:
 
     Raises:
         ValueError: for numbers that are NaN, infinite or beyond 2^53, and an ``out`` that lies below a file.
-
-    Examples:
-        >>> from dataclasses import dataclass
-        >>> from torchrl_koap.commands.options import check_options
-        >>> @dataclass
-        ... class Options:
-        ...     label_fraction: float
-        >>> check_options(Options(0.5))
-        >>> try:
-        ...     check_options(Options(float("nan")))
-        ... except ValueError as error:
-        ...     print(error)
-        --label-fraction must be a finite number, got nan
     """
     for field in fields(options):
         value, option = getattr(options, field.name), f"--{field.name.replace('_', '-')}"
@@ -133,18 +121,11 @@ def expand(words: Sequence[str]) -> list[str]:
 
 
 def _kind_of(labels: str) -> str:
-    try:
-        int(labels)
-        return "count"
-    except ValueError:
-        pass
-    try:
-        float(labels)
-        return "fraction"
-    except ValueError:
-        raise ValueError(
-            f"--labels must be a number of trajectories such as 5, or a share such as 0.02, got {labels!r}"
-        ) from None
+    for kind, number in (("count", int), ("fraction", float)):
+        with contextlib.suppress(ValueError):
+            number(labels)
+            return kind
+    raise ValueError(f"--labels must be a number of trajectories such as 5, or a share such as 0.02, got {labels!r}")
 
 
 def _words_of(path: Path, without: set[str]) -> list[str]:

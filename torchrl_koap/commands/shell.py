@@ -31,14 +31,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def describe_interrupt(error: KeyboardInterrupt) -> tuple[str, int]:
-    """Returns what to say of an interrupt, and the exit status that shells expect of it.
-
-    Examples:
-        >>> import signal
-        >>> from torchrl_koap.commands.shell import Interrupted, describe_interrupt
-        >>> describe_interrupt(Interrupted(signal.SIGTERM))[0].partition(";")[0]
-        'interrupted by SIGTERM'
-    """
+    """Returns what to say of an interrupt, and the exit status that shells expect of it."""
     number = error.number if isinstance(error, Interrupted) else signal.SIGINT
     by = "" if number == signal.SIGINT else f" by {signal.Signals(number).name}"
     return f"interrupted{by}; {KEPT}", 128 + number
