@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from command_calls import fails
 from late_files import wait_until
 from tiny_runs import koap
 
@@ -78,15 +79,6 @@ def curve(whole_curve, tmp_path):
     folder = tmp_path / "curve"
     shutil.copytree(whole_curve, folder)
     return folder
-
-
-def fails(capsys, *arguments):
-    """The one line of a command that cannot be done."""
-    capsys.readouterr()
-    assert koap(*arguments) == 1
-    out, err = capsys.readouterr()
-    assert out == "" and len(err.strip().splitlines()) == 1 and err.startswith("koap: "), err
-    return err
 
 
 def test_what_a_curve_writes(whole_curve):

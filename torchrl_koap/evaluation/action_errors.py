@@ -208,11 +208,8 @@ def errors_of_chunks(
 def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, task: Task) -> dict[str, Any]:
     """Takes root mean squared errors by column and by unit, and as shares of those of the mean action.
 
-    Args:
-        models (dict): name to predicted actions ``[N, act]``; ``"mean_action"`` is what ``"controller"`` has to beat.
-        true (Tensor): recorded actions ``[N, act]``.
-        episode (Tensor): trajectory of every step ``[N]``.
-        task (Task): names and units of the actions.
+    Of predicted actions ``[N, act]``, recorded ones ``[N, act]`` and the trajectory of every step ``[N]``;
+    ``"mean_action"`` is what the model ``"controller"`` has to beat.
 
     Returns:
         dict: ``labels``, ``trajectories``; ``relative``: the controller's error as a share of that of the mean action,

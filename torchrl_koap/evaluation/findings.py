@@ -91,13 +91,10 @@ def _describe_experiments(result: Mapping[str, Any]) -> str:
 def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
     """Says what is wrong with the latent dynamics as a model of the motion; an empty list if nothing is.
 
-    The errors of the last predicted step are compared, by the first part of the state. A latent model is faulted for an
+    The errors of :func:`~torchrl_koap.evaluation.latent_space.prediction_errors` after the last step are compared, by
+    the first part of the state. A latent model is faulted for an
     error above twice that of a linear model on raw states (fitted on the same inputs), for one above standing still,
     and for losing more by mapping states back than the linear model errs in all.
-
-    Args:
-        multi_step (mapping): by model of :data:`MODELS` and part of the state the errors after 1, 2, ... steps, as of
-            :func:`~torchrl_koap.evaluation.latent_space.prediction_errors`.
 
     Examples:
         >>> from torchrl_koap.evaluation.findings import latent_faults
@@ -121,10 +118,6 @@ def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
 
 def offline_faults(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[str]:
     """Says what is worse than what needs no learning at all, by the figures of an offline evaluation.
-
-    Args:
-        plan (mapping): of :func:`~torchrl_koap.evaluation.plan_errors.plan_errors`, or a note.
-        action (mapping): by split, of :func:`~torchrl_koap.evaluation.action_errors.summarise_errors`, or a note.
 
     Examples:
         >>> from torchrl_koap.evaluation.findings import offline_faults

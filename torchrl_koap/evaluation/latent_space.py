@@ -65,11 +65,8 @@ def infer_steps(controller: KoopmanInverseDynamics, data: TensorDictBase) -> Ten
 def split_trajectories(episode: Tensor, labelled: Tensor, *, seed: int = 0) -> Tensor:
     """Draws the numbers of half of the trajectories, to fit on, those with a label in the budget first.
 
-    The other half is then new to a decoder fitted within the budget too, as far as the budget leaves so many.
-
-    Args:
-        episode (Tensor): trajectory of every step ``[N]``.
-        labelled (Tensor): steps labelled in the budget, bool ``[N]``.
+    The other half is then new to a decoder fitted within the budget too, as far as the budget leaves so many. Of every
+    step are given its trajectory ``[N]`` and whether the budget labels it ``[N]``.
 
     Raises:
         ValueError: if there is only one trajectory.
@@ -185,13 +182,10 @@ def explained(predicted: Tensor, true: Tensor) -> list[float]:
 
 
 def probe(latent: Tensor, action: Tensor, groups: Tensor, fit: Tensor) -> list[float]:
-    """Returns the ``R^2`` of a linear map from latent to true actions, fitted on some steps, tested on the others.
+    """Returns the ``R^2`` of a linear map from latent ``[N, m]`` to true actions ``[N, act]``, all of which are read.
 
-    Args:
-        latent (Tensor): latent actions ``[N, m]``.
-        action (Tensor): true actions ``[N, act]``; all of them are read.
-        groups (Tensor): trajectory of every step ``[N]``, by which the ridge is chosen.
-        fit (Tensor): steps to fit on, bool ``[N]``.
+    It is fitted on the steps ``fit`` (bool ``[N]``) and tested on the others; ``groups`` are the trajectories ``[N]``
+    by which the ridge is chosen.
     """
     if fit.all() or not fit.any():
         raise ValueError(f"a probe is fitted on some steps and tested on others, got {int(fit.sum())} of {len(fit)}")
@@ -206,16 +200,13 @@ def analyse_latent(
     *,
     horizon: int = 10,
 ) -> dict[str, Any]:
-    """Measures spectrum, multi-step errors and what a linear probe explains.
+    """Measures spectrum, multi-step errors (fewer steps where trajectories are short) and what a linear probe explains.
 
     Args:
         controller (KoopmanInverseDynamics): the model, in evaluation mode, on the device of the data.
         data (TensorDictBase): flat ``[N]`` with all labels that there are, as the controller sees them.
         labelled (Tensor): steps labelled in the budget, bool ``[N]``.
         parts (mapping): columns of the state by name.
-
-    Keyword Args:
-        horizon (int): steps to predict; fewer where trajectories are shorter.
 
     Returns:
         dict: ``eigenvalues``, ``multi_step``, and under :data:`OUTSIDE_THE_BUDGET`

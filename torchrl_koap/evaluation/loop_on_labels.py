@@ -55,16 +55,8 @@ def check_loop(
     """Rolls a policy out on a ridge regression of the change of states, from recorded starts.
 
     The policy acts without limits first, which says whether it is stable by itself; if a command leaves its range, it
-    acts once more with them.
-
-    Args:
-        trained (Trained): the run.
-        data (TensorDictBase): flat data ``[N]`` with all labels that there are, which the ridge is fitted to.
-        labelled (TensorDictBase): the same after the label budget was applied: its commands are the demonstrated ones.
-
-    Keyword Args:
-        execution (ExecutionConfig, optional): how plans are to become actions. Default: as it was trained for.
-        seed (int): seed of the plans' noise.
+    acts once more with them. The ridge is fitted to all labels of the flat data ``[N]``; the demonstrated commands are
+    those of the label budget (``labelled``).
 
     Returns:
         dict: ``steps``, ``robots``, ``explained`` (share of the changes' variance on labels left out),

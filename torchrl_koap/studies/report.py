@@ -74,8 +74,7 @@ def write_study_report(
         outcomes (mapping, optional): of :func:`~torchrl_koap.studies.paired_comparison.compare_cells`.
 
     Keyword Args:
-        title (str): heading.
-        options (mapping, optional): of the study.
+        title, options: heading and options of the study.
         paper (sequence of PaperCell): of :func:`~torchrl_koap.studies.paper_results.paper_points`.
         reference (str): method that all others are compared with.
         layout (mapping, optional): of :func:`~torchrl_koap.studies.paper.write_paper_layout`, in place of ``paper``.

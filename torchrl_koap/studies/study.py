@@ -178,11 +178,7 @@ def _of_task(values: Sequence[str], task: str) -> str | None:
 
 
 def complete(study: Study, plugins: Sequence[str] = ()) -> Study:
-    """Fills in what the preset and the library know; paths become absolute.
-
-    Args:
-        study (Study): what was asked for.
-        plugins (sequence of str): those of earlier calls in the folder.
+    """Fills in what preset and library know, and the plugins of earlier calls in the folder; paths become absolute.
 
     Raises:
         ValueError: for an unknown preset or task, or a data set that is no folder.
@@ -246,12 +242,7 @@ def _by_task(name: str, values: Sequence[str], tasks: Sequence[str]) -> Iterator
 
 
 def union(one: Sequence[Any], other: Sequence[Any]) -> tuple[Any, ...]:
-    """The entries of two sequences, each once.
-
-    Args:
-        one (sequence): these first.
-        other (sequence): these behind.
-    """
+    """The entries of one sequence, then those of the other, each once."""
     return tuple(dict.fromkeys([*one, *other]))
 
 
