@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The networks of KOAP's first public code as methods of their own, in one file (docs/first_code.md).
+"""The networks of KOAP's first public code as methods of their own, in one file (docs/variants.md).
 
     PYTHONPATH=benchmarks koap train --plugin first_code --method first_code --dataset DIR --out runs/first_code
 

@@ -1,6 +1,6 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """
-Which controller? What labels and unlabelled data buy
+Which controller? What labels and unlabelled data add
 =====================================================
 
 **What you will learn**
@@ -16,7 +16,7 @@ Run it with ``python tutorials/compare_controllers.py``; it leaves ``compare_con
 # One set of demonstrations, several budgets
 # ------------------------------------------
 # ``LabelBudget`` hides every action outside the budget. With one seed a larger budget contains every smaller one, so
-# that curves are not driven by luck of the draw; three seeds say how much of a difference is such luck.
+# that curves do not depend on the draw. Three seeds show how much of a difference is chance.
 
 import statistics
 
@@ -117,11 +117,11 @@ for name, title in titles.items():
     print(f"{title:30}" + "".join(f"{cell:>22}" for cell in cells))
 
 # %%
-# What did the unlabelled data buy?
+# What did the unlabelled data add?
 # ---------------------------------
 # Read the last lines in pairs, draw by draw. ``koap`` against ``koap_labelled_only``: the same network, with and
 # without the 47 demonstrations that have no labels. ``koap`` against ``koap_untrained``: the same features, random
-# instead of trained. Where an interval crosses 0 nothing was bought, however good the method looks beside a ridge.
+# instead of trained. Where an interval crosses 0 there is no significant difference.
 
 print("\ndifference to KOAP in mm, draw by draw (below 0: better than KOAP)")
 for name in ("koap_untrained", "koap_labelled_only", "linear_steps", "dd_lookahead"):
@@ -156,9 +156,9 @@ figure.savefig("compare_controllers.png", dpi=90)
 # ----------
 # The three lines of KOAP lie on each other: with its features random, or without the 47 demonstrations that have no
 # labels, it is as good. On Avoiding the scaled inputs, the Fourier features and the closed-form decoder do the work;
-# the Koopman loss and the unlabelled data buy nothing that is seen here. They are shown 150 updates, but the committed
+# the Koopman loss and the unlabelled data add nothing that is seen here. They are shown 150 updates, but the committed
 # study with 1,000 says the same. A comparison without these controls would have credited the loss with all of it.
 # Supervised networks and the plain ridge need more labels for less. Small actions or large ones make no difference.
 #
 # An action error is not a success rate: ``koap curve`` puts planner, controller and environment together, over seeds,
-# with intervals and paired comparisons. Unlabelled data are what the *planner* lives on.
+# with intervals and paired comparisons. Unlabelled data train the *planner*.

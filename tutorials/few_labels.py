@@ -16,7 +16,7 @@ Run it with ``python tutorials/few_labels.py``; it takes about a minute and leav
 # Demonstrations, most of them without actions
 # --------------------------------------------
 # Scripted players steer the Panda's rod around six cylinders. The label budget keeps the actions of two of the 48
-# trajectories. Everywhere else the action is NaN and ``has_action`` is False: a leak would be loud.
+# trajectories. Everywhere else the action is NaN and ``has_action`` is False: a leak gives NaN losses.
 
 from pathlib import Path
 
@@ -81,7 +81,7 @@ print(f"decoder: penalty {fit['penalty']:g}, {fit['labels_used']} labels used")
 # %%
 # A planner over states
 # ---------------------
-# It never sees an action. Recovery augmentation shows it states beside the demonstrations together with the way back.
+# It never sees an action. Recovery augmentation shows it states off the demonstrated path, and the way back.
 
 planner = StatePlanner(TemporalUnet(2, 4), state_dim=2, relative=False, clip=1.2, num_steps=5)
 extended = extrapolate_ends(data, 13)

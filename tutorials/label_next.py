@@ -6,7 +6,7 @@ Which demonstration to label next
 **What you will learn**
 
 * why the next labels can be chosen before anybody has made them,
-* how much a chosen label is worth beside one drawn at random, and how to tell that from luck.
+* how much a chosen label lowers the error against one drawn at random, and how much of that is chance.
 
 Run it with ``python tutorials/label_next.py``; it leaves ``label_next.png`` behind.
 """
@@ -69,10 +69,10 @@ def choose(criterion, first, count):
 
 
 # %%
-# What it is worth
-# ----------------
+# What it gains
+# -------------
 # Errors are measured on demonstrations that no method was given labels of: the same twelve for all, kept out of every
-# choice. Six different first labels say how much is luck of the start.
+# choice. Six different first labels show how much is chance.
 
 judged = every[-12:]
 pool = torch.isin(demonstrations["episode"], torch.tensor(every[:-12]))
@@ -111,5 +111,5 @@ figure.savefig("label_next.png", dpi=90)
 # Conclusion
 # ----------
 # ``koap suggest RUN --count 5`` does this for a trained run and prints the command that labels exactly those. On
-# Avoiding the choice is worth a few per cent of the error, as most demonstrations show the same motions; read the
+# Avoiding the choice lowers the error by a few percent, as most demonstrations show the same motions; read the
 # spread of the pale lines before believing more. Where demonstrations differ widely there is more to choose.

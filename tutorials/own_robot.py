@@ -15,9 +15,9 @@ Run it with ``python tutorials/own_robot.py``; it leaves ``own_robot.png`` behin
 # %%
 # What was recorded
 # -----------------
-# Stand in your own recordings here: frames ``[T, d]`` of every trajectory, and commands ``[T - 1, a]`` of the few where
-# they were written down. In this example the robot is an arm of two joints that follows velocity commands with a lag,
-# and a person moved it to a goal, around an upright pole, on either side.
+# Put your own recordings here: frames ``[T, d]`` of every trajectory, and commands ``[T - 1, a]`` of the few that have
+# them. In this example the robot is an arm of two joints that follows velocity commands with a lag. A person moved it
+# to a goal, around an upright pole, on either side.
 
 import tempfile
 from pathlib import Path
@@ -149,6 +149,5 @@ figure.savefig("own_robot.png", dpi=90)
 # ----------
 # Sixty trajectories showed where to go and three how to get there. For the trials that miss, a longer training of the
 # planner (the default is more than ten times as long) is the first thing to try. The time per tick is that of the
-# machine that made this page, beside other work; an ``AsynchronousAgent`` plans in a thread. From the shell it is
-# ``koap convert``, ``koap train`` and ``koap eval``, which judge plans and commands on trajectories that were held
-# out, and say so in a report.
+# machine that made this page. An ``AsynchronousAgent`` plans in a thread. From the shell it is ``koap convert``, ``koap
+# train`` and ``koap eval``. They report errors of plans and commands on held-out trajectories.

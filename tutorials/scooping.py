@@ -16,9 +16,9 @@ Run it with ``python tutorials/scooping.py``; it needs the extra ``vision`` and 
 # %%
 # Two kinds of videos
 # -------------------
-# A spoon takes pieces out of a bowl, ten frames a second. The robot's recordings come with joint targets, of which
-# all but five demonstrations will be hidden; the hand has neither joints nor labels, another look, another speed and
-# other ways to approach. From the shell this is ``koap demos --task scooping --embodiment robot``, or ``hand``.
+# A spoon takes pieces out of a bowl, ten frames a second. The robot's recordings come with joint targets. They will be
+# hidden in all but five demonstrations. The hand has neither joints nor labels. It differs in look, speed and
+# approach. From the shell this is ``koap demos --task scooping --embodiment robot``, or ``hand``.
 
 import tempfile
 from pathlib import Path
@@ -52,8 +52,8 @@ for embodiment in ("robot", "hand"):
 # --------------------
 # EfficientNet-Lite0 has seen ImageNet and nothing else. Averages over a coarse grid keep where things are; their
 # principal components are fitted on these frames, without any label. A linear map from embeddings to the spoon's
-# position tells what they keep of it: it is fitted on three quarters of the robot's videos and judged on the others.
-# The policy has no part in that; it never sees the position.
+# position tells what they keep of it. It is fitted on three quarters of the robot's videos and tested on the others.
+# The policy never sees the position.
 
 sources = [Source(folder / embodiment) for embodiment in ("robot", "hand")]
 components = fit_projection(FrozenImageEncoder(backbone), sources, EMBEDDING_DIM)
@@ -71,9 +71,9 @@ print(f"{len(components.mean)} features, {EMBEDDING_DIM} components: the spoon's
 # %%
 # A planner of all videos, controllers of five demonstrations
 # ------------------------------------------------------------
-# The planner looks at no action, so the hand's videos count as much as the robot's. Controllers look at the
-# embeddings of all videos and at the joint targets of the five: ridge on raw frames, KOAP, and KOAP whose features
-# stay random (no training, the same decoder), which is the control.
+# The planner reads no action, so the hand's videos count as much as the robot's. Controllers read the embeddings of all
+# videos and the joint targets of the five. There are three of them: ridge on raw frames, KOAP, and the control, KOAP
+# with random features.
 
 data, labels = LabelBudget(episodes=range(LABELLED)).apply(stored)
 print(f"labels: {labels.labelled_transitions} of {labels.total_transitions} steps")
@@ -88,7 +88,7 @@ for name, steps in updates.items():
 # Scooping
 # --------
 # Fifteen trials from the three start positions. Joint targets are decoded once per plan
-# (``task.defaults.execution``): an error of a place that is read off every frame anew would act as a velocity.
+# (``task.defaults.execution``). Read off every frame anew, an error of a position would act as a velocity.
 
 
 def trials(trained):
@@ -111,8 +111,8 @@ for name, each in trained.items():
     print(f"{name:14} over the rim {over} of {TRIALS}, with a piece {taken}: {rate:.0f} % ({low:.0f}-{high:.0f})")
 
 # %%
-# Films above: a hand's video, a robot's, and a trial of KOAP, which takes a piece if any trial did. Below: success
-# with 95 % intervals, and how high KOAP's spoon was.
+# Films above: a hand's video, a robot's, and a trial of KOAP. It takes a piece if any trial did. Below: success with
+# 95 % intervals, and how high KOAP's spoon was.
 
 tried = sorted(episodes["koap"], key=lambda episode: not episode["next", "success"].any())
 films = {"a hand's video": sources[1].read()[0].frames, "a robot's video": sources[0].read()[0].frames}
@@ -141,11 +141,11 @@ figure.savefig("scooping.png", dpi=90)
 # %%
 # Conclusion
 # ----------
-# A network trained on other pictures, videos most of which have no actions, and five labelled demonstrations: the
-# spoon comes over the bowl, and it leaves with a piece in most trials. What a set of this size does not tell is which
-# controller is best: the intervals overlap, and features that stay random do about as well as those that were trained.
-# Nor are they told apart in the study with four times the videos, ``docs/results/scooping.md``.
+# The network was trained on other pictures, and five demonstrations have labels. The spoon comes over the bowl, and it
+# leaves with a piece in most trials. A set of this size does not tell which controller is best: the intervals
+# overlap. Random features do about as well as trained ones, also in the study with four times the videos,
+# ``docs/results/scooping.md``.
 #
-# From the shell: ``koap demos --task scooping --embodiment robot --out robot``, the same with ``hand``, then ``koap
+# From the shell: ``koap demos --task scooping --embodiment robot --out robot``, the same with ``hand``. Then ``koap
 # embed robot hand --mixed --out data``, ``koap train --task scooping --dataset data --labels.episodes 0 1 2 3 4`` and
 # ``koap eval``.

@@ -21,15 +21,17 @@ from pages import (
 
 from torchrl_koap.envs.gym import IDS
 from torchrl_koap.lookup import resolve
-from torchrl_koap.tasks import Task
+from torchrl_koap.runs.config import TrainConfig
+from torchrl_koap.tasks import Action, Task
 from torchrl_koap.tasks.registry import TASKS
+from torchrl_koap.training.defaults import resolve as default_config
 
 UNITS = {"quaternion": "1 (quaternion w, x, y, z)", "tan_yaw": "1 (tangent of the yaw)"}
 
 
 def setup(app: Any) -> dict[str, Any]:
     """Called by Sphinx."""
-    app.connect("builder-inited", lambda app: write_task_pages())
+    app.connect("builder-inited", lambda app: (write_task_pages(), write_defaults()))
     return {"parallel_read_safe": True}
 
 
@@ -188,6 +190,29 @@ def measured_blocks(task: Task) -> list[str]:
     shown = ("koap", task.defaults.method, "mpc", "linear_steps")
     rows = [row for row in benchmark_rows(task=task.name) if row["method"] in shown]
     return [heading("Measured", 1), measured_table(rows, "method"), "More: :doc:`/results`."]
+
+
+def write_defaults() -> None:
+    """Writes ``generated/defaults``: the options of a training of each task, and of your own data."""
+    own = Task(name="your own data", observation_parts={"x": 4}, actions={"u": Action()}, position="x", robot=(0, 1))
+    rows = []
+    for task in (own, *TASKS.values()):
+        config = default_config(TrainConfig(out="unused"), task)
+        planner, controller, execution = config.planner, config.controller, config.execution
+        size = f"{planner.steps:,} x {planner.batch_size}"
+        way = (
+            f"{execution.strategy}, {execution.replan_interval}, {execution.blend}, {execution.lead}, {execution.gain}"
+        )
+        names = (f"``{task.name}``" if task is not own else task.name, config.method, controller.preset)
+        rows.append((*names, planner.network, size, planner.learning_rate, controller.steps, way))
+    way = "execution: strategy, replan interval, blend, lead, gain"
+    head = ("task", "method", "preset", "planner", "updates x batch", "learning rate", "controller updates", way)
+    write_page(
+        "defaults",
+        heading("Defaults by task"),
+        "Made from the code. A planner updates at most this often; data of your own stop earlier.",
+        table(head, rows),
+    )
 
 
 def draw(task: Task) -> None:

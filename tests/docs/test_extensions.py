@@ -145,6 +145,12 @@ def test_success_never_stands_without_its_interval():
     assert "mpc" in "".join(task_pages.measured_blocks(task_pages.TASKS["avoiding"]))
 
 
+def test_defaults_of_every_task_are_a_page(generated):
+    task_pages.write_defaults()
+    page = (generated / "defaults.rst").read_text()
+    assert all(f"``{name}``" in page for name in task_pages.TASKS) and "your own data" in page and "3,000 x" in page
+
+
 def test_tables_keep_several_lines_in_a_cell():
     assert pages.table(("a", "b"), [("1", "x\ny")]).splitlines()[-2:] == ["     - x", "       y"]
     assert pages.table(("a",), []) == ""

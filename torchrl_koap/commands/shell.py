@@ -19,7 +19,7 @@ KEPT = "`koap train --resume` goes on from its last checkpoint, `koap demos` and
 
 
 class ReadEnough(Exception):
-    """Whoever reads what is printed has gone."""
+    """The reader of the output has gone."""
 
 
 class Interrupted(KeyboardInterrupt):

@@ -194,7 +194,7 @@ def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> lis
 
 
 def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | None]:
-    """Says how long a plan is beside the demonstrations.
+    """Says how long a plan and the demonstrations last.
 
     Args:
         data (TensorDictBase): flat data ``[N]``.

@@ -82,7 +82,7 @@ class OracleFollower(Follower):
         base = env.base_env if isinstance(env, TransformedEnv) else env
         if not isinstance(base, EpisodeState):
             raise ValueError(
-                f"the oracle controller needs an environment that simulates actions, {type(base).__name__} does not"
+                f"strategy 'oracle' needs an environment that simulates actions, {type(base).__name__} does not"
             )
         count, size = base.batch_size[0], len(self._changes)
         self._env, self._time, self._last = base, 0, np.zeros((count, size))

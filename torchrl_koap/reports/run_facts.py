@@ -83,7 +83,7 @@ class RunFacts:
 
     @property
     def offline(self) -> bool:
-        """Whether the task has no environment, so that recorded data say what the run is worth."""
+        """Whether the task has no environment, so that recorded data say how good the run is."""
         return self.task is not None and self.task.env is None
 
     @property

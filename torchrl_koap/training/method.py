@@ -21,7 +21,7 @@ SEES = ("all", "labelled")
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of training.
+    """One stage of a training: its loss, and the windows that it reads.
 
     Args:
         name (str): its name in the log.

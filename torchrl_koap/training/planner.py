@@ -122,7 +122,7 @@ def learn_planner(
 
 
 def check_interval(section: PlannerConfig, solver_steps: int) -> int:
-    """Updates between two scores, such that scores take a twentieth of the time; an update costs three forward passes.
+    """Updates between two scores, so that scores take 5 % of the time; an update costs three forward passes.
 
     Args:
         section (PlannerConfig): nothing left open.

@@ -16,7 +16,7 @@ from torchrl_koap.tasks.scooping import FRAME_HZ, START_HEIGHT, STARTS
 
 @dataclass(frozen=True)
 class Habits:
-    """How an embodiment moves.
+    """Speed, path and height of an embodiment that moves the spoon.
 
     Args:
         speed (float): of the spoon in the air (m/s).

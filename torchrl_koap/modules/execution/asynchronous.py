@@ -16,7 +16,7 @@ from torchrl_koap.modules.execution.policy import PlanningPolicy
 
 
 class AsynchronousAgent(Agent):
-    """Acts with a plan while the next one is made; what is executed meanwhile binds the new plan.
+    """Agent that follows a plan while a thread makes the next one.
 
     ::
 

@@ -1,0 +1,128 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""Pages are short and plain: a budget of words, short sentences, none of the words that hide what is meant."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+BUDGET = 14_000  # words in the navigation, tables included, code not
+LONGEST_MEAN = 18  # words a sentence
+OUTSIDE = {"appendix", "generated", "outputs", "extensions", "_static"}
+PAGES = sorted(page for page in DOCS.rglob("*.md") if not OUTSIDE & set(page.relative_to(DOCS).parts))
+# looked up, not read
+REFERENCE = {"d3il.md", "tasks.md", "methods.md", "glossary.md", "changelog.md", "conduct.md"}
+BANNED = re.compile(
+    r"\b(told apart|pays?|paid|buys?|bought|(is|are) worth|money|honest(ly)?|leash|by heart|luck(y|ily)?|loud(ly)?"
+    r"|in force|of before|the former|was wanted|tried and not kept|for the first time|in the wild|in secret"
+    r"|postures?|oracles?|regimes?|beside the demonstrations|random play|ledgers?|keeps? its bits|embodies"
+    r"|imagin(es?|ed)|dealt|forgives?|punish(es)?|verdicts?|foresee[sn]?|foresight|doubts?"
+    r"|a (tenth|hundredth|fiftieth|twentieth|third|quarter|fifth) of)\b",
+    re.IGNORECASE,
+)
+
+
+def text_of(page: Path) -> str:
+    """A page with what it includes."""
+
+    def included(found: re.Match[str]) -> str:
+        return (page.parent / found[1]).read_text()
+
+    return re.sub(r"```\{include\} (\S+)\n(?::[^\n]*\n)*```", included, page.read_text())
+
+
+def text_of_tutorial(file: Path) -> list[str]:
+    """Title and text of a tutorial, and its comments between cells."""
+    lines = [line.removeprefix("#").strip() for line in re.findall(r"^# ?.*$", file.read_text(), re.MULTILINE)]
+    return [ast.get_docstring(ast.parse(file.read_text())) or "", *(line for line in lines[1:] if line[:2] != "%%")]
+
+
+def without_code(text: str) -> str:
+    """Text and tables of a page, without code, directives, addresses and the marks of pictures."""
+    text = re.sub(r"^(`{3,}).*?^\1|^---\n.*?^---\n|<!--.*?-->", "", text, flags=re.MULTILINE | re.DOTALL)
+    return re.sub(r"!?\[([^\]]*)\]\([^)]*\)|\{\w+\}`([^`<]*)[^`]*`", r"\1\2", text)
+
+
+def sentences_of(text: str) -> list[str]:
+    """Sentences of a page: no tables, headings and formulas; an item of a list begins one."""
+    text = re.sub(
+        r"^(\||#|    ).*$|\$[^$\n]*\$", "", without_code(re.sub(r"!\[[^\]]*\]\([^)]*\)", "", text)), flags=re.MULTILINE
+    )
+    found = re.split(r"(?<=[.!?])\s+|\n\s*\n|\n(?:\*|-|\d+\.) |:\n", text)
+    return [sentence for sentence in found if len(sentence.split()) > 1]
+
+
+def mean_length(text: str) -> float:
+    words = [len(sentence.split()) for sentence in sentences_of(text)]
+    return sum(words) / max(1, len(words))
+
+
+def prose(text: str) -> str:
+    """A page without code in backticks, whose words are names."""
+    return re.sub(r"`[^`]*`", "", without_code(text))
+
+
+def test_the_navigation_has_a_budget_of_words():
+    texts = {str(page.relative_to(DOCS)): without_code(text_of(page)) for page in PAGES}
+    texts |= {file.stem: "\n".join(text_of_tutorial(file)) for file in sorted((ROOT / "tutorials").glob("*.py"))}
+    words = {name: len(re.findall(r"\w\S*", text)) for name, text in texts.items()}
+    assert sum(words.values()) <= BUDGET, sorted(words.items(), key=lambda item: -item[1])[:10]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
+def test_sentences_of_a_page_are_short_and_its_words_plain(page):
+    text = text_of(page)
+    if page.name not in REFERENCE and page.parent.name != "reference":
+        longest = sorted(sentences_of(text), key=lambda sentence: -len(sentence.split()))[:3]
+        assert mean_length(text) <= LONGEST_MEAN, longest
+    assert not (found := [match[0] for match in BANNED.finditer(prose(text))]), found
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "tutorials").glob("*.py")), ids=lambda file: file.stem)
+def test_text_of_tutorials_is_plain(file):
+    text = "\n".join(text_of_tutorial(file)).replace("``", "`")
+    assert mean_length(text) <= LONGEST_MEAN
+    assert not (found := [match[0] for match in BANNED.finditer(prose(text))]), found
+
+
+def test_every_picture_has_a_description():
+    for page in (ROOT / "README.md", *DOCS.rglob("*.md")):
+        for description in re.findall(r"!\[([^\]]*)\]", page.read_text()):
+            assert len(description.split()) >= 3, f"{page}: {description!r}"
+
+
+def spoken(tree: ast.Module):
+    """First sentences of public docstrings, and texts of errors."""
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            yield (ast.get_docstring(node) or "").split("\n\n")[0]
+        if isinstance(node, ast.Raise) and node.exc is not None:
+            yield from (
+                each.value
+                for each in ast.walk(node.exc)
+                if isinstance(each, ast.Constant) and isinstance(each.value, str)
+            )
+
+
+@pytest.mark.parametrize("folder", ["README.md", "torchrl_koap"])
+def test_words_of_docstrings_messages_and_the_readme_are_plain(folder):
+    if folder.endswith(".md"):
+        texts = [prose((ROOT / folder).read_text())]
+    else:
+        texts = [each for file in sorted((ROOT / folder).rglob("*.py")) for each in spoken(ast.parse(file.read_text()))]
+    found = [
+        (match[0], text) for text in texts for match in BANNED.finditer(re.sub(r"`[^`]*`|[\"']\w+[\"']", "", text))
+    ]
+    assert not found
+
+
+def test_what_is_counted():
+    text = "# Head\n\n![a b c](x.png)\n\nOne two `three four`. It [is](http://a.b) five.\n\n"
+    assert mean_length(text + "| a | b |\n") == 3.5
+    assert "koap" not in without_code("```bash\nkoap\n```\n") and "a | b" in without_code("| a | b |\n")
+    assert BANNED.search("that pays") and not BANNED.search("payload") and not BANNED.search(prose("`pays`"))
