@@ -154,24 +154,24 @@ def test_selecting_nothing_names_a_fraction_that_works(total):
 
 
 @pytest.mark.parametrize(
-    "amount",
-    [{"count": count} for count in (0, -1, True, 2.0, "3")]
-    + [{"fraction": fraction} for fraction in (0, -0.5, 1.5, math.nan, math.inf, True, "0.1")],
+    ("options", "message"),
+    [
+        *(({"count": count}, "count .* whole number of at least 1") for count in (0, -1, True, 2.0, "3")),
+        *(
+            ({"fraction": fraction}, r"label fraction must be in \(0, 1\]")
+            for fraction in (0, -0.5, 1.5, math.nan, math.inf, True, "0.1")
+        ),
+        ({"count": 1, "unit": "windows"}, "unknown unit 'windows'"),
+        ({"fraction": 0.1, "count": 1}, "a fraction, a count or episodes, got fraction and count"),
+        ({"count": 3, "episodes": (1, 2)}, "got count and episodes"),
+        ({"episodes": []}, "one or more different numbers"),
+        ({"episodes": [1, 1]}, "one or more different numbers"),
+        ({"episodes": (1, 2), "unit": "window"}, "episodes to label are trajectories, got unit 'window'"),
+    ],
 )
-def test_wrong_amounts(amount):
-    with pytest.raises(ValueError, match=r"label fraction must be in \(0, 1\]|count .* whole number of at least 1"):
-        LabelBudget(**amount)
-
-
-def test_wrong_options():
-    with pytest.raises(ValueError, match="unknown unit 'windows'"):
-        LabelBudget(count=1, unit="windows")
-    with pytest.raises(ValueError, match="a fraction, a count or episodes, got fraction and count"):
-        LabelBudget(fraction=0.1, count=1)
-    with pytest.raises(ValueError, match="9 labelled trajectories asked for, there are 4"):
-        LabelBudget(count=9).apply(demonstrations())
-    with pytest.raises(ValueError, match="longest: 12"):
-        LabelBudget(count=1, unit="window").apply(demonstrations((12, 3)))
+def test_wrong_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        LabelBudget(**options)
 
 
 def test_commands_hide_with_the_actions():
@@ -246,13 +246,6 @@ def test_given_episodes_are_labelled_and_no_others():
     assert report.selected_units == 2 and report.trajectories_touched == 2
     with pytest.raises(ValueError, match=r"no episodes \[3\] to label; the data have 0 to 40"):
         LabelBudget(episodes=[10, 3]).apply(data)
-    for wrong in ([], [1, 1]):
-        with pytest.raises(ValueError, match="one or more different numbers"):
-            LabelBudget(episodes=wrong)
-    with pytest.raises(ValueError, match="got count and episodes"):
-        LabelBudget(count=3, episodes=(1, 2))
-    with pytest.raises(ValueError, match="episodes to label are trajectories, got unit 'window'"):
-        LabelBudget(episodes=(1, 2), unit="window")
 
 
 def partly(lengths, shown, seed=0):
@@ -294,18 +287,24 @@ def test_missing_labels_are_the_budget():
     assert LabelBudget(count=2).apply(holes)[1].labelled_transitions == 72
 
 
-def test_a_budget_above_what_there_is_is_named():
-    data = partly((20, 33, 16, 40), shown=(1, 3))
-    with pytest.raises(ValueError, match="3 labelled trajectories asked for, only 2 of 4 have a label"):
-        LabelBudget(count=3).apply(data)
-    with pytest.raises(ValueError, match=r"fraction of 0.75 is 3 of 4 trajectories, but only 2 have a label \(0.5\)"):
-        LabelBudget(fraction=0.75).apply(data)
-    with pytest.raises(ValueError, match=r"episodes \[2\] are to be labelled, but the data hold no action of them"):
-        LabelBudget(episodes=[2, 3]).apply(data)
-    with pytest.raises(ValueError, match="none of the 109 steps has an action: there are no labels to spend"):
-        LabelBudget(count=1).apply(partly((20, 33, 16, 40), shown=()))
-    with pytest.raises(ValueError, match="no entry 'action', and thus no labels"):
-        LabelBudget(count=1).apply(data.exclude("has_action", "action"))
+PARTLY = partly((20, 33, 16, 40), shown=(1, 3))
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "message"),
+    [
+        (demonstrations(), {"count": 9}, "9 labelled trajectories asked for, there are 4"),
+        (demonstrations((12, 3)), {"count": 1, "unit": "window"}, "longest: 12"),
+        (PARTLY, {"count": 3}, "3 labelled trajectories asked for, only 2 of 4 have a label"),
+        (PARTLY, {"fraction": 0.75}, r"0.75 is 3 of 4 trajectories, but only 2 have a label \(0.5\)"),
+        (PARTLY, {"episodes": [2, 3]}, r"episodes \[2\] are to be labelled, but the data hold no action of them"),
+        (partly((20, 33), shown=()), {"count": 1}, "none of the 53 steps has an action: there are no labels to spend"),
+        (PARTLY.exclude("has_action", "action"), {"count": 1}, "no entry 'action', and thus no labels"),
+    ],
+)
+def test_a_budget_that_cannot_be_spent_is_named(data, options, message):
+    with pytest.raises(ValueError, match=message):
+        LabelBudget(**options).apply(data)
 
 
 def test_labels_that_are_no_numbers_are_named():

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from counted_windows import moving_windows
 from tensordict import TensorDict
 
 from torchrl_koap.data import ObjectPermutation, RandomPlanarTransform
@@ -12,13 +13,6 @@ from torchrl_koap.data import ObjectPermutation, RandomPlanarTransform
 
 def windows(count=64, width=8):
     return torch.randn(count, 16, width, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-
-
-def moving_windows():
-    torch.manual_seed(0)
-    state = torch.randn(6, 16, 4).cumsum(1)
-    action = torch.cat([state[..., :2].diff(dim=1), torch.full((6, 1, 2), torch.nan)], 1)
-    return TensorDict({"state": state, "action": action}, [6])
 
 
 def test_a_moved_scene_keeps_every_distance_and_angle():

@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from torchrl_koap.data import cut_windows, extrapolate_ends, flatten_trajectories, make_window_buffer, mark_labels
+from torchrl_koap.data import extrapolate_ends, flatten_trajectories, mark_labels
 from torchrl_koap.keys import validate
 
 
@@ -90,27 +90,3 @@ def test_a_trajectory_of_one_step_stands_still_and_short_ones_use_what_there_is(
     extended = extrapolate_ends(data, 2)["state"]
     assert torch.equal(extended[1], data["state"][0]) and torch.equal(extended[2], data["state"][0])
     torch.testing.assert_close(extended[-1], 3 * data["state"][2] - 2 * data["state"][1])
-
-
-@pytest.mark.parametrize("pad_before", [0, 1, 4])
-def test_windows_cut_at_once_are_those_of_the_buffer(pad_before):
-    data = flat([9, 5, 12])
-    cut = cut_windows(data, 5, select=["state", "episode"], pad_before=pad_before)
-    drawn = make_window_buffer(data, 5, 600, select=["state", "episode"], pad_before=pad_before).sample()
-    assert cut.shape == (sum(n + pad_before - 4 for n in (9, 5, 12)), 5)
-
-    def rows(windows):
-        return set(map(tuple, windows["state"].flatten(1).tolist()))
-
-    assert rows(cut) == rows(drawn) and len(rows(cut)) == len(cut)
-    assert (cut["episode"] == cut["episode"][:, :1]).all()
-    first = cut["padded"].squeeze(-1)
-    assert first.sum() == 3 * sum(range(pad_before + 1))
-    for window, padded in zip(cut["state"], first, strict=True):
-        assert (window[: padded.sum() + 1] == window[0]).all()  # the first frame is repeated
-    assert set(cut.keys()) == {"state", "episode", "padded"}
-
-
-def test_windows_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match=r"1 of 3 trajectories are shorter than a window \(6 steps\): 1 \(5 steps\)"):
-        cut_windows(flat([9, 5, 12]), 6)

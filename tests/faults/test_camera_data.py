@@ -83,6 +83,55 @@ def projection(change: Callable[[dict[str, Any], dict[str, str]], Any]) -> Calla
     return do
 
 
+def _write(place: Place, name: str, content: bytes) -> None:
+    (place.get("network") / name).write_bytes(content)
+
+
+def _png(size: int, channels: int = 3) -> bytes:
+    import numpy as np
+
+    from torchrl_koap.data.formats.writers import encode_png
+
+    return encode_png(np.zeros((size, size, channels), dtype=np.uint8))
+
+
+def first(rows: int) -> Callable[[dict[str, Any]], Any]:
+    return lambda content: [content.update({name: content[name][:rows]}) for name in content]
+
+
+CAMERA, STATE = "observation.images.third_person", "observation.state"
+# of the first episode: what is wrong, what is said, and the change
+EPISODE = {
+    "frames of no picture": ("picture|image", cell(CAMERA, {"bytes": b"PNG", "path": None})),
+    "frames of no bytes": ("picture|image", cell(CAMERA, {"bytes": None, "path": "x.png"})),
+    "frames of another size": ("size|shape", cell(CAMERA, {"bytes": _png(16), "path": ""})),
+    "frames with alpha": ("shape|colours", cell(CAMERA, {"bytes": _png(32, 4), "path": ""})),
+    "state of another width": (STATE, cell(STATE, [1.0])),
+    "state is NaN": ("NaN", cell(STATE, [float("nan")] * 3)),
+    "state is text": (STATE, put(STATE, ["x"] * 5)),
+    "action of another width": ("action", cell("action", [1.0])),
+    "action is infinite": ("infinite|NaN", cell("action", [float("inf")] * 7)),
+    "one row": ("row|frame", first(1)),
+    "no rows": ("row|frame", first(0)),
+}
+for _name in (CAMERA, STATE):
+    EPISODE |= {f"episode without {_name}": (_name, without(_name)), f"{_name} is null": (_name, cell(_name, None))}
+
+
+def in_projection() -> Iterator[tuple[str, str, Callable[[dict[str, Any], dict[str, str]], Any]]]:
+    """What is wrong, what is said, and the change of tensors and description."""
+    yield "of other weights", "other|fitted", lambda _, about: about.update(weights="0" * 64)
+    for name in ("weights", "stride", "size"):
+        yield f"without {name}", name, lambda _, about, n=name: about.pop(n)
+    for name, value in {"stride": "9", "size": "-1"}.items():
+        yield f"{name} {value}", f"{name}|frames must be", lambda _, about, n=name, v=value: about.update({n: v})
+        yield f"{name} empty", rf"{name}|projection\.safetensors", lambda _, about, n=name: about.update({n: ""})
+    for name in ("mean", "components"):
+        yield f"without {name}", name, lambda held, _, n=name: held.pop(n)
+        yield f"{name} cut", "mean|features", lambda held, _, n=name: held.update({n: held[n][:9].clone()})
+        yield f"{name} NaN", "NaN", lambda held, _, n=name: held[n].fill_(float("nan"))
+
+
 def faults() -> Iterator[Fault]:
     for name, damage in DAMAGE.items():
         for part, file in (("frames", INFO), ("frames", FIRST), ("network", WEIGHTS), ("network", PROJECTION)):
@@ -96,78 +145,16 @@ def faults() -> Iterator[Fault]:
         yield Fault(f"info.json without {name}", EMBED, "camera|total_episodes", info(without(name)))
     for value in (None, -1, 0, 1e9, "many", [2]):
         yield Fault(f"total_episodes {value}", EMBED, "total_episodes|episodes", info(put("total_episodes", value)))
-    for name, value in {"a list": [], "empty": {}, "null": None, "3": 3, "blind": {"observation.state": {}}}.items():
+    for name, value in {"a list": [], "empty": {}, "null": None, "3": 3, "blind": {STATE: {}}}.items():
         yield Fault(f"features {name}", EMBED, "camera|features", info(put("features", value)))
-    for name in ("observation.images.third_person", "observation.state"):
-        yield Fault(f"episode without {name}", EMBED, name, columns(without(name)))
-        yield Fault(f"{name} is null", EMBED, name, columns(cell(name, None)))
-    yield Fault("frames of no picture", EMBED, "picture|image", columns(cell(_CAMERA, {"bytes": b"PNG", "path": None})))
-    yield Fault("frames of no bytes", EMBED, "picture|image", columns(cell(_CAMERA, {"bytes": None, "path": "x.png"})))
-    yield Fault("frames of another size", EMBED, "size|shape", columns(cell(_CAMERA, {"bytes": _png(16), "path": ""})))
-    yield Fault("frames with alpha", EMBED, "shape|colours", columns(cell(_CAMERA, {"bytes": _png(32, 4), "path": ""})))
-    yield Fault("state of another width", EMBED, "observation.state", columns(cell("observation.state", [1.0])))
-    yield Fault("state is NaN", EMBED, "NaN", columns(cell("observation.state", [float("nan")] * 3)))
-    yield Fault("state is text", EMBED, "observation.state", columns(put("observation.state", ["x"] * 5)))
-    yield Fault("action of another width", EMBED, "action", columns(cell("action", [1.0])))
-    yield Fault("action is infinite", EMBED, "infinite|NaN", columns(cell("action", [float("inf")] * 7)))
-    yield Fault(
-        "one row", EMBED, "row|frame", columns(lambda content: [content.update({k: content[k][:1]}) for k in content])
-    )
-    yield Fault(
-        "no rows", EMBED, "row|frame", columns(lambda content: [content.update({k: content[k][:0]}) for k in content])
-    )
-
-    yield Fault(
-        "weights are code", OWN_WEIGHTS, "weights", lambda place: _write(place, WEIGHTS, pickle.dumps(os.system))
-    )
-    for name, content in {
-        "a list": [1],
-        "a number": 3,
-        "numbers by name": {"conv1.weight": 3},
-    }.items():
+    for name, (says, change) in EPISODE.items():
+        yield Fault(name, EMBED, says, columns(change))
+    code = pickle.dumps(os.system)
+    yield Fault("weights are code", OWN_WEIGHTS, "weights", lambda place: _write(place, WEIGHTS, code))
+    for name, content in {"a list": [1], "a number": 3, "numbers by name": {"conv1.weight": 3}}.items():
         yield Fault(f"weights are {name}", OWN_WEIGHTS, "weights|state_dict", torch_file(content))
-    yield Fault(
-        "projection of other weights", EMBED, "other|fitted", projection(lambda _, a: a.update(weights="0" * 64))
-    )
-    for name in ("weights", "stride", "size"):
-        yield Fault(f"projection without {name}", EMBED, name, projection(lambda _, a, n=name: a.pop(n)))
-    for name, value in {"stride": "9", "size": "-1"}.items():
-        yield Fault(
-            f"projection {name} {value}",
-            EMBED,
-            f"{name}|frames must be",
-            projection(lambda _, a, n=name, v=value: a.update({n: v})),
-        )
-        yield Fault(
-            f"projection {name} empty",
-            EMBED,
-            rf"{name}|projection\.safetensors",
-            projection(lambda _, a, n=name: a.update({n: ""})),
-        )
-    for name in ("mean", "components"):
-        yield Fault(f"projection without {name}", EMBED, name, projection(lambda t, _, n=name: t.pop(n)))
-        yield Fault(
-            f"projection {name} cut",
-            EMBED,
-            "mean|features",
-            projection(lambda t, _, n=name: t.update({n: t[n][:9].clone()})),
-        )
-        yield Fault(f"projection {name} NaN", EMBED, "NaN", projection(lambda t, _, n=name: t[n].fill_(float("nan"))))
-
-
-_CAMERA = "observation.images.third_person"
-
-
-def _write(place: Place, name: str, content: bytes) -> None:
-    (place.get("network") / name).write_bytes(content)
-
-
-def _png(size: int, channels: int = 3) -> bytes:
-    import numpy as np
-
-    from torchrl_koap.data.formats.writers import encode_png
-
-    return encode_png(np.zeros((size, size, channels), dtype=np.uint8))
+    for name, says, change in in_projection():
+        yield Fault(f"projection {name}", EMBED, says, projection(change))
 
 
 @pytest.mark.parametrize("fault", table(faults(), every=8))

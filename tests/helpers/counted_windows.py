@@ -1,9 +1,10 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Trajectories whose observations say which trajectory and step they are, so that windows can be told apart."""
+"""Trajectories whose observations say which trajectory and step they are, and windows whose actions move the state."""
 
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDict
 
 from torchrl_koap.data import flatten_trajectories
 
@@ -22,3 +23,11 @@ def demonstrations(lengths=LENGTHS):
 def seen(batch):
     values = batch["observation"]
     return [(int(w[0, 0]), tuple(int(step) for step in w[:, 1])) for w in values]
+
+
+def moving_windows():
+    """Windows of states, and actions that are the differences of their first two columns."""
+    torch.manual_seed(0)
+    state = torch.randn(6, 16, 4).cumsum(1)
+    action = torch.cat([state[..., :2].diff(dim=1), torch.full((6, 1, 2), torch.nan)], 1)
+    return TensorDict({"state": state, "action": action}, [6])

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import re
 
 import numpy as np
 import pytest
 from raw_episodes import write_raw_episode
-from shared_data import HUMAN
 
 from torchrl_koap.data.d3il.raw import OBJECT_COLUMNS, ROBOT_COLUMNS, read_raw_episode
 from torchrl_koap.files import DataError
@@ -82,25 +80,3 @@ def test_other_contents(tmp_path, content):
     path = tmp_path / "other.pkl"
     path.write_bytes(pickle.dumps(content))
     assert "missing key 'robot'" in problems(path)[0]
-
-
-def test_too_short_empty_damaged_hostile_absent(tmp_path):
-    write_raw_episode(tmp_path / "one.pkl", episode(rows=1))
-    assert "too short: 1 rows, at least 2" in problems(tmp_path / "one.pkl")[0]
-    (tmp_path / "empty.pkl").touch()
-    assert "empty" in problems(tmp_path / "empty.pkl")[0]
-    (tmp_path / "cut.pkl").write_bytes((tmp_path / "one.pkl").read_bytes()[:-20])
-    assert "not a complete pickle" in problems(tmp_path / "cut.pkl")[0]
-    (tmp_path / "hostile.pkl").write_bytes(pickle.dumps(os.system))
-    assert "system" in problems(tmp_path / "hostile.pkl")[0]
-    with pytest.raises(FileNotFoundError):
-        read_raw_episode(tmp_path / "absent.pkl")
-
-
-@pytest.mark.skipif(not HUMAN.is_dir(), reason=f"the human demonstrations are not at {HUMAN}")
-def test_human_demonstrations():
-    files = sorted(HUMAN.glob("env_*.pkl"))
-    assert len(files) == 24
-    for file in files[:3]:
-        read = read_raw_episode(file, robot=list(ROBOT_COLUMNS))
-        assert 65 <= len(read.robot["c_pos"]) <= 104 and not read.objects

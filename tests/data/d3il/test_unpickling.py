@@ -153,35 +153,26 @@ def test_other_containers_are_refused(protocol):
         loads_pickle(pickle.dumps({1, 2}, protocol))
 
 
-def test_arrays_of_plain_objects_are_refused():
-    with pytest.raises(UnsafePickleError, match="element type 'O8'"):
-        loads_pickle(pickle.dumps(np.array([None, "x"], dtype=object)))
-
-
-def test_f2py_is_refused_without_import():
-    content = b"\x80\x02cnumpy.f2py.diagnose\nrun\n)R."
-    with pytest.raises(UnsafePickleError, match=r"numpy\.f2py\.diagnose\.run"):
-        loads_pickle(content)
-
-
-def test_attribute_chains_are_refused():
-    content = b"\x80\x04\x8c\x05numpy\x8c\x10ndarray.__init__\x93."
-    with pytest.raises(UnsafePickleError, match=r"numpy\.ndarray\.__init__"):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (pickle.dumps(np.array([None, "x"], dtype=object)), "element type 'O8'"),
+        (b"\x80\x02cnumpy.f2py.diagnose\nrun\n)R.", r"numpy\.f2py\.diagnose\.run"),  # not even imported
+        (b"\x80\x04\x8c\x05numpy\x8c\x10ndarray.__init__\x93.", r"numpy\.ndarray\.__init__"),
+        (b"\x80\x04\x8c\x02os\x94\x8c\x06system\x940h\x00h\x01\x93.", r"instruction POP \(after os system\)"),
+        (b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94\x86h\x00h\x01\x93.", r"os\.system"),  # remembered names
+        (b"Pid\n.", "PERSID"),
+        (b"\x80\x04\x8c\x02id\x51.", "PERSID"),
+    ],
+)
+def test_what_asks_for_more_is_refused_by_name(content, message):
+    with pytest.raises(UnsafePickleError, match=message):
         loads_pickle(content)
 
 
 def test_a_name_that_is_no_text_is_refused():
     with pytest.raises(DataError, match="STACK_GLOBAL requires str"):
         loads_pickle(b"\x80\x04]\x8c\x06system\x93.")
-
-
-def test_remembered_names_are_resolved():
-    content = b"\x80\x04\x8c\x02os\x94\x8c\x06system\x940h\x00h\x01\x93."
-    with pytest.raises(UnsafePickleError):
-        loads_pickle(content)
-    content = b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94\x86h\x00h\x01\x93."
-    with pytest.raises(UnsafePickleError, match=r"os\.system"):
-        loads_pickle(content)
 
 
 def test_extension_codes_are_refused():
@@ -193,12 +184,6 @@ def test_extension_codes_are_refused():
             loads_pickle(content)
     finally:
         copyreg.remove_extension("builtins", "print", 0x7F)
-
-
-@pytest.mark.parametrize("content", [b"Pid\n.", b"\x80\x04\x8c\x02id\x51."])
-def test_persistent_ids_are_refused(content):
-    with pytest.raises(UnsafePickleError, match="PERSID"):
-        loads_pickle(content)
 
 
 @pytest.mark.parametrize(
@@ -272,7 +257,7 @@ def test_exponential_and_cyclic_containers():
 def test_damaged_files(tmp_path):
     content = pickle.dumps({"robot": {"c_pos": np.arange(30.0).reshape(10, 3)}})
     for end in range(len(content)):
-        with pytest.raises(DataError):
+        with pytest.raises(DataError, match="not a complete pickle" if end else "the file is empty"):
             loads_pickle(content[:end])
     path = tmp_path / "empty.pkl"
     path.touch()
