@@ -202,13 +202,6 @@ def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | N
 
     Returns:
         tuple: both in milliseconds, and a warning where a plan is short against the motion, else None.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.data import flatten_trajectories
-        >>> from torchrl_koap.data.quality import plan_coverage
-        >>> plan_coverage(flatten_trajectories([torch.zeros(29, 2)], None, action_dim=1), 14.0)
-        ('14 frames, 1000 ms; demonstrations last 2000 ms (median)', None)
     """
     frames = float(trajectory_lengths(data).double().median())
     covers = f"{HORIZON} frames, {1e3 * HORIZON / control_hz:.4g} ms"

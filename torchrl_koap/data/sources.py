@@ -119,7 +119,7 @@ def with_noise(data: TensorDictBase, columns: slice, sigma: float, *, seed: int 
         data (TensorDictBase): flat data ``[N]``; not changed.
         columns (slice): observation columns that are disturbed.
         sigma (float): standard deviation of the noise, in the units of the columns.
-        seed (int): seed of the noise: every reader of the same data meets the same.
+        seed (int): seed of the noise.
     """
     generator = torch.Generator().manual_seed(seed)
     now, following = data["observation"].clone(), data["next", "observation"].clone()

@@ -52,17 +52,6 @@ def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
     Raises:
         RunDirectoryError: naming the file and an option that is unknown, in another section, of another type or out of
             range.
-
-    Examples:
-        >>> from torchrl_koap.runs.config import TrainConfig
-        >>> from torchrl_koap.runs.config_files import from_json
-        >>> from_json(TrainConfig, {"out": "runs/a", "planner": {"steps": 20}}, "a.json").planner.steps
-        20
-        >>> try:
-        ...     from_json(TrainConfig, {"out": "runs/a", "labels": {"cuont": 5}}, "a.json")
-        ... except ValueError as error:
-        ...     print(error)
-        a.json: unknown option labels.cuont: did you mean labels.count?
     """
     return _read(kind, content, f"{path}", "", tuple(_names(kind)))
 

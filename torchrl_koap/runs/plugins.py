@@ -33,14 +33,6 @@ def load_plugins(names: Sequence[str]) -> None:
     Raises:
         PluginError: if a module is not found, or fails when it is imported; the message names it, and where it was
             looked for or what went wrong.
-
-    Examples:
-        >>> from torchrl_koap.runs.plugins import load_plugins
-        >>> load_plugins(["json"])
-        >>> load_plugins(["no_such_plugin"])  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        torchrl_koap.runs.plugins.PluginError: there is no plugin 'no_such_plugin'; looked for it in ...
     """
     if isinstance(names, str):
         raise PluginError(f"plugins must be a sequence of module names, got the string {names!r}")

@@ -15,13 +15,7 @@ FILES = ("config.json", "summary.json", "metrics.csv", "planner.safetensors", "c
 
 
 def pretrained_folders() -> dict[str, Path]:
-    """Names and folders of the trained policies: those of the checkout, or below the present folder.
-
-    Examples:
-        >>> from torchrl_koap.runs.pretrained import pretrained_folders
-        >>> all((folder / "config.json").exists() for folder in pretrained_folders().values())
-        True
-    """
+    """Names and folders of the trained policies: those of the checkout, or below the present folder."""
     roots = [Path("pretrained"), Path(__file__).resolve().parents[2] / "pretrained"]
     folders = [folder for root in roots if root.is_dir() for folder in sorted(root.iterdir())]
     return {folder.name: folder for folder in reversed(folders) if (folder / "config.json").exists()}

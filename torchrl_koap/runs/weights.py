@@ -108,14 +108,6 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
     Raises:
         CheckpointError: if the file is missing or damaged.
-
-    Examples:
-        >>> import tempfile, torch
-        >>> from torchrl_koap.runs.weights import load_tensors, save_tensors
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     save_tensors(f"{folder}/a.safetensors", {"x": torch.ones(2)}, {"task": "avoiding"})
-        ...     load_tensors(f"{folder}/a.safetensors")
-        ({'x': tensor([1., 1.])}, {'task': 'avoiding'})
     """
     if not Path(path).is_file():
         raise CheckpointError(f"{path} is missing")
@@ -154,16 +146,6 @@ def compact(tensors: Mapping[str, Tensor], *, only: Sequence[str] = ()) -> dict[
 
     Returns:
         dict: for a matrix ``name`` the entries ``name`` (int8) and ``name.row_scale`` (float32 ``[rows, 1, ...]``).
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.runs.weights import compact, expand
-        >>> weights = {"layer.weight": torch.randn(64, 64), "layer.bias": torch.randn(64)}
-        >>> small = compact(weights)
-        >>> {name: str(tensor.dtype) for name, tensor in small.items()}
-        {'layer.weight': 'torch.int8', 'layer.weight.row_scale': 'torch.float32', 'layer.bias': 'torch.float32'}
-        >>> (expand(small)["layer.weight"] - weights["layer.weight"]).abs().max().item() < 0.02
-        True
     """
     small = {}
     for name, tensor in tensors.items():

@@ -26,11 +26,6 @@ class Source:
         folder (str or Path): a data set of ``koap demos --embodiment``.
         episodes (int, optional): how many, from the first. Default: all.
         embodiment (str, optional): refuse those of another one.
-
-    Examples:
-        >>> from torchrl_koap.vision.demonstrations import Source
-        >>> Source("videos/robot", episodes=5).embodiment is None
-        True
     """
 
     folder: str | Path

@@ -35,11 +35,6 @@ class Format:
         read (callable): from a source, and some of the options, to :class:`Recordings`.
         options (tuple of str): which options of :func:`read_recordings` it takes.
         write (callable, optional): writes recordings into a new folder. Default: this format is not written.
-
-    Examples:
-        >>> from torchrl_koap.data.formats import FORMATS
-        >>> [name for name, form in FORMATS.items() if form.write is not None]
-        ['lerobot', 'npz']
     """
 
     what: str

@@ -61,11 +61,9 @@ def read_lerobot(
     """Reads a data set in format 2.x or 3.0; rows without actions have no label, images are skipped and listed.
 
     Args:
-        root (str or Path): its folder.
-        observations (sequence of str, optional): features that make up the state, in that order. Default: every feature
-            named ``observation...`` that holds numbers.
-        episodes (sequence of int): which episodes to read, such as those that were downloaded. Default: all.
-        options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the data set declares its rate by ``fps``.
+        root (str or Path): its folder; it declares its rate by ``fps``.
+        observations, episodes: as for :func:`~torchrl_koap.data.read_recordings`.
+        options: of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     info = read_info(root)
     known = info["features"]
@@ -152,8 +150,8 @@ def read_rows(
     columns: dict[str, Any] = {name: table[name].to_pylist() for name in pictures}
     for name in table.column_names:
         if name not in (*pictures, "__filename"):
+            announced = _announced(read_info(root)) if name == ACTION else 1
             try:
-                announced = _announced(read_info(root)) if name == ACTION else 1
                 columns[name] = numbers(table[name], name, announced=announced, files=files)
             except ValueError as error:
                 problems.append(str(error))

@@ -30,20 +30,14 @@ def is_hdf5(path: str | Path) -> bool:
     return Path(path).suffix in (".hdf5", ".h5") and Path(path).is_file()
 
 
-def read_robomimic(
-    file: str | Path,
-    *,
-    observations: Sequence[str] | None = None,
-    **options: Any,
-) -> Recordings:
-    """Reads trajectories from an HDF5 file.
+def read_robomimic(file: str | Path, *, observations: Sequence[str] | None = None, **options: Any) -> Recordings:
+    """Reads trajectories from an HDF5 file, which declares its rate by ``control_freq`` of ``env_args``.
 
     Args:
         file (str or Path): the file.
         observations (sequence of str, optional): entries of ``obs`` that make up the state, in that order. Default: all
             that are no images, by name.
-        options: of :func:`~torchrl_koap.data.formats.columns.assemble`; the file declares its rate by ``control_freq``
-            of ``env_args``.
+        options: of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     if importlib.util.find_spec("h5py") is None:
         raise RuntimeError("HDF5 files are read with an extra: pip install 'torchrl_koap[hdf5]'")

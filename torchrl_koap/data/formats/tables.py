@@ -19,6 +19,7 @@ import csv
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,18 +44,12 @@ def is_table_folder(folder: str | Path) -> bool:
     return any(_files(Path(folder)))
 
 
-def read_tables(
-    folder: str | Path,
-    *,
-    action_columns: Sequence[str] | None = None,
-    **options: Any,
-) -> Recordings:
+def read_tables(folder: str | Path, *, action_columns: Sequence[str] | None = None, **options: Any) -> Recordings:
     """Reads a folder of tables, in the order of their names.
 
     Args:
         folder (str or Path): the folder.
-        action_columns (sequence of str, optional): columns of CSV and parquet files that are actions, if they are not
-            named ``action...``. In NumPy archives actions are an entry of their own.
+        action_columns: as for :func:`~torchrl_koap.data.read_recordings`; in NumPy archives actions are an entry.
         options: of :func:`~torchrl_koap.data.formats.columns.assemble`.
     """
     folder = Path(folder)
@@ -104,43 +99,45 @@ def _read_npz(file: Path, action_columns: Sequence[str] | None) -> _Table:
                 raise ValueError(what) from error
     key = next((name for name in STATES if name in entries), None)
     if key is None:
-        raise ValueError(
-            f"has no states: wanted one of {', '.join(STATES)}, it holds {', '.join(entries) or 'nothing'}"
-        )
+        held = ", ".join(entries) or "nothing"
+        raise ValueError(f"has no states: wanted one of {', '.join(STATES)}, it holds {held}")
     acting = next((name for name in ACTIONS if name in entries), None)
     frames, read = entries[key], {key, acting, "state_names", "action_names", "control_hz"}
     if frames.ndim != 2 or frames.dtype.kind not in "fb":
         raise ValueError(f"{key} must be floating-point numbers [T, d], got {frames.dtype} {list(frames.shape)}")
-    states, unclear = _named(frames, entries.get("state_names"), "state"), []
-    for name in [name for name in entries if name not in read]:
-        values, kind = entries[name], kind_of(name)[0]
+    states, unclear, unread, steps = _named(frames, entries.get("state_names"), "state"), [], [], None
+    for name, values in entries.items():
+        kind = kind_of(name)[0]
         single = values.shape in ((len(frames),), (len(frames), 1)) and values.dtype.kind in "fiub"
-        if kind not in (None, "other") or single and kind is None:
-            states[name] = _frame_entry(name, values, len(frames))
-            read.add(name)
-            unclear += [name] if kind is None else []
-    steps = None
+        if name in read:
+            continue
+        if kind == "other" or kind is None and not single:
+            unread.append(name)
+            continue
+        states[name] = _frame_entry(name, values, len(frames))
+        unclear += [name] if kind is None else []
     if acting is not None:
         if entries[acting].ndim != 2 or entries[acting].dtype.kind not in "fiub":
             raise ValueError(f"{acting} must be numbers [T, a] or [T - 1, a], got {list(entries[acting].shape)}")
         steps = _named(entries[acting], entries.get("action_names"), "action")
     rate = float(entries["control_hz"]) if "control_hz" in entries else None
-    return Piece(file.name, states, steps, tuple(unclear)), rate, [name for name in entries if name not in read]
+    return Piece(file.name, states, steps, tuple(unclear)), rate, unread
 
 
 def _named_alike(pieces: list[Piece]) -> list[Piece]:
     """Archives without names take those of the first archive of their width that has some."""
 
-    def alike(piece: Piece) -> Piece:
-        found = [piece.states, piece.actions]
-        for number, kind in enumerate(("state", "action")):
-            for other in (piece.states if number == 0 else piece.actions for piece in pieces):
-                mine = found[number]
-                if mine and other and len(mine) == len(other) and f"{kind}_0" in mine and f"{kind}_0" not in other:
-                    found[number] = dict(zip(other, mine.values(), strict=True))
-        return Piece(piece.name, found[0] or {}, found[1], piece.unclear)
+    def named(columns: Any, made_up: str, others: list[Any]) -> Any:
+        if not columns or made_up not in columns:
+            return columns
+        fits = (other for other in others if other and len(other) == len(columns) and made_up not in other)
+        return dict(zip(next(fits, columns), columns.values(), strict=True))
 
-    return [alike(piece) for piece in pieces]
+    states, actions = [piece.states for piece in pieces], [piece.actions for piece in pieces]
+    return [
+        replace(piece, states=named(piece.states, "state_0", states), actions=named(piece.actions, "action_0", actions))
+        for piece in pieces
+    ]
 
 
 def _named(table: np.ndarray, given: np.ndarray | None, kind: str) -> dict[str, np.ndarray]:
