@@ -6,29 +6,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from raw_episodes import write_raw_episode
+from raw_episodes import write_folder, write_raw_episode
 from shared_data import HUMAN
 from tiny_runs import write_demonstrations
 
 from torchrl_koap.data import flatten_trajectories, load_ted, open_dataset, save_demonstrations, save_ted
-from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import get_task
 from torchrl_koap.training.datasets import find_task_of
-
-
-def write_sorting(folder, episodes=3):
-    rng = np.random.default_rng(0)
-    for number in range(episodes):
-        robot = {name: rng.normal(size=(5, *shape)) for name, shape in ROBOT_COLUMNS.items()}
-        boxes = {
-            f"{colour}-box{index}": {"pos": rng.normal(size=(5, 3)), "quat": rng.normal(size=(5, 4))}
-            for colour in ("red", "blue")
-            for index in (1, 2)
-        }
-        write_raw_episode(folder / f"env_{number:03d}_00.pkl", robot, boxes)
-    return folder
 
 
 def test_values_are_those_of_the_raw_episodes(tmp_path):
@@ -54,7 +40,7 @@ def test_values_are_those_of_the_raw_episodes(tmp_path):
 
 def test_demonstrations_of_another_task_are_used_where_that_is_meant(tmp_path):
     sorting, partial = get_task("sorting"), get_task("po_sorting")
-    raw = write_sorting(tmp_path / "raw")
+    raw = write_folder(tmp_path / "raw", "sorting")[0].parent
     theirs, _ = open_dataset(raw, task=sorting)
     save_ted(theirs.exclude("state"), tmp_path / "demos" / "ted", sorting)
     save_ted(theirs, tmp_path / "with state", sorting)

@@ -6,6 +6,12 @@ from __future__ import annotations
 import pickle
 from pathlib import Path
 
+import numpy as np
+
+from torchrl_koap.data.d3il.conversion import CONVERTERS
+from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS, RawEpisode
+from torchrl_koap.tasks import get_task
+
 
 def write_raw_episode(path, robot, objects=None, context=None):
     """One pickle: arrays ``[T, ...]`` of the robot by name, and of every object."""
@@ -14,3 +20,31 @@ def write_raw_episode(path, robot, objects=None, context=None):
     content = {"context": context, "robot": dict(robot), **(objects or {})}
     path.write_bytes(pickle.dumps(content, protocol=4))
     return path
+
+
+def turned(*degrees, sign=1.0):
+    """Quaternions of a rotation about z, one row per angle."""
+    half = np.radians(np.array(degrees)) / 2
+    zeros = np.zeros_like(half)
+    return sign * np.stack([np.cos(half), zeros, zeros, np.sin(half)], 1)
+
+
+def pose(positions, quat):
+    return {"pos": np.array(positions, dtype=float), "quat": quat}
+
+
+def made_up(task, rows=5, seed=0, extra=()):
+    """Any episode of a task, with everything that is logged."""
+    rng = np.random.default_rng(seed)
+    robot = {key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()}
+    names = (*CONVERTERS[get_task(task).source].objects, *extra)
+    objects = {name: pose(rng.normal(size=(rows, 3)), turned(*rng.uniform(-80, 80, rows))) for name in names}
+    return RawEpisode(robot=robot, objects=objects)
+
+
+def write_folder(folder, task, episodes=3, **kwargs):
+    files = [Path(folder) / f"env_{index:03d}_00.pkl" for index in range(episodes)]
+    for index, file in enumerate(files):
+        episode = made_up(task, rows=4 + index, seed=index, **kwargs)
+        write_raw_episode(file, episode.robot, episode.objects)
+    return files

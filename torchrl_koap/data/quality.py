@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -222,7 +221,4 @@ def constant_columns(actions: np.ndarray) -> list[float | None]:
 
 
 def _digest(*values: Tensor) -> bytes:
-    digest = hashlib.sha256()
-    for value in values:
-        digest.update(value.contiguous().reshape(-1).view(torch.uint8).cpu().numpy())
-    return digest.digest()
+    return hashlib.sha256(b"".join(value.cpu().numpy().tobytes() for value in values)).digest()

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from tensordict import TensorDict, TensorDictBase, is_leaf_nontensor
+from tensordict import TensorDict, TensorDictBase
 
 from torchrl_koap import keys
 from torchrl_koap.data.trajectories import trajectory_lengths
@@ -62,7 +62,7 @@ def save_ted(data: TensorDictBase, folder: str | Path, task: Task, notes: Mappin
     """
     folder = Path(folder)
     keys.validate(data, command=task.command_columns)
-    entries = {_joined(key): value for key, value in data.items(True, True, is_leaf=is_leaf_nontensor)}
+    entries = dict(data.flatten_keys("/").items())
     strange = [name for name, value in entries.items() if not isinstance(value, torch.Tensor)]
     if strange:
         raise TypeError(f"only tensors can be saved, {strange} are none")
@@ -200,12 +200,7 @@ def read_steps(folder: str | Path) -> TensorDict:
         raise DataError(path, str(error)) from error
     if changed:
         raise DataError(path, "it was changed: its checksum is another one")
-    nested = {tuple(name.split("/")) if "/" in name else name: value for name, value in entries.items()}
     try:
-        return TensorDict(nested, [about["steps"]])
+        return TensorDict(entries, [about["steps"]]).unflatten_keys("/")
     except (RuntimeError, ValueError, KeyError, TypeError) as error:
         raise DataError(path, f"its entries do not have {about['steps']} steps: {error}") from error
-
-
-def _joined(key: str | tuple[str, ...]) -> str:
-    return key if isinstance(key, str) else "/".join(key)

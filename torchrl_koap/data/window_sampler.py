@@ -109,7 +109,6 @@ class WindowSampler(RandomSampler):
         return torch.cat([self._draw(self._labelled, number), self._draw(self._others, batch_size - number)]), {}
 
     def _draw(self, choices: Tensor, number: int) -> Tensor:
-        if self._rng is None:
-            return choices[torch.randint(len(choices), (number,), device=choices.device)]
-        drawn = torch.randint(len(choices), (number,), device=self._rng.device, generator=self._rng)
+        device = choices.device if self._rng is None else self._rng.device
+        drawn = torch.randint(len(choices), (number,), device=device, generator=self._rng)
         return choices[drawn.to(choices.device)]

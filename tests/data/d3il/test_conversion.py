@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from raw_episodes import write_raw_episode
+from raw_episodes import made_up, pose, turned, write_folder, write_raw_episode
 
 from torchrl_koap.data import open_dataset
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files, read_raw
-from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS, RawEpisode
+from torchrl_koap.data.d3il.raw import RawEpisode
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, get_task
@@ -24,35 +24,7 @@ from torchrl_koap.tasks import TASKS, get_task
 ROOT3 = math.sqrt(3)
 
 
-def turned(*degrees, sign=1.0):
-    """Quaternions of a rotation about z, one row per angle."""
-    half = np.radians(np.array(degrees)) / 2
-    zeros = np.zeros_like(half)
-    return sign * np.stack([np.cos(half), zeros, zeros, np.sin(half)], 1)
-
-
 D3IL = [name for name, task in TASKS.items() if task.source in CONVERTERS]
-
-
-def pose(positions, quat):
-    return {"pos": np.array(positions, dtype=float), "quat": quat}
-
-
-def made_up(task, rows=5, seed=0, extra=()):
-    """Any episode of a task, with everything that is logged."""
-    rng = np.random.default_rng(seed)
-    robot = {key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()}
-    names = (*CONVERTERS[get_task(task).source].objects, *extra)
-    objects = {name: pose(rng.normal(size=(rows, 3)), turned(*rng.uniform(-80, 80, rows))) for name in names}
-    return RawEpisode(robot=robot, objects=objects)
-
-
-def write_folder(folder, task, episodes=3, **kwargs):
-    files = [Path(folder) / f"env_{index:03d}_00.pkl" for index in range(episodes)]
-    for index, file in enumerate(files):
-        episode = made_up(task, rows=4 + index, seed=index, **kwargs)
-        write_raw_episode(file, episode.robot, episode.objects)
-    return files
 
 
 def convert(task, episode):

@@ -8,15 +8,14 @@ import re
 
 import numpy as np
 import pytest
-from raw_episodes import write_raw_episode
+from raw_episodes import made_up, write_raw_episode
 
 from torchrl_koap.data.d3il.raw import OBJECT_COLUMNS, ROBOT_COLUMNS, read_raw_episode
 from torchrl_koap.files import DataError
 
 
-def episode(rows=6, seed=0):
-    rng = np.random.default_rng(seed)
-    return {key: rng.normal(size=(rows, *shape)) for key, shape in ROBOT_COLUMNS.items()}
+def episode():
+    return made_up("avoiding", rows=6).robot
 
 
 def problems(path, **kwargs):
