@@ -17,7 +17,6 @@ from pathlib import Path
 import page_rows
 import paper_rows
 import pictures
-import result_pictures
 import scooping_rows
 import tables
 import tyro
@@ -67,8 +66,7 @@ def main(*, check: bool = False) -> int:
     if check:
         print("\n".join(f"{path} is not what the figures give" for path in stale) or "every page is up to date")
         return int(bool(stale))
-    folder = ROOT / "docs" / "pictures"
-    drawn = [*pictures.draw_all(folder), *result_pictures.draw_result_pictures(folder)]
+    drawn = pictures.draw_all(ROOT / "docs" / "pictures")
     print("\n".join(f"wrote {path}" for path in [*stale, *(path.relative_to(ROOT) for path in drawn)]))
     return 0
 

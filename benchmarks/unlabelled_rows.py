@@ -1,11 +1,14 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Tables of docs/results/unlabelled_data.md: reductions of the error and successes in closed loop."""
+"""Tables and picture of docs/results/unlabelled_data.md: reductions of the error and successes in closed loop."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from scipy.stats import t as student
 from tables import percent, read_rows, table
 
@@ -17,6 +20,16 @@ REGIMES = {
     "pictures": "32 x 32 pictures, 64 components",
     "distractors": "64 columns, 2 distractors",
     "joints_hidden": "Stacking, joints hidden",
+}
+_LOOKS = {
+    "semi_supervised": ("#0b6e4f", "-", "o"),
+    "koap": ("#4ba3c3", "-", "v"),
+    "koap_untrained": ("#7a7a7a", "--", "s"),
+    "koap_labelled_only": ("#9b5de5", "--", "P"),
+    "koap_paper": ("#d4a017", "-", "X"),
+    "pca": ("#c1440e", "-.", "D"),
+    "linear_steps": ("#b0b0b0", ":", "^"),
+    "dd_lookahead": ("#2f4b8f", ":", "*"),
 }
 Cells = dict[tuple[str, int], dict[int, float]]  # method and labelled trajectories -> seed -> value
 
@@ -98,3 +111,53 @@ def paired_gain(gains: Sequence[float], unit: str = "%") -> str:
     half = student.ppf(0.975, len(gains) - 1) * statistics.stdev(gains) / len(gains) ** 0.5
     mean = statistics.fmean(gains)
     return f"{mean:+.0f} {unit} ({mean - half:+.0f} to {mean + half:+.0f})"
+
+
+def draw_unlabelled(path: Path) -> Path:
+    """Draws mean action errors above success in closed loop, a column per observation setting, as png."""
+    errors, successes = ({name: cells(name) for name in REGIMES} for cells in (unlabelled_errors, unlabelled_successes))
+    names = [name for name, cells in errors.items() if cells]
+    figure = Figure(figsize=(2.5 * len(names), 5.2))
+    axes = figure.subplots(2, len(names), squeeze=False, sharex="col")
+    for column, name in enumerate(names):
+        top, bottom = axes[:, column]
+        _draw_lines(top, errors[name])
+        top.set_ylim(bottom=0)
+        top.set_title(REGIMES[name], fontsize=9)
+        rolled_out = {cell: _percent(seeds) for cell, seeds in successes[name].items()}
+        _draw_lines(bottom, rolled_out)
+        bottom.set_ylim(-3, 103)
+        if not rolled_out:
+            bottom.text(0.5, 0.5, "not rolled out", transform=bottom.transAxes, ha="center", color="#7a7a7a")
+        bottom.set_xlabel("labelled trajectories")
+        labels = sorted({number for _, number in errors[name]})
+        bottom.set_xscale("log", base=2)
+        bottom.set_xticks(labels, [str(number) for number in labels])
+        bottom.minorticks_off()
+    axes[0, 0].set_ylabel("action error (mm, mrad)")
+    axes[1, 0].set_ylabel("success (%)")
+    handles = {
+        label: handle for axis in axes[0] for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    shown = [method for method in _LOOKS if method in handles]
+    figure.legend([handles[method] for method in shown], shown, loc="lower center", ncols=len(shown), frameon=False)
+    figure.tight_layout(rect=(0, 0.06, 1, 1))
+    figure.savefig(path, dpi=130, metadata={"Software": None})
+    return path
+
+
+def _draw_lines(axis: Axes, cells: Cells) -> None:
+    """A line per method; the range over seeds for the method itself alone, or they would hide each other."""
+    for method, (color, line, marker) in _LOOKS.items():
+        points = sorted((number, list(seeds.values())) for (name, number), seeds in cells.items() if name == method)
+        if not points:
+            continue
+        x = [number for number, _ in points]
+        if method == "semi_supervised":
+            axis.fill_between(x, *([end(e) for _, e in points] for end in (min, max)), color=color, alpha=0.15, lw=0)
+        axis.plot(x, [statistics.fmean(e) for _, e in points], color=color, ls=line, marker=marker, ms=4, label=method)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
+def _percent(seeds: Mapping[int, float]) -> dict[int, float]:
+    return {seed: 100 * share for seed, share in seeds.items()}
