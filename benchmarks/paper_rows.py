@@ -13,10 +13,8 @@ from tables import SOURCE, percent, share, table
 
 from torchrl_koap.evaluation.statistics import wilson_interval
 from torchrl_koap.studies.paper import (
-    DEFAULT,
     Entry,
     above_the_paper,
-    default_entries,
     draw_average,
     layout_rows,
     paper_entries,
@@ -110,12 +108,6 @@ def bench_sentence(name: str, method: str = "") -> str:
     if method:
         entries = [replace(entry, paper=paper_cell(entry.task, "koap", entry.level)) for entry in entries]
     above, both = above_the_paper(entries, method or "koap")
-    return f"{above} of {both}"
-
-
-def bench_defaults(name: str) -> str:
-    """In how many cells the method that a task is trained with unless told otherwise is above the paper's KOAP."""
-    above, both = above_the_paper(default_entries(paper_cells_beside(name)), DEFAULT)
     return f"{above} of {both}"
 
 

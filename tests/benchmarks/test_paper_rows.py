@@ -39,17 +39,6 @@ def test_another_method_is_counted_against_the_papers_koap(rows, tmp_path):
     assert rows.bench_sentence("made", "pca") == "1 of 2"  # the paper's KOAP has 78.0 and 98.05 %
 
 
-def test_a_task_is_counted_by_the_method_it_is_trained_with(rows, tmp_path):
-    here = {"task": "stacking_unobserved_joints"}
-    cells = [
-        cell("koap", 0.01, 60) | here,
-        cell("command_regression", 0.01, 6) | here,
-        cell("command_regression", 0.02, 30) | here,
-    ]
-    write_cells(tmp_path / "made.csv", [cell("koap", 0.02, 60), cell("command_regression", 0.02, 60), *cells])
-    assert rows.bench_defaults("made") == "2 of 3"  # command_regression has 10 % in one, the paper's KOAP 27.2 %
-
-
 def test_seeds_of_a_cell_with_the_fewest_labels_are_counted_together(rows, tmp_path):
     cells = [
         cell("dp", 0.02, 20) | {"seed": 1},

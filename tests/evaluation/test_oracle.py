@@ -22,10 +22,6 @@ TASK = get_task("avoiding")
 STEPS = 30
 
 
-class Straight(RecordedPlanner):
-    """Plans that are handed over, one for every control step."""
-
-
 def futures_of(start, speed, horizon=14):
     """States on a line that leaves ``start`` with ``speed`` m per control step, as plans of every step."""
     ramp = torch.cat([torch.linspace(0, 1, 6), torch.ones(STEPS + horizon)]).cumsum(0)
@@ -40,7 +36,7 @@ def policy_of(planner=None, **options):
 
 
 def follow(speeds, **options):
-    planner = Straight(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2))
+    planner = RecordedPlanner(StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2))
     policy = policy_of(planner, **options)
     start = AvoidingEnv(1).reset()["observation"][0, 2:]
     futures = torch.stack([futures_of(start, speed) for speed in speeds])

@@ -22,6 +22,7 @@ from torchrl_koap.runs.run_directory import RunDirectory, RunDirectoryError
 from torchrl_koap.runs.weights import load_tensors
 from torchrl_koap.training import Trained
 
+_PACKAGES = ("torchrl_koap", "torch", "torchrl", "tensordict", "mujoco", "dm-control", "gymnasium-robotics", "numba")
 _LATER = ("eval.json", "inspect.json", "suggestions.json")  # files that a run may have
 
 
@@ -47,16 +48,7 @@ class Doctor(Command):
 def machine_facts() -> dict[str, str]:
     """Facts about this machine, name to value."""
     facts = {"python": platform.python_version(), "platform": platform.platform()}
-    for name in (
-        "torchrl_koap",
-        "torch",
-        "torchrl",
-        "tensordict",
-        "mujoco",
-        "dm-control",
-        "gymnasium-robotics",
-        "numba",
-    ):
+    for name in _PACKAGES:
         try:
             facts[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
