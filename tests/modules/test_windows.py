@@ -70,15 +70,6 @@ def test_clamping_and_spans_by_brute_force(num_past, look_ahead, num_frames):
     assert reader_of(num_past, look_ahead).index(num_frames, part).tolist() == rows[2:6]
 
 
-@pytest.mark.parametrize(("num_past", "look_ahead"), CASES)
-def test_the_next_state_is_read_in_no_frame_that_counts(num_past, look_ahead):
-    for clamped in (False, True):
-        for t in reader_of(num_past, look_ahead, clamped=clamped).valid_frames(T):
-            assert t + 1 not in reader_of(num_past, look_ahead).index(T, range(t, t + 1)).flatten().tolist()
-    leak = reader_of(num_past, look_ahead).index(T, range(T - 2, T - 1)).flatten().tolist()
-    assert T - 1 in leak and T - 2 not in reader_of(num_past, look_ahead, clamped=True).valid_frames(T)
-
-
 @pytest.mark.parametrize("clamped", [False, True])
 @pytest.mark.parametrize(("num_past", "look_ahead"), CASES)
 def test_the_shortest_window_holds_one_frame_and_one_less_is_an_error(num_past, look_ahead, clamped):

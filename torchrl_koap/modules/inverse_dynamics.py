@@ -23,6 +23,10 @@ class InverseDynamics(TensorDictModuleBase):
     A subclass writes :meth:`predict`, and of the rest what it needs. Training calls, in this order, :meth:`prepare`,
     its losses, :meth:`finish`, and :meth:`fit_labels` where the method has a decoder in closed form.
 
+    Subclasses take the size ``state_dim`` of a state as it is read, ``action_dim`` of an action, and the keywords
+    below; those that read steps also ``num_past`` frames before the present one, and ``look_ahead``, an offset or
+    several.
+
     Args:
         reader (WindowReader, optional): reads what a frame is predicted from. A subclass without one has ``num_past``,
             ``num_window_frames`` and :meth:`valid_frames` of its own.

@@ -20,16 +20,8 @@ from torchrl_koap.modules.windows import WindowReader
 class LinearInverseDynamics(InverseDynamics):
     """Predicts the action by ridge regression on the raw frames ``x_{t-n}, ..., x_t, x_{t+k}``, without a latent.
 
-    It reads labelled frames only; there is nothing to train.
-
-    Args:
-        state_dim (int): size ``d`` of a state.
-        action_dim (int): size of an action.
-
-    Keyword Args:
-        num_past (int): frames before the present one. Defaults to ``1``.
-        look_ahead (int or sequence of int): offsets ``k >= 2``, as for KOAP. Defaults to ``8``.
-        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
+    It reads labelled frames only; there is nothing to train. Args as for
+    :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2`` as for KOAP.
 
     Examples:
         >>> import torch
@@ -51,7 +43,7 @@ class LinearInverseDynamics(InverseDynamics):
         self.decoder = LinearActionDecoder(self.reader.num_features, action_dim)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Predicts actions ``[*B, len(frames), act]`` of a window of raw states ``[*B, T, d]``."""
+        """Applies the regression to the frames read, at unit spread."""
         return self.decoder.linear(self.inputs(self.reader(self.normalize_state(state), frames)))
 
     @torch.no_grad()

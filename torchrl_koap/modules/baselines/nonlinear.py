@@ -23,19 +23,13 @@ class NonlinearInverseDynamics(LiftedInverseDynamics):
         \hat z_{t+1} = h_\theta(z_t, u_t), \qquad \hat a_t = d_\phi(u_t)
 
     All parts are perceptrons and trained together by :class:`~torchrl_koap.objectives.KOAPLoss`. As in KOAP,
-    ``f`` reads steps at unit scale and never ``x_{t+1}``, which the dynamics have to predict.
-
-    Args:
-        state_dim (int): size ``d`` of a state.
-        action_dim (int): size of an action.
+    ``f`` reads steps at unit scale and never ``x_{t+1}``, which the dynamics have to predict. Args as for
+    :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``, and:
 
     Keyword Args:
         latent_dim (int): size ``m`` of a lifted state and of a latent action. Defaults to ``32``.
         hidden_dims (sequence of int): widths of ``f``, ``h`` and ``d``. Defaults to ``(128, 128)``.
         lifting_dims (sequence of int): widths of ``g`` and its inverse. Defaults to ``(64, 64)``, as KOAP's default.
-        num_past (int): number ``n`` of frames before the present one. Defaults to ``4``.
-        look_ahead (int or sequence of int): offsets ``k >= 2``. Defaults to ``(2, 3, 4, 5)``.
-        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Examples:
         >>> import torch

@@ -23,18 +23,12 @@ class PrincipalInverseDynamics(LatentInverseDynamics):
     """Decodes the leading principal components of what a window holds by ridge regression.
 
     A window is the present frame and the scaled steps around it, those that ``semi_supervised`` reads. The components
-    come from all windows, labelled or not (:meth:`finish`); their number from the held-out labelled error.
-
-    Args:
-        state_dim (int): size ``d`` of a state.
-        action_dim (int): size of an action.
+    come from all windows, labelled or not (:meth:`finish`); their number from the held-out labelled error. Args as for
+    :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 2``, and:
 
     Keyword Args:
         counts (sequence of int): numbers of components to choose among. Defaults to ``(2, 4, 8, 16, 32, 64)``.
-        num_past (int): frames before the present one. Defaults to ``8``.
-        look_ahead (sequence of int): offsets ``k >= 2``. Defaults to ``(2, ..., 8)``.
         penalty (float): ridge where fewer than three trajectories have labels. Defaults to ``0.15``.
-        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Examples:
         >>> import torch

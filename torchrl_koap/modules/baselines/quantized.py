@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -56,7 +55,6 @@ class FiniteScalarQuantizer(nn.Module):
             raise ValueError(f"every entry of a code needs 3 levels or more, got levels {tuple(levels)}")
         if num_codebooks < 1:
             raise ValueError(f"num_codebooks must be >= 1, got {num_codebooks}")
-        self.num_codebooks, self.num_codes = num_codebooks, math.prod(levels)
         self.levels = tuple(levels) * num_codebooks
         self.project_in = nn.Linear(features, len(self.levels))
         self.project_out = nn.Linear(len(self.levels), features)
@@ -88,19 +86,12 @@ class QuantizedInverseDynamics(LatentInverseDynamics):
     with ``s_t`` the steps between the frames ``x_{t-n}, ..., x_{t+k}`` (:class:`~torchrl_koap.modules.WindowReader`).
     Trained in two stages: :class:`~torchrl_koap.objectives.QuantizedDynamicsLoss` on all windows, then
     :class:`~torchrl_koap.objectives.ActionLoss` with ``freeze_latents`` on the labelled frames. Actions are decoded
-    from the code alone.
-
-    Args:
-        state_dim (int): size ``d`` of a state.
-        action_dim (int): size of an action.
+    from the code alone. Args as for :class:`~torchrl_koap.modules.InverseDynamics`, and:
 
     Keyword Args:
         latent_dim (int): size ``m`` of a latent, before the quantisation and after it. Defaults to ``16``.
         hidden_dims (sequence of int): widths of the three networks. Defaults to ``(128, 128)``.
-        num_past (int): number ``n`` of frames before the present one. Defaults to ``4``.
         look_ahead (int or sequence of int): offsets ``k``; 1 must be one of them, the transition that is encoded.
-            Defaults to ``(1, 2, 3, 4, 5)``.
-        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Raises:
         ValueError: for a look-ahead without 1.

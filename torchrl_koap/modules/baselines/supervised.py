@@ -19,17 +19,11 @@ class SupervisedInverseDynamics(InverseDynamics):
         a_t = f(x_{t-n}, \dots, x_t, x_{t+k_1}, x_{t+k_2}, \dots)
 
     With ``look_ahead=1`` this is the inverse dynamics of Decision Diffuser, which is told the next state and nothing
-    further ahead. Trained by :class:`~torchrl_koap.objectives.ActionLoss`.
-
-    Args:
-        state_dim (int): size ``d`` of a state.
-        action_dim (int): size of an action.
+    further ahead. Trained by :class:`~torchrl_koap.objectives.ActionLoss`. Args as for
+    :class:`~torchrl_koap.modules.InverseDynamics`, offsets ``k >= 1``, and:
 
     Keyword Args:
         hidden_dims (sequence of int): widths. Defaults to ``(128, 128)``.
-        num_past (int): frames ``n`` before the present one. Defaults to ``4``.
-        look_ahead (int or sequence of int): offsets ``k >= 1``. Defaults to ``1``.
-        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Examples:
         >>> import torch
@@ -54,5 +48,5 @@ class SupervisedInverseDynamics(InverseDynamics):
         self.network = MLP(self.reader.num_features, action_dim, num_cells=hidden_dims, activation_class=nn.ReLU)
 
     def predict(self, state: Tensor, frames: range | None = None) -> Tensor:
-        """Predicts normalised actions ``[*B, len(frames), act]`` of a window of raw states ``[*B, T, d]``."""
+        """Applies the perceptron to what every frame reads."""
         return self.network(self.reader(self.normalize_state(state), frames))

@@ -21,17 +21,13 @@ class VariationalInverseDynamics(LatentInverseDynamics):
     with ``s_t`` the present state and the steps to and from it (:class:`~torchrl_koap.modules.WindowReader`), and an
     LSTM that runs over the window in both directions. Trained in two stages, as the paper says:
     :class:`~torchrl_koap.objectives.VariationalLoss` on all windows, then :class:`~torchrl_koap.objectives.ActionLoss`
-    with ``freeze_latents`` and ``sample`` on the labelled frames. Where it acts it reads the mean.
-
-    Args:
-        state_dim (int): size ``d`` of a state.
-        action_dim (int): size of an action.
+    with ``freeze_latents`` and ``sample`` on the labelled frames. Where it acts it reads the mean. Args as for
+    :class:`~torchrl_koap.modules.InverseDynamics`, and:
 
     Keyword Args:
         window (int): frames of the windows that it reads as a whole. Defaults to ``16``.
         latent_dim (int): size ``m`` of a latent. Defaults to ``16``.
         hidden_dim (int): size of the LSTM's state in either direction, and width of the decoders. Defaults to ``128``.
-        **kwargs: columns, normalisers and keys, see :class:`~torchrl_koap.modules.InverseDynamics`.
 
     Examples:
         >>> import torch

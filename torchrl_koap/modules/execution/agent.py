@@ -66,17 +66,12 @@ class Agent:
 
     @torch.no_grad()
     def act(self, observation: np.ndarray | Tensor | Sequence[float]) -> np.ndarray | Tensor:
-        """The action for an observation.
+        """The action ``[act]`` for an observation ``[obs]`` in raw units, or ``[n, act]`` for those of several robots.
 
-        Args:
-            observation (array or Tensor): ``[obs]`` of one robot or ``[n, obs]`` of several, raw units.
-
-        Returns:
-            array or Tensor: ``[act]`` or ``[n, act]``, of the kind of the observation.
+        It is an array or a tensor, as the observation is.
         """
         began = time.perf_counter()
-        observed = self._checked(observation)
-        newest = observed.unsqueeze(-2)
+        newest = self._checked(observation).unsqueeze(-2)
         if self._frames is None:
             self._frames = newest.expand(-1, self.policy.history, -1).clone()
         else:

@@ -92,9 +92,7 @@ class AsynchronousAgent(Agent):
         """
         super().reset()
         if observation is not None:
-            frames = self._checked(observation).unsqueeze(-2).expand(-1, self.policy.history, -1)
-            self._plan, took = self._make(frames, self._noise(len(frames)), None)
-            self._delay = self._steps(took)
+            self._make_first(self._checked(observation).unsqueeze(-2).expand(-1, self.policy.history, -1))
 
     def _forget(self) -> None:
         super()._forget()
@@ -109,8 +107,7 @@ class AsynchronousAgent(Agent):
     def _decide(self) -> Tensor:
         frames, policy = self._frames, self.policy
         if self._plan is None:
-            self._plan, took = self._make(frames, self._noise(len(frames)), None)
-            self._delay = self._steps(took)
+            self._make_first(frames)
         if self._pending is not None and self._pending.done():
             self._plan, took = self._pending.result()
             self._delay, self._age, self._pending = self._steps(took), self._begun, None
@@ -122,6 +119,10 @@ class AsynchronousAgent(Agent):
         self._age += 1
         self._begun += 1
         return action
+
+    def _make_first(self, frames: Tensor) -> None:
+        self._plan, took = self._make(frames, self._noise(len(frames)), None)
+        self._delay = self._steps(took)
 
     @torch.no_grad()
     def _make(self, frames: Tensor, noise: Tensor, prefix: Tensor | None) -> tuple[Tensor, float]:

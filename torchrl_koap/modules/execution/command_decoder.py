@@ -77,11 +77,6 @@ class CommandDecoder(nn.Module):
         self.decoder = nn.Linear(width, len(actions))
         self.inputs, self.outputs = Normalizer(inputs), Normalizer(len(actions))
 
-    @property
-    def num_axes(self) -> int:
-        """``J``."""
-        return self.decoder.out_features
-
     def set_scales(self, states: Tensor, commands: Tensor) -> None:
         """Takes mean and standard deviation of states ``[N, d]`` and of commands ``[N, J]``."""
         self.inputs = Normalizer.fit(self._read(states), mode="standard")

@@ -85,15 +85,9 @@ class CommandLimits(nn.Module):
             self.register_buffer(name, torch.as_tensor(list(columns), dtype=torch.long), persistent=False)
 
     def forward(self, observations: Tensor, action: Tensor) -> Tensor:
-        """What is left of an action.
+        """What is left of an action ``[*B, act]``, by observations ``[*B, history, obs]``, the present one last.
 
-        Args:
-            observations (Tensor): ``[*B, history, obs]``, the present one last.
-            action (Tensor): ``[*B, act]``; not changed.
-
-        Returns:
-            Tensor: ``[*B, act]``; what is within the limits keeps its bits, for episodes with contacts turn out
-            otherwise for a rounding error.
+        What is within the limits keeps its bits, for episodes with contacts turn out otherwise for a rounding error.
         """
         return self.paced(observations, self.in_range(action))
 

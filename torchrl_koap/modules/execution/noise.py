@@ -67,12 +67,6 @@ class StartNoise(TensorDictModuleBase):
 
     Keyword Args:
         noise_key (NestedKey): entry that is written, ``planner.noise_key``. Defaults to ``"noise"``.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from torchrl_koap.modules.execution.noise import NoiseStreams, StartNoise
-        >>> StartNoise(NoiseStreams([7], (14, 2), block=3))(TensorDict(batch_size=[1]))["noise"].shape
-        torch.Size([1, 14, 2])
     """
 
     def __init__(self, streams: NoiseStreams, *, noise_key: NestedKey = NOISE):

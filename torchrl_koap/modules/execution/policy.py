@@ -137,16 +137,13 @@ class PlanningPolicy(TensorDictModuleBase):
         previous: Tensor | None = None,
         started: Tensor | None = None,
     ) -> Tensor:
-        """Makes what is executed next: a plan, or a chunk of actions.
+        """Makes what is executed next: planned states ``[*B, H, d]``, or a chunk of actions ``[*B, n, act]``.
 
         Args:
             observations (Tensor): ``[*B, history, obs]``, raw units.
             noise (Tensor, optional): ``[*B, *noise_shape]``, standard normal. Default: random.
             previous (Tensor, optional): the plan of before, which several candidates are compared with.
             started (Tensor, optional): where an episode begins, bool ``[*B]``.
-
-        Returns:
-            Tensor: planned states ``[*B, H, d]``, or actions ``[*B, n, act]``.
         """
         states = self.state_of(observations)
         seen, candidates = states[..., -self.planner.history :, :], self.execution.candidates

@@ -23,9 +23,8 @@ def policy_transforms(
         history (int): observed frames, the present one included.
 
     Keyword Args:
-        observation_key (NestedKey): entry of the observation ``[*B, obs]``. Defaults to ``"observation"``.
-        history_key (NestedKey): entry that the policy reads, its ``in_keys[0]``. Defaults to
-            ``"observation_history"``.
+        observation_key (NestedKey): entry of the observation ``[*B, obs]``.
+        history_key (NestedKey): entry that the policy reads, its ``in_keys[0]``.
 
     Returns:
         Compose: transforms for a ``TransformedEnv``.
@@ -75,15 +74,7 @@ class PolicyEnv(TransformedEnv):
         super().__init__(env, Compose(*(transform.clone() for transform in transforms), *noise))
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Seeds the environment and the noise.
-
-        Args:
-            seed (int, optional): the seed.
-            static_seed (bool): return the same seed as that of the next environment.
-
-        Returns:
-            int: the seed for the next environment.
-        """
+        """Seeds the environment and the noise; as in :class:`torchrl.envs.EnvBase`."""
         if seed is not None:
             for transform in self.transform:
                 if isinstance(transform, NoiseTransform):

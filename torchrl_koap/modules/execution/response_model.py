@@ -131,7 +131,7 @@ class ResponseModel(nn.Module):
     def fit_ridge(
         self, coordinates: Tensor, steps: Tensor, *, penalty: float = 1e-5, coupled: bool = True
     ) -> ResponseModel:
-        """Fits the model to measured steps by ridge regression.
+        """Fits this model to measured steps by ridge regression, and returns it.
 
         Args:
             coordinates (Tensor): ``[n, J, 2 memory + 1]`` (:meth:`coordinates`).
@@ -140,9 +140,6 @@ class ResponseModel(nn.Module):
         Keyword Args:
             penalty (float): ridge penalty, relative to the coordinates' mean squares.
             coupled (bool): an axis may answer the commands of others; else each one is fitted by itself.
-
-        Returns:
-            ResponseModel: this one.
 
         Raises:
             ValueError: if there is no step, or the shapes do not fit.

@@ -29,10 +29,8 @@ class LatentActionModule(TensorDictModuleBase):
         latent_dim (int): size ``m`` of a latent action.
 
     Keyword Args:
-        num_past (int): number ``n`` of frames before the present one. Defaults to ``1``.
-        look_ahead (int or sequence of int): offset ``k >= 2``, or several. Defaults to ``8``.
-        relative (bool): read steps at unit scale beside the present frame, instead of frames. Defaults to ``False``.
-        clamped (bool): let frames whose look-ahead is cut at the window's end count. Defaults to ``False``.
+        num_past, look_ahead, relative, clamped: of the reader (:class:`~torchrl_koap.modules.WindowReader`), with the
+            paper's defaults: one frame before, one 8 ahead, frames instead of steps.
         in_key (NestedKey): window of states ``[*B, T, d]`` in the network's units. Defaults to ``"state"``.
         out_key (NestedKey): latent actions ``[*B, T, m]``. Defaults to ``"latent_action"``.
 

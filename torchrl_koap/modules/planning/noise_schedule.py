@@ -114,10 +114,6 @@ class NoiseSchedule(nn.Module):
         self.register_buffer("signal", signal.to(**default))
         self.register_buffer("noise", noise.to(**default))
 
-    def extra_repr(self) -> str:
-        """Shows the options in ``print(schedule)``."""
-        return f"prediction={self.prediction!r}, num_train_steps={self.num_train_steps}"
-
     def sample_time(self, like: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Draws training times ``[*B]``, in training steps, of the type and device of sequences ``[*B, H, d]``."""
         time = torch.randint(self.num_train_steps, like.shape[:-2], device=like.device, generator=generator)

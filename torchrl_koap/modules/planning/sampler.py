@@ -154,8 +154,6 @@ class ConditionalSampler(TensorDictModuleBase):
             sequence (Tensor): clean normalised sequences ``[*B, H, width]``.
             noise (Tensor, optional): of the same shape. Default: random.
             time (Tensor, optional): ``[*B]`` in training steps. Default: random.
-
-        Keyword Args:
             dtype (torch.dtype, optional): of the denoiser's matrix products. Default: that of its weights.
         """
         with torch.no_grad():
@@ -185,8 +183,6 @@ class ConditionalSampler(TensorDictModuleBase):
             history (Tensor): observed states, the present one last.
             noise (Tensor, optional): start noise ``[*B, H, width]``. Default: drawn.
             generator (torch.Generator, optional): source of what is drawn.
-
-        Keyword Args:
             prefix (Tensor, optional): first frames ``[*B, k, width]`` that the sequence has to have, ``k`` below the
                 horizon: what is executed anyway while it is sampled (real-time chunking, arXiv 2506.07339).
 
