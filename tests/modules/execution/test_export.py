@@ -21,7 +21,7 @@ from torchrl_koap.modules.execution.export import SUFFIXES, ExportError, export_
 
 def policy(**execution):
     torch.manual_seed(0)
-    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=3)
+    planner = StatePlanner(TemporalUnet(2, 4, channels=(8, 16)), state_dim=2, num_steps=2)
     controller = make_koopman_inverse_dynamics(2, 3)
     columns = {"commands": [0, 1], "states": [0, 1]}
     return make_policy(

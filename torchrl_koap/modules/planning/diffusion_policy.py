@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from tensordict import NestedKey
 from torch import Tensor, nn
 
-from torchrl_koap import keys
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.noise_schedule import NoiseSchedule
 from torchrl_koap.modules.planning.sampler import ConditionalSampler
@@ -35,7 +36,6 @@ class DiffusionPolicy(ConditionalSampler):
         state_dim (int): number ``d`` of state columns.
         action_dim (int): number ``act`` of action entries.
         relative (bool): the condition holds displacements from the present state. Defaults to False.
-        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``. Defaults to ``["history"]``.
         out_keys (list of NestedKey): the entry of the actions ``[*B, H, act]``. Defaults to ``["action_chunk"]``.
 
     Raises:
@@ -59,12 +59,13 @@ class DiffusionPolicy(ConditionalSampler):
         state_dim: int,
         action_dim: int,
         relative: bool = False,
+        out_keys: Sequence[NestedKey] = (ACTION_CHUNK,),
         **options: Any,
     ):
         if action_dim < 1:
             raise ValueError(f"action_dim must be at least 1, got {action_dim}")
-        options = {"in_keys": [keys.HISTORY], "out_keys": [ACTION_CHUNK]} | options
-        super().__init__(denoiser, schedule, state_dim=state_dim, width=action_dim, relative=relative, **options)
+        options |= {"relative": relative, "out_keys": out_keys}
+        super().__init__(denoiser, schedule, state_dim=state_dim, width=action_dim, **options)
         self.action_dim = action_dim
         self.action_normalizer = Normalizer(action_dim)
 

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+from tensordict import NestedKey
 from torch import Tensor, nn
 
 from torchrl_koap import keys
@@ -38,7 +40,6 @@ class StatePlanner(ConditionalSampler):
         state_dim (int): number ``d`` of state columns.
         relative (bool): model displacements from the present state. Defaults to True.
         forecast (bool): model deviations from a linear forecast. Defaults to False.
-        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``. Defaults to ``["history"]``.
         out_keys (list of NestedKey): the entry of the plan ``[*B, H, d]``. Defaults to ``["plan"]``.
 
     Examples:
@@ -60,10 +61,11 @@ class StatePlanner(ConditionalSampler):
         state_dim: int,
         relative: bool = True,
         forecast: bool = False,
+        out_keys: Sequence[NestedKey] = (keys.PLAN,),
         **options: Any,
     ):
-        options = {"in_keys": [keys.HISTORY], "out_keys": [keys.PLAN]} | options
-        super().__init__(denoiser, schedule, state_dim=state_dim, width=state_dim, relative=relative, **options)
+        options |= {"relative": relative, "out_keys": out_keys}
+        super().__init__(denoiser, schedule, state_dim=state_dim, width=state_dim, **options)
         entries = self.horizon * state_dim
         self.plan_normalizer = Normalizer(entries)
         self.forecast = LinearForecast(len(self.condition_normalizer.scale), entries) if forecast else None

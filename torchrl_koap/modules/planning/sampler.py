@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from torchrl_koap.keys import HISTORY
 from torchrl_koap.lookup import lookup
 from torchrl_koap.modules.normalizer import Normalizer
 from torchrl_koap.modules.planning.noise_schedule import SOLVERS, NoiseSchedule
@@ -30,9 +32,9 @@ class ConditionalSampler(TensorDictModuleBase):
     Keyword Args:
         state_dim (int): number ``d`` of state columns.
         width (int): columns of a sequence.
-        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``, raw units.
         out_keys (list of NestedKey): the entry of the sequence ``[*B, H, width]``, raw units.
         relative (bool): the condition holds older frames as displacements from the present one.
+        in_keys (list of NestedKey): the entry of the history ``[*B, h, d]``, raw units. Defaults to ``["history"]``.
         history (int): number ``h`` of observed frames, the present one included. Defaults to 2.
         horizon (int): number ``H`` of frames of a sequence. Defaults to 14.
         features (nn.Module, optional): ``features(history [*B, h, d]) -> [*B, f]`` with the attribute ``num_features``:
@@ -55,9 +57,9 @@ class ConditionalSampler(TensorDictModuleBase):
         *,
         state_dim: int,
         width: int,
-        in_keys: list[NestedKey],
-        out_keys: list[NestedKey],
+        out_keys: Sequence[NestedKey],
         relative: bool,
+        in_keys: Sequence[NestedKey] = (HISTORY,),
         history: int = 2,
         horizon: int = 14,
         features: nn.Module | None = None,
