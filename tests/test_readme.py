@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import shlex
 from dataclasses import replace
@@ -55,7 +56,10 @@ def test_targets_exist():
 
 
 @pytest.mark.parametrize("arguments", CALLS, ids=" ".join)
-def test_commands_parse(arguments):
+def test_commands_parse(arguments, monkeypatch):
+    """With every extra: a launcher that is not installed is refused (tests/studies/test_launchers.py)."""
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: name == "ray" or found(name, *rest))
     options = parsed(arguments)
     assert type(options).__name__.lower() == arguments[0]
 
@@ -98,7 +102,7 @@ def test_python_runs(code, demonstrations, tmp_path, monkeypatch):
     assert "train(" not in code or [type(config).__name__ for config in called] == ["TrainConfig", "EvalConfig"]
 
 
-PATHS = re.findall(r"`((?:torchrl_koap|tutorials|benchmarks|tests|docs)/[\w./]*)`", TEXT)
+PATHS = re.findall(r"`((?:torchrl_koap|tutorials|examples|benchmarks|tests|docs)/[\w./]*)`", TEXT)
 
 
 def test_links_lead_somewhere():

@@ -10,7 +10,10 @@ from typing import Any
 from pages import ROOT, heading, table, toctree, write_page
 
 PACKAGE = ROOT / "torchrl_koap"
-ROOMS = ("tasks", "data", "modules", "objectives", "envs", "runs", "training", "evaluation", "reports", "studies")
+ROOMS = (
+    *("tasks", "data", "modules", "objectives", "envs", "vision", "runs", "training", "evaluation", "reports"),
+    "studies",
+)
 BASE = ("keys", "lookup", "files")
 
 

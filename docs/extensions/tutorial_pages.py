@@ -20,8 +20,8 @@ FOLDER, OUTPUTS = ROOT / "tutorials", ROOT / "docs" / "outputs"
 ORDER = (
     "few_labels",
     "own_robot",
-    "gymnasium_robot",
     "modules_by_hand",
+    "gymnasium_robot",
     "compare_controllers",
     "planners",
     "own_task",
@@ -29,6 +29,7 @@ ORDER = (
     "scooping",
     "label_curve",
 )
+FIRST = 4  # of them are the tutorials; the others are the gallery
 DIGEST = "# code: "
 
 
@@ -52,9 +53,11 @@ def write_tutorial_pages() -> None:
     write_page(
         "tutorials/index",
         heading("Tutorials"),
-        "Each is a script that tells one story, prints its numbers and ends with a picture. ``make tutorials`` runs "
-        "them all; what is shown here is what it left.",
-        table(("script", "story", "to begin with"), rows),
+        "Each is a script that prints its numbers and ends with a picture. ``make tutorials`` runs them all and keeps "
+        "the output that these pages show. Read the first four in this order.",
+        table(("script", "title", "first point"), rows[:FIRST]),
+        heading("Example gallery", 1),
+        table(("script", "title", "first point"), rows[FIRST:]),
         toctree(ORDER, hidden=True),
     )
 
