@@ -25,7 +25,7 @@ WANTED = (
     "torchrl_koap/reports/templates/run.html",
     "torchrl_koap/reports/templates/style.css",
 )
-UNWANTED = ("tests/", "shared/", "pretrained/", "docs/", "benchmarks/", "runs/")
+UNWANTED = ("tests/", "shared/", "pretrained/", "docs/", "benchmarks/", "examples/", "runs/")
 SCRIPT = """
 import tempfile, torchrl_koap
 from pathlib import Path

@@ -1,0 +1,32 @@
+# This source code is licensed under the MIT license found in the LICENSE file.
+"""The example without ``koap train`` is short, names the parts that it shows, and runs."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "train_without_commands.py"
+
+
+def test_the_example_has_sixty_lines_of_code():
+    code = [line for line in EXAMPLE.read_text().splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    assert len(code) <= 60
+    for part in (
+        "KoopmanInverseDynamics",
+        "LabelBudget",
+        "make_window_buffer",
+        "KOAPLoss",
+        "TransformedEnv",
+        "Collector",
+    ):
+        assert part in EXAMPLE.read_text(), part
+
+
+def test_the_example_runs(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), "--demonstrations", "4", "--updates", "2"])
+    runpy.run_path(str(EXAMPLE), run_name="__main__")
+    labels, controller, planner, rollouts = capsys.readouterr().out.splitlines()
+    assert "transitions have labels" in labels and "loss_koopman" in controller and "loss_planner" in planner
+    assert rollouts.startswith("(8, 120): ") and "nan" not in controller + planner
