@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchrl_koap.evaluation.statistics import expected_entropy, mode_entropy, wilson_interval
+from torchrl_koap.evaluation.statistics import expected_entropy, mode_entropy, rate, wilson_interval
 
 Z = 1.959963984540054
 
@@ -22,17 +22,18 @@ def test_known_intervals():
     assert wilson_interval(0, 20) == pytest.approx((0.0, 0.1611), abs=5e-5)
     assert wilson_interval(1, 29) == pytest.approx((0.0061, 0.1718), abs=5e-5)
     assert wilson_interval(0, 20)[0] == 0.0 and wilson_interval(20, 20)[1] == 1.0
+    assert rate([True, True]) == {"rate": 1.0, "low": pytest.approx(0.342, abs=5e-4), "high": 1.0, "episodes": 2}
 
 
 @given(st.integers(1, 500).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
 def test_bounds_solve_the_score_equation_and_are_symmetric(case):
     successes, trials = case
     low, high = wilson_interval(successes, trials)
-    rate = successes / trials
-    assert 0 <= low <= rate <= high <= 1
+    share = successes / trials
+    assert 0 <= low <= share <= high <= 1
     for bound in (low, high):
         if 0 < bound < 1:
-            assert (rate - bound) ** 2 == pytest.approx(Z**2 * bound * (1 - bound) / trials, rel=1e-6, abs=1e-12)
+            assert (share - bound) ** 2 == pytest.approx(Z**2 * bound * (1 - bound) / trials, rel=1e-6, abs=1e-12)
     assert wilson_interval(trials - successes, trials) == pytest.approx((1 - high, 1 - low), abs=1e-12)
 
 
@@ -45,7 +46,7 @@ def test_impossible_counts_are_refused(successes, trials):
 def test_known_entropies():
     assert mode_entropy([0, 0, 1, 2], 4) == pytest.approx(0.75)  # (1/2 ln 2 + 2/4 ln 4) / ln 4
     assert mode_entropy(range(24), 24) == pytest.approx(1.0)
-    assert mode_entropy([5] * 60, 24) == 0.0 and math.copysign(1, mode_entropy([5], 24)) == 1
+    assert mode_entropy([5] * 60, 24) == mode_entropy([], 4) == 0.0 and math.copysign(1, mode_entropy([5], 24)) == 1
     assert mode_entropy([0, 1], 24) == pytest.approx(math.log(2) / math.log(24))
 
 

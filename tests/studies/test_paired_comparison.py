@@ -24,6 +24,7 @@ def test_p_value_by_hand():
     # |sum| of +-3 +-1 +-1 is 5, 3, 3, 1 and mirrored: 6 of 8 are at least 3
     assert sign_flip_p([3, -1, 1]) == pytest.approx(6 / 8)
     assert sign_flip_p([3, 1, 1]) == pytest.approx(2 / 8)
+    assert sign_flip_p([]) == sign_flip_p([1, -1, 0]) == 1.0
     values = [1 / 3, 2 / 3, -1 / 3, 1.0, 0.0]
     sums = [
         sum(s * v for s, v in zip(signs, values[:4], strict=True)) for signs in itertools.product((-1, 1), repeat=4)

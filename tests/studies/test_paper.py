@@ -29,6 +29,7 @@ def test_both_tables_are_whole():
     methods = ("koap", "nonlinear", "pretrain", "relabel")
     assert places == {(t, m, n) for t in (tasks[0], tasks[4]) for m in methods for n in range(1, 6)}
     assert all(0 <= cell.success <= 1 and 0 <= cell.spread < 0.25 for cell in first + second)
+    assert len([cell for cell in first + second if cell.task != "stacking_1"]) == 165
 
 
 @pytest.mark.parametrize(

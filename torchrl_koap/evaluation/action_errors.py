@@ -215,15 +215,6 @@ def summarise_errors(models: dict[str, Tensor], true: Tensor, episode: Tensor, t
         dict: ``labels``, ``trajectories``; ``relative``: the controller's error as a share of that of the mean action,
         root mean square over columns (1: no better than always giving the mean action); ``unit`` and ``column``: rows
         with the errors of every model in the unit of the data; ``trajectory``: the relative error of each.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.evaluation.action_errors import summarise_errors
-        >>> from torchrl_koap.tasks import get_task
-        >>> true = torch.tensor([[1.0, 2.0], [-1.0, -2.0]])
-        >>> models = {"controller": true / 2, "mean_action": torch.zeros(2, 2)}
-        >>> summarise_errors(models, true, torch.zeros(2), get_task("avoiding"))["relative"]
-        0.5
     """
     square = {name: (predicted - true).square() for name, predicted in models.items()}
     units, names = list(task.action_units), task.action_names

@@ -20,13 +20,7 @@ _WORSE = 2.0  # from here on a latent model's error is no longer that of a compa
 
 
 def unit_circle_sides(magnitudes: Sequence[float]) -> list[str]:
-    """Tells whether eigenvalues of these magnitudes lie ``"inside"``, ``"on"`` or ``"outside"`` the unit circle.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.findings import unit_circle_sides
-        >>> unit_circle_sides([0.9, 0.9995, 1.2])
-        ['inside', 'on', 'outside']
-    """
+    """Tells whether eigenvalues of these magnitudes lie ``"inside"``, ``"on"`` or ``"outside"`` the unit circle."""
     low, high = 1 - ON_THE_CIRCLE, 1 + ON_THE_CIRCLE
     return ["outside" if size > high else "inside" if size < low else "on" for size in magnitudes]
 
@@ -95,12 +89,6 @@ def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
     the first part of the state. A latent model is faulted for an error above twice that of a linear model on raw states
     (fitted on the same inputs), for one above standing still, and for losing more by mapping states back than the
     linear model errs in all.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.findings import latent_faults
-        >>> errors = {"koopman": 2.0, "reconstruction": 0.5, "linear": 0.04, "copy_last": 9.0}
-        >>> latent_faults({name: {"xy": [value]} for name, value in errors.items()})[0]
-        'the latent dynamics predict 50 times worse than a linear model on raw states'
     """
     part = next(iter(multi_step["koopman"]))
     koopman, back, linear, still = (float(multi_step[model][part][-1]) for model in MODELS)
@@ -117,14 +105,7 @@ def latent_faults(multi_step: Mapping[str, Any]) -> list[str]:
 
 
 def offline_faults(plan: Mapping[str, Any], action: Mapping[str, Any]) -> list[str]:
-    """Says what is worse than what needs no learning at all, by the figures of an offline evaluation.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.findings import offline_faults
-        >>> row = {"name": "dq1", "unit": "rad", "controller": 0.004, "mean_action": 0.003}
-        >>> offline_faults({"note": ""}, {"left_out": {"column": [row]}, "outside_budget": {"note": ""}})
-        ['action dq1 is worse than always giving its mean (labelled trajectories left out): 4 against 3 mrad']
-    """
+    """Says what is worse than what needs no learning at all, by the figures of an offline evaluation."""
     faults = []
     for row in plan.get("unit", ()):
         own = row["planner"]["energy_score"]["overall"]

@@ -27,13 +27,6 @@ def spectrum(eigenvalues: Tensor) -> dict[str, Any]:
     r"""Tells where the eigenvalues of an operator lie, and in how many steps its slowest parts fade to 1/e.
 
     The decay times are :math:`-1 / \ln |\lambda|` of the five slowest of those inside the unit circle.
-
-    Examples:
-        >>> import math
-        >>> import torch
-        >>> from torchrl_koap.evaluation.latent_space import spectrum
-        >>> spectrum(torch.tensor([1.0, 1.25, 1j / math.e], dtype=torch.complex128))
-        {'spectral_radius': 1.25, 'inside': 1, 'on': 1, 'outside': 1, 'slowest_decay_steps': [1.0]}
     """
     size = eigenvalues.detach().abs().double().sort(descending=True).values
     sides = unit_circle_sides(size.tolist())
@@ -167,15 +160,7 @@ def _roll_linear(controller: KoopmanInverseDynamics, weight: Tensor, states: Ten
 
 
 def explained(predicted: Tensor, true: Tensor) -> list[float]:
-    """Returns the share ``R^2`` of the variance of every column ``[N, a]`` that is explained; NaN without variance.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.evaluation.latent_space import explained
-        >>> true = torch.tensor([[0.0], [2.0]])
-        >>> explained(true, true), explained(torch.ones(2, 1), true)
-        ([1.0], [0.0])
-    """
+    """Returns the share ``R^2`` of the variance of every column ``[N, a]`` that is explained; NaN without variance."""
     left = (predicted - true).double().square().sum(0)
     spread = (true - true.mean(0)).double().square().sum(0)
     return torch.where(spread > 0, 1 - left / spread, torch.nan).tolist()

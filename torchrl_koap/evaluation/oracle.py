@@ -44,20 +44,6 @@ class OracleFollower(Follower):
 
     Raises:
         ValueError: if the task has no environment, or does not say which state columns its actions move.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.evaluation.oracle import OracleFollower
-        >>> from torchrl_koap.evaluation.rollouts import roll_out
-        >>> from torchrl_koap.envs import AvoidingEnv
-        >>> from torchrl_koap.modules import MLPDenoiser, StatePlanner, make_policy
-        >>> from torchrl_koap.tasks import get_task
-        >>> _ = torch.manual_seed(0)
-        >>> planner = StatePlanner(MLPDenoiser(2, 4, horizon=14, width=8, depth=1), state_dim=2)
-        >>> task = get_task("avoiding")
-        >>> policy = make_policy(planner, state_of=task.state_of, follower=OracleFollower(task))
-        >>> roll_out(policy, AvoidingEnv, [0], max_steps=3)[0]["action"].shape
-        torch.Size([3, 2])
     """
 
     knows_command = True

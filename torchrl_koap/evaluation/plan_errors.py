@@ -25,14 +25,7 @@ SITUATIONS = 500  # that are looked at, at most
 
 
 def baseline_plans(history: Tensor, horizon: int) -> dict[str, Tensor]:
-    """Makes the plans ``[*B, H, d]`` that a planner has to beat, of two or more observed states ``[*B, h, d]``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.evaluation.plan_errors import baseline_plans
-        >>> {name: plan.squeeze(-1).tolist() for name, plan in baseline_plans(torch.tensor([[0.0], [1.0]]), 2).items()}
-        {'standing_still': [1.0, 1.0], 'constant_velocity': [2.0, 3.0]}
-    """
+    """Makes the plans ``[*B, H, d]`` that a planner has to beat, of two or more observed states ``[*B, h, d]``."""
     now, before = history[..., -1:, :], history[..., -2:-1, :]
     ahead = torch.arange(1, horizon + 1, device=history.device, dtype=history.dtype)[:, None]
     return {
@@ -94,13 +87,6 @@ def score_sequences(
 
     Returns:
         tuple: rows as in :func:`plan_errors`, and per unit the energy score of every model in every situation ``[N]``.
-
-    Examples:
-        >>> import torch
-        >>> from torchrl_koap.evaluation.plan_errors import score_sequences
-        >>> (row,), _ = score_sequences({"still": torch.zeros(1, 5, 2, 1)}, torch.ones(5, 2, 1), ["q"], ["rad"])
-        >>> row["still"]["energy_score"]
-        {'overall': 1.0, 'per_step': [1.0, 1.0]}
     """
     rows, scores = [], []
     for unit, columns in unit_groups(units).items():

@@ -104,13 +104,6 @@ def task_scores(
 
     ``d3il_score`` among them is the single figure D3IL ranks methods by, where it is defined. What the function returns
     as ``rates``, a name in words to a bool per rollout, joins the success in ``rates``, with an interval.
-
-    Examples:
-        >>> from torchrl_koap.evaluation.scores import task_scores
-        >>> from torchrl_koap.tasks import get_task
-        >>> result = {"rates": {"success": {"rate": 0.5}}, "mode_entropy": 1.0}
-        >>> task_scores(get_task("aligning"), result, [], [])["d3il_score"]
-        0.75
     """
     rule = resolve(task.score, f"score of task {task.name!r}")
     found = {} if rule is None else dict(rule(result, episodes, contexts))

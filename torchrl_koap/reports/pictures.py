@@ -94,11 +94,6 @@ class Picture:
         order (int): pictures stand in the report in this order.
         empty (str): what the report says where the source holds nothing to draw; nothing if it is empty.
         offline (bool): it is of tasks without an environment alone, which are evaluated on recorded data.
-
-    Examples:
-        >>> from torchrl_koap.reports.pictures import all_pictures
-        >>> all_pictures()["modes.png"].source
-        'rollouts.safetensors'
     """
 
     name: str

@@ -40,15 +40,6 @@ class RunFacts:
         inspection (mapping): ``inspect.json``.
         config (mapping): ``config.json``.
         damaged (tuple of str): what was wrong with which of them.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from torchrl_koap.reports.run_facts import RunFacts
-        >>> from torchrl_koap.tasks import get_task
-        >>> evaluation = {"rates": {"success": {"rate": 0.5, "episodes": 8}}}
-        >>> run = RunFacts(Path("runs/koap"), get_task("avoiding"), evaluation=evaluation)
-        >>> run.modes.number, run.successes
-        (24, 4)
     """
 
     folder: Path

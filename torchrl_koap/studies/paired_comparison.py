@@ -83,14 +83,6 @@ def compare(first: Mapping[int, Outcome], second: Mapping[int, Outcome], *, erro
 
     Returns:
         Comparison or None: None if the two share nothing. The same arguments always give the same numbers.
-
-    Examples:
-        >>> from torchrl_koap.studies.paired_comparison import compare
-        >>> good = {0: {(context, 7): True for context in range(6)}}
-        >>> poor = {0: {(context, 7): False for context in range(6)}}
-        >>> result = compare(good, poor)
-        >>> result.difference, result.p, result.contexts
-        (1.0, 0.03125, 6)
     """
     shared = {seed: first[seed].keys() & second[seed].keys() for seed in first.keys() & second.keys()}
     seeds = sorted(seed for seed, keys in shared.items() if keys)
@@ -145,11 +137,6 @@ def sign_flip_p(differences: Sequence[float]) -> float:
 
     Up to 13 of them all flips are counted; beyond, 10,000 drawn ones, the same in every call, and the observed one
     among them, so that the p-value is never below 2 / 10,001.
-
-    Examples:
-        >>> from torchrl_koap.studies.paired_comparison import sign_flip_p
-        >>> sign_flip_p([1, 1, 1]), sign_flip_p([1, -1, 0]), sign_flip_p([])
-        (0.25, 1.0, 1.0)
     """
     values = np.asarray(differences, dtype=float)
     values = values[values != 0]
@@ -160,13 +147,7 @@ def sign_flip_p(differences: Sequence[float]) -> float:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Holm's correction: p-values adjusted so that the chance of any false alarm stays below the level; None stays.
-
-    Examples:
-        >>> from torchrl_koap.studies.paired_comparison import holm
-        >>> holm([0.01, 0.04, None, 0.03])
-        [0.03, 0.06, None, 0.06]
-    """
+    """Holm's correction: p-values adjusted so that the chance of any false alarm stays below the level; None stays."""
     order = sorted((index for index, p in enumerate(p_values) if p is not None), key=lambda index: p_values[index])
     adjusted: list[float | None] = [None] * len(p_values)
     largest = 0.0

@@ -27,12 +27,6 @@ class Entry:
     Args:
         level (int): label level, 1 for the fewest labels.
         label_share (float): share of the labels.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper import Entry
-        >>> from torchrl_koap.studies.paper_results import paper_cell
-        >>> Entry("avoiding", "koap", 1, 0.02, None, paper_cell("avoiding", "koap", 1)).text
-        'not run [78.0 +- 8.6]'
     """
 
     task: str
@@ -66,12 +60,6 @@ def paper_entries(rows: Sequence[Mapping[str, Any]]) -> list[Entry]:
 
     Raises:
         ValueError: as :func:`~torchrl_koap.studies.summary.summarise`.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper import paper_entries
-        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.05, "seed": 0, "status": "missing"}
-        >>> [(entry.level, entry.paper.success) for entry in paper_entries([cell])]
-        [(2, 0.9805)]
     """
     found: dict[tuple[str, int, str], Summary] = {}
     for item in summarise(rows):
@@ -114,12 +102,6 @@ def default_entries(entries: Sequence[Entry]) -> list[Entry]:
     """Cells of the method that a task is trained with unless told otherwise, under one name, beside the paper's KOAP.
 
     Their method is :data:`DEFAULT`; tasks that nobody registered have none.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper import Entry, default_entries
-        >>> cells = [Entry("avoiding", method, 1, 0.02, None, None) for method in ("koap", "dp")]
-        >>> [(entry.method, entry.text) for entry in default_entries(cells)]
-        [("task's default", 'not run [78.0 +- 8.6]')]
     """
     own = [entry for entry in entries if (task := TASKS.get(entry.task)) and entry.method == task.defaults.method]
     return [replace(entry, method=DEFAULT, paper=paper_cell(entry.task, "koap", entry.level)) for entry in own]

@@ -27,11 +27,6 @@ class PaperCell:
         label_share (float): share of the labels at this level.
         success (float): mean success in 0..1.
         spread (float): what is printed after the ``+-``, in the same unit.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper_results import paper_cell
-        >>> paper_cell("avoiding", "koap", 1).text
-        '78.0 +- 8.6'
     """
 
     table: int
@@ -54,13 +49,7 @@ def _content() -> dict[str, Any]:
 
 
 def paper_levels(task: str) -> tuple[float, ...]:
-    """Shares of labels of the paper's levels, the fewest first; empty for a task that is not in the paper.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper_results import paper_levels
-        >>> paper_levels("avoiding"), paper_levels("sorting_6")
-        ((0.02, 0.05, 0.1, 0.25, 0.5), ())
-    """
+    """Shares of labels of the paper's levels, the fewest first; empty for a task that is not in the paper."""
     entries = [entry for entry in _content()["tasks"].values() if task in entry["tasks"]]
     return tuple(percent / 100 for entry in entries for percent in entry["label_percent"])
 
@@ -70,11 +59,6 @@ def paper_cells(table: int) -> list[PaperCell]:
 
     Raises:
         ValueError: for another table.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper_results import paper_cells
-        >>> len([cell for cell in paper_cells(1) + paper_cells(2) if cell.task != "stacking_1"])
-        165
     """
     tables = _content()["tables"]
     lookup(tuple(tables), str(table), "table of the paper")
@@ -89,13 +73,7 @@ def paper_cells(table: int) -> list[PaperCell]:
 
 
 def paper_cell(task: str, method: str, level: int) -> PaperCell | None:
-    """A cell of the paper, None if it has no such one; of both tables the first; level 1 has the fewest labels.
-
-    Examples:
-        >>> from torchrl_koap.studies.paper_results import paper_cell
-        >>> paper_cell("aligning", "koap", 1).success, paper_cell("aligning", "koap_untrained", 1)
-        (0.8028, None)
-    """
+    """A cell of the paper, None if it has no such one; of both tables the first; level 1 has the fewest labels."""
     return _by_place().get((task, method, level))
 
 

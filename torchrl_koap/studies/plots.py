@@ -54,14 +54,7 @@ class _Line:
 
 
 def method_styles(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Colour, marker and linestyle of every method, by its place; no two of the first 27 look alike.
-
-    Examples:
-        >>> from torchrl_koap.studies.plots import method_styles
-        >>> styles = method_styles([f"method {index}" for index in range(27)])
-        >>> len({str(style) for style in styles.values()})
-        27
-    """
+    """Colour, marker and linestyle of every method, by its place; no two of the first 27 look alike."""
     return {
         method: {
             "color": _COLORS[index % len(_COLORS)],

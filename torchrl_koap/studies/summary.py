@@ -47,13 +47,6 @@ class Summary:
     ``labels`` and ``demonstrations`` are shares; ``done``, ``failed`` and ``missing`` the seeds whose cell is that.
     ``measures`` are ``"success"``, ``"seed_success"`` (worst and best seed) and those :data:`MEASURES` that some cell
     has.
-
-    Examples:
-        >>> from torchrl_koap.studies.summary import summarise
-        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.02, "seed": 0, "status": "missing"}
-        >>> summary = summarise([cell])[0]
-        >>> summary.missing, summary.mean("success") is None
-        ((0,), True)
     """
 
     task: str
@@ -90,13 +83,6 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[Summary]:
 
     Raises:
         ValueError: if a cell occurs twice, or is done without its number of episodes and successes.
-
-    Examples:
-        >>> from torchrl_koap.studies.summary import summarise
-        >>> cell = {"task": "avoiding", "method": "koap", "labels": 0.02, "status": "done", "episodes": 30}
-        >>> pooled = summarise([cell | {"seed": 0, "successes": 30}, cell | {"seed": 1, "successes": 15}])[0]
-        >>> pooled.mean("success"), pooled.episodes, pooled.measures["seed_success"].low, pooled.done
-        (0.75, 60, 0.5, (0, 1))
     """
     groups: dict[tuple, dict[int, Mapping[str, Any]]] = {}
     tasks, methods = [list(dict.fromkeys(row[name] for row in rows)) for name in ("task", "method")]
