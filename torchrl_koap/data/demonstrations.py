@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
 from tensordict import TensorDict
 
-from torchrl_koap.data.formats.columns import kind_of
+from torchrl_koap.data.formats.columns import kind_of, unknown
 from torchrl_koap.data.formats.recordings import Recordings, make_recordings
 from torchrl_koap.data.quality import constant_columns
 from torchrl_koap.data.ted import save_ted
@@ -151,16 +150,17 @@ def make_demonstrations(
     if rate is None:
         problems.append("control_hz is missing: frames per second")
     commanded = _columns(command, names, "command", problems)
-    own = _columns(robot, names, "robot", problems) if robot is not None else None
-    if own is None:
-        own = [column for column in range(len(names)) if column not in commanded]
+    others = [column for column in range(len(names)) if column not in commanded]
+    own = others if robot is None else _columns(robot, names, "robot", problems)
     problems += [f"column {names[column]!r} is the robot's and a command" for column in own if column in commanded]
     if commanded and commanded != list(range(min(commanded), min(commanded) + len(commanded))):
         problems.append(f"command columns must lie side by side, got {', '.join(names[c] for c in commanded)}")
-    if len(commanded) == len(names):
+    if not others:
         problems.append("every column is a command: nothing is left to plan and act on")
     kinds: tuple[ActionKind, ...] = _each(action_kind, len(acting), "action_kind", problems)
     reached = _targets(kinds, targets, own, names, problems)
+    if targets is not None:
+        problems += [f"column {names[column]!r} is a target and a command" for column in reached if column in commanded]
     units = _each(action_units, len(acting), "action_units", problems)
     own_units = _each(state_units, len(names), "state_units", problems)
     problems += _coarse(np.concatenate(recordings.states), names)
@@ -170,12 +170,8 @@ def make_demonstrations(
     if problems:
         raise DataError(f"task {name!r}", problems)
     constants = constant_columns(np.concatenate(recordings.actions))
-    data = flatten_trajectories(
-        [torch.from_numpy(frames) for frames in recordings.states],
-        [torch.from_numpy(steps) for steps in recordings.actions],
-    )
-    state_column = {column: index for index, column in enumerate(c for c in range(len(names)) if c not in commanded)}
-    moved = [state_column[column] for column in reached]
+    data = flatten_trajectories(recordings.states, recordings.actions)
+    moved = [others.index(column) for column in reached]
     parts = _parts(names, set(own), set(commanded))
     task = Task(
         name=name,
@@ -189,7 +185,7 @@ def make_demonstrations(
         max_steps=max_steps or round(_SLACK * max(len(frames) for frames in recordings.states)),
         control_hz=float(rate),
         command=_COMMAND if commanded else None,
-        robot=tuple(state_column[column] for column in own),
+        robot=tuple(others.index(column) for column in own),
     )
     return data, task
 
@@ -211,17 +207,14 @@ def _parts(names: Sequence[str], own: set[int], commanded: set[int]) -> dict[str
 
 
 def _columns(given: Sequence[str | int], names: Sequence[str], what: str, problems: list[str]) -> list[int]:
-    found = []
-    for column in given:
-        if isinstance(column, str):
-            try:
-                found.append(list(names).index(lookup(names, column, f"column in {what}:")))
-            except ValueError as error:
-                problems.append(str(error))
-        elif 0 <= column < len(names):
-            found.append(int(column))
-        else:
-            problems.append(f"{what}: there is no column {column}, only 0..{len(names) - 1}")
+    problems += unknown([column for column in given if isinstance(column, str)], names, f"column in {what}:")
+    numbers = [names.index(column) if column in names else column for column in given]
+    found = [int(number) for number in numbers if not isinstance(number, str) and 0 <= number < len(names)]
+    problems += [
+        f"{what}: there is no column {number}, only 0..{len(names) - 1}"
+        for number in numbers
+        if not isinstance(number, str) and number not in found
+    ]
     repeated = sorted({names[column] for column in found if found.count(column) > 1})
     if repeated:
         problems.append(f"{what} holds {', '.join(repeated)} more than once")

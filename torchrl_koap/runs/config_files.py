@@ -7,6 +7,7 @@ import difflib
 import functools
 import importlib.metadata
 import json
+import os
 import platform
 import types
 from collections.abc import Iterator, Mapping
@@ -38,7 +39,7 @@ def read_config(run: RunDirectory) -> TrainConfig:
 
 def to_json(config: Any) -> dict[str, Any]:
     """Returns options as ``json`` reads them, section by section."""
-    return json.loads(json.dumps(asdict(config), default=str))  # paths
+    return json.loads(json.dumps(asdict(config), default=os.fspath))
 
 
 def from_json(kind: type[Config], content: Any, path: str | Path) -> Config:
