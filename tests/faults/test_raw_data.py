@@ -16,7 +16,7 @@ import pytest
 from fault_damage import DAMAGE, flip
 from fault_ledger import Fault, Place, check, edit_json, meet, table
 
-from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS
+from torchrl_koap.data.d3il.conversion import ROBOT_COLUMNS
 from torchrl_koap.files import sha256_of
 
 FILE = "env_003_00.pkl"

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_koap.data.d3il.conversion import CONVERTERS
-from torchrl_koap.data.d3il.raw import ROBOT_COLUMNS, RawEpisode
+from torchrl_koap.data.d3il.conversion import CONVERTERS, ROBOT_COLUMNS, RawEpisode
 from torchrl_koap.tasks import get_task
 
 

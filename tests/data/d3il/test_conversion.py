@@ -15,8 +15,14 @@ import torch
 from raw_episodes import made_up, pose, turned, write_folder, write_raw_episode
 
 from torchrl_koap.data import open_dataset
-from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files, read_raw
-from torchrl_koap.data.d3il.raw import RawEpisode
+from torchrl_koap.data.d3il.conversion import (
+    CONVERTERS,
+    ROBOT_COLUMNS,
+    RawEpisode,
+    find_raw_files,
+    read_raw,
+    read_raw_episode,
+)
 from torchrl_koap.files import DataError
 from torchrl_koap.keys import validate
 from torchrl_koap.tasks import TASKS, get_task
@@ -249,6 +255,15 @@ def test_faults_of_all_files_come_together(tmp_path):
     assert len(error.value.problems) == 5 and "env_000" not in text and calls[-1] == (4, 5)
 
 
+def broken(**arrays):
+    """A change of arrays of the robot."""
+    return lambda content: content["robot"].update({name: make(content["robot"]) for name, make in arrays.items()})
+
+
+def with_nan(robot):
+    return np.where(np.arange(15).reshape(5, 3) == 10, np.nan, robot["c_pos"])
+
+
 @pytest.mark.parametrize(
     ("change", "problems"),
     [
@@ -259,18 +274,44 @@ def test_faults_of_all_files_come_together(tmp_path):
             lambda c: c["blue-box2"]["pos"].__setitem__((2, 1), np.nan),
             ["'blue-box2/pos' is NaN or infinite in 1 values, first in row 2"],
         ),
+        (broken(c_pos=with_nan), ["'robot/c_pos' is NaN or infinite in 1 values, first in row 3"]),
+        (broken(c_pos=lambda r: r["c_pos"] / 0), ["'robot/c_pos' is NaN or infinite"]),
         (lambda c: c["red-box1"].update(quat=np.zeros((5, 3))), ["'red-box1/quat' must have shape (T, 4), got (5, 3)"]),
-        (lambda c: c["red-box1"].update(pos=np.zeros((4, 3))), ["unequal lengths"]),
+        (broken(c_pos=lambda r: r["c_pos"][:, :2]), ["'robot/c_pos' must have shape (T, 3), got (5, 2)"]),
+        (broken(gripper_width=lambda r: r["c_pos"]), ["'robot/gripper_width' must have shape (T,), got (5, 3)"]),
+        (broken(c_pos=lambda r: r["c_pos"].tolist()), ["'robot/c_pos' must be an array (T, 3), got list"]),
+        (broken(c_pos=lambda r: r["c_pos"].astype("U8")), ["'robot/c_pos' must hold real numbers, got dtype <U8"]),
+        (broken(c_pos=lambda r: r["c_pos"] + 1j), ["'robot/c_pos' must hold real numbers, got dtype complex128"]),
+        (lambda c: c["red-box1"].update(pos=np.zeros((4, 3))), ["unequal lengths: blue-box1/pos 5"]),
         (lambda c: (c.pop("red-box1"), c.pop("blue-box2")), ["missing key 'red-box1'", "missing key 'blue-box2'"]),
+        (
+            lambda c: (broken(j_pos=lambda r: r["j_pos"] * np.nan)(c), c["red-box1"].pop("quat"), c.pop("blue-box1")),
+            ["'robot/j_pos' is NaN or infinite in 35 values", "missing key 'red-box1/quat'", "missing key 'blue-box1'"],
+        ),
     ],
 )
 def test_what_is_missing_or_broken_is_named(tmp_path, change, problems):
     episode = made_up("sorting")
     content = {"robot": dict(episode.robot), **{name: dict(entry) for name, entry in episode.objects.items()}}
-    change(content)
+    with np.errstate(divide="ignore"):
+        change(content)
     file = tmp_path / "env_007_01.pkl"
     file.write_bytes(pickle.dumps(content))
     found = faults("sorting", tmp_path)
     assert len(found) == len(problems)
     for problem in problems:
         assert any(line.startswith(f"{file}: {problem}") for line in found), found
+
+
+@pytest.mark.parametrize("content", [[1, 2], {"robot": [1]}, {"observation": np.zeros(3)}, None])
+def test_other_contents(tmp_path, content):
+    (tmp_path / "other.pkl").write_bytes(pickle.dumps(content))
+    assert "missing key 'robot'" in faults("avoiding", tmp_path)[0]
+
+
+def test_what_is_there_is_read(tmp_path):
+    episode = made_up("stacking", extra=["target-box"])
+    path = write_raw_episode(tmp_path / "a.pkl", episode.robot, episode.objects, context=[(0.1, np.zeros(2))])
+    read = read_raw_episode(path, robot=list(ROBOT_COLUMNS), objects=["red-box"])
+    np.testing.assert_equal(read.robot, episode.robot)
+    np.testing.assert_equal(read.objects, episode.objects)

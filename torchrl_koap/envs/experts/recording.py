@@ -16,8 +16,7 @@ import numpy as np
 import torch
 
 from torchrl_koap import keys
-from torchrl_koap.data.d3il.conversion import CONVERTERS, Converter
-from torchrl_koap.data.d3il.raw import RawEpisode
+from torchrl_koap.data.d3il.conversion import CONVERTERS, Converter, RawEpisode
 from torchrl_koap.envs.base import ManipulationEnv
 from torchrl_koap.envs.experts.disturbances import Disturbances
 from torchrl_koap.envs.registry import mode_index_of
