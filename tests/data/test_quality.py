@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_koap.data import flatten_trajectories
-from torchrl_koap.data.quality import constant_columns, find_warnings, plan_coverage, still_ends
+from torchrl_koap.data import DataError, flatten_trajectories, make_recordings
+from torchrl_koap.data.quality import (
+    constant_columns,
+    drop_short,
+    find_warnings,
+    plan_coverage,
+    still_ends,
+    trim_still,
+)
 from torchrl_koap.tasks import Action, Task
 
 PATH = torch.arange(40.0).reshape(20, 2)
@@ -121,3 +128,22 @@ def test_stillness_is_told():
     assert still_ends(frames).tolist() == [[40, 0], [40, 0]]
     (warning,) = warnings(frames, columns=["q"], units=())
     assert warning.startswith("nothing moves in 68% of all frames at the start and 0% at the end")
+
+
+LINE = PATH.double().numpy()
+
+
+def test_frames_and_actions_are_cut_together():
+    frames = np.concatenate([LINE[:1].repeat(9, 0), LINE, LINE[-1:].repeat(4, 0)])
+    found = trim_still(make_recordings([frames, LINE], [np.arange(33.0)[:, None], None], control_hz=20))
+    np.testing.assert_array_equal(found.states, [LINE, LINE])
+    np.testing.assert_array_equal(found.actions[0][:, 0], np.arange(9.0, 28))
+    assert found.skipped == ("13 still frames of 1 trajectories",) and found.control_hz == 20
+
+
+def test_short_trajectories_are_left_out_and_named():
+    recordings = make_recordings([LINE[:16], LINE[:17], LINE], action_dim=1, sources=["a", "b", "c"])
+    found = drop_short(recordings)
+    assert found.sources == ("b", "c") and found.skipped == ("a (15 steps)",) and len(found.actions) == 2
+    with pytest.raises(DataError, match="no trajectory has the 16 steps of a window"):
+        drop_short(make_recordings([LINE[:9]], action_dim=1))

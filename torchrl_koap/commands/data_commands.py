@@ -14,10 +14,9 @@ from tensordict import TensorDictBase
 
 from torchrl_koap.commands.options import Command
 from torchrl_koap.data import open_dataset, read_recordings, save_demonstrations, write_recordings
-from torchrl_koap.data.cleaning import drop_short, trim_still
 from torchrl_koap.data.d3il.conversion import CONVERTERS, find_raw_files
 from torchrl_koap.data.formats import FORMATS, Recordings
-from torchrl_koap.data.quality import find_warnings, plan_coverage
+from torchrl_koap.data.quality import drop_short, find_warnings, plan_coverage, trim_still
 from torchrl_koap.data.ted import stored_folder
 from torchrl_koap.envs.experts.demonstration_folder import record_to_folder
 from torchrl_koap.envs.experts.demonstrations import BATCH_SIZE

@@ -1,19 +1,21 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""Warnings about demonstrations that are right in form and unlikely: said, not refused, since it may be meant."""
+"""What is right in form and unlikely in demonstrations: said, not refused, since it may be meant; some can be cut."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from torchrl_koap import keys
+from torchrl_koap.data.formats.recordings import Recordings
 from torchrl_koap.data.trajectories import trajectory_lengths
-from torchrl_koap.files import some
+from torchrl_koap.files import DataError, some
 from torchrl_koap.tasks import HORIZON, WINDOW, Task
 
 FARTHEST = 100.0  # m, or rad: no robot on a table gets there
@@ -190,6 +192,41 @@ def _stillness(trajectories: Sequence[np.ndarray], called: Sequence[str]) -> lis
         f" (most in {called[longest]}: {ends[longest, 0]} and {ends[longest, 1]} of {lengths[longest]}), so a policy"
         " may learn to stand still; `koap convert --trim-still` cuts them"
     ]
+
+
+def trim_still(recordings: Recordings) -> Recordings:
+    """Cuts the frames at both ends of trajectories in which nothing moves; ``skipped`` counts them."""
+    ends = still_ends(recordings.states)
+    spans = [(start, len(frames) - end) for frames, (start, end) in zip(recordings.states, ends, strict=True)]
+    return replace(
+        recordings,
+        states=[frames[start:end] for frames, (start, end) in zip(recordings.states, spans, strict=True)],
+        actions=[steps[start : end - 1] for steps, (start, end) in zip(recordings.actions, spans, strict=True)],
+        skipped=(*recordings.skipped, f"{ends.sum()} still frames of {ends.any(1).sum()} trajectories"),
+    )
+
+
+def drop_short(recordings: Recordings) -> Recordings:
+    """Leaves out trajectories with fewer steps than a window; ``skipped`` names them.
+
+    Raises:
+        DataError: if none is left.
+    """
+    kept = [index for index, steps in enumerate(recordings.actions) if len(steps) >= WINDOW]
+    if not kept:
+        raise DataError("these recordings", f"no trajectory has the {WINDOW} steps of a window")
+    short = [
+        f"{name} ({len(steps)} steps)"
+        for name, steps in zip(recordings.sources, recordings.actions, strict=True)
+        if len(steps) < WINDOW
+    ]
+    return replace(
+        recordings,
+        states=[recordings.states[index] for index in kept],
+        actions=[recordings.actions[index] for index in kept],
+        sources=tuple(recordings.sources[index] for index in kept),
+        skipped=(*recordings.skipped, *short),
+    )
 
 
 def plan_coverage(data: TensorDictBase, control_hz: float) -> tuple[str, str | None]:

@@ -1,7 +1,7 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
 """From a folder of D3IL's raw pickles to trajectories (docs/d3il.md, Recordings), by the task in :data:`CONVERTERS`.
 
-One pickle per demonstration (docs/d3il.md, Recordings), one row per control step, ``T`` rows::
+One pickle per demonstration, one row per control step, ``T`` rows::
 
     context                                              what the scene was reset to; None in Avoiding
     robot    c_pos, c_vel, des_c_pos            (T, 3)   measured velocity and pose, commanded pose of the end effector
@@ -31,21 +31,11 @@ from torchrl_koap.files import DataError
 from torchrl_koap.tasks.action_rules import gripper_command
 from torchrl_koap.tasks.features import tan_yaw
 
-ROBOT_COLUMNS = {
-    "time_stamp": (),
-    "sim_step": (),
-    "wall_clock": (),
-    "j_pos": (7,),
-    "j_vel": (7,),
-    "c_pos": (3,),
-    "c_vel": (3,),
-    "c_quat": (4,),
-    "des_c_pos": (3,),
-    "des_c_quat": (4,),
-    "des_j_pos": (7,),
-    "des_j_vel": (7,),
-    "des_j_acc": (7,),
-    "gripper_width": (),
+ROBOT_COLUMNS: dict[str, tuple[int, ...]] = {
+    **dict.fromkeys(("time_stamp", "sim_step", "wall_clock", "gripper_width"), ()),
+    **dict.fromkeys(("j_pos", "j_vel", "des_j_pos", "des_j_vel", "des_j_acc"), (7,)),
+    **dict.fromkeys(("c_pos", "c_vel", "des_c_pos"), (3,)),
+    **dict.fromkeys(("c_quat", "des_c_quat"), (4,)),
 }
 OBJECT_COLUMNS = {"sim_step": (), "pos": (3,), "quat": (4,)}
 _LEAST_ROWS = 2
