@@ -1,5 +1,5 @@
 # This source code is licensed under the MIT license found in the LICENSE file.
-"""The house: its rooms, what lies in them, and who may import whom, as the test of the imports has it."""
+"""The architecture: subpackages, their files, and who may import whom, as the test of the imports has it."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def write_design_page() -> None:
     ]
     write_page(
         "design",
-        heading("The house"),
-        "Rooms are folders of the package. An arrow points to what a room may import; what is imported by way of "
-        "another room is left out of the drawing. A test reads every import and fails where one points upward, so that "
-        "``import torchrl_koap.modules`` never loads a simulator.",
+        heading("Architecture"),
+        "An arrow points from a subpackage to one that it may import. Imports by way of another subpackage are left out "
+        "of the drawing. A test reads every import and fails where one points upward. So ``import "
+        "torchrl_koap.modules`` never loads a simulator.",
         ".. raw:: html\n   :file: rooms.svg",
-        table(("room", "may import"), rules),
+        table(("subpackage", "may import"), rules),
         *blocks,
     )
 
@@ -98,7 +98,7 @@ def drawing(allowed: dict[str, set[str]]) -> str:
         for room, (x, y) in place.items()
     ]
     return (
-        f'<svg class="drawing" viewBox="0 0 {WIDTH} {60 + ROW * top}" role="img" aria-label="rooms and imports">'
+        f'<svg class="drawing" viewBox="0 0 {WIDTH} {60 + ROW * top}" role="img" aria-label="subpackages and imports">'
         '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
         '<path d="M0 0 L8 4 L0 8 z"/></marker></defs>' + "".join((*lines, *boxes)) + "</svg>\n"
     )

@@ -29,7 +29,7 @@ EQUATIONS = {
 }
 WINDOWS = {
     "all": "all windows, labelled or not, as they come",
-    "mixed": "all windows, a quarter of every batch labelled",
+    "mixed": "all windows, 25 % of every batch labelled",
     "labelled": "labelled windows alone",
 }
 

@@ -169,7 +169,7 @@ def body_blocks(task: Task) -> list[str]:
     for index, body in enumerate(task.bodies):
         for (x0, x1), (y0, y1) in scene.starts_of(index):
             rows.append((body.label, f"{x0:g} to {x1:g}", f"{y0:g} to {y1:g}", f"{low:g} to {high:g}"))
-    dealt = "The regions are dealt out to the bodies at random." if scene.shared_starts else ""
+    dealt = "Each body gets one of the regions at random." if scene.shared_starts else ""
     return [
         heading("Where the bodies start", 1),
         table(("body", "x (m)", "y (m)", "yaw (deg)"), rows),

@@ -90,6 +90,14 @@ def test_text_of_tutorials_is_plain(file):
     assert not (found := [match[0] for match in BANNED.finditer(prose(text))]), found
 
 
+def test_words_of_the_appendix_and_of_generated_pages_are_plain():
+    pages = [page.read_text() for page in sorted((DOCS / "appendix").glob("*.md"))]
+    for file in sorted((DOCS / "extensions").glob("*.py")):
+        nodes = ast.walk(ast.parse(file.read_text()))
+        pages += [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    assert not (found := [match[0] for page in pages for match in BANNED.finditer(prose(page))]), found
+
+
 def test_every_picture_has_a_description():
     for page in (ROOT / "README.md", *DOCS.rglob("*.md")):
         for description in re.findall(r"!\[([^\]]*)\]", page.read_text()):
