@@ -40,8 +40,8 @@ def write_design_page() -> None:
     write_page(
         "design",
         heading("Architecture"),
-        "An arrow points from a subpackage to one that it may import. Imports by way of another subpackage are left out "
-        "of the drawing. A test reads every import and fails where one points upward. So ``import "
+        "An arrow points from a subpackage to one that it may import. Imports by way of another subpackage are left "
+        "out of the drawing. A test reads every import and fails where one points upward. So ``import "
         "torchrl_koap.modules`` never loads a simulator.",
         ".. raw:: html\n   :file: rooms.svg",
         table(("subpackage", "may import"), rules),

@@ -49,7 +49,7 @@ class _Line:
     paper: Sequence[tuple[float, float]] = ()
 
     @property
-    def places(self) -> list[float]:
+    def positions(self) -> list[float]:
         return [x for x, *_ in self.points]
 
 
@@ -153,7 +153,7 @@ def plot_average(
     figure = Figure(figsize=(7.4, 4.6), layout="constrained")
     axes = figure.add_subplot()
     _draw_lines(axes, lines, beside=lambda x, step: x + 0.028 * step)
-    levels = sorted({level for line in lines for level in line.places})
+    levels = sorted({level for line in lines for level in line.positions})
     axes.set(xlim=(levels[0] - 0.25, levels[-1] + 0.25), xticks=levels)
     axes.set(xlabel="label level (1: fewest labels)", ylabel="success (%)")
     _scale_shares(axes, 100)
@@ -211,8 +211,8 @@ def _lines(
             values = (factor * value for value in (found.mean, found.low, found.high))
             lines[item.method, item.labels if several else None].points.append((place, *values))
     drawn = [line for line in lines.values() if line.points]
-    if by == "demonstrations" and any(len(set(line.places)) > 1 for line in drawn):
-        return [line for line in drawn if len(set(line.places)) > 1]  # the others do not scale anything
+    if by == "demonstrations" and any(len(set(line.positions)) > 1 for line in drawn):
+        return [line for line in drawn if len(set(line.positions)) > 1]  # the others do not scale anything
     return drawn
 
 
@@ -239,7 +239,7 @@ def _scale_errors(axes: Axes, lines: Sequence[_Line]) -> None:
 
 def _log_x(axes: Axes, lines: Sequence[_Line], *, ticks: bool) -> None:
     """Logarithmic axis that ends at the data; ``ticks`` at the places themselves, where there is room."""
-    places = sorted({value for line in lines for value in [*line.places, *(place for place, _ in line.paper)]})
+    places = sorted({value for line in lines for value in [*line.positions, *(place for place, _ in line.paper)]})
     positive = [place for place in places if place > 0] or [1.0]
     low, high = positive[0], positive[-1]
     margin = max(1.12, (high / low) ** 0.06) if len(positive) > 1 else 2.0
