@@ -5,14 +5,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from inverse_dynamics_test_base import normalizers
+from inverse_dynamics_test_base import KEYS, T, normalizers, partly_labelled
 from loss_test_base import LossTestBase
-from tensordict import TensorDict
 
 from torchrl_koap.modules import SupervisedInverseDynamics, make_koopman_inverse_dynamics
 from torchrl_koap.objectives import ActionLoss, KOAPLoss
-
-T = 7
 
 
 def make_loss(seed=0, **options):
@@ -21,16 +18,12 @@ def make_loss(seed=0, **options):
     return ActionLoss(network, **options)
 
 
-def make_batch(*batch, share=0.5):
-    generator = torch.Generator().manual_seed(4)
-    has_action = torch.rand(*batch, T, 1, generator=generator) < share
-    action = torch.where(has_action, torch.randn(*batch, T, 2, generator=generator), torch.nan)
-    state = torch.randn(*batch, T, 3, generator=generator)
-    return TensorDict({"state": state, "action": action, "has_action": has_action}, batch)
+def windows(*batch):
+    return partly_labelled(*batch).exclude("padded")
 
 
 class TestActionLoss(LossTestBase):
-    default_keys = {"state": "state", "action": "action", "has_action": "has_action", "padded": "padded"}
+    default_keys = KEYS
     in_names, out_keys = ("state", "action", "has_action"), ("loss_action",)
     learning_rate = 1e-2
 
@@ -38,7 +31,7 @@ class TestActionLoss(LossTestBase):
         return make_loss(seed, **options)
 
     def make_batch(self, *batch):
-        return make_batch(*batch)
+        return windows(*batch)
 
     def counted(self, batch, key, elements):
         return int(batch["has_action"][..., 1:-1, :].sum())
@@ -46,7 +39,7 @@ class TestActionLoss(LossTestBase):
 
 @pytest.mark.parametrize("trailing", [True, False])
 def test_equals_a_plain_loop(trailing):
-    loss, batch = make_loss(), make_batch(4)
+    loss, batch = make_loss(), windows(4)
     padded = torch.zeros(4, T, 1, dtype=torch.bool)
     padded[0, :3], padded[1, -2:] = True, True
     prediction = loss.network(batch.clone())["action"]
@@ -63,7 +56,7 @@ def test_equals_a_plain_loop(trailing):
 
 def test_actions_of_another_width_are_refused_and_not_broadcast():
     network = SupervisedInverseDynamics(3, 2, num_past=1)
-    batch = make_batch(4)
+    batch = windows(4)
     batch["action"] = batch["action"][..., :1].contiguous()
     with pytest.raises(ValueError, match="'action' has 1 columns, the network decodes 2"):
         ActionLoss(network)(batch)

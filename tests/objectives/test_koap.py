@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from inverse_dynamics_test_base import KEYS, recorded
 from loss_test_base import LossTestBase
 from small_koopman import HISTORY, LOSSES, NETWORKS, K, T, make_batch, make_network
 from tensordict import TensorDict
@@ -18,7 +19,7 @@ def span(clamped):
 
 
 class TestKOAP(LossTestBase):
-    default_keys = {"state": "state", "action": "action", "has_action": "has_action", "padded": "padded"}
+    default_keys = KEYS
     in_names = ("state", "action", "has_action")
     out_keys = ("loss_reconstruction", "loss_koopman", "loss_action")
     coefficients = {"koopman_coeff": "loss_koopman", "action_coeff": "loss_action"}
@@ -36,10 +37,9 @@ class TestKOAP(LossTestBase):
     def counted(self, batch, key, elements):
         if key == "loss_reconstruction":
             return elements.numel()
-        frames = slice(span(False).start, span(False).stop)
-        count = ~(batch["padded"][..., frames] | batch["padded"][..., frames.start + 1 : frames.stop + 1])
+        count = recorded(batch, span(False))
         if key == "loss_action":
-            count &= batch["has_action"][..., frames, 0]
+            count &= batch["has_action"][..., span(False).start : span(False).stop, 0]
         assert (elements[~count] == 0).all() and (elements[count] > 0).all()
         return count.sum()
 

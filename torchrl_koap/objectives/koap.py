@@ -13,6 +13,7 @@ without labels gives exactly 0, and an unlabelled (NaN) action reaches neither v
 
 from __future__ import annotations
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
@@ -41,7 +42,7 @@ class _KoopmanLoss(WindowLoss):
                 latent = network.infer(state, span)
             if RECONSTRUCTION in wanted:
                 error = network.lifting.reconstruction_error(lifted, network.normalize_state(state))
-                found[RECONSTRUCTION] = self._reduce(error)
+                found[RECONSTRUCTION] = self._reduce(error, torch.ones_like(error, dtype=torch.bool))
             if KOOPMAN in wanted:
                 predicted = network.predict_next(lifted[..., span.start : span.stop, :], latent)
                 error = (predicted - lifted[..., span.start + 1 : span.stop + 1, :]).square().mean(-1)

@@ -7,16 +7,13 @@ import pytest
 import torch
 from inverse_dynamics_test_base import (
     ACTION,
-    KEYS,
     STATE,
     InverseDynamicsTestBase,
     T,
     normalizers,
     partly_labelled,
     reached,
-    recorded,
 )
-from loss_test_base import LossTestBase
 from tensordict import TensorDict
 
 from torchrl_koap.modules import NonlinearInverseDynamics
@@ -34,30 +31,6 @@ def make_network(seed=0, **options):
 class TestNonlinearInverseDynamics(InverseDynamicsTestBase):
     def make_network(self, seed=0, **options):
         return make_network(seed, **options)
-
-
-class TestLoss(LossTestBase):
-    default_keys = KEYS
-    in_names = ("state", "action", "has_action")
-    out_keys = ("loss_reconstruction", "loss_koopman", "loss_action")
-    coefficients = {"koopman_coeff": "loss_koopman", "action_coeff": "loss_action"}
-    learning_rate = 1e-2
-    test_compiled_equals_eager = None  # that of the Koopman model compiles the same terms
-
-    def make_loss(self, seed=0, **options):
-        return KOAPLoss(make_network(seed), **options)
-
-    def make_batch(self, *batch):
-        return partly_labelled(*batch)
-
-    def counted(self, batch, key, elements):
-        if key == "loss_reconstruction":
-            return elements.numel()
-        counts = recorded(batch, SPAN)
-        if key == "loss_action":
-            counts = counts & batch["has_action"][..., SPAN.start : SPAN.stop, 0]
-        assert (elements[~counts] == 0).all() and (elements[counts] > 0).all()
-        return int(counts.sum())
 
 
 def in_plain_loops(network, batch):
