@@ -88,15 +88,23 @@ def test_the_seed_fixes_everything(make_policy, layout):
     env.close()
 
 
+@pytest.mark.parametrize("collected", [False, True])
 @pytest.mark.parametrize("make_policy", [feedback, open_loop, candidates, chunks])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_every_environment_is_served_as_if_it_were_alone(make_policy, layout):
+def test_every_environment_is_served_as_if_it_were_alone(make_policy, layout, collected):
     env = LAYOUTS[layout](make_policy)
-    env.set_seed(2)
-    with torch.no_grad():
-        rollout = env.rollout(8, make_policy(), break_when_any_done=False)  # episodes last six steps
+    if collected:
+        frames = 8 * max(env.batch_size.numel(), 1)
+        collector = Collector(env, make_policy(), frames_per_batch=frames, total_frames=frames)
+        collector.set_seed(3)
+        (rollout,) = list(collector)
+        collector.shutdown()
+    else:
+        env.set_seed(2)
+        with torch.no_grad():
+            rollout = env.rollout(8, make_policy(), break_when_any_done=False)  # episodes last six steps
+        env.close()
     assert rollout.shape == (*env.batch_size, 8)
-    env.close()
     alone(make_policy, rollout)
 
 
@@ -140,19 +148,6 @@ def _in_processes(make_policy, layout):
         env.close()
     for key in ("observation", "action"):  # another process may round differently, and random weights answer that
         torch.testing.assert_close(rollouts[0][key], rollouts[1][key], rtol=1e-3, atol=1e-2)
-
-
-@pytest.mark.parametrize("make_policy", [feedback, open_loop, candidates, chunks])
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_in_a_collector(make_policy, layout):
-    env = LAYOUTS[layout](make_policy)
-    frames = 8 * max(env.batch_size.numel(), 1)
-    collector = Collector(env, make_policy(), frames_per_batch=frames, total_frames=frames)
-    collector.set_seed(3)
-    (batch,) = list(collector)
-    collector.shutdown()
-    assert batch.shape[-1] == 8
-    alone(make_policy, batch)
 
 
 @POLICIES

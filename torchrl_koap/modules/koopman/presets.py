@@ -100,13 +100,14 @@ def make_koopman_inverse_dynamics(
 ) -> KoopmanInverseDynamics:
     """Builds a :class:`KoopmanInverseDynamics` from a preset; keywords override single choices.
 
+    Normalisers, ``columns`` and ``targets`` are those of :class:`~torchrl_koap.modules.InverseDynamics`.
+
     Args:
         state_dim (int): number of state columns that are read.
         action_dim (int): size of an action.
 
     Keyword Args:
         preset (str): ``"default"``, ``"absolute"``, ``"semi_supervised"`` or ``"paper"``.
-        state_normalizer, action_normalizer, columns, targets: see :class:`~torchrl_koap.modules.InverseDynamics`.
         **overrides: any entry of ``PRESETS[preset]``, and of ``NETWORK_OPTIONS`` for the network chosen.
 
     Returns:
